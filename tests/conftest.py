@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import control
 import numpy as np
@@ -13,12 +14,10 @@ from matplotlib.figure import Figure
 
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
+from impc.studies.example.cases import CaseResult, run_case
+from plants import yalmip_example
 from tests.labelled_axes import require_labels
 from tests.support import SEARCH, leave_blank
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 
 # What a command says must not depend on how fast it was; tests of progress ask for it.
 os.environ["IMPC_QUIET"] = "1"
@@ -60,3 +59,9 @@ def example_plant() -> Plant:
 def example_bounds(example_plant: Plant) -> Bounds:
     """|u| <= 1."""
     return Bounds(example_plant, u_min=-1, u_max=1)
+
+
+@pytest.fixture(scope="session")
+def case_a() -> CaseResult:
+    """Case A of the example, by every method."""
+    return run_case(Plant(yalmip_example()), "A")

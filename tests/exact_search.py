@@ -10,33 +10,17 @@ from __future__ import annotations
 
 from decimal import Decimal
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from tests.exact_mpc import NOTHING, ROUNDED, ZERO, exact, solve, zeros
-
-if TYPE_CHECKING:
-    from tests.exact_mpc import Exact, ExactProgram
+from tests.exact_mpc import NOTHING, ROUNDED, ZERO, Exact, ExactProgram, exact, solve, zeros
 
 
 def first_input(
     program: ExactProgram, x: np.ndarray, guess: np.ndarray, kept: Decimal = ROUNDED
 ) -> np.ndarray | None:
-    """The proved first input at a state (n,); None when it is proved that there is none.
-
-    Parameters
-    ----------
-    guess : (2 N m + r,) of bool
-        The rows that are thought to be active.
-    kept : Decimal
-        What a row may be exceeded by, as a share of its right side.
-
-    Raises
-    ------
-    ArithmeticError
-        When a hundred digits are too few for either proof.
-    """
+    """The proved first input at a state (n,); None when it is proved that there is none."""
     start = exact(x)
     u, price = _Search(program, start, np.array(guess, dtype=bool)).run(kept)
     if u is None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import control
 import numpy as np
+import pytest
 import scipy.optimize
 from hypothesis import settings
 from matplotlib.figure import Figure
@@ -20,16 +23,8 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.studies.cache import Steps
 from impc.studies.pool import Answer, Task, answered
-
-if TYPE_CHECKING:
-    import io
-    from collections.abc import Callable
-
-    import pytest
-
-    from impc.studies.cache import Steps
-
 
 #: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
 SEARCH = int(os.environ.get("IMPC_SEARCH", "1"))

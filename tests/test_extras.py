@@ -8,16 +8,13 @@ import re
 import subprocess
 import sys
 import tomllib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from impc.extras import EXTRAS
 from tests.documents.blocks import ROOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 OWN = {"impc", "plants"}
@@ -135,18 +132,3 @@ def test_one_line_says_how_to_get_it(call: str, message: str, tmp_path: Path) ->
         tmp_path,
     )  # fmt: skip
     assert done.stdout == message + "\n", done.stderr
-
-
-@pytest.mark.full
-def test_a_subject_is_simulated_in_the_formats_that_are_there(tmp_path: Path) -> None:
-    done = plain(
-        "from impc.cli.main import main\n"
-        "main(['simulate', 'seated-balance', '--out', 's', '--trials', '1', '--duration', '2'])",
-        tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(
-        "without c3d, tdms; to write them too: pip install 'impc[formats]'\n"
-    )
-    written = {path.name for path in (tmp_path / "s").iterdir() if "trial" in path.name}
-    assert written == {f"trial_1{end}" for end in (".csv", ".tsv", ".xlsx", ".mat", "_v73.mat")}

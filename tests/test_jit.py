@@ -64,17 +64,6 @@ def test_a_folder_that_others_could_have_made_is_not_used(
     assert "NUMBA_CACHE_DIR" not in os.environ
 
 
-def test_nothing_is_said_or_set_where_caches_can_be_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("NUMBA_CACHE_DIR", "MPLCONFIGDIR"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    assert keep_caches() == ""
-    assert "NUMBA_CACHE_DIR" not in os.environ
-
-
 def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "impc/__pycache__").write_text("a file, where numba would make a folder")

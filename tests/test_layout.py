@@ -8,9 +8,7 @@ from tests.documents.blocks import ROOT
 
 LONGEST = 60
 #: Compiled inner loops: a call would have to pass, and allocate, what they keep in registers.
-KERNELS = {
-    "impc/control/compiled_dual.py": {"solve_dual"},
-}
+KERNELS = {"impc/control/compiled_dual.py": {"solve_dual"}}
 
 
 def lines(node: ast.FunctionDef) -> int:

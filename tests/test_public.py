@@ -59,12 +59,6 @@ def test_importing_it_loads_no_other_library() -> None:
     assert {name for name in found if name.startswith("impc.")} == set()
 
 
-def test_a_name_loads_its_module_and_not_the_others() -> None:
-    found = loaded("import impc", "impc.Weights")
-    assert {"impc.model.weights", "numpy"} <= found
-    assert found.isdisjoint({"casadi", "numba", "impc.inverse.problem", "matplotlib"})
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -87,21 +81,6 @@ def test_the_example_of_the_name_runs(
         runner.run(test, out=told.append)
     assert runner.summarize(verbose=False).attempted > 0
     assert told == []
-
-
-def test_an_example_that_is_wrong_is_found() -> None:
-    def wrong() -> None:
-        """Add.
-
-        Examples
-        --------
-        >>> 1 + 1
-        3
-        """
-
-    found = doctest.DocTestFinder(recurse=False).find(wrong, "wrong", globs={})
-    runner = doctest.DocTestRunner(optionflags=FLAGS)
-    assert runner.run(found[0], out=lambda _: None).failed == 1
 
 
 def test_the_page_lists_every_name_once() -> None:

@@ -12,12 +12,9 @@ import hashlib
 import json
 import os
 import pickle
-import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -29,14 +26,12 @@ from impc.control.simulation import scenario
 from impc.errors import InfeasibleError
 from impc.files.formats import write_table
 from impc.files.table import make_table
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from impc.model.weights import Weights
 from tests.experiments.test_nonlinear_mpc import linear_step
 from tests.nonlinear.test_problem import TRUTH, made
 from tests.studies.cohort.carts import cart_plant, subject_trial
-
-if TYPE_CHECKING:
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
 
 ROOT = Path(__file__).parents[1]
 # Python runs it in each process, before anything else.
@@ -208,20 +203,6 @@ def test_results_are_those_of_the_folder_without(runs: tuple[Path, Path, list[st
     assert pictures
     for name in (*pictures, Path("out", "units.csv")):
         assert (plain / name).read_bytes() == (trapped / name).read_bytes(), name
-
-
-@pytest.mark.full
-@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
-def test_no_library_opens_anything_of_the_folder(runs: tuple[Path, Path, list[str]]) -> None:
-    """Those in C too, which tell Python nothing."""
-    trapped = runs[1]
-    log = trapped.parent / "strace"
-    calls = ("-f", "-qq", "--seccomp-bpf", "-e", "trace=open,openat,execve", "-o", str(log))
-    run(trapped, "again", "strace", *calls)
-    named = re.findall(r'(?:open|openat|execve)\((?:AT_FDCWD, )?"([^"]+)"', log.read_text())
-    opened = {os.path.normpath(trapped / name) for name in named}
-    assert f"{trapped}/sub-1.mat" in opened
-    assert sprung(trapped, opened) == set()
 
 
 def test_ipopt_obeys_no_file(

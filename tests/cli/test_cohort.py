@@ -9,9 +9,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import psutil
@@ -19,14 +20,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from impc.cli.main import main
-from impc.reporting.writer import owned
-from impc.studies import scheduler
 from tests.studies.cohort.carts import write_study
 from tests.studies.test_scheduler import certificates
 from tests.support import leave_blank
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[2]
 SEED = 8
@@ -101,10 +97,7 @@ def workers_of(process: psutil.Process) -> list[psutil.Process]:
 
 @pytest.mark.parametrize(
     "kills",
-    [
-        pytest.param((1, 1), marks=pytest.mark.full),
-        pytest.param((3, 2), marks=pytest.mark.full),
-    ],
+    [pytest.param((1, 1), marks=pytest.mark.full), pytest.param((3, 2), marks=pytest.mark.full)],
 )
 def test_workers_and_client_may_die(
     study: Path, undisturbed: Path, tmp_path: Path, kills: tuple[int, int]
@@ -190,15 +183,6 @@ def scheduler_and_workers(folder: Path, workers: int, *tls: str) -> Iterator[tup
 
 
 @pytest.mark.full
-def test_a_scheduler_of_ones_own(study: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Scheduler and two workers started apart: the same bytes."""
-    with scheduler_and_workers(tmp_path, 2) as (_, address):
-        done = run(study, tmp_path / "out", "--scheduler", address)
-    assert done.returncode == 0, done.stderr
-    same_tables(tmp_path / "out", undisturbed)
-
-
-@pytest.mark.full
 @pytest.mark.parametrize("secure", [False, True])
 def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
     secure: bool, study: Path, undisturbed: Path, tmp_path: Path
@@ -231,24 +215,6 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
     done = run(study, out, "--workers", "1")
     assert done.returncode == 0, done.stderr
     same_tables(out, undisturbed)
-
-
-def test_no_scheduler_is_one_line(
-    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(scheduler, "_PATIENCE", "1s")
-    done = run_here(study, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
-    assert done.exit_code == 2
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert "does not answer" in done.stderr
-
-
-def test_two_runs_into_one_folder_are_refused(study: Path, tmp_path: Path) -> None:
-    with owned(tmp_path, "cohort"):
-        done = run(study, tmp_path, "--workers", "1")
-    assert done.returncode == 2
-    assert "another run is writing to it" in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -284,14 +250,3 @@ def test_damaged_recordings_stop_nobody_else(
     again = run_here(study, out, "--workers", "1")
     assert again.exit_code == 0, again.stderr
     assert len(pd.read_csv(out / "units.csv")) == subjects
-
-
-def test_other_settings_are_refused(study: Path, undisturbed: Path) -> None:
-    text = study.read_text()
-    try:
-        study.write_text(text.replace("horizon = 10", "horizon = 5"))
-        done = run_here(study, undisturbed, "--workers", "1")
-    finally:
-        study.write_text(text)
-    assert done.exit_code == 2
-    assert "other recordings or with other settings" in done.stderr

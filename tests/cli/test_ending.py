@@ -151,18 +151,6 @@ def command(
     )  # fmt: skip
 
 
-@pytest.mark.full
-def test_modules_beside_recordings_replace_nothing(tmp_path: Path) -> None:
-    """Neither the package's plants nor what is installed, nor what is not: slycot is not."""
-    for name in ("numpy", "json", "plants", "control", "click", "scipy", "casadi", "slycot"):
-        (tmp_path / f"{name}.py").write_text("open('imported', 'a').write(__name__)\n")
-    (tmp_path / "a.csv").write_text(RECORDING)
-    done = command("inspect", "a.csv", "--plant", "seated-balance", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert not (tmp_path / "imported").exists()
-    assert "[signals.theta1]" in done.stdout
-
-
 INTERRUPTED = """
 import atexit, os, signal
 def interrupt():

@@ -21,10 +21,8 @@ from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
 from impc.files.results import read_result
-from impc.inverse.methods import METHODS
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings
-from tests.files.damaged import DAMAGED, PLANT
 from tests.support import easier_seat
 
 OWN_PLANT = """
@@ -206,14 +204,6 @@ def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> Non
     np.testing.assert_array_equal(sheet.theta1_simulated, tables["trajectories"].theta1_simulated)
 
 
-def test_the_command_prints_the_table(fitted: tuple[Result, Path]) -> None:
-    printed = fitted[0].stdout
-    for name in ("feedback_gain", "inverse_lqr_output", "clipped_lqr", "inverse_mpc"):
-        assert f"\n{METHODS[name].label} " in printed
-    assert "VAF of trials left out, theta1" in printed
-    assert "degrees: so far it is not the subject's" in printed
-
-
 @pytest.mark.full
 def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A semicolon file with decimal commas; a plant beside it; names to stumble over."""
@@ -252,27 +242,6 @@ def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.Monk
     assert "<i>" not in page
     assert r"$\frac{F}$ &lt;i&gt;" in page
     assert found["trials"][0]["trial"] == r"mine\udcff$x^$"
-
-
-@pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_recording_ends_in_one_line_and_nothing_else(name: str, tmp_path: Path) -> None:
-    damage = DAMAGED[name]
-    folder = tmp_path / "in"
-    folder.mkdir()
-    path, text = damage.make(folder)
-    config = tmp_path / "subject.toml"
-    config.write_text(text)
-    out = tmp_path / "out"
-    done = run("fit", str(path), "--plant", PLANT, "--config", str(config),
-               "--out", str(out))  # fmt: skip
-    assert done.exit_code == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("impc: error: ")
-    assert done.stderr.count("\n") == 1
-    assert damage.phrase in done.stderr
-    assert not out.exists()
-    if path.exists() and path.is_file():
-        os.remove(path)
 
 
 @pytest.mark.parametrize(

@@ -134,19 +134,3 @@ def test_a_plan_that_cannot_be_made_is_refused_in_one_line(
     assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "out" / "report.html").exists()
-
-
-def test_the_file_of_a_plan_is_one_that_a_fit_reads(tmp_path: Path) -> None:
-    """[plan] stands beside the tables of `impc fit`, which passes over it."""
-    signals = (
-        "\n[recording]\nrate = 100\n"
-        '[signals.theta1]\ncolumn = "a"\nunit = "deg"\n'
-        '[signals.theta2]\ncolumn = "b"\nunit = "deg"\n'
-    )
-    (tmp_path / "both.toml").write_text(PLAN + signals, encoding="utf-8")
-    (tmp_path / "none.csv").write_text("a,b\n1,2\n", encoding="utf-8")
-    done = run(
-        "fit", str(tmp_path / "none.csv"), "--plant", "seated-balance",
-        "--config", str(tmp_path / "both.toml"), "--out", str(tmp_path / "fit"),
-    )  # fmt: skip
-    assert "none.csv" in done.stderr  # read, and too short

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from impc.cli.console import progress
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @pytest.fixture(autouse=True)
@@ -28,23 +26,6 @@ def interrupted(*given: Any) -> None:
 def test_an_interruption_says_how_much_is_kept() -> None:
     with pytest.raises(KeyboardInterrupt, match="2 of 9"):
         interrupted(9, "step", lambda count: f"{count} of 9")
-
-
-def test_a_first_step_tells_nothing_of_the_others(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """It may have compiled what they use."""
-    times = iter(range(0, 1000, 20))
-    monkeypatch.setattr("impc.cli.console.time.monotonic", lambda: next(times))
-    with progress(9, "step") as done:
-        done("a")
-    assert capsys.readouterr().err == "1 of 9 steps (a)\n"
-
-
-def test_without_anything_kept_nothing_is_said() -> None:
-    with pytest.raises(KeyboardInterrupt) as caught:
-        interrupted(2, "step")
-    assert caught.value.args == ()
 
 
 def test_lines_stand_in_a_pipe_every_ten_seconds(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +15,6 @@ from impc.errors import FallError
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings, read_unit
 from impc.studies.cohort.study import read_study
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(("noise", "least", "most"), [("0", 0.93, 1.07), ("3", 2.0, 6.0)])
@@ -45,13 +42,6 @@ def test_the_truth_moved_by_what_is_recorded_leaves_the_noise_of_the_recorder(
             x = np.array(body(x, np.append(-K @ x, trial.disturbance[k])))[:, 0]
         left = np.degrees(trial.outputs - states @ plant.C.T)
         assert least < np.sqrt(np.mean(left**2)) / 0.03 < most
-
-
-def test_the_next_command_is_said(tmp_path: Path) -> None:
-    out = tmp_path / "my data"
-    given = ("--subjects", "2", "--trials", "1", "--duration", "5", "--out", str(out))
-    done = CliRunner().invoke(main, ["simulate", "cohort", *given])
-    assert done.stdout.splitlines()[-1] == f"next: impc cohort '{out}'/study.toml"
 
 
 def test_falls_are_said_and_their_trials_left_out(tmp_path: Path) -> None:

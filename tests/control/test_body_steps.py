@@ -1,4 +1,4 @@
-"""The loop with a body that is not linear: its trajectory, and its derivatives."""
+"""The loop with a body that is not linear: its trajectory, its derivatives, its code."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import scipy.integrate
 from impc.arrays import Array
 from impc.checking import replace
 from impc.cli.seat import seat_controller
-from impc.control.body_steps import next_state, slopes_along
+from impc.control.body_steps import address, body_tape, next_state, slopes_along
 from impc.control.casadi_controller import build_mpc, simulate_mpc
 from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.compiled_body import states_along
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
@@ -196,13 +197,6 @@ def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
     assert np.max(np.abs(drift)) > 1e-3
 
 
-def test_the_linearisation_of_the_seats_body_is_its_plant() -> None:
-    plant = seat_controller({}, 6.0).plant
-    still = np.zeros((1, plant.n)), np.zeros((1, plant.m)), np.zeros((1, 1))
-    for found, exact in zip(slopes_along(plant, *still), (plant.A, plant.B, plant.E), strict=True):
-        assert np.allclose(found[0], exact, rtol=0, atol=1e-14)
-
-
 def test_other_solvers_and_casadis_controller_move_the_same_body() -> None:
     plant = pendulum()
     controller = law(plant)
@@ -246,3 +240,27 @@ def test_the_loop_function_differentiates_through_the_body() -> None:
         push[k] = h
         moved = end(at[0], START, PUSH + push) - end(at[0], START, PUSH - push)
         assert np.allclose(by_push[k, 0], moved[0] / (2 * h), rtol=1e-5, atol=1e-7)
+
+
+def test_bodies_that_differ_by_parameters_share_their_code() -> None:
+    """A family of plants is translated once; the constants are those of each."""
+    one, other = pendulum(2.1), pendulum(2.2)
+    assert one.body is not None
+    assert other.body is not None
+    assert address(one.body, 2, moving=True) == address(other.body, 2, moving=True)
+    assert address(one.body, 2, moving=True) != address(one.body, 2, moving=False)
+    given = np.array([0.4, -0.2]), np.array([0.3]), np.array([0.1])
+    assert np.any(next_state(one, *given) != next_state(other, *given))
+
+
+def test_the_same_states_with_derivatives_and_without() -> None:
+    """To the last digit, and without them nothing behind the states is written."""
+    body = pendulum().body
+    x, rest = np.random.default_rng(0).standard_normal((30, 2)), np.zeros((30, 1))
+    found = []
+    for moving in (False, True):
+        tape, ahead = body_tape(body, 2, 4, moving=moving), np.empty((30, 2))
+        states_along(tape, x, rest, rest, ahead)
+        assert bool(np.any(tape.slopes)) == moving
+        found.append(ahead)
+    assert np.array_equal(found[0], found[1])

@@ -11,10 +11,8 @@ import pytest
 
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
-from impc.control.named_solver import excluded_row
-from impc.control.simulation import Scenario, Status, require_complete, scenario
+from impc.control.simulation import Scenario, Status, require_complete
 from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -51,17 +49,6 @@ def test_soft_rows_on_a_plant_that_runs_away_are_refused_by_name() -> None:
     assert np.all(np.abs(run.u) <= 1 + 1e-9)
     with pytest.raises(SolverError, match="cannot be determined in double precision"):
         require_complete(controller, run)
-
-
-def test_a_feasible_program_has_no_excluded_row(example_plant: Plant) -> None:
-    """A plan keeps every row from the first starts, and none does from the last."""
-    bounds = Bounds(example_plant, u_min=-1, u_max=1, x_min=-3, x_max=3)
-    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3)
-    rows = build_rows(controller)
-    for x0 in ([0.0, 0.0], [1.0, 1.5], [-1.0, -1.5]):
-        assert simulate(controller, scenario(example_plant, x0, 1)).complete
-        assert excluded_row(rows, np.array(x0)) == -1
-    assert excluded_row(rows, np.array([2.9, -2.9])) >= 0
 
 
 def test_random_plants_are_right_or_say_no() -> None:

@@ -161,18 +161,6 @@ def test_a_given_disturbance_is_no_input() -> None:
         closed_loop_function(controller)
 
 
-def test_the_solver_of_the_controller_is_that_of_the_function(example_plant: Plant) -> None:
-    bounds = Bounds(example_plant, u_min=-1, u_max=1)
-    law = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3)
-    found = [
-        closed_loop_function(replace(law, solver=solver), 20).jacobian()(
-            law.K, 1, [1, 3], ca.DM(20, 0), 0, 0
-        )[0]
-        for solver in ("compiled", "qpoases")
-    ]
-    np.testing.assert_allclose(found[0].full(), found[1].full(), atol=1e-12)
-
-
 def test_what_is_no_controller_is_nan(example_plant: Plant) -> None:
     bounds = Bounds(example_plant, u_min=-1, u_max=1)
     law = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3)

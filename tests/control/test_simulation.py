@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from impc.control.simulation import Simulation, Status, require_complete, scenar
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.model.weights import Weights
 
 
@@ -67,3 +69,17 @@ def test_a_scenario_says_what_is_missing(example_plant: Plant) -> None:
     with pytest.raises(DataError, match="x0"):
         scenario(example_plant, [1, np.nan], 5)
     assert scenario(example_plant, [1, 3], 5).disturbance.shape == (5, 0)
+
+
+def test_a_start_beyond_feasibility_is_nan_and_no_recording() -> None:
+    """It was a frozen state with u = 0, from which weights were inferred without a word."""
+    plant = Plant(control.ss([[2.0]], [[1]], [[1]], 0, 1))
+    law = Controller(plant, Weights(1, 1), Bounds(plant, u_min=-1, u_max=1), 3)
+    with pytest.warns(UserWarning, match="sample 0: .*; what follows is NaN"):
+        run = law.simulate([2.0], steps=5)
+    assert run.status[0] == Status.INFEASIBLE
+    assert run.x[0] == 2.0
+    assert np.all(np.isnan(run.x[1:]))
+    assert np.all(np.isnan(run.u))
+    with pytest.raises(DataError, match="NaN"):
+        Recording(plant, run.x)

@@ -26,20 +26,7 @@ _FILE = re.compile(r"# (\S+\.\w+)\n")
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block.
-
-    Attributes
-    ----------
-    page : str
-        "README.md", "docs/start.md".
-    line : int
-        Of its first line in the page, from 1.
-    language : str
-    text : str
-        Without the indentation of a list.
-    output : str or None
-        The `text` block that follows directly; None when none does.
-    """
+    """A fenced block."""
 
     page: str
     line: int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import msgspec
 
@@ -13,9 +13,6 @@ from impc.studies.cohort.study import StudyTable
 from impc.studies.fit.settings import fit_settings
 from impc.studies.selection.settings import select_settings
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 __all__ = ["require_valid"]
 
 # What a part lacks to be a configuration.
@@ -23,13 +20,7 @@ _SIGNAL = '\n[signals.any]\ncolumn = "any"\nunit = "1"\n'
 
 
 def require_valid(text: str, folder: Path) -> None:
-    """Read a block as the commands do.
-
-    Raises
-    ------
-    ImpcError, msgspec.ValidationError
-        When a key is unknown, or a value of the wrong kind or out of range.
-    """
+    """Read a block as the commands do."""
     whole = "signals" in tomllib.loads(text)
     path = folder / "block.toml"
     path.write_text(text if whole else text + _SIGNAL, encoding="utf-8")

@@ -15,15 +15,12 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from click.testing import CliRunner
 
 from impc.cli.main import main
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 __all__ = ["run_line", "working_in"]
 
@@ -49,14 +46,7 @@ def working_in(folder: Path) -> Iterator[None]:
 
 
 def run_line(line: str, kept: Path) -> str:
-    """Run one line in the current folder and return what it prints.
-
-    Parameters
-    ----------
-    line : str
-    kept : Path
-        Folder for what `impc simulate` and `impc fit` made, for the lines that make the same.
-    """
+    """Run one line in the current folder and return what it prints."""
     program, *arguments = shlex.split(line)
     importlib.invalidate_caches()
     if program in ("impc", ".venv/bin/impc"):

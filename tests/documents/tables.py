@@ -9,14 +9,7 @@ __all__ = ["NOT_RUN", "PREPARED", "SMALLER", "Smaller"]
 
 @dataclass(frozen=True)
 class Smaller:
-    """What is run instead of a line of a page.
-
-    Attributes
-    ----------
-    lines : tuple of str
-        Command lines; `edit FILE OLD NEW` does what an editor would do.
-    reason : str
-    """
+    """What is run instead of a line of a page."""
 
     lines: tuple[str, ...]
     reason: str
@@ -36,14 +29,10 @@ NOT_RUN = {
     ("README.md", ". .venv/bin/activate"): _ENVIRONMENT,
     ("docs/start.md", "make demo"): _ENVIRONMENT,
     ("docs/start.md", ". .venv/bin/activate"): _ENVIRONMENT,
-    ("docs/contributing.md", "make check"): _WHOLE,
-    ("docs/contributing.md", "make test"): _WHOLE,
-    ("docs/contributing.md", "make full"): _WHOLE,
-    ("docs/contributing.md", "make slow"): _WHOLE,
-    ("docs/contributing.md", "make fuzz"): _WHOLE,
-    ("docs/contributing.md", "make search"): _WHOLE,
-    ("docs/contributing.md", "make look"): _WHOLE,
-    ("docs/contributing.md", "make numerics"): _WHOLE,
+    **{
+        ("docs/contributing.md", f"make {target}"): _WHOLE
+        for target in ("check", "test", "full", "slow", "fuzz", "search", "look", "numerics")
+    },
     ("docs/contributing.md", "python -m pytest tests/documents -k start"): _WHOLE,
     ("docs/contributing.md", "python -m pytest tests/model/test_riccati.py"): _WHOLE,
     ("docs/contributing.md", "make docs"): _SITE,

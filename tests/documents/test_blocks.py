@@ -13,17 +13,13 @@ import io
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.documents.blocks import PAGES, blocks, command_lines
+from tests.documents.blocks import PAGES, Block, blocks, command_lines
 from tests.documents.settings import require_valid
 from tests.documents.shell import run_line, working_in
 from tests.documents.tables import NOT_RUN, PREPARED, SMALLER
-
-if TYPE_CHECKING:
-    from tests.documents.blocks import Block
 
 _SILENT = {"text", "bibtex", "matlab"}
 _NUMBER = re.compile(r"[-+]?\d+(\.\d*)?(e[-+]?\d+)?")
@@ -108,18 +104,13 @@ def test_the_tables_have_no_stale_entries() -> None:
     assert all(entry.reason for entry in SMALLER.values())
 
 
-@pytest.mark.parametrize("page", list(PAGES))
-def test_no_block_is_overlooked(page: str) -> None:
-    content = PAGES[page].read_text(encoding="utf-8")
-    fences = re.findall(r"^ *```(.*)$", content, flags=re.M)
-    assert "~~~" not in content
-    opened = [fence for fence in fences[::2] if not fence.startswith("{")]
-    assert opened == [block.language for block in blocks(page)]
-
-
-@pytest.mark.parametrize("page", list(PAGES))
-def test_links_lead_somewhere(page: str) -> None:
-    folder = PAGES[page].parent
-    links = re.findall(r"\]\(([^)#]+)[^)]*\)", PAGES[page].read_text(encoding="utf-8"))
-    local = [link for link in links if "://" not in link]
-    assert [link for link in local if not (folder / link).exists()] == []
+def test_no_block_is_overlooked_and_links_lead_somewhere() -> None:
+    for page, path in PAGES.items():
+        content = path.read_text(encoding="utf-8")
+        fences = re.findall(r"^ *```(.*)$", content, flags=re.M)
+        assert "~~~" not in content
+        opened = [fence for fence in fences[::2] if not fence.startswith("{")]
+        assert opened == [block.language for block in blocks(page)]
+        links = re.findall(r"\]\(([^)#]+)[^)]*\)", content)
+        local = [link for link in links if "://" not in link]
+        assert [link for link in local if not (path.parent / link).exists()] == [], page

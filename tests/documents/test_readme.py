@@ -1,11 +1,10 @@
-"""The README keeps its word: its first lines, and its table. Its blocks run in tests/documents."""
+"""The README keeps its word: its table is that of the example."""
 
 from __future__ import annotations
 
 import pytest
 
-from impc.model.plant import Plant
-from impc.studies.example.cases import run_case
+from impc.studies.example.cases import CaseResult
 from impc.studies.example.report import methods_finding
 from tests.documents.blocks import PAGES, blocks
 
@@ -20,17 +19,10 @@ def close(shown: str, found: str) -> bool:
         return shown == found
 
 
-def test_the_first_lines_are_the_two_commands() -> None:
-    first = README.split("```")[1].split()
-    assert first[:3] == ["sh", "make", "demo"]
-    assert "make test" in README.split("```")[1]
-    assert README.index("make demo") < 200
-
-
-def test_the_table_is_what_comes_out(example_plant: Plant) -> None:
+def test_the_table_is_what_comes_out(case_a: CaseResult) -> None:
     texts = (block.text for block in blocks("README.md") if block.language == "text")
     shown = next(text for text in texts if "feedback_gain" in text)
-    found = methods_finding(run_case(example_plant, "A")).text()
+    found = methods_finding(case_a).text()
     shown_rows, found_rows = shown.splitlines(), found.splitlines()
     assert len(shown_rows) == len(found_rows)
     assert shown_rows[0].split() == found_rows[0].split()

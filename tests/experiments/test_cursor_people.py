@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 
 import plants
-from experiments.cursor_data import RATE, Condition, data_file, read_conditions
+from experiments.cursor_data import RATE, Condition
 from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
 from impc.control.controller import Controller
 from impc.model.bounds import Bounds
@@ -19,7 +19,6 @@ from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.profile import level_interval
 from impc.output_feedback.simulation import simulate_person
-from tests.experiments.recordings import recorded
 from tests.support import nelder_mead
 
 pytestmark = pytest.mark.full
@@ -94,26 +93,6 @@ def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
     assert nelder_mead(lower, rest, 400) == pytest.approx(1.92, abs=0.15)
 
 
-@pytest.mark.full
-@recorded
-def test_a_noisy_sense_is_not_taken_for_a_low_price() -> None:
-    """The most blurred target: from the price of least squares the search ends at 2, and 4 px."""
-    condition = read_conditions(data_file())[5]
-    found = fit_follower(condition, np.arange(len(condition.target)), (14,)).fit
-    levels = dict(zip(found.space.names, found.levels, strict=True))
-    assert found.prices is not None
-    assert np.exp(found.prices[0]) > 20
-    assert levels["sensory error"] > 20
-
-
-def test_trials_are_judged_as_they_were_fitted() -> None:
-    follower = fitted()
-    again = judged(follower, simulated(), np.arange(4))
-    assert nats(again) == pytest.approx(nats(follower.fit), rel=1e-12)
-    one = judged(follower, simulated(), np.array([2]))
-    assert nats(one) == pytest.approx(float(np.mean(follower.fit.told.trials[2].told[FIRST:])))
-
-
 def test_a_free_regression_is_that_of_its_normal_equations() -> None:
     """Against rows written out one by one; and no better than the truth can be."""
     condition, mine, others = simulated(), np.array([0, 1]), np.array([2, 3])
@@ -134,16 +113,3 @@ def test_a_free_regression_is_that_of_its_normal_equations() -> None:
     told = regression_nats(condition, mine, others)
     assert told == pytest.approx(expected, abs=1e-6)
     assert told < nats(judged(fitted(), condition, others))
-
-
-def test_the_offset_is_the_likeliest() -> None:
-    """Moved by half a pixel either way the likelihood is less; it is a parabola in the offset."""
-    follower = fitted()
-    values = []
-    for away in (-0.5, 0.0, 0.5):
-        moved = Follower(follower.delay, follower.offset + away, follower.fit)
-        values.append(nats(judged(moved, simulated(), np.arange(4))))
-    assert values[1] > max(values[0], values[2])
-    best = 0.25 * (values[0] - values[2]) / (values[0] - 2 * values[1] + values[2])
-    # The offset was the likeliest of the fit before the last.
-    assert abs(best) < 0.1

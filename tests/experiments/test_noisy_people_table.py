@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from dataclasses import asdict
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from experiments.noisy_people_score import Score
-from experiments.noisy_people_study import main
-from experiments.noisy_people_table import HEADS, means, pooled, row
+from experiments.noisy_people_table import HEADS, means, row
 from impc.checking import replace
 
 ONE = Score(
@@ -50,18 +44,6 @@ def test_a_row_counts_what_is_inside() -> None:
     assert everything[14] == "50 ± 0"
 
 
-def test_all_rows_of_a_kind_in_one_line() -> None:
-    other = replace(ONE, likely=[(-0.01, 0.01), (0.1, 0.05)], converged=False)
-    line = pooled([[ONE, other], [ONE]])
-    assert line.startswith("3 people: directions 3 of 6 (50.0 %), entries 6 of 9 (66.7 %)")
-    assert "settled 2, gains off by more than themselves 0, of which 0 settled" in line
-    lost = replace(ONE, likely_error=2.0)
-    assert "themselves 2, of which 1 settled" in pooled([[lost, replace(lost, converged=False)]])
-    # Means of the first kind are none; of the second one and two deviations.
-    assert "mean errors below 0.25 2 of 4" in line
-    assert line.endswith("mean errors of all 0.33 ± 0.67, -0.67 ± 1.33")
-
-
 def test_means_have_the_standard_errors_of_draws() -> None:
     rng = np.random.default_rng(4)
     drawn = 0.5 + rng.standard_normal((400, 2))
@@ -71,22 +53,3 @@ def test_means_have_the_standard_errors_of_draws() -> None:
     assert other == pytest.approx(0.05, rel=0.1)
     # A direction that few are told along has no mean.
     assert len(means([[(1.0, 1.0)], [(1.0, 1.0)], [(1.0, 1.0), (2.0, 1.0)]])) == 1
-
-
-def test_files_of_several_runs_are_summed_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    first, second = tmp_path / "a.jsonl", tmp_path / "b.jsonl"
-    first.write_text(json.dumps(asdict(ONE)) + "\n", encoding="utf-8")
-    passed = {"study": ONE.study, "seed": 2, "passed": "falls"}
-    unfitted = {"study": ONE.study, "seed": 3, "reason": "no regulator"}
-    lines = [json.dumps(asdict(replace(ONE, seed=4))), json.dumps(passed), json.dumps(unfitted)]
-    second.write_text("\n".join(lines), encoding="utf-8")
-    monkeypatch.setattr(sys, "argv", ["study", "sum", str(first), str(second)])
-    main()
-    out = capsys.readouterr().out
-    assert "| seat, both, VAF 70, met | 2 | 25 |" in out
-    assert "seat, met: 2 people: directions 2 of 4" in out
-    assert "(profile)" not in out, "nobody was asked"
-    assert "not scored: seat, both, VAF 70, met: falls: 1" in out
-    assert "not scored: seat, both, VAF 70, met: no regulator: 1" in out

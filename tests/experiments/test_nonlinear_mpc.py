@@ -52,14 +52,3 @@ def test_a_loop_that_falls_ends_where_it_falls() -> None:
     assert not run.complete
     assert 0 < run.reached < 400
     np.testing.assert_array_equal(run.x[run.reached + 1], run.x[-1])
-
-
-def test_a_loop_that_falls_at_its_last_sample_is_not_complete() -> None:
-    plant = Plant(yalmip_example())
-    weights, bounds = Weights(np.eye(2), 1), Bounds(plant, u_min=-0.01, u_max=0.01)
-    mpc = build_nonlinear_mpc(linear_step(plant), plant, weights, bounds, 3)
-    falls = simulate_nonlinear(mpc, scenario(plant, [3.0, 3.0], 400)).reached
-    cut = simulate_nonlinear(mpc, scenario(plant, [3.0, 3.0], falls + 1))
-    assert not cut.complete
-    assert cut.reached == falls
-    assert np.all(np.isfinite(cut.x))

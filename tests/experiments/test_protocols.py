@@ -43,13 +43,6 @@ def test_a_planted_torque() -> None:
     assert found.trials == 6 + 2 + 2
 
 
-def test_one_pass_is_not_enough() -> None:
-    """At 3 Nm passed, lost; at 2 Nm passed twice."""
-    outcomes = iter([True, False, True, True])
-    found = torque_amplitude(lambda a: 3.0 * a, lambda _: next(outcomes), angle=8.0)
-    assert (found.coarse, found.amplitude) == (3.0, 2.0)
-
-
 def test_what_cannot_be_found_is_said() -> None:
     with pytest.raises(SolverError, match="never lost"):
         critical_stiffness(lambda _: True)

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
 from experiments.benchmarks.workloads import example
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
 from impc.inverse.table31 import CONDITION_WEIGHT
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.inverse.problem import Problem
 
 
 @pytest.mark.parametrize("route", [prox_linear, smooth_surrogate])

@@ -1,358 +1,344 @@
-"""Files that are damaged themselves, or not what they say that they are."""
+"""Damaged recordings, what they say they are not, and settings that cannot be right.
+
+`DAMAGED[name]` has a phrase of the one line in which it must end, and a function of a folder that
+writes the file and returns its path and the text of a configuration for `PLANT`.
+"""
 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import c3d
 import h5py
 import numpy as np
 from nptdms import ChannelObject, TdmsWriter
 
-from tests.files.damage import OWN_RATE, Damage, register, written, written_by_impc
-from tests.files.samples import (
-    csv_text,
-    hdf5_mat,
-    opaque_variable,
-    pushed_seat,
-    save_mat,
-    settings,
-)
+from impc.files.formats import write_table
+from impc.files.table import make_table
+from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat, settings
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
+__all__ = ["DAMAGED", "PLANT", "written", "written_by_impc"]
 
-    from tests.files.damage import Made
-
-__all__ = ["DAMAGED_FILES"]
-
-DAMAGED_FILES: dict[str, Damage] = {}
+#: The plant that the configurations are for, as the command line takes it.
+PLANT = "plants:seated_balance_plant"
+Make = Callable[[Path], tuple[Path, str]]
+Change = tuple[str, str]
+#: TDMS and C3D tell their rate: the clock is taken out of the configuration.
+OWN_RATE = ('time = "time"', "")
+SEAT = pushed_seat()
+TEXT = csv_text(SEAT)
+LINES = TEXT.split("\n")
 
 
-def _damage(phrase: str, in_file: bool = True) -> Callable[[Callable[[Path], Made]], None]:
-    return register(DAMAGED_FILES, phrase, in_file)
-
-
-def _cut(path: Path, share: float) -> Path:
-    content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+def written(folder: Path, content: bytes | str, name: str = "trial.csv") -> Path:
+    """A file with this content."""
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
-# The file as such -----------------------------------------------------------------------------
+def written_by_impc(folder: Path, name: str) -> Path:
+    """The pushed seat at 100 samples per second, without its clock."""
+    columns = pushed_seat()
+    columns.pop("time")
+    write_table(folder / name, make_table(name, columns, {"seat": "deg", "trunk": "deg"}, 100.0))
+    return folder / name
 
 
-@_damage("does not exist")
-def _missing_file(folder: Path) -> Made:
-    return folder / "trial.csv", settings()
+def made(fill: Callable[[Path], object], name: str = "trial.csv", *changes: Change) -> Make:
+    """What `fill` writes to a path, and settings with these changes."""
 
+    def make(folder: Path) -> tuple[Path, str]:
+        fill(folder / name)
+        return folder / name, settings(*changes)
 
-@_damage("is a folder")
-def _folder_for_a_file(folder: Path) -> Made:
-    (folder / "trial.csv").mkdir()
-    return folder / "trial.csv", settings()
+    return make
 
 
-@_damage("is empty (0 bytes)")
-def _empty_csv(folder: Path) -> Made:
-    return written(folder, ""), settings()
+def text(content: bytes | str, name: str = "trial.csv", *changes: Change) -> Make:
+    return made(lambda path: written(path.parent, content, name), name, *changes)
 
 
-@_damage("is empty (0 bytes)")
-def _empty_mat(folder: Path) -> Made:
-    return written(folder, "", "trial.mat"), settings()
+def lines(changed: dict[int, str]) -> Make:
+    """The sound text with some of its lines exchanged."""
+    return text("\n".join((dict(enumerate(LINES)) | changed).values()))
 
 
-def _sparse(path: Path) -> Path:
-    with path.open("wb") as file:
-        file.truncate(2_000_000_000)
-    return path
+def seat(*changes: Change, **columns: Any) -> Make:
+    """The sound text with other columns and settings."""
+    return text(csv_text({**SEAT, **columns}), "trial.csv", *changes)
 
 
-@_damage("has 2.0 GB")
-def _sparse_csv_of_two_gigabytes(folder: Path) -> Made:
-    return _sparse(folder / "trial.csv"), settings()
+def changed(name: str, where: slice | int, value: Any) -> Any:
+    """A column with other samples."""
+    column = SEAT[name].copy()
+    column[where] = value
+    return column
 
 
-@_damage("has 2.0 GB")
-def _sparse_mat_of_two_gigabytes(folder: Path) -> Made:
-    return _sparse(folder / "trial.mat"), settings()
+def cut(make: Make) -> Make:
+    """Six tenths of a file."""
+    return broken(make, lambda content: content[: int(0.6 * len(content))])
 
 
-@_damage("has the ending '.xls'")
-def _old_excel_workbook(folder: Path) -> Made:
-    return written(folder, b"\xd0\xcf\x11\xe0" + bytes(100), "trial.xls"), settings()
+def broken(make: Make, change: Callable[[bytes], bytes]) -> Make:
+    def remade(folder: Path) -> tuple[Path, str]:
+        path, configuration = make(folder)
+        path.write_bytes(change(path.read_bytes()))
+        return path, configuration
 
+    return remade
 
-@_damage("is damaged and cannot be read (File is not a zip file)")
-def _excel_workbook(folder: Path) -> Made:
-    return written(folder, b"PK\x03\x04" + bytes(100), "trial.xlsx"), settings()
 
+def mat(values: dict[str, Any], name: str = "trial.mat", **options: Any) -> Make:
+    """A .mat file of version 5 by scipy."""
+    return made(lambda path: save_mat(path, values, **options), name)
 
-@_damage("a zip archive or an Excel workbook")
-def _excel_workbook_called_csv(folder: Path) -> Made:
-    return written(folder, b"PK\x03\x04" + bytes(100)), settings()
 
+def mat73(values: dict[str, Any], classes: dict[str, str] | None = None) -> Make:
+    """One of version 7.3 by h5py."""
+    return made(lambda path: hdf5_mat(path, values, classes), "trial.mat")
 
-@_damage("is a MATLAB file")
-def _mat_called_csv(folder: Path) -> Made:
-    save_mat(folder / "trial.csv", pushed_seat())
-    return folder / "trial.csv", settings()
 
+def linked(add: Callable[[Path, Any], object]) -> Make:
+    """One of version 7.3 whose seat lies in another file."""
 
-@_damage("a Python pickle")
-def _pickle_called_mat(folder: Path) -> Made:
-    return written(folder, b"\x80\x04\x95" + bytes(600), "trial.mat"), settings()
+    def fill(path: Path) -> None:
+        hdf5_mat(path.with_name("other.mat"), SEAT)
+        path.with_name("raw").write_bytes(bytes(8 * 600))
+        hdf5_mat(path, {"time": np.arange(600.0)})
+        with h5py.File(path, "r+") as file:
+            add(path.with_name("raw"), file)
 
+    return made(fill, "trial.mat")
 
-# Delimited text -------------------------------------------------------------------------------
 
+def outside(raw: Path, file: Any) -> None:
+    file.create_dataset("seat", (600,), "f8", external=[(raw, 0, 8 * 600)])
 
-@_damage("is empty")
-def _csv_of_blank_lines(folder: Path) -> Made:
-    return written(folder, "\n \n\n"), settings()
 
+def own(name: str, change: Change = OWN_RATE) -> Make:
+    """A TDMS or C3D file as impc writes it."""
+    return made(lambda path: written_by_impc(path.parent, name), name, change)
 
-@_damage("no rows of numbers")
-def _csv_of_a_header_alone(folder: Path) -> Made:
-    return written(folder, "time,seat,trunk,push\n"), settings()
 
+def tdms(*channels: tuple[Any, ...]) -> Make:
+    def fill(path: Path) -> None:
+        with TdmsWriter(str(path)) as writer:
+            writer.write_segment([ChannelObject("g", *channel) for channel in channels])
 
-@_damage("a zero byte in line 4")
-def _zero_bytes_in_csv(folder: Path) -> Made:
-    lines = csv_text(pushed_seat()).split("\n")
-    lines[3] = "\0" * 20
-    return written(folder, "\n".join(lines)), settings()
+    return made(fill, "trial.tdms", OWN_RATE)
 
 
-@_damage("ends in the middle of a row")
-def _truncated_csv(folder: Path) -> Made:
-    text = csv_text(pushed_seat())
-    return written(folder, text[: text.rindex(",") - 3]), settings()
-
-
-@_damage("is divided by bars")
-def _wrong_delimiter(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat(), "|")), settings()
-
-
-@_damage("is divided by commas")
-def _tsv_with_commas(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat()), "trial.tsv"), settings()
-
-
-@_damage("names 4 columns, and the rows below have 8 values")
-def _decimal_commas_between_commas(folder: Path) -> Made:
-    shifted = {name: values + 0.123456 for name, values in pushed_seat().items()}
-    return written(folder, csv_text(shifted, ",", ",")), settings()
-
-
-@_damage("column 'seat' has text in 2 of 600 rows, the first 'overload' in line 12")
-def _text_in_a_column(folder: Path) -> Made:
-    lines = csv_text(pushed_seat()).split("\n")
-    for line in (11, 40):
-        time, _, *rest = lines[line].split(",")
-        lines[line] = ",".join([time, "overload", *rest])
-    return written(folder, "\n".join(lines)), settings()
-
-
-@_damage("is text, such as 'left' in line 2", in_file=False)
-def _column_of_text(folder: Path) -> Made:
-    header, *lines = csv_text(pushed_seat()).strip().split("\n")
-    text = "\n".join([header + ",side", *(line + ",left" for line in lines)])
-    return written(folder, text), settings(('"seat"', '"side"'))
-
-
-@_damage("line 31 has 5 values where the first row has 4")
-def _row_with_a_value_more(folder: Path) -> Made:
-    lines = csv_text(pushed_seat()).split("\n")
-    lines[30] += ",1.0"
-    return written(folder, "\n".join(lines)), settings()
-
-
-@_damage("signals.theta2.column may be time, seat, seat_2, push", in_file=False)
-def _two_columns_of_one_name(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat()).replace("trunk", "seat", 1)), settings()
-
-
-@_damage("names 3 columns")
-def _header_too_short(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat()).replace(",push", "", 1)), settings()
-
-
-# MATLAB ---------------------------------------------------------------------------------------
-
-
-@_damage("is damaged and cannot be read")
-def _truncated_mat(folder: Path) -> Made:
-    save_mat(folder / "trial.mat", pushed_seat())
-    return _cut(folder / "trial.mat", 0.6), settings()
-
-
-@_damage("is damaged and cannot be read")
-def _compressed_mat_with_wrong_bytes(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    save_mat(path, pushed_seat(), do_compression=True)
-    content = bytearray(path.read_bytes())
-    content[2000:2100] = bytes(100)
-    path.write_bytes(content)
-    return path, settings()
-
-
-@_damage("is damaged and cannot be read")
-def _truncated_mat_of_version_73(folder: Path) -> Made:
-    hdf5_mat(folder / "trial.mat", pushed_seat())
-    return _cut(folder / "trial.mat", 0.6), settings()
-
-
-@_damage("says that it is version 5 and holds version 7.3")
-def _version_73_called_5(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    hdf5_mat(path, pushed_seat())
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 5.0 MAT-file".ljust(116) + bytes(8) + b"\0\1IM")
-    return path, settings()
-
-
-@_damage("says that it is version 7.3 and holds version 5")
-def _version_5_called_73(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    save_mat(path, pushed_seat())
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(116) + bytes(8) + b"\0\2IM")
-    return path, settings()
-
-
-@_damage("T is a MATLAB table")
-def _table_object(folder: Path) -> Made:
-    header = b"MATLAB 5.0 MAT-file".ljust(116) + bytes(8) + b"\0\1IM"
-    return written(folder, header + opaque_variable(b"T", b"table"), "trial.mat"), settings()
-
-
-@_damage("T is a MATLAB table")
-def _table_object_of_version_73(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    hdf5_mat(path, {"T": np.arange(6, dtype=np.uint32)}, {"T": "table"})
-    return path, settings()
-
-
-@_damage("is a cell array")
-def _cell_array(folder: Path) -> Made:
-    cells = np.empty(2, dtype=object)
-    cells[:] = [np.arange(5.0), "seat"]
-    save_mat(folder / "trial.mat", {"data": cells})
-    return folder / "trial.mat", settings()
-
-
-@_damage("holds no column of numbers")
-def _mat_of_text_and_one_number(folder: Path) -> Made:
-    save_mat(folder / "trial.mat", {"subject": "S01", "fs": 100.0})
-    return folder / "trial.mat", settings()
-
-
-@_damage("is complex")
-def _complex_signal(folder: Path) -> Made:
-    save_mat(folder / "trial.mat", {"seat": np.exp(1j * np.arange(600))})
-    return folder / "trial.mat", settings()
-
-
-@_damage("has 3 dimensions")
-def _three_dimensions(folder: Path) -> Made:
-    save_mat(folder / "trial.mat", {"data": np.zeros((5, 6, 7))})
-    return folder / "trial.mat", settings()
-
-
-@_damage("seat points elsewhere")
-def _link_to_another_file(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    hdf5_mat(folder / "other.mat", pushed_seat())
-    hdf5_mat(path, {"time": np.arange(600.0)})
-    with h5py.File(path, "r+") as file:
-        file["seat"] = h5py.ExternalLink("other.mat", "seat")
-    return path, settings()
-
-
-@_damage("seat lies in another file")
-def _data_in_another_file(folder: Path) -> Made:
-    path = folder / "trial.mat"
-    (folder / "raw").write_bytes(bytes(8 * 600))
-    hdf5_mat(path, {"time": np.arange(600.0)})
-    with h5py.File(path, "r+") as file:
-        external = [(folder / "raw", 0, 8 * 600)]
-        file.create_dataset("seat", (600,), "f8", external=external)
-    return path, settings()
-
-
-@_damage("does not begin as such a file")
-def _text_called_mat(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat()), "trial.mat"), settings()
-
-
-# TDMS and C3D ---------------------------------------------------------------------------------
-
-
-@_damage("ends in the middle of its data")
-def _truncated_tdms(folder: Path) -> Made:
-    return _cut(written_by_impc(folder, "trial.tdms"), 0.6), settings(OWN_RATE)
-
-
-@_damage("does not begin as such a file")
-def _text_called_tdms(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat()), "trial.tdms"), settings(OWN_RATE)
-
-
-@_damage("has channels of 100 and 200 samples per second")
-def _tdms_of_two_rates(folder: Path) -> Made:
-    rates = {"seat": 100.0, "trunk": 200.0}
-    with TdmsWriter(str(folder / "trial.tdms")) as writer:
-        writer.write_segment(
-            [
-                ChannelObject("g", name, pushed_seat()[name], {"wf_increment": 1 / rate})
-                for name, rate in rates.items()
-            ]
-        )
-    return folder / "trial.tdms", settings(OWN_RATE)
-
-
-@_damage("holds no column of numbers")
-def _tdms_of_text(folder: Path) -> Made:
-    with TdmsWriter(str(folder / "trial.tdms")) as writer:
-        writer.write_segment([ChannelObject("g", "notes", ["a", "b"])])
-    return folder / "trial.tdms", settings(OWN_RATE)
-
-
-@_damage("says 100 samples per second and recording.rate 500", in_file=False)
-def _rate_that_contradicts_the_file(folder: Path) -> Made:
-    return written_by_impc(folder, "trial.tdms"), settings((OWN_RATE[0], "rate = 500.0"))
-
-
-@_damage("of 600 frames")
-def _truncated_c3d(folder: Path) -> Made:
-    return _cut(written_by_impc(folder, "trial.c3d"), 0.6), settings(OWN_RATE)
-
-
-@_damage("does not begin as such a file")
-def _text_called_c3d(folder: Path) -> Made:
-    return written(folder, csv_text(pushed_seat()), "trial.c3d"), settings(OWN_RATE)
-
-
-@_damage("is damaged and cannot be read")
-def _c3d_with_a_wrong_header(folder: Path) -> Made:
-    path = written_by_impc(folder, "trial.c3d")
-    content = bytearray(path.read_bytes())
-    content[4] += 1  # number of analog measurements in a frame
-    path.write_bytes(content)
-    return path, settings(OWN_RATE)
-
-
-@_damage("has no analog channels")
-def _c3d_of_markers_alone(folder: Path) -> Made:
+def markers(path: Path) -> None:
     writer = c3d.Writer(point_rate=100.0)
     writer.set_point_labels(["head"])
     writer.add_frames([(np.zeros((1, 5)), np.zeros((0, 0))) for _ in range(20)])
-    with (folder / "trial.c3d").open("wb") as file, warnings.catch_warnings():
+    with path.open("wb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # c3d warns of what is missing
         writer.write(file)
-    return folder / "trial.c3d", settings(OWN_RATE)
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(2_000_000_000)
+
+
+def head_of(version: str, end: bytes) -> bytes:
+    return f"MATLAB {version} MAT-file".encode().ljust(116) + bytes(8) + end
+
+
+HEAD_5, HEAD_73 = head_of("5.0", b"\0\1IM"), head_of("7.3", b"\0\2IM")
+PICKLE, ZIP, XLS = b"\x80\x04\x95" + bytes(600), b"PK\x03\x04" + bytes(100), b"\xd0\xcf\x11\xe0"
+CELLS = np.empty(2, dtype=object)
+CELLS[:] = [np.arange(5.0), "seat"]
+SHIFTED = {name: values + 0.123456 for name, values in SEAT.items()}
+OVERLOAD = {k: LINES[k].replace(LINES[k].split(",")[1], "overload", 1) for k in (11, 40)}
+SIDES = "\n".join([LINES[0] + ",side", *(line + ",left" for line in LINES[1:-1])])
+RATES = [("seat", 100.0), ("trunk", 200.0)]
+DEGREES = 'column = "seat"\nunit = "deg"\nlimit = 12.0'
+UNEVEN = np.cumsum(np.where(np.arange(600) % 2, 0.0196, 0.0004))
+THETA2 = '[signals.theta2]\ncolumn = "trunk"\nunit = "deg"\n'
+PATTERN = "pattern = '(?P<subject>[^_]+)_(?P<trial>[0-9]+)'"
+
+DAMAGED: dict[str, tuple[str, Make]] = {
+    "missing file": ("does not exist", made(lambda _: None)),
+    "folder for a file": ("is a folder", made(Path.mkdir)),
+    "empty csv": ("is empty (0 bytes)", text("")),
+    "empty mat": ("is empty (0 bytes)", text("", "trial.mat")),
+    "csv of two gigabytes": ("has 2.0 GB", made(sparse)),
+    "mat of two gigabytes": ("has 2.0 GB", made(sparse, "trial.mat")),
+    "old workbook": ("has the ending '.xls'", text(XLS + bytes(100), "trial.xls")),
+    "no workbook": (
+        "is damaged and cannot be read (File is not a zip file)", text(ZIP, "trial.xlsx")
+    ),
+    "workbook called csv": ("a zip archive or an Excel workbook", text(ZIP)),
+    "mat called csv": ("is a MATLAB file", mat(SEAT, "trial.csv")),
+    "pickle called mat": ("a Python pickle", text(PICKLE, "trial.mat")),
+    **{
+        f"text called {ending}": (
+            "does not begin as such a file", text(TEXT, f"trial.{ending}", OWN_RATE)
+        )
+        for ending in ("mat", "tdms", "c3d")
+    },
+    # Delimited text
+    "blank lines": ("is empty", text("\n \n\n")),
+    "header alone": ("no rows of numbers", text("time,seat,trunk,push\n")),
+    "zero bytes": ("a zero byte in line 4", lines({3: "\0" * 20})),
+    "truncated csv": ("ends in the middle of a row", text(TEXT[: TEXT.rindex(",") - 3])),
+    "wrong delimiter": ("is divided by bars", text(csv_text(SEAT, "|"))),
+    "tsv with commas": ("is divided by commas", text(TEXT, "trial.tsv")),
+    "decimal commas between commas": (
+        "names 4 columns, and the rows below have 8 values", text(csv_text(SHIFTED, ",", ","))
+    ),
+    "words in a column": (
+        "column 'seat' has text in 2 of 600 rows, the first 'overload' in line 12", lines(OVERLOAD)
+    ),
+    "column of words": (
+        "is text, such as 'left' in line 2", text(SIDES, "trial.csv", ('"seat"', '"side"'))
+    ),
+    "row with a value more": (
+        "line 31 has 5 values where the first row has 4", lines({30: LINES[30] + ",1.0"})
+    ),
+    "two columns of one name": (
+        "signals.theta2.column may be time, seat, seat_2, push",
+        lines({0: "time,seat,seat,push"}),
+    ),
+    "header too short": ("names 3 columns", lines({0: "time,seat,trunk"})),
+    # MATLAB
+    "truncated mat": ("is damaged and cannot be read", cut(mat(SEAT))),
+    "truncated 7.3": ("is damaged and cannot be read", cut(mat73(SEAT))),
+    "packed mat with wrong bytes": (
+        "is damaged and cannot be read",
+        broken(mat(SEAT, do_compression=True), lambda c: c[:2000] + bytes(100) + c[2100:]),
+    ),
+    "7.3 called 5": (
+        "says that it is version 5 and holds version 7.3",
+        broken(mat73(SEAT), lambda content: HEAD_5 + content[128:]),
+    ),
+    "5 called 7.3": (
+        "says that it is version 7.3 and holds version 5",
+        broken(mat(SEAT), lambda content: HEAD_73 + content[128:]),
+    ),
+    "table object": (
+        "T is a MATLAB table", text(HEAD_5 + opaque_variable(b"T", b"table"), "trial.mat")
+    ),
+    "table object of 7.3": (
+        "T is a MATLAB table", mat73({"T": np.arange(6, dtype=np.uint32)}, {"T": "table"})
+    ),
+    "cell array": ("is a cell array", mat({"data": CELLS})),
+    "text and one number": ("holds no column of numbers", mat({"subject": "S01", "fs": 100.0})),
+    "complex signal": ("is complex", mat({"seat": np.exp(1j * np.arange(600))})),
+    "three dimensions": ("has 3 dimensions", mat({"data": np.zeros((5, 6, 7))})),
+    "link to another file": (
+        "seat points elsewhere",
+        linked(lambda _, file: file.update(seat=h5py.ExternalLink("other.mat", "seat"))),
+    ),
+    "data in another file": ("seat lies in another file", linked(outside)),
+    # TDMS and C3D
+    "truncated tdms": ("ends in the middle of its data", cut(own("trial.tdms"))),
+    "tdms of two rates": (
+        "has channels of 100 and 200 samples per second",
+        tdms(*((name, SEAT[name], {"wf_increment": 1 / rate}) for name, rate in RATES)),
+    ),
+    "tdms of text": ("holds no column of numbers", tdms(("notes", ["a", "b"]))),
+    "rate that contradicts the file": (
+        "says 100 samples per second and recording.rate 500",
+        own("trial.tdms", (OWN_RATE[0], "rate = 500.0")),
+    ),
+    "truncated c3d": ("of 600 frames", cut(own("trial.c3d"))),
+    "c3d with a wrong header": (  # number of analog measurements in a frame
+        "is damaged and cannot be read",
+        broken(own("trial.c3d"), lambda c: c[:4] + bytes([c[4] + 1]) + c[5:]),
+    ),
+    "c3d of markers alone": ("has no analog channels", made(markers, "trial.c3d", OWN_RATE)),
+    # The clock
+    "times repeated": (
+        "is repeated 3 times, the first from sample 101 to 102",
+        seat(time=changed("time", slice(101, 104), 1.0)),
+    ),
+    "clock that runs backward": (
+        "runs backward 1 times, the first from sample 300 to 301",
+        seat(time=changed("time", slice(300, 600), SEAT["time"][:300])),
+    ),
+    "missing time": (
+        "has 1 missing times, the first in sample 8", seat(time=changed("time", 7, np.nan))
+    ),
+    "gap in the clock": (
+        "has 1 gaps, the first at 2 s, the longest of 0.51 s",
+        seat(time=changed("time", slice(201, 600), SEAT["time"][201:] + 0.5)),
+    ),
+    "uneven clock": ("is uneven", seat(time=UNEVEN)),
+    "absent clock": ("column 'clock': is not in the file", seat(('"time"', '"clock"'))),
+    "unknown rate": ("tells no clock and no rate", seat(OWN_RATE)),
+    "clock in degrees": ("is no time", seat(('"time"', '"time"\ntime_unit = "deg"'))),
+    "cut behind the end": (
+        "does not reach recording.stop = 60 s", seat(('"time"', '"time"\nstop = 60.0'))
+    ),
+    # Channels
+    "absent column": (
+        "column 'seat angle': is not in the file", seat(('"seat"', '"seat angle"'))
+    ),
+    "unit against the file": (
+        "is in 'rad' by the configuration and in 'deg' by the file",
+        text(
+            TEXT.replace("seat", "seat (deg)", 1),
+            "trial.csv",
+            (DEGREES, 'column = "seat"\nunit = "rad"'),
+        ),
+    ),
+    "degrees called radians": (
+        "degrees taken for radians", seat(('unit = "deg"\nlimit = 12.0', 'unit = "rad"'))
+    ),
+    "radians called degrees": ("radians taken for degrees", seat(seat=np.deg2rad(SEAT["seat"]))),
+    "missing samples": (
+        "10 of 600 samples are missing or not finite, the first sample 51",
+        seat(seat=changed("seat", slice(50, 60), np.nan)),
+    ),
+    "infinite sample": (
+        "1 of 600 samples are missing or not finite, the first sample 100",
+        seat(seat=changed("seat", 99, np.inf)),
+    ),
+    "missing end": (
+        "at an end of the recording",
+        seat(
+            ('"time"', '"time"\nfill_gaps = 1.0'), seat=changed("seat", slice(590, 600), np.nan)
+        ),
+    ),
+    "constant channel": ("is constant at 0 deg in all 600 samples", seat(seat=np.zeros(600))),
+    "push that never acts": ("is constant at 0 Nm", seat(push=np.zeros(600))),
+    "angle beyond the stop": (
+        "is beyond its stop of 12 deg", seat(seat=changed("seat", 70, 13.0))
+    ),
+    "clipped channel": ("is clipped at 2 deg", seat(seat=np.clip(SEAT["seat"], -2.0, 2.0))),
+    "too few samples": (
+        "has 40 samples at the plant's rate, 50 are needed",
+        text(csv_text({name: values[:40] for name, values in SEAT.items()})),
+    ),
+    # The configuration
+    "output without a column": ("signals.theta2: is missing", seat((THETA2, ""))),
+    "signal that the plant lacks": (
+        "signals.theta3: is no output", seat(("signals.theta2", "signals.theta3"))
+    ),
+    "misspelled key": (
+        "signals.theta1.limt: is not known; did you mean limit?", seat(("limit", "limt"))
+    ),
+    "limit in words": (
+        "signals.theta1.limit: Expected 'float | null', got 'str'",
+        seat(("limit = 12.0", 'limit = "12"')),
+    ),
+    "unknown unit": ("unit 'wibble' is not known", seat(('unit = "Nm"', 'unit = "wibble"'))),
+    "unit not filled in": (
+        "signals.perturbation.unit: is still '?'", seat(('unit = "Nm"', 'unit = "?"'))
+    ),
+    "no toml": ("is not TOML", seat(("[signals.theta1]", "[signals.theta1"))),
+    "name that does not match": (
+        "does not match recording.pattern", seat(('subject = "S01"', PATTERN))
+    ),
+    "no regular expression": (
+        "is no regular expression", seat(('subject = "S01"', "pattern = '(?P<subject>'"))
+    ),
+}  # fmt: skip

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import struct
 import zipfile
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import h5py
@@ -13,11 +15,7 @@ import numpy as np
 import scipy.io
 import scipy.signal
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from impc.arrays import Array
+from impc.arrays import Array
 
 __all__ = [
     "CONFIGURATION",

@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import h5py
 import numpy as np
@@ -19,12 +19,8 @@ import impc
 from impc.errors import DataError
 from impc.files import apart
 from impc.files.formats import read_table
+from impc.files.table import Table
 from tests.files.samples import hdf5_mat, pushed_seat
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.files.table import Table
 
 SEAT = pushed_seat(60)
 # Nothing but the reading of a line, and then an end of some kind.

@@ -6,8 +6,8 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import openpyxl
@@ -15,9 +15,6 @@ import pytest
 
 from impc.errors import DataError
 from impc.files.formats import read_table
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 TIME = np.round(np.arange(40) * 0.02, 2)
 TILT = np.round(np.sin(0.3 * np.arange(40)), 4)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import tracemalloc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from impc.errors import InputError
 from impc.files.configuration import RecordingTable, SignalTable, read_configuration
 from tests.files.samples import settings
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 WHOLE = """
 [recording]

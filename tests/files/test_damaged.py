@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -13,13 +13,9 @@ from impc.errors import InputError
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings
-from tests.files.damaged import DAMAGED, PLANT
+from impc.model.plant import Plant
+from tests.files.damaged_files import DAMAGED, PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.model.plant import Plant
 
 
 @pytest.fixture(scope="module")
@@ -27,41 +23,37 @@ def seat() -> Plant:
     return make_plant(find_plant(PLANT, {}), ("perturbation",))
 
 
-def test_there_are_sixty_of_them() -> None:
-    assert len(DAMAGED) >= 60
-
-
 @pytest.mark.parametrize("name", DAMAGED)
-def test_one_line_from_the_library(name: str, tmp_path: Path, seat: Plant) -> None:
-    path, text = DAMAGED[name].make(tmp_path)
+def test_one_line_says_what_where_and_what_to_do(name: str, tmp_path: Path, seat: Plant) -> None:
+    phrase, make = DAMAGED[name]
+    path, text = make(tmp_path)
     (tmp_path / "subject.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
         read_recordings([path], read_configuration(tmp_path / "subject.toml"), seat)
     message = str(caught.value)
-    assert DAMAGED[name].phrase in message
+    assert phrase in message
     assert "\n" not in message
     assert message.count(path.name) <= 1  # no message within a message
     assert all((caught.value.subject, caught.value.problem, caught.value.remedy))
     assert len(message) - len(str(tmp_path)) < 420
 
 
-@pytest.mark.parametrize("name", DAMAGED)
-def test_one_line_and_status_2_from_the_command(name: str, tmp_path: Path) -> None:
-    damage = DAMAGED[name]
-    path, text = damage.make(tmp_path)
-    config = tmp_path / "subject.toml"
-    config.write_text(text, encoding="utf-8")
+@pytest.mark.parametrize("command", ["inspect", "fit", "draft"])
+def test_a_command_ends_with_status_2_and_writes_nothing(command: str, tmp_path: Path) -> None:
+    phrase, make = DAMAGED["truncated mat"]
+    path, text = make(tmp_path)
+    (tmp_path / "subject.toml").write_text(text, encoding="utf-8")
     before = sorted(tmp_path.iterdir())
-    calls = [[str(path), "--config", str(config), "--plant", PLANT]]
-    if damage.in_file:
-        calls.append([str(path), "--out", str(tmp_path / "new.toml")])
-    for call in calls:
-        result = CliRunner().invoke(main, ["inspect", *call])
-        assert result.exit_code == 2
-        assert result.stdout == ""
-        assert result.stderr.startswith("impc: error: ")
-        assert damage.phrase in result.stderr
-        assert result.stderr.count("\n") == 1
+    words = ["inspect" if command == "draft" else command, str(path)]
+    if command != "inspect":
+        words += ["--out", str(tmp_path / "out")]
+    if command != "draft":
+        words += ["--config", str(tmp_path / "subject.toml"), "--plant", PLANT]
+    done = CliRunner().invoke(main, words)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.startswith("impc: error: ")
+    assert phrase in done.stderr
+    assert done.stderr.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
 
 

@@ -15,7 +15,7 @@ import pytest
 from impc.checking import replace
 from impc.errors import DataError
 from impc.files.configuration import Configuration, RecordingTable, SignalTable
-from impc.files.digests import content_digest, digest, source_digest, versions
+from impc.files.digests import content_digest, digest, source_digest
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -105,11 +105,6 @@ def test_a_plant_file_and_files_that_are_arguments(tmp_path: Path) -> None:
     table.write_text("2")
     assert source_digest(str(plant)) != first
     assert source_digest("plants:cursor_plant", {"masses": str(table), "size": 1.0}) != by_name
-
-
-def test_versions_name_what_computes() -> None:
-    assert versions()["numpy"] == np.__version__
-    assert len(versions()["impc"]) == 64
 
 
 def test_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from impc.arrays import Array
 from impc.cli.plant import find_plant
 from impc.errors import InputError
 from impc.files import apart
@@ -17,15 +19,9 @@ from impc.files.inspection import draft_configuration, summary
 from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings, recording_of
 from impc.files.table import make_table
-from tests.files.damaged import PLANT
+from impc.model.plant import Plant
+from tests.files.damaged_files import PLANT
 from tests.files.samples import csv_text, pushed_seat, settings
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.model.plant import Plant
 
 BASE = pushed_seat()
 TIME = 'time = "time"'
@@ -144,14 +140,6 @@ def test_a_pattern_that_never_ends(
     config.write_text(settings((TIME, f"{TIME}\npattern = '(?P<trial>a+)'")))
     (trial,) = read_recordings([path], read_configuration(config), seat)
     assert trial.label.trial == "a" * 60
-
-
-def test_a_circle_of_links(tmp_path: Path, seat: Plant) -> None:
-    path = tmp_path / "trial.csv"
-    path.symlink_to(path)
-    (tmp_path / "subject.toml").write_text(settings())
-    with pytest.raises(InputError, match="cannot be opened"):
-        read_recordings([path], read_configuration(tmp_path / "subject.toml"), seat)
 
 
 def test_a_name_that_is_not_utf_8(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -94,33 +93,6 @@ def _fail_at(patch: pytest.MonkeyPatch, place: int) -> None:
 
     for name in ("fsync", "replace"):
         patch.setattr(os, name, full(getattr(os, name)))
-
-
-@pytest.mark.skipif(os.name != "posix", reason="a limit that the system keeps")
-def test_a_disk_that_takes_only_a_part_of_a_file(tmp_path: Path) -> None:
-    """The system cuts a write in its middle, at every 40th byte: files are whole or absent."""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    refused = 0
-    for room in range(0, 1000, 40):
-        folder, said = tmp_path / f"{room}", ""
-        work(folder, OLD)
-        try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (room, limit[1]))
-            work(folder, NEW)
-        except OutputError as error:
-            said = str(error)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        if not said:
-            break
-        refused += 1
-        assert said.endswith("make room and start again")
-        found = shown(folder)
-        assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
-        assert not list(folder.rglob("*.part"))
-        assert found_in(folder).items() <= STAGES.items()
-    assert refused >= 5
-    assert shown(folder) == NEW
 
 
 KILLED = """

@@ -150,22 +150,3 @@ def test_an_interrupted_study_goes_on_with_what_is_the_same(
     # A changed recording leaves those of the others as they are.
     spared = {"recording": 2, "nothing": 3}.get(changed, 0)
     assert len(again) == len(fresh) - spared
-
-
-@pytest.mark.usefixtures("blank_figures")
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_flipped_byte_in_what_is_kept_is_computed_again(
-    command: str, study: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In each file at another place; the result is that of an undisturbed run."""
-    assert run(command, study, "fresh").exit_code == 0
-    here(monkeypatch, stop=3)
-    assert run(command, study).exit_code == 130
-    for number, path in enumerate(sorted((study.parent / "out" / "in-progress").iterdir()), 1):
-        content = bytearray(path.read_bytes())
-        content[number * len(content) // 4] ^= 1
-        path.write_bytes(content)
-    again = here(monkeypatch)
-    assert run(command, study).exit_code == 0
-    assert len(again) == 8
-    assert told(study) == told(study, "fresh")

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import control
 import numpy as np
 import pytest
 
+from impc.arrays import Array
 from impc.errors import DataError, FallError, InputError
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings, read_unit
 from impc.model.plant import Plant
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.model.recordings import Recording
+from impc.model.recordings import Recording
 
 SAMPLES = 600
 SETTINGS = """

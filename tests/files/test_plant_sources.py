@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import control
 import numpy as np
 import pytest
 import scipy.io
 
-import plants
 from impc.errors import ImpcError, InputError, PlantError
 from impc.files.plant_sources import (
     PlantSource,
@@ -21,7 +23,6 @@ from impc.files.plant_sources import (
     plant_family_of,
     plant_source,
 )
-from impc.studies.selection.model_source import model_source
 from tests.files.samples import mat5_array, mat5_element, mat5_file
 
 A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
@@ -111,13 +112,6 @@ def test_a_module_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.Monk
         plant_source("broken_plant:x", {})
 
 
-def test_a_model_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "ending_model.py").write_text("def model(): raise SystemExit(0)\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="model ending_model:model: ends in SystemExit"):
-        model_source("ending_model:model", {})
-
-
 @pytest.mark.parametrize("suffix", ["mat", "npz", "json"])
 def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"plant.{suffix}"
@@ -137,149 +131,108 @@ def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
     assert plant.dt == 0.1
 
 
-def test_a_free_parameter_of_the_seat() -> None:
-    def make(J2: float = 1.0) -> object:
-        return plants.seated_balance_plant(plants.SeatedBalanceParameters(J2=J2))
-
-    source = plant_source("plants:seated_balance_plant", {})
-    moving = type(source)("seat", make, {"J2": 1.3})
-    family = plant_family_of(moving, ("perturbation",), ["J2"])
-    assert family is not None
-    assert family.nominal.tolist() == [1.3]
+def saved(**changed: object) -> Callable[[Path], str]:
+    """A file of JSON with these entries changed."""
+    content = json.dumps({"A": A, "B": B, "C": C, "dt": 0.1, **changed}).encode()
+    return written("plant.json", content)
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments", "says"),
-    [
-        ("seat", {}, "neither a known name, a file, nor module:function"),
-        (".here:f", {}, "neither a known name, a file, nor module:function"),
-        ("plants:no_such", {}, "cannot be imported"),
-        ("no_such_module:f", {}, "cannot be imported"),
-        ("plants:seated_balance_plant", {"weight": 3}, "refuses its arguments"),
-        ("nowhere.mat", {}, "does not exist"),
-        ("nowhere.json", {}, "does not exist"),
-    ],
-)
-def test_what_cannot_be_used_is_said_in_one_line(
-    name: str, arguments: dict[str, object], says: str
+def written(name: str, content: bytes) -> Callable[[Path], str]:
+    def write(folder: Path) -> str:
+        (folder / name).write_bytes(content)
+        return str(folder / name)
+
+    return write
+
+
+def arrays(name: str, **changed: object) -> Callable[[Path], str]:
+    """A file of matrices, .mat or .npz."""
+
+    def write(folder: Path) -> str:
+        save: Any = scipy.io.savemat if name.endswith("mat") else np.savez_compressed
+        given = {"A": A, "B": B, "C": C, "dt": 0.1, **changed}
+        content = io.BytesIO()
+        save(content, given) if name.endswith("mat") else save(content, **given)
+        return written(name, content.getvalue())(folder)
+
+    return write
+
+
+def pipe(folder: Path) -> str:
+    os.mkfifo(folder / "pipe.json")
+    return str(folder / "pipe.json")
+
+
+# A type that does not exist.
+CRASH = mat5_file(mat5_array(6, (3, 3), "A", mat5_element(200, bytes(72))))
+NO_PLANT: list[tuple[str | Callable[[Path], str], str]] = [
+    ("seat", "neither a known name, a file, nor module:function"),
+    (".here:f", "neither a known name, a file, nor module:function"),
+    ("plants:no_such", "cannot be imported"),
+    ("no_such_module:f", "cannot be imported"),
+    ("builtins:dict", r"expected a control\.StateSpace"),
+    ("nowhere.mat", "does not exist"),
+    ("nowhere.json", "does not exist"),
+    (written("plant.json", b'{"A": [[1]], "B": [[1]], "C": [[1]]}'), "lacks dt"),
+    (written("plant.json", b"[1, 2]"), "holds no names"),
+    (written("plant.json", b"{"), "cannot be read"),
+    (written("deep.json", b"[" * 100_000), "nested too deep"),
+    (written("digits.json", b'{"A": ' + b"1" * 5000 + b"}"), "cannot be read"),
+    (written("bytes.json", b"\xff"), "cannot be read"),
+    (written("none.json", b""), "is empty"),
+    (written("cut.npz", b"PK\x03\x04" + bytes(200)), "cannot be read"),
+    (written("crash.mat", CRASH), "ends the process"),
+    (arrays("bomb.npz", A=np.zeros(10_000_000)), "too large once it is unpacked"),
+    (pipe, "is no ordinary file"),
+    (arrays("objects.npz", A=np.array([{"a": 1}], dtype=object)), "cannot be read"),
+    (saved(A=[["x"]]), "not made of numbers in rows"),
+    (saved(B=[[1, 2]], C=[[1, 2]]), "plant"),
+    (saved(states=["x", "v", "a"]), "names 3 states and has 2"),
+    (saved(states=["x"]), "names 1 states and has 2"),
+    (saved(inputs=["force"]), "names 1 inputs and has 2"),
+    (saved(outputs=["x", "y"]), "names 2 outputs and has 1"),
+    (saved(states=["x", "x"]), "names two states 'x'"),
+    (saved(states={"x": 1}), "that are not names"),
+    (saved(states=[["x"], []]), "names 1 states"),
+    (saved(states=["x", None]), "that are not names"),
+    (saved(**{"state\x1bs": ["x", "v"]}), r"does not know state\\x1bs"),
+    *(
+        (arrays(f"plant.{ending}", **changed), says)
+        for ending in ("mat", "npz")
+        for changed, says in (
+            ({"A": np.array(A) + 1j}, "complex"),
+            ({"D": np.array([[1j, 0]])}, "complex"),
+            ({"dt": 0.1 + 1j}, "complex"),
+            ({"dt": np.inf}, r"beyond 1e\+70 in dt"),
+            ({"A": 1e200 * np.array(A)}, r"beyond 1e\+70 in A"),
+            ({"dt": [0.1, 0.2]}, "dt that is not one number"),
+            ({"C": np.array([["1", "0"]])}, "not made of numbers in rows"),
+            ({"A": np.array([A, A])}, "not made of numbers in rows"),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "says"), NO_PLANT)
+def test_what_is_no_plant_is_one_line(
+    name: str | Callable[[Path], str], says: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match=says) as caught:
-        make_plant(plant_source(name, arguments), ())
+    with pytest.raises(ImpcError, match=says) as caught:
+        make_plant(plant_source(name if isinstance(name, str) else name(tmp_path), {}), ())
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_hold_no_plant(tmp_path: Path) -> None:
-    path = tmp_path / "plant.json"
-    for text, says in (
-        ('{"A": [[1]], "B": [[1]], "C": [[1]]}', "lacks dt"),
-        ("[1, 2]", "holds no names"),
-        ("{", "cannot be read"),
-        ('{"A": [["x"]], "B": [[1]], "C": [[1]], "dt": 1}', "not made of numbers in rows"),
-        ('{"A": [[1]], "B": [[1, 2]], "C": [[1, 2]], "dt": 1}', "plant"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ImpcError, match=says) as caught:
-            make_plant(plant_source(str(path), {}), ())
-        assert "\n" not in str(caught.value)
-    np.savez(tmp_path / "objects.npz", A=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match="cannot be read"):
-        plant_source(str(tmp_path / "objects.npz"), {})
-
-
-def test_a_plant_without_a_command() -> None:
+def test_what_does_not_go_with_a_plant() -> None:
     source = plant_source("plants:seated_balance_plant", {})
     with pytest.raises(PlantError, match="all its inputs are recorded"):
         make_plant(source, ("command", "perturbation"))
-
-
-def test_a_free_parameter_without_a_value() -> None:
-    source = plant_source("plants:seated_balance_plant", {})
     with pytest.raises(InputError, match="no nominal value"):
         plant_family_of(source, (), ["mass"])
+    with pytest.raises(InputError, match="refuses its arguments"):
+        make_plant(plant_source("plants:seated_balance_plant", {"weight": 3}), ())
 
-
-def test_what_a_function_returns_must_be_a_state_space() -> None:
-    source = plant_source("builtins:dict", {})
-    with pytest.raises(PlantError, match=r"expected a control\.StateSpace"):
-        make_plant(source, ())
-
-
-@pytest.mark.parametrize("suffix", ["mat", "npz"])
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"A": np.array(A) + 1j}, "complex"),
-        ({"D": np.array([[1j, 0]])}, "complex"),
-        ({"dt": 0.1 + 1j}, "complex"),
-        ({"dt": np.inf}, r"beyond 1e\+70 in dt"),
-        ({"A": 1e200 * np.array(A)}, r"beyond 1e\+70 in A"),
-        ({"dt": [0.1, 0.2]}, "dt that is not one number"),
-        ({"C": np.array([["1", "0"]])}, "not made of numbers in rows"),
-        ({"A": np.array([A, A])}, "not made of numbers in rows"),
-    ],
-)
-def test_matrices_that_are_no_plant(
-    tmp_path: Path, suffix: str, change: dict[str, object], says: str
-) -> None:
-    path = tmp_path / f"plant.{suffix}"
-    matrices: dict[str, object] = {"A": A, "B": B, "C": C, "dt": 0.1, **change}
-    if suffix == "mat":
-        scipy.io.savemat(path, matrices)
-    else:
-        np.savez(path, **matrices)  # type: ignore[arg-type]  # its stub knows arrays only
-    with pytest.raises(InputError, match=says) as caught:
-        make_plant(plant_source(str(path), {}), ())
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("names", "says"),
-    [
-        ({"states": ["x", "v", "a"]}, "names 3 states and has 2"),
-        ({"states": ["x"]}, "names 1 states and has 2"),
-        ({"inputs": ["force"]}, "names 1 inputs and has 2"),
-        ({"outputs": ["x", "y"]}, "names 2 outputs and has 1"),
-        ({"states": ["x", "x"]}, "names two states 'x'"),
-        ({"states": {"x": 1}}, "that are not names"),
-        ({"states": [["x"], []]}, "names 1 states"),
-        ({"states": ["x", None]}, "that are not names"),
-        ({"state\x1bs": ["x", "v"]}, r"does not know state\\x1bs"),
-    ],
-)
-def test_names_that_are_not_those_of_the_plant(
-    tmp_path: Path, names: dict[str, object], says: str
-) -> None:
-    path = tmp_path / "plant.json"
-    path.write_text(json.dumps({"A": A, "B": B, "C": C, "dt": 0.1, **names}))
-    with pytest.raises(InputError, match=says):
-        make_plant(plant_source(str(path), {}), ())
-
-
-def test_files_of_plants_that_are_hostile(tmp_path: Path) -> None:
-    def refused(name: str, content: bytes, says: str) -> None:
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=says) as caught:
-            plant_source(str(tmp_path / name), {})
-        assert "\n" not in str(caught.value)
-
-    refused("deep.json", b"[" * 100_000, "nested too deep")
-    refused("digits.json", b'{"A": ' + b"1" * 5000 + b"}", "cannot be read")
-    refused("bytes.json", b"\xff", "cannot be read")
-    refused("none.json", b"", "is empty")
-    refused("cut.npz", b"PK\x03\x04" + bytes(200), "cannot be read")
-    numbers = mat5_element(200, bytes(72))  # a type that does not exist
-    refused("crash.mat", mat5_file(mat5_array(6, (3, 3), "A", numbers)), "ends the process")
-    np.savez_compressed(tmp_path / "bomb.npz", A=np.zeros(10_000_000))
-    refused("bomb.npz", (tmp_path / "bomb.npz").read_bytes(), "too large once it is unpacked")
-    os.mkfifo(tmp_path / "pipe.json")
-    with pytest.raises(InputError, match="is no ordinary file"):
-        plant_source(str(tmp_path / "pipe.json"), {})
-
-
-def test_a_function_whose_plant_is_complex() -> None:
-    def make() -> object:
+    def complex_plant() -> object:
         return control.ss(np.array([[0.5 + 1j]]), 1, 1, 0, 0.1)
 
-    source = plant_source("plants:seated_balance_plant", {})
     with pytest.raises(PlantError, match="has complex matrices"):
-        make_plant(type(source)("mine", make, {}), ())
+        make_plant(PlantSource("mine", complex_plant, {}), ())

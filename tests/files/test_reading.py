@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import control
 import numpy as np
 import pytest
 
+from impc.arrays import Array
 from impc.errors import DataError, InputError
 from impc.files.causality import misaligned
-from impc.files.configuration import read_configuration
+from impc.files.configuration import Configuration, read_configuration
 from impc.files.reading import read_recordings
 from impc.model.plant import Plant
-from impc.model.recordings import Label
+from impc.model.recordings import Label, Recording
 from plants import seated_balance_plant, ternary_torque
 from tests.files.samples import csv_text, pushed_seat, settings
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.files.configuration import Configuration
-    from impc.model.recordings import Recording
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from impc.assess.variance_accounted_for import whiteness
 from impc.files.resampling import held_means, instants, resampled_samples, same_rate
 
 DT = 0.01
@@ -53,14 +52,6 @@ def test_a_straight_line_stays_one_up_to_both_ends(rate: float) -> None:
     np.testing.assert_allclose(result, 3.0 - 2.0 * DT * np.arange(len(result)), atol=1e-3)
 
 
-def test_the_ends_do_not_ring() -> None:
-    # A slow movement that begins and ends within the edge: 1 Hz, from its steepest point on.
-    time = np.arange(3000) / 1000
-    result = instants(np.sin(2 * np.pi * time), 1 / 1000, DT)
-    exact = np.sin(2 * np.pi * DT * np.arange(len(result)))
-    assert np.abs(result - exact).max() < 1e-3
-
-
 def test_the_same_rate_passes_unchanged() -> None:
     values = np.random.default_rng(0).normal(size=500)
     for period in (DT, DT * (1 + 1e-6)):
@@ -98,31 +89,8 @@ def test_the_impulse_of_a_push_is_kept(rate: float) -> None:
     assert DT * result.sum() == pytest.approx(values.sum() / rate, rel=1e-9)
 
 
-def test_the_held_plant_moves_as_under_the_recorded_push() -> None:
-    # A mass pushed at 1 kHz and at 100 Hz by the means: velocities agree at every instant.
-    rng = np.random.default_rng(2)
-    fine = rng.normal(size=5000)
-    coarse = held_means(fine, 1e-3, DT)
-    linear = np.concatenate([[0.0], np.cumsum((fine[1:] + fine[:-1]) / 2)]) * 1e-3
-    velocity = np.concatenate([[0.0], np.cumsum(coarse)]) * DT
-    np.testing.assert_allclose(velocity[:-1], linear[::10], atol=1e-12)
-
-
 @pytest.mark.parametrize(("samples", "rate", "expected"), [(1000, 1000, 100), (1001, 1000, 101)])
 def test_number_of_samples(samples: int, rate: float, expected: int) -> None:
     assert resampled_samples(samples, 1 / rate, DT) == expected
     assert len(instants(np.ones(samples), 1 / rate, DT)) == expected
     assert len(held_means(np.ones(samples), 1 / rate, DT)) == expected
-
-
-def test_a_recording_shorter_than_the_filter() -> None:
-    np.testing.assert_allclose(instants(np.full(30, 2.5), 1e-3, DT), 2.5, rtol=1e-12)
-
-
-def test_white_noise_of_a_faster_recorder_is_not_white_at_the_slower_rate() -> None:
-    """What the page of a person says of residuals that are not white (docs/noisy-people.md)."""
-    noise = np.random.default_rng(0).standard_normal(90_000)
-    slower = instants(noise, 0.001, 0.01)
-    assert slower[1:] @ slower[:-1] / (slower @ slower) == pytest.approx(0.15, abs=0.03)
-    assert whiteness(slower[:, None], 100)[0] < 1e-6
-    assert whiteness(instants(noise[:9000], 0.01, 0.01)[:, None], 100)[0] > 1e-3

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import datetime
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openpyxl
@@ -16,9 +17,6 @@ from impc.files.spreadsheet import workbook_bytes
 from impc.files.table import make_table
 from impc.studies.cohort.sheet import column_values, read_sheet
 from tests.files.samples import ods_file, pushed_seat
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SEAT = pushed_seat(50)
 

@@ -8,39 +8,42 @@ import pytest
 from impc.errors import InputError
 from impc.files.units import USUAL, as_pint_says, is_unit, si_unit
 
+TORQUE = "kilogram * meter ** 2 / second ** 2"
+SAME = [
+    (np.pi / 180, "radian", ["deg", "°", "degrees", "˚"]),
+    (np.pi / 200, "radian", ["gon"]),
+    (1e-3, "radian", ["mrad"]),
+    (np.pi / 180, "radian / second", ["°/s", "º/s"]),
+    (1.0, "radian / second", ["rad.s-1"]),
+    (np.pi / 180, "radian / second ** 2", ["deg/s2"]),
+    (1.0, TORQUE, ["Nm", "N*m", "N m", "N·m", "N.m"]),
+    (1e-3, TORQUE, ["mNm", "N mm"]),
+    (4.4482216152605 * 0.3048, TORQUE, ["lbf*ft"]),
+    (1.0, "kilogram * meter ** 2 / radian / second ** 2", ["Nm/rad"]),
+    (1e-3, "meter", ["mm"]),
+    (1e-3, "second", ["ms"]),
+    (1e-6, "second", ["µs"]),
+    (1.0, "meter / second ** 2", ["m/s²"]),
+    (9.80665, "meter / second ** 2", ["g_0"]),
+    (1e6, "kilogram / meter / second ** 2", ["MPa"]),
+    (1.0, "dimensionless", ["1", ""]),
+    (0.01, "dimensionless", ["%"]),
+]
+REFUSED = [
+    ("is not known; write it as in", ["wibble", "Sekunden", "m**999999999", "(2)**9", "m" * 41,
+                                      "9**9**9", "__import__('os')"]),
+    ("has an offset", ["degC"]),
+    ("can be read in two ways", ["g", "a.u.", "px"]),
+    ("write deg for degrees", ["Grad", "grad", "GRAD/s", "grad/s^2", "Grade"]),
+    ("write rad", ["rads"]),
+    ("write rpm", ["U/min"]),
+    (r"write N\*m for a torque", ["NM"]),
+    ("a capital M is mega", ["Mm", "Mrad", "Ms", "MV"]),
+]  # fmt: skip
+
 
 @pytest.mark.parametrize(
-    ("written", "factor", "base"),
-    [
-        ("deg", np.pi / 180, "radian"),
-        ("°", np.pi / 180, "radian"),
-        ("degrees", np.pi / 180, "radian"),
-        ("mrad", 1e-3, "radian"),
-        ("°/s", np.pi / 180, "radian / second"),
-        ("deg/s2", np.pi / 180, "radian / second ** 2"),
-        ("Nm", 1.0, "kilogram * meter ** 2 / second ** 2"),
-        ("N*m", 1.0, "kilogram * meter ** 2 / second ** 2"),
-        ("N m", 1.0, "kilogram * meter ** 2 / second ** 2"),
-        ("N·m", 1.0, "kilogram * meter ** 2 / second ** 2"),
-        ("N.m", 1.0, "kilogram * meter ** 2 / second ** 2"),
-        ("mNm", 1e-3, "kilogram * meter ** 2 / second ** 2"),
-        ("N mm", 1e-3, "kilogram * meter ** 2 / second ** 2"),
-        ("Nm/rad", 1.0, "kilogram * meter ** 2 / radian / second ** 2"),
-        ("mm", 1e-3, "meter"),
-        ("ms", 1e-3, "second"),
-        ("µs", 1e-6, "second"),
-        ("m/s²", 1.0, "meter / second ** 2"),
-        ("g_0", 9.80665, "meter / second ** 2"),
-        ("lbf*ft", 4.4482216152605 * 0.3048, "kilogram * meter ** 2 / second ** 2"),
-        ("1", 1.0, "dimensionless"),
-        ("", 1.0, "dimensionless"),
-        ("%", 0.01, "dimensionless"),
-        ("º/s", np.pi / 180, "radian / second"),
-        ("˚", np.pi / 180, "radian"),
-        ("rad.s-1", 1.0, "radian / second"),
-        ("MPa", 1e6, "kilogram / meter / second ** 2"),
-        ("gon", np.pi / 200, "radian"),
-    ],
+    ("written", "factor", "base"), [(one, *given) for *given, texts in SAME for one in texts]
 )
 def test_si_base_units(written: str, factor: float, base: str) -> None:
     unit = si_unit(written)
@@ -50,32 +53,7 @@ def test_si_base_units(written: str, factor: float, base: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("written", "phrase"),
-    [
-        ("wibble", "is not known"),
-        ("degC", "has an offset"),
-        ("g", "can be read in two ways"),
-        ("a.u.", "can be read in two ways"),
-        ("Grad", "write deg for degrees"),
-        ("grad", "write deg for degrees"),
-        ("GRAD/s", "write deg for degrees"),
-        ("grad/s^2", "write deg for degrees"),
-        ("Grade", "write deg for degrees"),
-        ("rads", "write rad"),
-        ("U/min", "write rpm"),
-        ("NM", r"write N\*m for a torque"),
-        ("px", "can be read in two ways"),
-        ("Mm", "a capital M is mega"),
-        ("Mrad", "a capital M is mega"),
-        ("Ms", "a capital M is mega"),
-        ("MV", "a capital M is mega"),
-        ("Sekunden", "is not known; write it as in"),
-        ("9**9**9", "is not known"),
-        ("m**999999999", "is not known"),
-        ("(2)**9", "is not known"),
-        ("m" * 41, "is not known"),
-        ("__import__('os')", "is not known"),
-    ],
+    ("written", "phrase"), [(one, phrase) for phrase, texts in REFUSED for one in texts]
 )
 def test_units_that_cannot_be_used(written: str, phrase: str) -> None:
     with pytest.raises(InputError, match=phrase):

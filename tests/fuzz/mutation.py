@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
+import random
 import struct
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import random
 
 __all__ = ["EDGES", "mutated_bytes", "mutated_text"]
 

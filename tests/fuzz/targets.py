@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import random
+from collections.abc import Callable
 from operator import methodcaller
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import control
 import numpy as np
@@ -21,11 +24,6 @@ from impc.model.plant import Plant
 from tests.files.samples import csv_text, hdf5_mat, ods_file, pushed_seat, save_mat
 from tests.files.test_blocks import SHAPES
 from tests.fuzz.mutation import EDGES, mutated_bytes, mutated_text
-
-if TYPE_CHECKING:
-    import random
-    from collections.abc import Callable
-    from pathlib import Path
 
 __all__ = ["TARGETS", "Fuzzer"]
 
@@ -66,15 +64,7 @@ _PIECES = (
 
 
 class Fuzzer:
-    """One folder, one generator, sound files to begin with.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the cases are written, one over the other.
-    rng : random.Random
-        Chooses what is changed.
-    """
+    """One folder, one generator, sound files to begin with."""
 
     def __init__(self, folder: Path, rng: random.Random) -> None:
         self.folder = folder
@@ -125,13 +115,7 @@ class Fuzzer:
         return path, lambda: make_plant(plant_source(str(path), {}), ())
 
     def reason(self, read: Callable[[], Any]) -> str:
-        """Why a case is refused; empty when it is read.
-
-        Raises
-        ------
-        AssertionError
-            When the reason is more than one line, or a long one.
-        """
+        """Why a case is refused; empty when it is read."""
         try:
             read()
         except ImpcError as error:

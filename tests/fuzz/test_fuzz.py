@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from tests.fuzz.targets import TARGETS, Fuzzer
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # Cases of each target, about two seconds.
 _CASES = {".csv": 120, ".tsv": 60, ".txt": 60, ".mat": 400, ".tdms": 300, ".c3d": 150,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from impc.errors import InputError, WeightsError
+from impc.errors import WeightsError
 from impc.model.plant import Plant
 from impc.model.riccati import (
     gain_gradients,
@@ -95,11 +95,6 @@ def test_a_mode_without_weight_is_an_error() -> None:
     plant = Plant(control.ss(np.diag([1.0, 0.5]), [[1], [1]], np.eye(2), 0, True))
     with pytest.raises(WeightsError, match="weigh every mode"):
         solve_lqr(plant, Weights(np.diag([0.0, 1.0]), 1))
-
-
-def test_sizes_are_compared(example_plant: Plant) -> None:
-    with pytest.raises(InputError, match="weights: has 3 states, what stands before it 2"):
-        solve_lqr(example_plant, Weights(np.eye(3), 1))
 
 
 def test_changes_of_a_regulator_along_weights_and_plant() -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 
-from impc.checking import replace
 from plants import SeatedBalanceParameters, SeatLayout, from_anthropometry
 from plants.anthropometry import DE_LEVA
 
@@ -59,12 +57,6 @@ def test_scaling_with_mass_and_height() -> None:
         assert tall.l12 > base.l12
 
 
-def test_seat_adds_its_own_inertia() -> None:
-    bare = from_anthropometry(79.7, 1.66, layout=SeatLayout(seat_radius=0.0))
-    added = from_anthropometry(79.7, 1.66).J1 - bare.J1
-    assert added == pytest.approx(20 * 0.25**2)
-
-
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
@@ -78,13 +70,3 @@ def test_bad_persons_are_refused_by_name(name: str, arguments: Any) -> None:
     with pytest.raises(ValueError, match=rf"^{name}: expected .*, got .*; give ") as error:
         from_anthropometry(*arguments)
     assert "\n" not in str(error.value)
-
-
-def test_bad_layouts_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"^seat_mass: "):
-        replace(SeatLayout(), seat_mass=-1.0)
-    with pytest.raises(ValueError, match=r"^l12: "):
-        from_anthropometry(79.7, 1.66, layout=SeatLayout(pivot_depth=-1.0))
-    for each in fields(SeatLayout):
-        assert SeatLayout.__doc__ is not None
-        assert each.name in SeatLayout.__doc__

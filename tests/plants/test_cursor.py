@@ -19,11 +19,6 @@ def test_names_and_size() -> None:
     assert system.dt == pytest.approx(1 / 60)
 
 
-def test_target_moves_the_error_and_nothing_else() -> None:
-    system = plants.cursor_plant(sample_time=0.02)
-    np.testing.assert_allclose(system.B[:, 1], [-0.02, *np.zeros(6)], atol=1e-15)
-
-
 def test_a_step_command_gives_the_position_of_a_delayed_lag() -> None:
     """c(t) of a'' = (1 - exp(-s/lag)), s = t - delay, by the integral; Padé's error is 1e-3."""
     delay, lag, dt = 0.1, 0.08, 0.005

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import plants
-from plants import HEAD_NECK_FIXED, HEAD_NECK_PARAMETERS, TABLE_4_3
+from plants import HEAD_NECK_FIXED, TABLE_4_3
 
 NOMINAL = np.array([float(value or 0) for value in TABLE_4_3["nominal"]])
 
@@ -79,17 +79,6 @@ def test_pitch_feels_gravity() -> None:
     expected = kvis / (kvis + kccr + k - m * 9.81 * lever)
     assert abs(system(0)) == pytest.approx(expected)
     assert expected == pytest.approx(0.838, abs=2e-3)
-
-
-def test_parameters_are_documented() -> None:
-    for item in HEAD_NECK_PARAMETERS:
-        assert item.unit
-        assert item.source
-        assert item.pathway in ("visual", "vestibular", "proprioceptive", "intrinsic")
-    with pytest.raises(ValueError, match="yaw or pitch"):
-        plants.head_neck_matrices("roll")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="12 numbers"):
-        plants.head_neck_plant(np.ones(3))
 
 
 def test_steps_keep_their_durations_and_sizes() -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
 
 import plants
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 CASES = [
     # function, poles (descending modulus), rank of the controllability matrix, outputs
@@ -47,7 +45,3 @@ def test_yalmip_gain_and_riccati_solution_are_those_of_the_reference() -> None:
     K = np.linalg.solve(1 + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
     np.testing.assert_allclose(K, [[1.49383, -0.88111]], atol=5e-6)
     np.testing.assert_allclose(P, [[5.36016, -1.21933], [-1.21933, 1.98969]], atol=5e-6)
-
-
-def test_cannon_output_is_the_difference_of_the_states() -> None:
-    np.testing.assert_array_equal(plants.cannon_example().C, [[-1.0, 1.0]])

@@ -56,16 +56,6 @@ def test_default_is_the_published_register() -> None:
     np.testing.assert_array_equal(ternary_sequence(), expected)
 
 
-def test_four_stages_feed_back_the_first_and_the_last() -> None:
-    # The published taps for a period of 80.
-    assert maximal_recurrence(4) == (1, 0, 0, 1)
-
-
-def test_long_registers_have_a_recurrence() -> None:
-    assert len(maximal_recurrence(20)) == 20
-    assert len(ternary_sequence(20, 1000)) == 1000
-
-
 def test_a_seed_shifts_the_sequence_and_nothing_else() -> None:
     seed = int(np.random.default_rng().integers(2**31))
     print(f"seed {seed}")

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from impc.arrays import Array, Frozen, frozen
-from impc.errors import OutputError
 from impc.studies.cache import Cache, Steps, from_json
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -93,22 +90,6 @@ def test_a_step_that_fails_is_not_kept(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_kept_reads_the_same(tmp_path: Path) -> None:
-    kept = Cache(tmp_path / "kept")
-    content = {
-        "x": np.random.default_rng(0).standard_normal(50).tolist(),
-        "n": [None, float("inf")],
-        "t": "µ\ud800",
-    }
-    assert kept.find("a/b", "d") is None
-    kept.keep("a/b", "d", content)
-    assert kept.find("a/b", "d") == content
-    assert kept.find("a/b", "other") is None
-    kept.forget()
-    kept.forget()
-    assert not kept.folder.exists()
-
-
 def test_names_that_fall_together_are_told_apart(tmp_path: Path) -> None:
     kept = Cache(tmp_path)
     kept.keep("trial 1", "d", 1)
@@ -137,13 +118,6 @@ def test_a_link_in_the_place_of_the_draft_is_not_followed(tmp_path: Path) -> Non
     (tmp_path / ".a.json.part").symlink_to(target)
     Cache(tmp_path).keep("a", "d", 1)
     assert target.read_text() == "mine"
-
-
-def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "kept").write_text("")
-    with pytest.raises(OutputError, match="cannot be written") as caught:
-        Cache(tmp_path / "kept").keep("a", "d", 1)
-    assert "\n" not in str(caught.value)
 
 
 def test_only_what_was_kept_is_forgotten(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tracemalloc
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -14,6 +14,7 @@ from click.testing import CliRunner
 import impc.cli.console
 import impc.studies.cohort.engine
 import impc.studies.fit.subject
+from impc.arrays import Array, IntArray
 from impc.checking import replace
 from impc.cli.console import require_consent
 from impc.cli.main import main
@@ -34,7 +35,7 @@ from impc.studies.effort import (
     select_evaluations,
     selection_effort,
 )
-from impc.studies.fit.settings import FitSettings, StructureSettings
+from impc.studies.fit.settings import FitSettings
 from impc.studies.selection.analysis import select_study
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.model import ParametricModel, Trial, sensitivity
@@ -44,23 +45,7 @@ from tests.files.test_inputs import here
 from tests.studies.cohort.carts import write_study
 from tests.studies.selection.dosing import in_turn
 from tests.studies.selection.heads import head_model, head_trials
-from tests.studies.selection.test_methods import blood_study
 from tests.support import random_plant
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.arrays import Array, IntArray
-
-
-def test_each_structure_is_a_fit_more_and_one_for_each_trial_left_out() -> None:
-    plant = random_plant(np.random.default_rng(5), 4, 1, 0.95)
-    trial = Recording(plant, np.ones((50, 4)))
-    problem = Problem(plant, Bounds(plant), 10, (trial, trial, trial), terminal_set=False)
-    plain, one = FitSettings(), FitSettings(structure=StructureSettings())
-    # Two fits and three without a trial; then four more.
-    told = [fit_effort(problem, settings).seconds for settings in (plain, one)]
-    assert told[1] == pytest.approx(told[0] * 9 / 5)
 
 
 @pytest.mark.parametrize(("n", "m", "horizon"), [(2, 1, 300), (4, 2, 100), (8, 1, 150)])
@@ -186,16 +171,6 @@ def test_compiling_a_model_is_no_part_of_what_a_selection_takes(
     assert selection_effort(model, [trials], 10).seconds == pytest.approx(0.2)
 
 
-def test_memory_of_a_selection_grows_with_recordings_and_workers() -> None:
-    model, trials = drug()
-    one = selection_effort(model, [trials], 1)
-    # 192 samples of one output, three parameters, six arrays, two threads.
-    assert one.gigabytes == pytest.approx(8e-9 * 192 * 3 * 12)
-    assert selection_effort(model, [trials * 5, trials], 1).gigabytes == 5 * one.gigabytes
-    assert Effort(10, 1).shared(6, 2) == Effort(30, 2)
-    assert Effort(10, 1).shared(1, 8) == Effort(10, 1)
-
-
 def test_a_cohort_for_days_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six subjects: refused as one request, begun with --yes, and not asked for when it is done."""
     here(monkeypatch)
@@ -218,22 +193,3 @@ def test_a_cohort_for_days_ends_at_once(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(impc.studies.cohort.engine, "run_study", begun)
     done = CliRunner().invoke(main, [*words, "--yes"])
     assert done.exit_code == 130, done.output
-
-
-@pytest.mark.parametrize("command", ["select", "key-parameters"])
-def test_a_selection_asks_too(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its time is measured: here the limit is moved, so that no clock decides."""
-    done = here(monkeypatch, stop=0)
-    study = blood_study(tmp_path, 1, 2)
-    words = [command, str(study), "--allow-model", "--out", str(tmp_path / "out")]
-    monkeypatch.setattr(impc.cli.console, "_SECONDS", 0.0)
-    refused = CliRunner().invoke(main, words)
-    assert refused.exit_code == 2, refused.output
-    assert "lower replicates or starts in [select]" in refused.stderr
-    assert not (tmp_path / "out").exists()
-    assert CliRunner().invoke(main, [*words, "--yes"]).exit_code == 130
-    monkeypatch.setattr(impc.cli.console, "_SECONDS", 7200.0)
-    assert CliRunner().invoke(main, words).exit_code == 130
-    assert done == []

@@ -23,12 +23,7 @@ from impc.reporting.document import json_bytes
 from impc.reporting.finding import csv_bytes
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
-from impc.studies.methods_table import (
-    column_terms,
-    methods_data,
-    methods_finding,
-    until_its_end,
-)
+from impc.studies.methods_table import column_terms, methods_data, methods_finding, until_its_end
 
 
 @pytest.fixture(scope="module")

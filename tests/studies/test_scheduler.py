@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import shutil
 import subprocess
-import sys
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import distributed
 import pytest
@@ -20,9 +20,6 @@ from impc.studies import scheduler as module
 from impc.studies.cache import Cache
 from impc.studies.pool import Task, run
 from impc.studies.scheduler import Cluster, connected
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # A client whose scheduler is gone leaves its socket to the garbage collector, at any later time.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -132,48 +129,3 @@ def test_a_scheduler_that_is_lost(
         with pytest.raises(OutputError, match="was lost"):
             assert pool.threads
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_is_killed_leaves_no_log(tmp_path: Path) -> None:
-    """In processes of their own, ended by SIGKILL: one line, where Dask itself logs 112."""
-    place = tmp_path / "scheduler.json"
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    common = ["--no-dashboard", "--scheduler-file", str(place)]
-    server = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"]
-    started = [
-        subprocess.Popen([*server, "--port", "0", *common], **quiet),
-        subprocess.Popen([*worker, *common, "--local-directory", str(tmp_path)], **quiet),
-    ]
-    code = (
-        "import json, sys, time\n"
-        "from impc.studies.pool import Task\n"
-        "from impc.studies.scheduler import Cluster, connected\n"
-        "from impc.errors import ImpcError\n"
-        "try:\n"
-        "    with connected(Cluster(json.load(open(sys.argv[1]))['address'])) as pool:\n"
-        "        for number in range(100):\n"
-        "            pool.submit(number, [Task('', '', time.sleep, (0.5,))])\n"
-        "        for number in range(100):\n"
-        "            print(pool.take(), flush=True)\n"
-        "except ImpcError as error:\n"
-        "    print(error, file=sys.stderr)\n"
-    )
-    try:
-        while not place.exists():
-            time.sleep(0.05)
-        client = subprocess.Popen(
-            [sys.executable, "-c", code, str(place)], stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert client.stdout is not None
-        client.stdout.readline()
-        started[0].kill()
-        _, said = client.communicate(timeout=120)
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
-    assert len(said.splitlines()) == 1
-    assert "was lost while tasks were out" in said

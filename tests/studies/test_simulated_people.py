@@ -11,9 +11,7 @@ import plants
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
-from impc.errors import InputError
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.simulation import simulate_person
 from impc.studies.simulated_people import simulate_subject
 
 STEP = plants.seated_balance_step_for()
@@ -53,28 +51,6 @@ def test_who_hardly_errs_moves_as_who_sees_all() -> None:
     found = simulate_subject(work.controller, linear_step(), torque, person=person)
     # Noise of 1e-9, times gains of some hundreds: 1.5e-7 here.
     np.testing.assert_allclose(found.states, plain.states, atol=1e-6)
-
-
-@pytest.mark.full
-def test_noise_of_a_person_is_that_of_the_linear_loop() -> None:
-    """The linear plant at 100 Hz and at 1000 Hz: the same spread of the angles, to its error."""
-    work = seat(1, 30.0, 70.0)
-    plant = work.controller.plant
-    person = Observer(plant, ["theta1", "theta2", "theta1_rate", "theta2_rate"], motor=0.5,
-                      sensory=[2e-3, 2e-3, 2e-2, 2e-2])  # fmt: skip
-    still = np.zeros((3000, 1))
-    ours = simulate_subject(work.controller, linear_step(), held(still[:, 0]), person=person)
-    other = simulate_person(work.controller, person, still, seed=1)
-    spread = [np.std(item[:, :2], axis=0) for item in (ours.states[::10], other.states)]
-    # Thirty seconds of a motion that forgets in about one: a sixth of a deviation.
-    np.testing.assert_allclose(spread[0], spread[1], rtol=0.5)
-
-
-def test_process_noise_has_no_place_on_a_nonlinear_plant() -> None:
-    controller = seat(1, 1.0, 6.0).controller
-    with pytest.raises(InputError, match="process: cannot be simulated here"):
-        simulate_subject(controller, STEP, np.zeros(100),
-                         person=Observer(controller.plant, process=1e-3))  # fmt: skip
 
 
 def test_ranges_and_saturation_of_the_reference() -> None:
@@ -126,11 +102,6 @@ def test_a_fall_is_told() -> None:
     assert trial.fell is not None
     assert 0 < trial.fell < 5
     assert np.all(np.isfinite(trial.outputs))
-
-
-def test_a_rate_that_does_not_fit_is_said() -> None:
-    with pytest.raises(InputError, match="rate"):
-        simulate_subject(seat(1, 1.0).controller, STEP, np.zeros(100), rate=150.0)
 
 
 def test_a_person_by_mass_and_height() -> None:

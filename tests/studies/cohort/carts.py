@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import control
 import numpy as np
@@ -14,9 +15,6 @@ from impc.control.simulation import require_complete, scenario
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 __all__ = ["cart_plant", "subject_trial", "write_study"]
 

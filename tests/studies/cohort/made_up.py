@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
 
-from impc.assess.assessments import ASSESSMENTS
+from impc.assess.assessments import ASSESSMENTS, Assessment
 from impc.files.configuration import Configuration, RecordingTable
 from impc.model.plant import Plant
 from impc.studies.cohort.study import KEYS, Study, Unit
 from impc.studies.cohort.tasks import FitTask
-
-if TYPE_CHECKING:
-    from impc.assess.assessments import Assessment
 
 __all__ = ["fit_of", "made_up_study", "replicate_of", "tasks_of"]
 

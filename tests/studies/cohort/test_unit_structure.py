@@ -13,8 +13,7 @@ import scipy.stats
 from impc.checking import replace
 from impc.files.plant_sources import plant_source
 from impc.studies.cohort.comparison import compare_cohort, measures_of
-from impc.studies.cohort.engine import Failures, Store
-from impc.studies.cohort.report import write_report
+from impc.studies.cohort.engine import Store
 from impc.studies.cohort.study import Study, read_study
 from impc.studies.cohort.tables import cohort_tables
 from impc.studies.cohort.tasks import fit_unit, study_tasks
@@ -60,15 +59,6 @@ def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]
     assert price.notna().all()
 
 
-def test_the_page_says_it_as_a_factor(fitted: tuple[Study, Store]) -> None:
-    study, store = fitted
-    write_report(study, store, Failures({}, {}), "impc cohort study.toml")
-    page = (store.folder / "report.html").read_text(encoding="utf-8")
-    assert "times as high in b as in a" in page
-    assert "is refused by the recordings of" in page
-    assert "Prices within the structure" in page
-
-
 def made_up(subjects: int, visits: int) -> pd.DataFrame:
     rng = np.random.default_rng(4)
     rows = []
@@ -89,12 +79,6 @@ def test_the_mixed_model_of_whole_tables_is_students_t_on_subject_means() -> Non
     assert found.p == pytest.approx(test.pvalue, rel=1e-3)
     interval = test.confidence_interval(0.95)
     assert (found.low, found.high) == pytest.approx((interval.low, interval.high), abs=1e-3)
-
-
-def test_too_few_subjects_have_no_mixed_model() -> None:
-    (found,) = (item for item in compare_cohort(made_up(4, 2)) if item.question == "mixed")
-    assert found.note == "too few subjects (4)"
-    assert np.isnan(found.p)
 
 
 def test_a_unit_without_a_structure_has_no_columns_for_it() -> None:

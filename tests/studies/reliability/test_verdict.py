@@ -62,8 +62,3 @@ def test_few_subjects_tell_nothing_however_high_the_estimate() -> None:
     lines = answer(study(made))
     assert "4 subjects and 2 visits do not tell" in lines[0]
     assert not any("is excellent" in line or "is good" in line for line in lines)
-
-
-def test_one_visit() -> None:
-    (line,) = answer(study(scores(5, 1, 0.01)))
-    assert "cannot be said of one visit" in line

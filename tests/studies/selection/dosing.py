@@ -6,16 +6,14 @@ the curve has the same shape and another size: V and the two rates share a direc
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy.signal
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from impc.studies.selection.model import ParametricModel
-    from impc.studies.selection.model_source import Runner
+from impc.studies.selection.model import ParametricModel
+from impc.studies.selection.model_source import Runner
 
 __all__ = ["blood_model", "in_turn"]
 

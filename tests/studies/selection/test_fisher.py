@@ -90,12 +90,6 @@ def test_growing_sets_is_exhaustive_search(bound: float) -> None:
     assert largest_subsets([FOUND.F], bound) == exhaustive([FOUND.F], bound)
 
 
-def test_the_dissertation_s_subset_is_feasible_at_the_first_bound() -> None:
-    found = largest_subsets([FOUND.F], 0.05)
-    assert found.size == 5
-    assert free_indices(MODEL, NAMES_FIM) in found.subsets
-
-
 def test_variances_are_those_of_the_inverse() -> None:
     rng = np.random.default_rng(SEED)
     root = rng.standard_normal((30, 6))

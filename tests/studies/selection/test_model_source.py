@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +16,6 @@ from impc.studies.selection.model import Trial
 from impc.studies.selection.model_source import model_source, on_pool
 from tests.studies.selection.dosing import in_turn
 from tests.support import ThisProcess
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SUBSETS = ((0, 1), (0, 1, 2))
 
