@@ -20,6 +20,7 @@ from impc.control.simulation import scenario
 from impc.errors import BoundsError, DataError, ImpcError, InputError, PlantError, WeightsError
 from impc.files.formats import read_table
 from impc.files.reading import read_recordings
+from impc.files.saved_estimates import load
 from impc.files.table import make_table
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
