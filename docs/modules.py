@@ -73,7 +73,9 @@ def _page(name: str) -> str:
     public = [
         item
         for item, thing in vars(module).items()
-        if not item.startswith("_") and _told(thing) and inspect.unwrap(thing).__module__ == name
+        if not item.startswith("_")
+        and _identified(thing)
+        and inspect.unwrap(thing).__module__ == name
     ]
     names = (
         f"\n   .. autosummary::\n      :nosignatures:\n\n{_indented(public, 6)}\n" if public else ""
@@ -81,7 +83,7 @@ def _page(name: str) -> str:
     return _PAGE.format(name=name, line="=" * len(name), names=names)
 
 
-def _told(thing: object) -> bool:
+def _identified(thing: object) -> bool:
     """Classes and functions: of anything else autosummary would show its type's docstring."""
     plain = inspect.unwrap(thing) if callable(thing) else thing
     return inspect.isclass(plain) or inspect.isroutine(plain)

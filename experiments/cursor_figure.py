@@ -1,4 +1,4 @@
-"""The figure of the cursor experiment: trials, VAF by blur, gain and price by blur."""
+"""The figure of the cursor experiment: trials, VAF by blur, gain and cost weight by blur."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def cursor_figure(results: Sequence[ConditionResult]) -> dict[str, bytes]:
             _trial(axes[letter], item, letter)
         axes["A"].legend(ncols=3, loc="upper left", bbox_to_anchor=(0, 1.32))
         _vaf(axes["C"], results)
-        _prices(axes["D"], results)
+        _cost_weights(axes["D"], results)
         return {f"cursor-tracking.{kind}": content for kind, content in render(figure).items()}
 
 
@@ -86,16 +86,16 @@ def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
     axes.legend(loc="lower left")
 
 
-def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
-    """Gain and price; the price is the same for all weights with that gain, so it has no band."""
+def _cost_weights(axes: Axes, results: Sequence[ConditionResult]) -> None:
+    """Gain and weight; the weight is the same for all weights with that gain, so it has no band."""
     blur = [item.blur for item in results]
     axes.plot(
         blur,
-        [item.price_of_error for item in results],
+        [item.weight_of_error for item in results],
         "D:",
         color=GREEN,
         markerfacecolor="white",
-        label="price of the error (s$^{-4}$), R = 1",
+        label="cost weight of the error (s$^{-4}$), R = 1",
     )
     axes.plot(
         blur,
@@ -107,6 +107,6 @@ def _prices(axes: Axes, results: Sequence[ConditionResult]) -> None:
     axes.set_yscale("log")
     axes.set_ylim(1, 1e9)
     axes.set_xlabel("blur (px)")
-    axes.set_ylabel("gain, price (-)")
+    axes.set_ylabel("gain, cost weight (-)")
     axes.set_title("(D)", loc="left")
     axes.legend(loc="upper right")

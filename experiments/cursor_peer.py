@@ -81,8 +81,8 @@ def peer_half(condition: Condition, half: int, model: str) -> PeerRow:
     jax.config.update("jax_enable_x64", True)
     mine, others = (_shifted(condition, part) for part in parts)
     steps = np.diff(condition.target[parts[0]], axis=1)
-    told = _told(jax, model, float(np.std(steps)))
-    slopes = jax.jit(jax.value_and_grad(lambda theta: -told(theta, mine)))
+    likelihood = _identified(jax, model, float(np.std(steps)))
+    slopes = jax.jit(jax.value_and_grad(lambda theta: -likelihood(theta, mine)))
 
     def objective(theta: Array) -> tuple[float, Array]:
         value, slope = slopes(theta)
@@ -103,7 +103,7 @@ def peer_half(condition: Condition, half: int, model: str) -> PeerRow:
         condition.blur,
         half,
         -float(found.fun),
-        float(told(found.x, others)),
+        float(likelihood(found.x, others)),
         float(found.x[-1] * _PIXELS),
         dict(zip(_STARTS[model], np.exp(found.x[:-1]).tolist(), strict=True)),
         int(found.nfev),
@@ -116,13 +116,13 @@ def _shifted(condition: Condition, which: IntArray) -> Array:
     return np.stack([target[:, :-_DELAY], response[:, _DELAY:]], axis=-1)
 
 
-def _told(jax: Any, model: str, steps: float) -> Callable[[Any, Array], Any]:
+def _identified(jax: Any, model: str, steps: float) -> Callable[[Any, Array], Any]:
     """Mean log-likelihood of the cursor from sample FIRST on, at theta (q,)."""
     jnp = jax.numpy
     make = getattr(importlib.import_module("lqg.tracking"), model)
     names = list(_STARTS[model])
 
-    def told(theta: Any, trials: Array) -> Any:
+    def likelihood(theta: Any, trials: Array) -> Any:
         x = jnp.asarray(trials).at[:, :, 1].add(-_PIXELS * theta[-1])
         x = x - x[:, :1, :1]  # their estimate begins at zero
         numbers = {name: jnp.exp(value) for name, value in zip(names, theta, strict=False)}
@@ -136,7 +136,7 @@ def _told(jax: Any, model: str, steps: float) -> Callable[[Any, Array], Any]:
         each = -(jnp.log(2 * jnp.pi * variance) + left**2 / variance) / 2
         return jnp.mean(each[:, FIRST - _DELAY - 1 :])
 
-    return told
+    return likelihood
 
 
 def main() -> None:

@@ -2,17 +2,17 @@
 
 The hand's velocity follows a command that arrives whole samples late (`plants.pursuit_plant`). The
 person sees the error with noise, feels the speed of the hand with noise, and knows how the target
-moves: by steps that no step before tells, of the size that they have. Commands follow from the
-estimate, by the price of the error beside that of the command. Motor noise enters with the command,
-and what moves the cursor beside is white from sample to sample. Everything but the delay is
-searched by maximum likelihood (docs/noisy-people.md), for each of some delays; people sit a few
+moves: by steps that no step before says, of the size that they have. Commands follow from the
+estimate, by the cost weight of the error beside that of the command. Motor noise enters with the
+command, and what moves the cursor beside is white from sample to sample. Everything but the delay
+is searched by maximum likelihood (docs/noisy-people.md), for each of some delays; people sit a few
 pixels beside the target, so the mean error is taken off, and then what the likelihood would rather
 have.
 
 A trial begins with the cursor on the target and ends with a person who has been at it for long: the
 first three seconds are given, and neither fitted nor judged. A person is judged by the mean
 log-likelihood, in nats a sample, of the next position of the cursor given all before and the
-target; beside stands what a linear prediction with every coefficient free tells.
+target; beside stands what a linear prediction with every coefficient free says.
 `experiments.cursor_people_study` is the comparison.
 """
 
@@ -34,7 +34,7 @@ from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.start import gain_space
 from impc.output_feedback.unknowns import PersonCoordinates
@@ -62,7 +62,7 @@ FIRST = 180
 _LAG = 0.03
 # Where levels begin: px, px/s. Under a blur of 17 px a search from others can end lower.
 _BESIDE, _MOTOR, _SEEN, _FELT, _RECORDER = 0.3, 60.0, 10.0, 20.0, 0.2
-# Logarithm of the price about that where a search begins.
+# Logarithm of the cost weight about that where a search begins.
 _SPREAD = 5.0
 
 
@@ -81,7 +81,7 @@ class Follower:
 
     delay: int
     offset: float
-    fit: PersonFit
+    fit: OutputFeedbackFit
 
 
 def follower_problem(condition: Condition, which: IntArray, delay: int, offset: float) -> Problem:
@@ -107,7 +107,7 @@ def fit_follower(
 ) -> Follower:
     """The likeliest person behind some trials (k,), of those with one of some delays.
 
-    The first sample that is `counted` is told given those before it.
+    The first sample that is `counted` is identified given those before it.
     """
     error = (condition.response[which] - condition.target[which])[:, FIRST:]
     offset = float(np.mean(error))
@@ -119,7 +119,7 @@ def fit_follower(
 
 def _fitted(
     condition: Condition, which: IntArray, delay: int, offset: float, counted: int
-) -> PersonFit:
+) -> OutputFeedbackFit:
     problem = follower_problem(condition, which, delay, offset)
     near = fit_controller(problem)
     structure = Structure(near.problem.plant, ["error"])
@@ -136,7 +136,7 @@ def _fitted(
         walk=float(np.std([trial.disturbance for trial in problem.recordings])),
         persistence=0.0,
     )
-    return fit_person(
+    return fit_output_feedback(
         least_squares,
         person,
         recorder=np.array([_RECORDER]),
@@ -146,30 +146,32 @@ def _fitted(
     )
 
 
-def judged(follower: Follower, condition: Condition, which: IntArray) -> PersonFit:
+def judged(follower: Follower, condition: Condition, which: IntArray) -> OutputFeedbackFit:
     """The same person beside other trials (k,): what the fit would have said of them."""
     fit = follower.fit
     other = follower_problem(condition, which, follower.delay, follower.offset)
     there = other.at(np.array(other.starts), np.array(fit.problem.logarithms))
     posed = replace(there, structure=fit.problem.structure)
-    prices = gain_space(Point(np.array(fit.K), np.array(fit.S), posed), fit.prices)
+    cost_weights = gain_space(Point(np.array(fit.K), np.array(fit.S), posed), fit.cost_weights)
     space = PersonCoordinates(
-        prices, fit.observer, np.array(fit.recorder), counted=fit.space.counted
+        cost_weights, fit.observer, np.array(fit.recorder), counted=fit.space.counted
     )
-    told = space.told(space.start)
-    return dataclasses.replace(fit, problem=there, told=told, log_likelihood=told.value)
+    identified = space.identified(space.start)
+    return dataclasses.replace(
+        fit, problem=there, identified=identified, log_likelihood=identified.value
+    )
 
 
-def nats(fit: PersonFit) -> float:
+def nats(fit: OutputFeedbackFit) -> float:
     """Mean log-likelihood of a sample, the first three seconds left out."""
-    return float(np.mean([trial.told[FIRST:] for trial in fit.told.trials]))
+    return float(np.mean([trial.identified[FIRST:] for trial in fit.identified.trials]))
 
 
 def _beside(follower: Follower, condition: Condition, which: IntArray) -> float:
     """By how much the offset is to be moved: innovations are linear in it."""
     step = 1.0
     moved = dataclasses.replace(follower, offset=follower.offset + step)
-    here, there = (judged(one, condition, which).told.trials for one in (follower, moved))
+    here, there = (judged(one, condition, which).identified.trials for one in (follower, moved))
     first = np.concatenate([one.innovations[FIRST:, 0] for one in here])
     other = np.concatenate([one.innovations[FIRST:, 0] for one in there])
     spread = np.concatenate([one.spreads[FIRST:, 0, 0] for one in here])
@@ -182,7 +184,7 @@ _POSITIONS, _TARGETS = 20, 60
 
 
 def regression_nats(condition: Condition, mine: IntArray, others: IntArray) -> float:
-    """What a free linear prediction tells of trials left out, nats a sample.
+    """What a free linear prediction says of trials left out, nats a sample.
 
     A regression on 20 positions before, 60 of the target and a constant, fitted to the trials
     `mine` (k,) and judged on others (j,) as a person is.

@@ -30,12 +30,12 @@ from impc.reporting.writer import write_files
 
 if TYPE_CHECKING:
     from impc.arrays import IntArray
-    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.fit import OutputFeedbackFit
 
 __all__ = ["main"]
 
 _AHEAD = (1, 6, 12, 30)
-_TOLD = ("outside", "steps", "regression")
+_IDENTIFIED = ("outside", "steps", "regression")
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class _Row:
     regression: float
     delay: int
     offset: float
-    price: float
+    cost_weight: float
     lag: float
     levels: dict[str, float]
     intervals: dict[str, list[float]]
@@ -65,20 +65,20 @@ def _half(condition: Condition, half: int) -> _Row:
     follower = fit_follower(condition, mine)
     there = judged(follower, condition, others)
     steps = fit_steps(_expected(follower.fit, condition, mine))
-    told = (
+    cells = (
         nats(there),
         step_nats(steps, _expected(there, condition, others)),
         regression_nats(condition, mine, others),
     )
     ahead = prediction_errors(there, _AHEAD)[:, 0].tolist()
-    return _row(condition.blur, half, follower, told, {}, ahead)
+    return _row(condition.blur, half, follower, cells, {}, ahead)
 
 
-def _expected(fit: PersonFit, condition: Condition, which: IntArray) -> Expected:
+def _expected(fit: OutputFeedbackFit, condition: Condition, which: IntArray) -> Expected:
     """What the filter expects of the cursor, from the first sample that is judged."""
     position = condition.response[which]
-    off = np.array([trial.innovations[:, 0] for trial in fit.told.trials])
-    spread = np.array([trial.spreads[:, 0, 0] for trial in fit.told.trials])
+    off = np.array([trial.innovations[:, 0] for trial in fit.identified.trials])
+    spread = np.array([trial.spreads[:, 0, 0] for trial in fit.identified.trials])
     parts = position, np.roll(position, 1, axis=1), position - off, np.sqrt(spread)
     return Expected(*(part[:, FIRST:].ravel() for part in parts))
 
@@ -100,7 +100,7 @@ def _row(
     ahead: list[float],
 ) -> _Row:
     fit = follower.fit
-    assert fit.prices is not None
+    assert fit.cost_weights is not None
     assert fit.problem.family is not None
     levels = fit.levels
     return _Row(
@@ -110,7 +110,7 @@ def _row(
         *outside,
         follower.delay,
         follower.offset,
-        float(np.exp(fit.prices[0])),
+        float(np.exp(fit.cost_weights[0])),
         float(fit.problem.family.nominal[0] * np.exp(fit.problem.logarithms[0])),
         dict(zip(fit.space.names, levels.tolist(), strict=True)),
         intervals,
@@ -121,7 +121,7 @@ def _row(
 
 
 def _table(rows: list[_Row]) -> str:
-    """Halves: how well the other half is told."""
+    """Halves: how well the other half is identified."""
     lines = [
         "| blur, px | nats a sample, even, odd trials left out | mean | with steps and rests "
         "| free regression | errors 1, 6, 12, 30 samples ahead, px |",
@@ -132,12 +132,12 @@ def _table(rows: list[_Row]) -> str:
             (row for row in rows if row.blur == blur), key=lambda row: -row.half
         )  # half 1 leaves the even trials out
         each = ", ".join(f"{row.outside:.4f}" for row in pair)
-        told = " | ".join(f"{_mean(pair, name):.4f}" for name in _TOLD)
+        cells = " | ".join(f"{_mean(pair, name):.4f}" for name in _IDENTIFIED)
         ahead = np.sqrt(np.mean(np.square([row.ahead for row in pair]), axis=0))
         far = ", ".join(f"{value:.2f}" for value in ahead)
-        lines.append(f"| {blur:.0f} | {each} | {told} | {far} |")
-    told = " | ".join(f"{_mean(rows, name):.4f}" for name in _TOLD)
-    return "\n".join([*lines, f"| mean | | {told} | |"])
+        lines.append(f"| {blur:.0f} | {each} | {cells} | {far} |")
+    cells = " | ".join(f"{_mean(rows, name):.4f}" for name in _IDENTIFIED)
+    return "\n".join([*lines, f"| mean | | {cells} | |"])
 
 
 def _mean(rows: list[_Row], name: str) -> float:
@@ -148,7 +148,7 @@ def _numbers(rows: list[_Row]) -> str:
     """Whole blurs: every number of the model, with its interval where it has one."""
     names = list(rows[0].levels)
     lines = [
-        "| blur, px | delay, ms | lag, ms | beside, px | price of the error, 1/s^2 | "
+        "| blur, px | delay, ms | lag, ms | beside, px | cost weight of the error, 1/s^2 | "
         + " | ".join(names)
         + " |",
         "|" + "---|" * (5 + len(names)),
@@ -157,7 +157,7 @@ def _numbers(rows: list[_Row]) -> str:
         levels = (_spanned(row.levels[name], row.intervals[name]) for name in names)
         lines.append(
             f"| {row.blur:.0f} | {1e3 * row.delay / RATE:.0f} | {1e3 * row.lag:.0f} "
-            f"| {row.offset:.1f} | {row.price:.3g} | " + " | ".join(levels) + " |"
+            f"| {row.offset:.1f} | {row.cost_weight:.3g} | " + " | ".join(levels) + " |"
         )
     return "\n".join(lines)
 

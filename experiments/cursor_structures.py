@@ -2,8 +2,8 @@
 
 Three statements on the cost, beside the command: the error alone; error and velocity of the cursor;
 error, velocity and effort, the acceleration of the hand. Each is fitted with delay and lag, tested,
-and judged on trials left out (docs/structures.md). The price of velocity is told over that of the
-error, in s^2, with its profile's interval.
+and judged on trials left out (docs/structures.md). The cost weight of velocity is identified over
+that of the error, in s^2, with its profile's interval.
 
     python -m experiments.cursor_structures --out results/cursor-structures
 """
@@ -23,10 +23,10 @@ from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import residual_noise
-from impc.assess.price_profiles import PriceProfiles
 from impc.assess.structured_weights import tangent
 from impc.assess.structures import StructureFit, assess_structure, criterion_of
 from impc.assess.variance_accounted_for import left_out_vaf, residuals_of, vaf
+from impc.assess.weight_profiles import WeightProfiles
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STRUCTURES", "StructureRow", "structure_rows"]
 
-#: Name -> features of the state that have a price.
+#: Name -> features of the state that have a cost weight.
 STRUCTURES = {
     "error": ["error"],
     "error, velocity": ["error", "velocity"],
@@ -71,10 +71,11 @@ class StructureRow:
         Of all trials, and mean over trials left out, %.
     aic : float
         Akaike's criterion; less is better.
-    prices : list of float
+    cost weights : list of float
         At R = 1.
     velocity, low, high : float
-        Price of velocity over that of the error and its interval of 95 %, s^2; NaN without one.
+        Cost weight of velocity over that of the error and its interval of 95 %, s^2; NaN without
+        one.
     """
 
     blur: float
@@ -86,7 +87,7 @@ class StructureRow:
     vaf: float
     held_out: float
     aic: float
-    prices: list[float]
+    cost_weights: list[float]
     velocity: float
     low: float
     high: float
@@ -125,12 +126,12 @@ def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
         other = fit_controller(problem.leaving_out(index), near.stage_weights)
         held.append(left_out_vaf(other, problem.recordings[index], 1.0).vaf)
     at = near.problem, np.array(near.gain), np.array(near.metric)
-    told = int(np.count_nonzero(gain_covariance(*at).told))
+    identified = int(np.count_nonzero(gain_covariance(*at).identified))
     roots = np.asarray(residual_noise(residuals_of(near, near.problem)).root)
     nothing = float("nan")
     return StructureRow(
         blur, "any weights", "", False, nothing, 0, float(vaf(recorded, simulated)[0]),
-        float(np.mean(held)), criterion_of(near, roots, told), [], nothing, nothing, nothing,
+        float(np.mean(held)), criterion_of(near, roots, identified), [], nothing, nothing, nothing,
     )  # fmt: skip
 
 
@@ -147,22 +148,22 @@ def _row(blur: float, name: str, fit: StructureFit) -> StructureRow:
         float(fit.vaf[0]),
         float(fit.held_out[0]),
         fit.aic,
-        np.exp(np.array(fit.estimate.prices)).tolist(),
+        np.exp(np.array(fit.estimate.cost_weights)).tolist(),
         *_velocity(fit),
     )
 
 
 def _velocity(fit: StructureFit) -> tuple[float, float, float]:
-    """Price of velocity over that of the error, with the ends of its interval."""
+    """Cost weight of velocity over that of the error, with the ends of its interval."""
     estimate, covariance = fit.estimate, fit.covariance
     if estimate is None or covariance is None or "velocity" not in fit.structure.labels:
         return (float("nan"),) * 3
-    at = tangent(fit.structure, estimate.problem, np.array(estimate.prices))
-    profiles, row = PriceProfiles(at, covariance), np.zeros(fit.structure.count)
+    at = tangent(fit.structure, estimate.problem, np.array(estimate.cost_weights))
+    profiles, row = WeightProfiles(at, covariance), np.zeros(fit.structure.count)
     error, velocity = (fit.structure.labels.index(name) for name in ("error", "velocity"))
-    prices = np.array(estimate.prices)
-    if not np.isfinite(prices[velocity]):
-        high = profiles.zero(velocity).high - prices[error]
+    cost_weights = np.array(estimate.cost_weights)
+    if not np.isfinite(cost_weights[velocity]):
+        high = profiles.zero(velocity).high - cost_weights[error]
         return 0.0, 0.0, float(np.exp(high))
     row[velocity], row[error] = 1.0, -1.0
     found = profiles.interval(row)

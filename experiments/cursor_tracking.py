@@ -54,8 +54,8 @@ __all__ = [
     "condition_problem",
     "fit_condition",
     "left_out_vaf",
-    "price_ratio",
     "resampled",
+    "weight_ratio",
 ]
 
 _SECOND = round(RATE)
@@ -64,8 +64,8 @@ _NOMINAL = (0.15, 0.08)
 _RATIO = 10.0
 # The range of 39 holds the next one in 95 of 100 cases.
 _RESAMPLES = 39
-# Standard deviation of the logarithm of a delay or lag that the recordings tell.
-_TOLD = 0.5
+# Standard deviation of the logarithm of a delay or lag that the recordings identify.
+_IDENTIFIED = 0.5
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ConditionResult:
     delay, lag : float
         s.
     delay_determined, lag_determined : bool
-        Whether the recordings tell them.
+        Whether the recordings identify them.
     vaf_in, vaf_out : list of float
         Of each trial, from all and from the others, %.
     baseline_out, ceiling_out : list of float
@@ -89,11 +89,11 @@ class ConditionResult:
         Of error (1/s^2) and velocity (1/s).
     gain_determined : int
         Directions of the gain, of 7, that are known to better than their natural size.
-    price_of_error, price_low, price_high : float
+    weight_of_error, cost_weight_low, cost_weight_high : float
         Q_ee at R = 1 in the least conditioned weights, and its range over all weights with the same
         gain and a condition number up to ten times the least.
-    resampled_price, resampled_gain : list of float
-        Price and gain of the error of every fit to trials drawn again.
+    resampled_weight, resampled_gain : list of float
+        Cost weight and gain of the error of every fit to trials drawn again.
     limit : str
         What the recordings say of an acceleration limit.
     recorded, simulated, target : list of float
@@ -112,10 +112,10 @@ class ConditionResult:
     ceiling_out: list[float]
     gain: list[float]
     gain_determined: int
-    price_of_error: float
-    price_low: float
-    price_high: float
-    resampled_price: list[float]
+    weight_of_error: float
+    cost_weight_low: float
+    cost_weight_high: float
+    resampled_weight: list[float]
     resampled_gain: list[float]
     limit: str
     recorded: list[float]
@@ -154,22 +154,22 @@ def left_out_vaf(condition: Condition, index: int) -> tuple[float, float, Array]
 
 
 def resampled(condition: Condition, count: int, seed: int = 0) -> tuple[list[float], list[float]]:
-    """Price (R = 1) and gain of the error, fitted `count` times to trials drawn with replacement.
+    """Cost weight (R = 1) and gain of the error, of `count` fits to trials drawn with replacement.
 
-    Every pair of weights with one gain has the same price of the error on this plant, so that of
-    the weights at hand will do.
+    Every pair of weights with one gain has the same cost weight of the error on this plant, so that
+    of the weights at hand will do.
     """
     problem = condition_problem(condition)
-    prices, gains = [], []
+    cost_weights, gains = [], []
     for index in range(count):
         rng = np.random.default_rng(seed + index)
         drawn = rng.integers(len(problem.recordings), size=len(problem.recordings))
         trials = tuple(problem.recordings[trial] for trial in drawn)
         fitted = fit_controller(replace(problem, recordings=trials))
         weights = fitted.stage_weights
-        prices.append(float(weights.Q[0, 0] / weights.R[0, 0]))
+        cost_weights.append(float(weights.Q[0, 0] / weights.R[0, 0]))
         gains.append(float(fitted.gain[0, 0]))
-    return prices, gains
+    return cost_weights, gains
 
 
 def fit_condition(
@@ -188,18 +188,18 @@ def fit_condition(
     found = weights_set(gain_fibre(plant, fitted.gain), _RATIO)
     of_error = np.zeros((1, plant.n + 1, plant.n + 1))
     of_error[0, 0, 0] = 1.0
-    (price,) = linear_ranges(found, of_error)
+    (cost_weight,) = linear_ranges(found, of_error)
     delay, lag = _parameters(fitted)
-    told = np.array(covariance.parameters) < _TOLD
-    prices, gains = resampled(condition, resamples, seed)
+    identified = np.array(covariance.parameters) < _IDENTIFIED
+    cost_weights, gains = resampled(condition, resamples, seed)
     shown = int(np.argsort([item[0] for item in outside])[count // 2])
     return ConditionResult(
         condition.blur,
         count,
         delay,
         lag,
-        bool(told[0]),
-        bool(told[1]),
+        bool(identified[0]),
+        bool(identified[1]),
         inside,
         [item[0] for item in outside],
         [item[1] for item in outside],
@@ -207,9 +207,9 @@ def fit_condition(
         fitted.gain[0, :2].tolist(),
         int(np.count_nonzero(np.array(covariance.deviations) < 1)),
         float(found.least.weights.Q[0, 0]),
-        price.low,
-        price.high,
-        prices,
+        cost_weight.low,
+        cost_weight.high,
+        cost_weights,
         gains,
         _limit(fitted),
         condition.response[shown].tolist(),
@@ -243,8 +243,8 @@ def _limit(fitted: Estimate) -> str:
         if reason or misfit > 1.01 * free:
             break
         least = float(share * peak)
-    told = "no bound fits better" if best > 0.99 * free else "a bound fits better"
-    return f"peak {peak:.0f}; {told}; bounds above {least:.0f} fit as well"
+    identified = "no bound fits better" if best > 0.99 * free else "a bound fits better"
+    return f"peak {peak:.0f}; {identified}; bounds above {least:.0f} fit as well"
 
 
 def _parameters(fitted: Estimate) -> tuple[float, float]:
@@ -271,7 +271,8 @@ def _table(results: list[ConditionResult]) -> str:
     lines = [
         "blur px  trials  delay ms  lag ms  VAF in %  VAF out % (least)  delayed feedback %"
         "  free response %"
-        "  K error 1/s^2 (interval)  K velocity 1/s  gain determined  price of error (interval)"
+        "  K error 1/s^2 (interval)  K velocity 1/s  gain determined  cost weight of error "
+        "(interval)"
         "  acceleration, px/s^2"
     ]
     for item in results:
@@ -282,7 +283,7 @@ def _table(results: list[ConditionResult]) -> str:
             f"{np.mean(item.baseline_out):17.1f} {np.mean(item.ceiling_out):15.1f}  "
             f"{item.gain[0]:11.1f} ({_span(item.resampled_gain)}) {item.gain[1]:11.2f} "
             f"{item.gain_determined:16d} of 7"
-            f"{item.price_of_error:12.3g} ({_span(item.resampled_price)})  "
+            f"{item.weight_of_error:12.3g} ({_span(item.resampled_weight)})  "
             f"{item.limit}"
         )
     return "\n".join(lines)
@@ -296,20 +297,24 @@ def _span(values: list[float]) -> str:
     return f"{min(values):.3g} to {max(values):.3g}" if values else "no interval"
 
 
-def price_ratio(results: list[ConditionResult]) -> str:
+def weight_ratio(results: list[ConditionResult]) -> str:
     """How much less the error costs under the widest blur than under the least, in words."""
     first, last = results[0], results[-1]
     ratios = [
-        one / other for one, other in zip(first.resampled_price, last.resampled_price, strict=False)
+        one / other
+        for one, other in zip(first.resampled_weight, last.resampled_weight, strict=False)
     ]
     if not ratios:
-        return "Without resampled trials nothing is said of how the price of the error changes."
-    count, least, most = len(first.resampled_price), np.min(ratios), np.max(ratios)
+        return (
+            "Without resampled trials nothing is said of how the cost weight of the error changes."
+        )
+    count, least, most = len(first.resampled_weight), np.min(ratios), np.max(ratios)
     level = 100 * (count - 1) / (count + 1)
-    told = "falls" if least > 1 else "is not told from constant: it changes"
+    identified = "falls" if least > 1 else "is not distinguished from constant: it changes"
     return (
-        f"From {first.blur:g} to {last.blur:g} px the price of the error {told} by a factor of "
-        f"{first.price_of_error / last.price_of_error:.3g} ({level:.0f} %: {least:.3g} to "
+        f"From {first.blur:g} to {last.blur:g} px the cost weight of the error {identified} by a "
+        "factor of "
+        f"{first.weight_of_error / last.weight_of_error:.3g} ({level:.0f} %: {least:.3g} to "
         f"{most:.3g})."
     )
 
@@ -330,7 +335,7 @@ def main() -> None:
         found = pool.map(fit, conditions, range(0, 1000 * len(conditions), 1000))
         results = list(tqdm(found, total=len(conditions), unit="condition", disable=None))
     print(_table(results))
-    print(price_ratio(results))
+    print(weight_ratio(results))
     content: Any = plain({f"{item.blur:g} px": asdict(item) for item in results})
     files = {"result.json": (json.dumps(content, indent=1) + "\n").encode()}
     write_files(given.out, files | cursor_figure(results))

@@ -5,7 +5,7 @@ adjoint lambda_j of the dynamics it satisfies
 
     lambda_j = Q x_j + A' lambda_{j+1},        R u_j + B' lambda_{j+1} = 0
 
-wherever no input stands at its bound (there a multiplier takes what is missing, and the row is left
+wherever no input is at its bound (there a multiplier takes what is missing, and the row is left
 out). lambda_N, what comes after the stretch, is free. The rows are linear in (Q, R, lambda_N): the
 weights that leave the least sum of squares, Q >= 0, R > 0, trace R = m, are one convex program.
 Keshavarz, Wang, Boyd 2011 (imputing a convex objective); Englert, Vien, Toussaint 2017 (inverse
@@ -162,7 +162,7 @@ _DIFFUSE = 1e6
 
 
 def _estimate(problem: Problem, start: Estimate) -> Estimate:
-    known = start.problem.known()
+    known = start.problem.with_nuisance_fixed()
     weights = inverse_kkt(known, np.array(start.gain))
     K = np.array(solve_lqr(known.plant, weights).K)
     return simulated_estimate(

@@ -62,7 +62,7 @@ COMPARED = {name: METHODS[name] for name in compared_methods()} | {"inverse_kkt"
 
 _LIMITS = (70.0, 6.0, 4.5)
 _CEILINGS = (99.99, 99.0, 90.0, 70.0, 50.0)
-# Colour, marker and line of each method: three families, inside each told apart by the marker.
+# Colour, marker and line of each method: three families, inside each distinguished by the marker.
 _MARKS = {
     "feedback_gain": (INK, "o", ":"),
     "inverse_lqr_gradient": (BLUE, "s", "--"),
@@ -139,7 +139,7 @@ def _judge(estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array) -
     T, _ = natural_coordinates(plant, truth)
     error = float(np.linalg.norm((K - truth) @ T) / np.linalg.norm(truth @ T))
     run = simulate(
-        controller_for(COMPARED[estimate.method].sees(unseen), K, np.array(estimate.S)), drive
+        controller_for(COMPARED[estimate.method].restrict(unseen), K, np.array(estimate.S)), drive
     )
     share = None
     if run.complete:

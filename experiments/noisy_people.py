@@ -4,7 +4,7 @@ A cart of two states under a push of three levels, two such carts with a spring 
 input each, or the linear seated subject under the ternary torque. Noise is in the motor, in the
 senses, or in both, of a size that leaves the motion without noise a VAF of 90 or 70 %; the limit of
 the command is far away, or met at a tenth of the samples and more (by two carts, less often).
-Prices are log-uniform within a factor of two. At the limit some on the seat fall.
+Cost weights are log-uniform within a factor of two. At the limit some on the seat fall.
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ def _on_pair(rng: np.random.Generator, limit: float) -> tuple[Controller, list[A
         inputs=["u1", "u2", "push1", "push2"], outputs=["x1", "x2"],
     )  # fmt: skip
     plant = Plant(system, ["u1", "u2"])
-    prices = np.array([8.0, 1.0, 8.0, 1.0]) * _factors(rng, 4)
-    weights = Weights(np.diag(prices), np.diag([1.0, float(_factors(rng, 1)[0])]))
+    cost_weights = np.array([8.0, 1.0, 8.0, 1.0]) * _factors(rng, 4)
+    weights = Weights(np.diag(cost_weights), np.diag([1.0, float(_factors(rng, 1)[0])]))
     law = Controller(
         plant, weights, Bounds(plant, u_min=-limit, u_max=limit), 5, terminal_set=False
     )

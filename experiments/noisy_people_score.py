@@ -11,8 +11,8 @@ import numpy as np
 from impc.assess.covariance import gain_covariance
 from impc.inverse.methods import fit
 from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import fit_person
-from impc.output_feedback.prior import TOLD
+from impc.output_feedback.fit import fit_output_feedback
+from impc.output_feedback.prior import IDENTIFIED
 from impc.output_feedback.profile import fallen
 from impc.output_feedback.simulation import simulate_person
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from experiments.noisy_people import Recorded, Subject
     from impc.arrays import Array
     from impc.output_feedback.covariance import PersonCovariance
-    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.fit import OutputFeedbackFit
     from impc.output_feedback.observer import Observer
 
 __all__ = [
@@ -72,7 +72,7 @@ class Score:
     least_error, likely_error : float
         Of the gain, as a share of it, in natural coordinates.
     least, likely, expected : list of pairs
-        Error and deviation along each direction that the method tells, the best first: of least
+        Error and deviation along each direction that the method says, the best first: of least
         squares, and of maximum likelihood by the sandwich and as expected.
     entries : list of pairs
         Intervals of the entries of the gain by the sandwich, less the truth, as shares of the
@@ -123,7 +123,7 @@ def score(
     gain, metric = np.array(first.gain), np.array(first.metric)
     least = gain_covariance(first.problem, gain, metric, curvature=True)
     clock.append(time.process_time())
-    likely = fit_person(first, blind(who))
+    likely = fit_output_feedback(first, blind(who))
     clock.append(time.process_time())
     expected = person_covariance(likely, "expected")
     robust = person_covariance(likely)
@@ -163,12 +163,12 @@ def blind(who: Subject) -> Observer:
     return who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
 
 
-def above_truth(likely: PersonFit, who: Subject) -> float:
+def above_truth(likely: OutputFeedbackFit, who: Subject) -> float:
     """What the search makes largest, at the fit minus at the subject as simulated, nats."""
     return likely.value - likely.prior.at(true_unknowns(likely, who)).value
 
 
-def true_unknowns(likely: PersonFit, who: Subject) -> Array:
+def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
     """The subject as simulated, in the coordinates of the fit (q,)."""
     space = likely.space
     own, theta = space.space, np.array(space.start)
@@ -182,7 +182,7 @@ def true_unknowns(likely: PersonFit, who: Subject) -> Array:
 
 
 def _steps(
-    likely: PersonFit, covariance: PersonCovariance, truth: Array
+    likely: OutputFeedbackFit, covariance: PersonCovariance, truth: Array
 ) -> list[tuple[float, float]]:
     own, space = likely.space.space, likely.space
     error = own.natural(np.array(likely.K) - truth)
@@ -190,20 +190,22 @@ def _steps(
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
 
 
-def _told(directions: Array, deviations: Array) -> tuple[Array, Array]:
-    """Determined directions and their deviations, the best told first."""
+def _identified(directions: Array, deviations: Array) -> tuple[Array, Array]:
+    """Determined directions and their deviations, the best identified first."""
     order = np.argsort(deviations, kind="stable")
-    order = order[deviations[order] < TOLD]
+    order = order[deviations[order] < IDENTIFIED]
     return directions[order], deviations[order]
 
 
-def _aims(fit: PersonFit, covariance: PersonCovariance, who: Subject) -> tuple[Array, Array, Array]:
+def _aims(
+    fit: OutputFeedbackFit, covariance: PersonCovariance, who: Subject
+) -> tuple[Array, Array, Array]:
     """Determined directions, their deviations, and where the truth is along them."""
-    directions, deviations = _told(covariance.directions, covariance.deviations)
+    directions, deviations = _identified(covariance.directions, covariance.deviations)
     return directions, deviations, directions @ true_unknowns(fit, who)[: fit.space.gain]
 
 
-def _fell(likely: PersonFit, covariance: PersonCovariance, who: Subject) -> list[float]:
+def _fell(likely: OutputFeedbackFit, covariance: PersonCovariance, who: Subject) -> list[float]:
     """What the likelihood falls by along each direction held at the truth, nats."""
     found, along = [], np.zeros(len(likely.theta))
     directions, _, aims = _aims(likely, covariance, who)
@@ -216,7 +218,7 @@ def _fell(likely: PersonFit, covariance: PersonCovariance, who: Subject) -> list
 def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
     """Errors and deviations along determined directions, each turned to where it is largest."""
     found = []
-    for direction, deviation in zip(*_told(directions, deviations), strict=True):
+    for direction, deviation in zip(*_identified(directions, deviations), strict=True):
         sign = np.sign(direction[np.argmax(np.abs(direction))])
         found.append((float(sign * direction @ np.ravel(error)), float(deviation)))
     return found

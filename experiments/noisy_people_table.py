@@ -21,12 +21,12 @@ HEADS = (
     "people", "count", "at the limit %", "ended at the truth or above", "settled",
     "least squares: error %", "bias / deviation", "95 % holds %",
     "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
-    "(profile)", "entries told, all", "levels hold %", "seconds: least squares, likelihood",
+    "(profile)", "entries identified, all", "levels hold %", "seconds: least squares, likelihood",
 )  # fmt: skip
 # Nats by which a likelihood falls at either end of an interval of 95 %.
 _LOWER = TWO_SIDED**2 / 2
-# An entry is told when half of its interval is below this share of it.
-_TOLD = 1.0
+# An entry is identified when half of its interval is below this share of it.
+_IDENTIFIED = 1.0
 # As far below the truth a search may end, nats.
 _ENDED = 0.5
 # Of a deviation: what a bias is to be below.
@@ -71,8 +71,10 @@ def row(scores: list[Score]) -> list[str]:
         cells += [_bias(pairs), _share([_inside(each) for each in pairs])]
     cells.append(_share([_inside(one.expected) for one in scores]))
     cells.append(_share([[nats <= _LOWER for nats in one.fell] for one in scores if one.fell]))
-    told = [[pair for pair in one.entries if pair[1] - pair[0] < 2 * _TOLD] for one in scores]
-    some = f"{_share([_around(each) for each in told])} ({sum(map(len, told))})"
+    identified = [
+        [pair for pair in one.entries if pair[1] - pair[0] < 2 * _IDENTIFIED] for one in scores
+    ]
+    some = f"{_share([_around(each) for each in identified])} ({sum(map(len, identified))})"
     cells.append(f"{some}, {_share([_around(one.entries) for one in scores])}")
     cells.append(_share([_levels(one) for one in scores]))
     times = np.median([one.seconds[:2] for one in scores], axis=0)
@@ -80,12 +82,13 @@ def row(scores: list[Score]) -> list[str]:
 
 
 def means(pairs: Sequence[Pairs]) -> list[tuple[float, float]]:
-    """Mean error in deviations and its standard error, of each direction that most are told along.
+    """Mean error in deviations and its standard error, of each direction that most identify.
 
     Parameters
     ----------
     pairs : sequence of list of pairs
-        Error and deviation along the directions that each subject is told along, the best first.
+        Error and deviation along the directions that each subject is identified along, the best
+        first.
     """
     found = []
     for each in itertools.zip_longest(*pairs):

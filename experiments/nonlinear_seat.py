@@ -196,7 +196,7 @@ def fitted_prices(amplitude: float, steps: int) -> dict[str, Array]:
     bounds = Bounds(plant, u_min=-_SHARE * amplitude, u_max=_SHARE * amplitude)
     trial = Recording(plant, loop.x @ plant.C.T, np.vstack([torque, torque[-1:]]), loop.x[0])
     posed = Problem(plant, bounds, HORIZON, [trial], terminal_set=False, structure=structure)
-    linear = fit(posed, "structured").prices
+    linear = fit(posed, "structured").cost_weights
     assert linear is not None
     true = np.array([truth[name] for name in names])
     return {

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from impc.nonlinear.combinations import Combination, Combinations
     from impc.nonlinear.recordings import OptimalRecording
 
-__all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "told_error"]
+__all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "identified_error"]
 
 #: Of the closed loops: initial state, and what differs from the truth of the one plan, so that
 #: limits of states and of inputs are both met.
@@ -51,19 +51,19 @@ class Outcome:
     loss : float
         Sum of squares over states and inputs; NaN where there is no plan at the start.
     error : float
-        Largest relative error of a told product of parameters.
+        Largest relative error of a identified product of parameters.
     evaluations : int
     seconds : float
         CPU time, s.
-    untold : str
-        What is not told.
+    unidentified : str
+        What is not identified.
     """
 
     loss: float
     error: float
     evaluations: int
     seconds: float
-    untold: str
+    unidentified: str
 
 
 def demonstration(system: PeerSystem) -> OptimalRecording:
@@ -91,14 +91,14 @@ def fit_from(
     except ImpcError as error:
         return Outcome(np.nan, np.nan, 0, time.process_time() - began, str(error))
     seconds = time.process_time() - began
-    untold = ", ".join(one.name for one in found.combinations.untold) or "none"
-    wrong = told_error(found.combinations, truth)
-    return Outcome(found.loss, wrong, found.evaluations, seconds, untold)
+    unidentified = ", ".join(one.name for one in found.combinations.unidentified) or "none"
+    wrong = identified_error(found.combinations, truth)
+    return Outcome(found.loss, wrong, found.evaluations, seconds, unidentified)
 
 
-def told_error(found: Combinations, truth: dict[str, float]) -> float:
-    """Largest relative error of the told products."""
-    errors = [abs(one.value / _product(truth, one) - 1) for one in found.told]
+def identified_error(found: Combinations, truth: dict[str, float]) -> float:
+    """Largest relative error of the identified products."""
+    errors = [abs(one.value / _product(truth, one) - 1) for one in found.identified]
     return max(errors)
 
 
@@ -107,10 +107,10 @@ def _product(truth: dict[str, float], one: Combination) -> float:
 
 
 def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bool]], list[str]]:
-    """Whether 95 % intervals hold the truth, by told product, on the noisy robot arm.
+    """Whether 95 % intervals hold the truth, by identified product, on the noisy robot arm.
 
     Noise on states and inputs, each of its signal's root mean square less `decibel`; the initial
-    state is known, and the start is the truth. What else was untold by the noise is listed.
+    state is known, and the start is the truth. What else was unidentified by the noise is listed.
     """
     system = SYSTEMS["robot arm"]()
     clean = demonstration(system)
@@ -122,11 +122,11 @@ def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bo
         noisy = [_noisy(item, share, rng) for item in (clean.x, clean.u)]
         recording = system.problem.recorded_plan(*noisy, x0=system.x0)
         found = fit_optimal_control(system.problem, [recording], system.truth).combinations
-        for one in found.told:
+        for one in found.identified:
             expected = _product(system.truth, one)
             inside = abs(np.log(one.value / expected)) < 1.96 * one.deviation
             held.setdefault(one.name, []).append(bool(inside))
-        if len(found.untold) != 2:
+        if len(found.unidentified) != 2:
             odd.append("; ".join(found.sentences[:-1]))
     return held, odd
 
@@ -138,13 +138,13 @@ def _noisy(values: Array, share: float, rng: np.random.Generator) -> Array:
 
 def _line(name: str, S: float, outcomes: list[Outcome]) -> str:
     good = [one for one in outcomes if one.loss < 1e-10]
-    untold = sorted({one.untold for one in good})
+    unidentified = sorted({one.unidentified for one in good})
     return (
         f"| {name} | {S:g} | {len(good)} of {len(outcomes)} | "
         f"{max(one.loss for one in good):.1e} | {max(one.error for one in good):.1e} | "
         f"{np.median([one.evaluations for one in good]):.0f} | "
         f"{np.median([one.seconds for one in good]):.2f} ({max(o.seconds for o in good):.2f}) | "
-        f"{' or '.join(untold)} |"
+        f"{' or '.join(unidentified)} |"
     )
 
 
@@ -157,7 +157,10 @@ def _starts(systems: Iterable[str], count: int) -> None:
             print(_line(name, S, found), flush=True)
             for seed, one in enumerate(found):
                 if not one.loss < 1e-10:
-                    print(f"  seed {seed}: loss {one.loss:.3g}, {one.seconds:.1f} s; {one.untold}")
+                    print(
+                        f"  seed {seed}: loss {one.loss:.3g}, {one.seconds:.1f} s; "
+                        f"{one.unidentified}"
+                    )
 
 
 def _loops(systems: Iterable[str], count: int, solver: str) -> None:
@@ -171,7 +174,7 @@ def _loops(systems: Iterable[str], count: int, solver: str) -> None:
             found = fit_from(system, recording, truth, 0.1, seed, solver)
             print(
                 f"| {name} | {solver} | {seed} | {found.loss:.1e} | {found.error:.1e} | "
-                f"{found.evaluations} | {found.seconds:.1f} | {found.untold} |",
+                f"{found.evaluations} | {found.seconds:.1f} | {found.unidentified} |",
                 flush=True,
             )
 
@@ -192,7 +195,7 @@ def main() -> None:
         held, odd = coverage(10 * given.count)
         for name, item in (*held.items(), ("all", list(itertools.chain(*held.values())))):
             print(f"{name}: {sum(item)} of {len(item)}, {100 * np.mean(item):.1f} %")
-        print(f"another direction is not told in {len(odd)}:", *odd, sep="\n")
+        print(f"another direction is not identified in {len(odd)}:", *odd, sep="\n")
 
 
 if __name__ == "__main__":

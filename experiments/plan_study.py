@@ -40,11 +40,15 @@ def cart() -> tuple[Person, Perturbation, tuple[Design, ...], int]:
     """A cart pushed at random for 40 s, with white noise."""
     plant = carts(1)
     structure = Structure(plant, "diagonal")
-    prices = np.log([4.0, 1.0])
+    cost_weights = np.log([4.0, 1.0])
     law = Controller(
-        plant, structure.weights(prices), Bounds(plant, u_min=-1, u_max=1), 8, terminal_set=False
+        plant,
+        structure.weights(cost_weights),
+        Bounds(plant, u_min=-1, u_max=1),
+        8,
+        terminal_set=False,
     )
-    person = Person(law, structure, prices, np.array([0.03]), 0.0, np.array([np.inf]))
+    person = Person(law, structure, cost_weights, np.array([0.03]), 0.0, np.array([np.inf]))
 
     def push(amplitude: float, dwell: float, number: int) -> Array:
         levels = np.random.default_rng([5, number]).choice([-amplitude, 0, amplitude], (400, 1))
@@ -57,10 +61,10 @@ def seat() -> tuple[Person, Perturbation, tuple[Design, ...], int]:
     """The seated person of docs/structures.md, with noise correlated over 50 ms."""
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, "diagonal", over=_BODY)
-    prices = np.log([6e3, 9e3, 6e2, 4e2])
-    law = Controller(plant, structure.weights(prices), Bounds(plant), 20, terminal_set=False)
+    cost_weights = np.log([6e3, 9e3, 6e2, 4e2])
+    law = Controller(plant, structure.weights(cost_weights), Bounds(plant), 20, terminal_set=False)
     noise, stops = np.radians([0.05, 0.05]), np.array([np.inf, np.inf])
-    person = Person(law, structure, prices, noise, float(np.exp(-0.01 / 0.05)), stops)
+    person = Person(law, structure, cost_weights, noise, float(np.exp(-0.01 / 0.05)), stops)
 
     def torque(amplitude: float, dwell: float, number: int) -> Array:
         return plants.ternary_torque(amplitude, dwell, 30.0, 100.0, seed=number)[:, None]
@@ -75,25 +79,27 @@ _PEOPLE: dict[str, Callable[[], tuple[Person, Perturbation, tuple[Design, ...], 
 
 
 def compare(name: str, fits: int) -> list[tuple[Design, Array, Array, Array, Array]]:
-    """Experiment, then deviations of prices, foreseen and seen, and of told gains, both.
+    """Experiment, then deviations of weights, foreseen and seen, and of identified gains, both.
 
-    Gains are along the directions that the plan calls told.
+    Gains are along the directions that the plan calls identified.
     """
     person, perturbation, grid, trials = _PEOPLE[name]()
     found = []
     for design in tqdm(grid, disable=None):
-        told = try_design(person, design, perturbation, trials=trials, draws=trials)
-        if told.expected is None or told.problem is None:
+        tried = try_design(person, design, perturbation, trials=trials, draws=trials)
+        if tried.expected is None or tried.problem is None:
             continue
-        seen = simulated_fits(person, told.problem, fits, 1)
-        gain = told.expected.gain
-        steps = np.array([gain.along(K - person.controller.K) for K in seen.gains])[:, gain.told]
+        seen = simulated_fits(person, tried.problem, fits, 1)
+        gain = tried.expected.gain
+        steps = np.array([gain.along(K - person.controller.K) for K in seen.gains])[
+            :, gain.identified
+        ]
         found.append(
             (
                 design,
-                told.expected.deviations,
-                np.std(seen.prices, axis=0),
-                gain.deviations[gain.told],
+                tried.expected.deviations,
+                np.std(seen.cost_weights, axis=0),
+                gain.deviations[gain.identified],
                 np.std(steps, axis=0),
             )
         )
@@ -107,7 +113,10 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=100)
     given = parser.parse_args()
     found = compare(given.person, given.fits)
-    print("| amplitude | dwell (s) | prices, foreseen | seen / foreseen | gains, seen / foreseen |")
+    print(
+        "| amplitude | dwell (s) | cost weights, foreseen | seen / foreseen | gains, seen / "
+        "foreseen |"
+    )
     print("|---|---|---|---|---|")
     for design, foreseen, seen, gains, gains_seen in found:
         print(

@@ -4,7 +4,7 @@ One, two or three carts on a falling track, each with a force of its own and cou
 pushed at random for 80 s; every force is at its limit for some percent of the time. The positions
 are recorded with noise, white or first-order, that leaves a VAF of 90 or 70 % to reach. Each
 recording is fitted as `impc fit` does, and the intervals of the entries of K that the recordings
-tell, and of its told directions, are compared with the truth.
+say, and of its identified directions, are compared with the truth.
 
     python -m experiments.printed_intervals --recordings 200
     python -m experiments.printed_intervals --recordings 200 --random
@@ -65,9 +65,9 @@ class Scores:
     Attributes
     ----------
     entries : Array
-        Of K (m * n,); NaN where the recording does not tell the entry by itself.
+        Of K (m * n,); NaN where the recording does not identify the entry by itself.
     directions : Array
-        Along the directions of the gain (m * n,), best determined first; NaN where not told.
+        Along the directions of the gain (m * n,), best determined first; NaN where not identified.
     bias : Array
         Error of each entry of K over its true value (m * n,).
     """
@@ -102,7 +102,7 @@ def carts(count: int, dt: float = 0.1) -> Plant:
 
 
 def regulator(plant: Plant) -> Controller:
-    """Prices of 4, 5, ... on positions and 1 on speeds; R is 1 on, .3 beside the diagonal."""
+    """Cost weights of 4, 5, ... on positions and 1 on speeds; R is 1 on, .3 beside the diagonal."""
     m = plant.m
     Q = np.diag(np.concatenate([4.0 + np.arange(m), np.ones(plant.n - m)]))
     weights = Weights(Q, 0.7 * np.eye(m) + 0.3)
@@ -173,8 +173,8 @@ def score(controller: Controller, trial: Recording) -> Scores:
     estimate = gain_estimate(fit(controller, trial))
     found, error = estimate.covariance, estimate.K - controller.K
     return Scores(
-        np.where(np.ravel(found.told_entries), np.ravel(error / found.entries), np.nan),
-        np.where(found.told, found.along(error) / found.deviations, np.nan),
+        np.where(np.ravel(found.individually_identified), np.ravel(error / found.entries), np.nan),
+        np.where(found.identified, found.along(error) / found.deviations, np.nan),
         np.ravel(error / controller.K),
     )
 
@@ -202,10 +202,10 @@ def _cell(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float, root: 
     entries = np.array([item.entries for item in found])
     directions = np.array([item.directions for item in found])
     bias = 100 * np.median([item.bias[0] for item in found])
-    told = 100 * np.mean(np.isfinite(directions))
+    identified = 100 * np.mean(np.isfinite(directions))
     print(
         f"| {inputs} | {vaf:g} | {root:g} | {_range(entries)} | {_range(directions)} | "
-        f"{told:.0f} | {bias:+.1f} |",
+        f"{identified:.0f} | {bias:+.1f} |",
         flush=True,
     )
 
@@ -215,16 +215,18 @@ def _random(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float) -> N
     found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
     entries = np.concatenate([item.entries for item in found])[:, None]
     directions = np.concatenate([item.directions for item in found])[:, None]
-    told = 100 * np.mean(np.isfinite(directions))
+    identified = 100 * np.mean(np.isfinite(directions))
     cells = [f"{100 * shares(scores)[0]:.1f}" for scores in (entries, directions)]
-    print(f"| {inputs}, random | {vaf:g} | 0 | {' | '.join(cells)} | {told:.0f} | |", flush=True)
+    print(
+        f"| {inputs}, random | {vaf:g} | 0 | {' | '.join(cells)} | {identified:.0f} | |", flush=True
+    )
 
 
 def _range(scores: Array) -> str:
-    """Least, most and mean share of the columns that are told in a quarter of the recordings."""
+    """Least, most and mean share of the columns identified in a quarter of the recordings."""
     often = np.mean(np.isfinite(scores), axis=0) >= 0.25
     if not np.any(often):
-        return "none told"
+        return "none identified"
     percent = 100 * shares(scores[:, often])
     return f"{np.min(percent):.1f} to {np.max(percent):.1f}, mean {np.mean(percent):.1f}"
 
@@ -238,7 +240,10 @@ def main() -> None:
     parser.add_argument("--random", action="store_true", help="a random plant each, white noise")
     parser.add_argument("--roots", type=float, nargs="+", default=[0.0, 0.8])
     given = parser.parse_args()
-    print("| inputs | VAF % | root | entries of K, % | directions, % | told, % | bias of K11, % |")
+    print(
+        "| inputs | VAF % | root | entries of K, % | directions, % | identified, % | bias of K11, "
+        "% |"
+    )
     print("|---|---|---|---|---|---|---|")
     with ProcessPoolExecutor(2) as pool:
         if given.random:

@@ -1,10 +1,10 @@
 """Structured weights on simulated subjects: coverage, level and power of the test, global misfit.
 
-The seat: prices of the four body states, log-uniform within a factor of four of (6e3, 9e3, 6e2,
-4e2), three trials of 30 s under the ternary torque, no limit, noise on the angles. Carts: two of
-`experiments.printed_intervals` with prices of four states and two inputs, at their limits for some
-percent of the time; there a cross term shows in the gain. Each line that is written is one subject,
-so that a run can be ended at any time and be summed up:
+The seat: cost weights of the four body states, log-uniform within a factor of four of (6e3, 9e3,
+6e2, 4e2), three trials of 30 s under the ternary torque, no limit, noise on the angles. Carts: two
+of `experiments.printed_intervals` with cost weights of four states and two inputs, at their limits
+for some percent of the time; there a cross term shows in the gain. Each line that is written is one
+subject, so that a run can be ended at any time and be summed up:
 
     python -m experiments.structure_study run seat --vaf 90 --subjects 200 --out seat.jsonl
     python -m experiments.structure_study run carts --cross 0.5 --subjects 400 --out carts.jsonl
@@ -23,9 +23,9 @@ import numpy as np
 
 import plants
 from experiments.printed_intervals import carts, with_noise
-from impc.assess.price_profiles import PriceProfiles
-from impc.assess.structured_weights import Tangent, price_covariance, tangent
+from impc.assess.structured_weights import Tangent, tangent, weight_covariance
 from impc.assess.structures import structure_test
+from impc.assess.weight_profiles import WeightProfiles
 from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured_fit import fit_structure
@@ -57,13 +57,13 @@ class Person:
     ----------
     structure : Structure
         That is fitted.
-    prices : Array
+    cost weights : Array
         Its true unknowns (count,).
     problem : Problem
     """
 
     structure: Structure
-    prices: Array
+    cost_weights: Array
     problem: Problem
 
 
@@ -77,11 +77,11 @@ class Score:
         Plant, VAF, colour of the noise, cross term.
     seed : int
     holds, normal : list of bool
-        Whether the profile and the normal interval of each price hold the truth.
+        Whether the profile and the normal interval of each cost weight hold the truth.
     one_sided : list of bool
         Whether the profile has no lower end.
     errors : list of float or None
-        Of the logarithms, over their deviations; None for a price of zero.
+        Of the logarithms, over their deviations; None for a cost weight of zero.
     excess : float
         How far the misfit is above that of a search from the truth, in units of chi-squared.
     probability, freedom : float and int
@@ -107,22 +107,24 @@ def seat_person(seed: int, vaf: float, root: float) -> Person:
     rng = np.random.default_rng([seed, round(vaf), round(100 * root)])
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, "diagonal", over=_BODY)
-    prices = _TYPICAL + rng.uniform(-np.log(4), np.log(4), 4)
-    controller = Controller(plant, structure.weights(prices), Bounds(plant), 20, terminal_set=False)
+    cost_weights = _TYPICAL + rng.uniform(-np.log(4), np.log(4), 4)
+    controller = Controller(
+        plant, structure.weights(cost_weights), Bounds(plant), 20, terminal_set=False
+    )
     trials = []
     for phase in (None, 1, 2):
         torque = plants.ternary_torque(duration=30.0, rate=100, seed=phase)
         trials.append(with_noise(controller, torque, rng, vaf, root))
-    return Person(structure, prices, fit_problem(plant, trials, FitSettings()))
+    return Person(structure, cost_weights, fit_problem(plant, trials, FitSettings()))
 
 
 def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
-    """Two carts; the prices of the positions have `cross` of their geometric mean together."""
+    """Two carts; the weights of the positions have `cross` of their geometric mean together."""
     rng = np.random.default_rng([seed, round(vaf), round(100 * root), round(100 * cross)])
     plant = carts(2)
     structure = Structure(plant, "diagonal")
-    prices = np.log([4.0, 5.0, 1.0, 1.0, 1.0]) + rng.uniform(-np.log(2), np.log(2), 5)
-    weights = structure.weights(prices)
+    cost_weights = np.log([4.0, 5.0, 1.0, 1.0, 1.0]) + rng.uniform(-np.log(2), np.log(2), 5)
+    weights = structure.weights(cost_weights)
     Q = np.array(weights.Q)
     Q[0, 1] = Q[1, 0] = cross * np.sqrt(Q[0, 0] * Q[1, 1])
     controller = Controller(
@@ -133,7 +135,7 @@ def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
         push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (80, 2)), 10, axis=0)
         trials.append(with_noise(controller, push, rng, vaf, root))
     settings = FitSettings(horizon=8, u_max=1.0)
-    return Person(structure, prices, fit_problem(plant, trials, settings))
+    return Person(structure, cost_weights, fit_problem(plant, trials, settings))
 
 
 def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> Score:
@@ -151,29 +153,31 @@ def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> S
     problem, structure = person.problem, person.structure
     near = fit_controller(problem)
     end = fit_structure(near.problem, structure, np.array(near.gain), np.array(near.metric))
-    at = tangent(structure, end.problem, np.array(end.prices))
-    found, tested = price_covariance(at), structure_test(at)
-    prices = np.array(end.prices)
+    at = tangent(structure, end.problem, np.array(end.cost_weights))
+    found, tested = weight_covariance(at), structure_test(at)
+    cost_weights = np.array(end.cost_weights)
     errors = [
-        float((prices[i] - person.prices[i]) / found.each[i]) if np.isfinite(prices[i]) else None
+        float((cost_weights[i] - person.cost_weights[i]) / found.each[i])
+        if np.isfinite(cost_weights[i])
+        else None
         for i in range(structure.count)
     ]
     made, excess = [], float("nan")
     if intervals:
-        best = search_from(near.problem, structure, person.prices)
-        least = _misfit(tangent(structure, best.problem, np.array(best.prices)))
+        best = search_from(near.problem, structure, person.cost_weights)
+        least = _misfit(tangent(structure, best.problem, np.array(best.cost_weights)))
         excess = len(at.residual) * (_misfit(at) - least) / least
-        profiles = PriceProfiles(at, found)
+        profiles = WeightProfiles(at, found)
         rows = np.eye(structure.count)
         made = [
-            profiles.interval(rows[i]) if np.isfinite(prices[i]) else profiles.zero(i)
+            profiles.interval(rows[i]) if np.isfinite(cost_weights[i]) else profiles.zero(i)
             for i in range(structure.count)
         ]
     powers = [item.power for item in tested.powers]
     return Score(
         study,
         seed,
-        [item.holds(float(true)) for item, true in zip(made, person.prices, strict=False)],
+        [item.holds(float(true)) for item, true in zip(made, person.cost_weights, strict=False)],
         [error is None or abs(error) <= 1.96 for error in errors],
         [item.low == -np.inf for item in made],
         errors,
@@ -256,7 +260,7 @@ def main() -> None:
 
 
 def _sum(given: argparse.Namespace) -> None:
-    print("| study | subjects | profile intervals hold % (each) | where a price is zero % "
+    print("| study | subjects | profile intervals hold % (each) | where a cost weight is zero % "
           "| one-sided % | normal ones hold % "
           "| refused at 5 % | global misfit % | power foreseen % |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|")

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from impc.model.weights import weight_error as weight_error
     from impc.nonlinear.fit import fit_optimal_control as fit_optimal_control
     from impc.nonlinear.problem import OptimalControlProblem as OptimalControlProblem
-    from impc.output_feedback.fit import fit_person as fit_person
+    from impc.output_feedback.fit import fit_output_feedback as fit_output_feedback
     from impc.output_feedback.observer import Observer as Observer
     from impc.studies.estimate_page import report as report
     from impc.studies.fit.settings import FitSettings as FitSettings
@@ -92,7 +92,7 @@ _NAMES = {
     "files.table": "make_table",
     "inverse.equivalent_weights": "least_condition_weights other_weights",
     "inverse.estimates": "Estimate",
-    "output_feedback.fit": "fit_person",
+    "output_feedback.fit": "fit_output_feedback",
     "inverse.inverse_lqr": "inverse_lqr_gradient inverse_lqr_lmi",
     "inverse.methods": "fit",
     "inverse.problem": "Problem",

@@ -65,7 +65,7 @@ def _listen() -> None:
                 _waiting.pop()("compiling, once: a minute or two (`impc warm` does it beforehand)")
 
         def on_end(self, _event: Any) -> None:
-            """Nothing is told."""
+            """Nothing is said."""
 
     register: Any = event.register
     register("numba:compile", Once())
@@ -93,23 +93,23 @@ def _base() -> Path | None:
 
 
 def keep_caches() -> str:
-    """Give numba and matplotlib a folder where they have none; what to tell the user, or nothing.
+    """Give numba and matplotlib a folder where they have none; what to say the user, or nothing.
 
     To be called before either is imported; processes that are begun later inherit it.
     """
-    told = []
+    stated = []
     if _base() is None:
-        told.append("NUMBA_CACHE_DIR")
+        stated.append("NUMBA_CACHE_DIR")
     if "MPLCONFIGDIR" not in os.environ and not (
         _writable(_cache_home() / "matplotlib") and _writable(_config_home() / "matplotlib")
     ):
-        told.append("MPLCONFIGDIR")
-    if not told:
+        stated.append("MPLCONFIGDIR")
+    if not stated:
         return ""
     folder = _private_folder()
     if folder is None:
         return "caches are not kept, no folder for them can be written: TMPDIR may name one"
-    for name in told:
+    for name in stated:
         os.environ[name] = str(folder / name.lower())
         (folder / name.lower()).mkdir(exist_ok=True)
     return f"caches are kept in {folder}, for home or installation cannot be written"

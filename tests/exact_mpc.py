@@ -103,31 +103,33 @@ class ExactProgram:
         stage, normal, _ = self.rows
         return np.concatenate([u.ravel(), -u.ravel(), (normal * x[stage]).sum(axis=1)])
 
-    def pull(self, x: Exact, u: Exact, price: Exact) -> Exact:
+    def pull(self, x: Exact, u: Exact, cost_weight: Exact) -> Exact:
         """Derivative of the Lagrangian by the inputs (N, m), with the rows' multipliers."""
         A, B, Q, R = self.matrices
         p = self.P @ x[-1]
-        found = self.push(price)
-        found += (price[: self.width] - price[self.width : 2 * self.width]).reshape(u.shape)
+        found = self.push(cost_weight)
+        found += (cost_weight[: self.width] - cost_weight[self.width : 2 * self.width]).reshape(
+            u.shape
+        )
         for k in range(self.horizon - 1, -1, -1):
             found[k] += R @ u[k] + p @ B
             p = Q @ x[k] + p @ A
         return found
 
-    def push(self, price: Exact) -> Exact:
+    def push(self, cost_weight: Exact) -> Exact:
         """Derivative by the inputs (N, m) of the rows of states, weighted by their multipliers."""
         A, B, _, _ = self.matrices
         stage, normal, _ = self.rows
         pushed = zeros(self.horizon + 1, len(A))
-        for row in np.flatnonzero(price[2 * self.width :]):
-            pushed[stage[row]] += price[2 * self.width + row] * normal[row]
+        for row in np.flatnonzero(cost_weight[2 * self.width :]):
+            pushed[stage[row]] += cost_weight[2 * self.width + row] * normal[row]
         p, found = pushed[-1], zeros(self.horizon, B.shape[1])
         for k in range(self.horizon - 1, -1, -1):
             found[k] = p @ B
             p = pushed[k] + p @ A
         return found
 
-    def is_optimal(self, x: Exact, u: Exact, price: Exact, kept: Decimal) -> bool:
+    def is_optimal(self, x: Exact, u: Exact, cost_weight: Exact, kept: Decimal) -> bool:
         """Karush, Kuhn and Tucker, of the program whose rows are moved by less than `kept`.
 
         What the derivative g misses of zero moves u by |g| / min eig(R) at most.
@@ -136,19 +138,19 @@ class ExactProgram:
         excess, room = self.heights(plan, u) - self.sides, kept * self.sides
         reach = np.min(self.sides[: 2 * self.width]) * Decimal(np.linalg.eigvalsh(self.R)[0])
         return bool(
-            np.all(price >= 0)
+            np.all(cost_weight >= 0)
             and np.all(excess <= room)
-            and np.all(abs(excess[price > 0]) <= room[price > 0])
-            and np.max(abs(self.pull(plan, u, price))) <= Decimal("1e-15") * reach
+            and np.all(abs(excess[cost_weight > 0]) <= room[cost_weight > 0])
+            and np.max(abs(self.pull(plan, u, cost_weight))) <= Decimal("1e-15") * reach
         )
 
-    def is_excluded(self, x: Exact, price: Exact) -> bool:
-        """Whether no inputs within their bounds bring the priced sum of rows of states to zero."""
+    def is_excluded(self, x: Exact, cost_weight: Exact) -> bool:
+        """Whether no inputs in their bounds bring the penalised sum of rows of states to zero."""
         still = zeros(self.horizon, len(self.u_max))
         excess = (self.heights(self.states(x, still), still) - self.sides)[2 * self.width :]
-        push = self.push(price)
+        push = self.push(cost_weight)
         least = np.minimum(push * exact(self.u_max), push * exact(self.u_min)).sum()
-        return bool(np.all(price >= 0) and price[2 * self.width :] @ excess + least > 0)
+        return bool(np.all(cost_weight >= 0) and cost_weight[2 * self.width :] @ excess + least > 0)
 
 
 def solve(matrix: Exact, right: Exact) -> Exact:

@@ -22,12 +22,12 @@ def first_input(
 ) -> np.ndarray | None:
     """The proved first input at a state (n,); None when it is proved that there is none."""
     start = exact(x)
-    u, price = _Search(program, start, np.array(guess, dtype=bool)).run(kept)
+    u, cost_weight = _Search(program, start, np.array(guess, dtype=bool)).run(kept)
     if u is None:
-        if not program.is_excluded(start, price):
+        if not program.is_excluded(start, cost_weight):
             raise ArithmeticError("the rows are not proved to exclude each other")
         return None
-    if not program.is_optimal(start, u, price, kept):
+    if not program.is_optimal(start, u, cost_weight, kept):
         raise ArithmeticError("the plan is not proved")
     return np.array([float(value) for value in u[0]])
 
@@ -37,7 +37,7 @@ class _Plan(NamedTuple):
 
     u: Exact
     x: Exact
-    price: Exact
+    cost_weight: Exact
 
     def moved(self, length: Decimal, by: _Plan) -> _Plan:
         return _Plan(*(one + length * other for one, other in zip(self, by, strict=True)))
@@ -50,7 +50,7 @@ class _Search:
         self.active[self.system.dependent] = False
         while True:
             self.plan = self.system.answer(x)
-            wrong = self.active & (self.plan.price < 0)
+            wrong = self.active & (self.plan.cost_weight < 0)
             if not np.any(wrong):
                 break
             self._set(wrong, False)
@@ -63,7 +63,7 @@ class _Search:
             broken = np.where(self.active, ZERO, excess / sides - kept)
             row = int(np.argmax(broken))
             if broken[row] <= 0:
-                return self.plan.u, self.plan.price
+                return self.plan.u, self.plan.cost_weight
             excluded = self._enter(row)
             if excluded is not None:
                 return None, excluded
@@ -82,18 +82,18 @@ class _Search:
             gain = self._gain(row, change)
             height = self.program.heights(self.plan.x, self.plan.u)[row]
             full = (height - self.program.sides[row]) / gain if gain > least else None
-            falls = self.active & (change.price < -NOTHING * np.max(change.price))
+            falls = self.active & (change.cost_weight < -NOTHING * np.max(change.cost_weight))
             ends = np.flatnonzero(falls)
             if full is None and not len(ends):
-                return np.where(change.price > 0, change.price, ZERO)
-            lasts = self.plan.price[ends] / -change.price[ends]
+                return np.where(change.cost_weight > 0, change.cost_weight, ZERO)
+            lasts = self.plan.cost_weight[ends] / -change.cost_weight[ends]
             if full is not None and not np.any(lasts < full):
                 self.plan = self.plan.moved(full, change)
                 self._set(row, True)
                 return None
             first = int(np.argmin(lasts))
             self.plan = self.plan.moved(lasts[first], change)
-            self.plan.price[ends[first]] = ZERO
+            self.plan.cost_weight[ends[first]] = ZERO
             self._set(ends[first], False)
 
     def _gain(self, row: int, change: _Plan) -> Decimal:
@@ -134,14 +134,14 @@ class _Equalities:
         """The plan from a state."""
         u_max, u_min = exact(self.program.u_max), exact(self.program.u_min)
         fixed = np.where(self.upper, u_max, np.where(self.lower, u_min, ZERO))
-        price = zeros(len(self.program.sides))
-        return self._tightened(self._plan(x, fixed), price, self.program.rows[2])
+        cost_weight = zeros(len(self.program.sides))
+        return self._tightened(self._plan(x, fixed), cost_weight, self.program.rows[2])
 
     def answer_to(self, row: int) -> _Plan:
         """Change of the plan with the multiplier of a row that is not active."""
-        price = zeros(len(self.program.sides))
-        price[row] = Decimal(1)
-        return self._tightened(self._response(row), price, zeros(len(self.program.rows[2])))
+        cost_weight = zeros(len(self.program.sides))
+        cost_weight[row] = Decimal(1)
+        return self._tightened(self._response(row), cost_weight, zeros(len(self.program.rows[2])))
 
     def _recur(self) -> None:
         A, B, Q, R = self.program.matrices
@@ -161,7 +161,7 @@ class _Equalities:
     def _plan(
         self, x: Exact, fixed: Exact, on_x: Exact | None = None, on_u: Exact | None = None
     ) -> tuple[Exact, Exact]:
-        """Inputs and states with linear prices on states (N + 1, n) and inputs (N, m) added."""
+        """Inputs and states with linear weights on states (N + 1, n) and inputs (N, m) added."""
         A, B, _, R = self.program.matrices
         N = self.program.horizon
         on_x = zeros(N + 1, len(A)) if on_x is None else on_x
@@ -212,7 +212,7 @@ class _Equalities:
             else:
                 self.dependent.append(int(2 * self.program.width + row))
 
-    def _tightened(self, plan: tuple[Exact, Exact], price: Exact, sides: Exact) -> _Plan:
+    def _tightened(self, plan: tuple[Exact, Exact], cost_weight: Exact, sides: Exact) -> _Plan:
         """The plan brought onto the tight rows of states, with the multipliers of all rows."""
         (u, x), width = plan, self.program.width
         stage, normal, _ = self.program.rows
@@ -226,8 +226,8 @@ class _Equalities:
         for value, row in zip(p, tight, strict=True):
             moved, reached = self._response(2 * width + row)
             u, x = u + value * moved, x + value * reached
-            price[2 * width + row] += value
-        pull = self.program.pull(x, u, price).ravel()
-        price[:width] += np.where(self.upper.ravel(), -pull, ZERO)
-        price[width : 2 * width] += np.where(self.lower.ravel(), pull, ZERO)
-        return _Plan(u, x, price)
+            cost_weight[2 * width + row] += value
+        pull = self.program.pull(x, u, cost_weight).ravel()
+        cost_weight[:width] += np.where(self.upper.ravel(), -pull, ZERO)
+        cost_weight[width : 2 * width] += np.where(self.lower.ravel(), pull, ZERO)
+        return _Plan(u, x, cost_weight)

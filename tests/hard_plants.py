@@ -47,8 +47,8 @@ def hard_case(seed: int, largest: int = 60) -> HardCase:
     m = int(rng.integers(1, min(n, 3) + 1))
     horizon = int(rng.integers(1, largest + 1))
     plant = random_plant(rng, n, m, rng.uniform(0.7, 2.0))
-    price = 10 ** rng.uniform(-2, 2)
-    weights = Weights(random_weights(rng, n), price * random_weights(rng, m))
+    cost_weight = 10 ** rng.uniform(-2, 2)
+    weights = Weights(random_weights(rng, n), cost_weight * random_weights(rng, m))
     x_max = rng.uniform(1, 4) if rng.random() < 0.4 else np.inf
     low, high = -rng.uniform(0.3, 3, size=m), rng.uniform(0.3, 3, size=m)
     bounds = Bounds(plant, u_min=low, u_max=high, x_min=-x_max, x_max=x_max)
@@ -97,7 +97,7 @@ def reference(case: HardCase) -> ExactProgram:
     )
 
 
-def prices(prepared: PreparedLoop, x: np.ndarray) -> np.ndarray:
+def cost_weights(prepared: PreparedLoop, x: np.ndarray) -> np.ndarray:
     """Multipliers of the package, in the order of the reference's rows; 1 where only the sign is.
 
     Those of the rows that are active, or of those that exclude each other.
@@ -155,15 +155,15 @@ def faults(case: HardCase, run: Simulation, samples: int) -> list[str]:
     program, prepared = reference(case), prepare_loop(controller, directions(controller, 0))
     if status == Status.INFEASIBLE:
         x = run.x[run.reached]
-        price = prices(prepared, x)
-        excluded = program.is_excluded(exact(x), exact(price))
-        if not excluded and first_input(program, x, price > 0, NOTHING) is not None:
+        cost_weight = cost_weights(prepared, x)
+        excluded = program.is_excluded(exact(x), exact(cost_weight))
+        if not excluded and first_input(program, x, cost_weight > 0, NOTHING) is not None:
             found.append("called infeasible, and there is a plan")
     busy = np.flatnonzero(run.status[:applied] != Status.FREE)
     if not len(busy):
         busy = np.arange(min(applied, 1))
     for t in busy[np.linspace(0, len(busy) - 1, min(samples, len(busy))).astype(int)]:
-        active = prices(prepared, run.x[t]) > 0
+        active = cost_weights(prepared, run.x[t]) > 0
         true = first_input(program, run.x[t], active)
         if true is None:
             true = first_input(program, run.x[t], active, _PROMISED)

@@ -40,10 +40,10 @@ WIDTHS = (1500, 400)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _POLICY = re.compile(r'(<meta http-equiv="Content-Security-Policy"\s+content="[^"]*)">')
 _AROUND = """<!DOCTYPE html><body><script>
-addEventListener("message", (told) => {{
+addEventListener("message", (identified) => {{
   const place = document.createElement("pre");
   place.id = "look";
-  place.textContent = told.data;
+  place.textContent = identified.data;
   document.body.append(place);
 }});
 </script><iframe src="page.html" style="width: {}px; height: 2000px; border: 0"></iframe></body>"""
@@ -79,10 +79,10 @@ def main(pages: list[str]) -> int:
                 print(f"the eye is blind at {width}: {', '.join(missed)}", file=sys.stderr)
                 return 1
         shown = [Path(page) for page in pages] or _made(folder)
-        return max([_told(browser, page, width) for page in shown for width in WIDTHS])
+        return max([_identified(browser, page, width) for page in shown for width in WIDTHS])
 
 
-def _told(browser: str, page: Path, width: int) -> int:
+def _identified(browser: str, page: Path, width: int) -> int:
     found = {what: places for what, places in _look(browser, page, width).items() if places}
     print(f"{page.parent.name}/{page.name} at {width}: {'nothing found' if not found else ''}")
     for what, places in found.items():
@@ -111,9 +111,9 @@ def _look(browser: str, page: Path, width: int) -> dict[str, Any]:
              around.as_uri()],
             capture_output=True, text=True, check=True, timeout=120,
         )  # fmt: skip
-    told = re.search(r'<pre id="look">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert told, "the script did not run"
-    found: dict[str, Any] = json.loads(html.unescape(told[1]))
+    identified = re.search(r'<pre id="look">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert identified, "the script did not run"
+    found: dict[str, Any] = json.loads(html.unescape(identified[1]))
     assert found.pop("width") == width
     return found
 

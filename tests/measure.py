@@ -1,7 +1,7 @@
 """The table of sizes that changes of the house are judged by: `make measure`.
 
-Lines are those of files, docstrings and blank lines counted; what shows results is told by the
-names of its files.
+Lines are those of files, docstrings and blank lines counted; what shows results is identified by
+the names of its files.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.documents.blocks import blocks
 
 _SHOWN = re.compile(
     r"reporting/|/\w*(report|page|figures|tables?|sentences|words|schema|verdict|findings?|charts|"
-    r"sheet|told|truth|asked)\.py$|\.(html|css|js)$"
+    r"sheet|identified|truth|asked)\.py$|\.(html|css|js)$"
 )
 _OF_DOCUMENTS = re.compile(r"tests/documents/|tests/test_(public|layout)")
 

@@ -1,4 +1,4 @@
-"""The numerical tests on other linear algebra: `make numerics`, and how it is told.
+"""The numerical tests on other linear algebra: `make numerics`, and how it is identified.
 
     python -m tests.numerics PYTHON...
 

@@ -58,7 +58,7 @@ def extrapolated_slope(function: Callable[[float], Any], first: float = 1e-2) ->
 
     One step alone must weigh truncation against rounding, which grow where the other falls: at
     1e-5 a gain of 256 with a P of condition 1e5 is off by 2e-4. Neville's table takes both away
-    and tells its own error, by which the estimate is chosen.
+    and says its own error, by which the estimate is chosen.
     """
     table: list[np.ndarray] = []
     best, least = np.zeros(0), np.inf

@@ -1,4 +1,4 @@
-"""What is given to public functions: wrong things are told in a line, the same things work."""
+"""What is given to public functions: wrong things are said in a line, the same things work."""
 
 from __future__ import annotations
 

@@ -13,9 +13,9 @@ KERNELS = {"impc/control/compiled_dual.py": {"solve_dual"}}
 
 def lines(node: ast.FunctionDef) -> int:
     """Of its code, without the docstring and its example."""
-    told = node.body[0] if ast.get_docstring(node) else None
+    stated = node.body[0] if ast.get_docstring(node) else None
     whole = (node.end_lineno or 0) - node.lineno + 1
-    return whole - (0 if told is None else (told.end_lineno or 0) - told.lineno + 1)
+    return whole - (0 if stated is None else (stated.end_lineno or 0) - stated.lineno + 1)
 
 
 def test_functions_fit_a_screen() -> None:

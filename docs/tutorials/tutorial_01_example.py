@@ -40,5 +40,5 @@ print("Q =", np.round(weights.Q, 6).tolist(), " R =", np.round(weights.R, 6).tol
 # %%
 # And what of that came from the recording. The gain did; that Q is the identity is the choice of
 # the least condition number among all weights with this gain, see :doc:`/equivalent-weights`.
-told = found.identifiability()
-print(f"determined: {told.rank} of {told.free} directions; chosen: {told.chosen}")
+identified = found.identifiability()
+print(f"determined: {identified.rank} of {identified.free} directions; chosen: {identified.chosen}")

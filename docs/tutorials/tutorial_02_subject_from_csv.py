@@ -34,8 +34,8 @@ terminal(
 show("fit/trajectories-trial-1.png")
 
 # %%
-# **Mistakes are told in one line**, and nothing is written. Angles in degrees that are said to be
-# radians:
+# **Mistakes are identified in one line**, and nothing is written. Angles in degrees that are said
+# to be radians:
 terminal("cp subject/subject.toml wrong.toml")
 change("wrong.toml", 'unit = "deg"', 'unit = "rad"')
 terminal(

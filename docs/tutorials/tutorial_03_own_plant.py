@@ -72,7 +72,7 @@ for trial in (1, 2):
     print(f"trial {trial}: {100 * np.mean(np.abs(moved.u) > 2.999):.0f} % of the time at the bound")
 
 # %%
-# **What the columns mean.** The file tells no units, so they are ours to say. ``impc inspect``
+# **What the columns mean.** The file says no units, so they are ours to say. ``impc inspect``
 # writes a first version of this, with a ``?`` for what it cannot know:
 terminal("impc inspect stick_1.csv --plant stick:stick")
 

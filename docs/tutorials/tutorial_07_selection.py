@@ -1,5 +1,5 @@
 """
-Which parameters can be told: a model from another field
+Which parameters can be identified: a model from another field
 ========================================================
 
 Any function from parameters and an input to outputs will do. Here a drug in the blood, from dose
@@ -92,7 +92,7 @@ replicates = 40
 terminal("impc select dosing.toml --model dosing:blood_model --out select")
 
 # %%
-# Intervals of the parameters that can be told, patient by patient:
+# Intervals of the parameters that can be identified, patient by patient:
 show("select/intervals.png")
 
 # %%

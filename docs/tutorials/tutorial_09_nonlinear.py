@@ -3,8 +3,8 @@ A nonlinear problem of your own, from file to page
 ==================================================
 
 A cart carries a pole that hangs, and somebody swings it up. The equations are known but for the
-masses; the force has a limit that nobody told, and an angle has a price in force that nobody knows.
-What was recorded is where the cart was, how the pole stood, and the force: not a speed. The
+masses; the force has a limit that nobody identified, and an angle has a price in force that nobody
+knows. What was recorded is where the cart was, how the pole stood, and the force: not a speed. The
 problem is a function in CasADi, the rest is a file that says what the columns mean.
 """
 
@@ -12,7 +12,7 @@ from terminal import RESULTS, show, terminal, write
 
 # %%
 # **The problem**: states, inputs and parameters are symbols with names; dynamics, cost and limits
-# are expressions. The price of force is 1, which fixes the scale of the others. Units tell the
+# are expressions. The price of force is 1, which fixes the scale of the others. Units say the
 # reader of recordings what a column may be, and ``dt`` on which clock.
 write(
     "swing.py",
@@ -140,7 +140,7 @@ for one in impc.load(RESULTS / "swing-fit").table("parameters").itertuples():
     )
 
 # %%
-# **What a recording cannot say.** With the length free as well, the page would tell which
+# **What a recording cannot say.** With the length free as well, the page would say which
 # combinations are known and which are not (:doc:`/nonlinear`).
 # A wrong file, a wrong expression or a start without a plan ends in one line:
 (RESULTS / "far.toml").write_text(

@@ -44,9 +44,9 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     far = subject("seat", 0, "both", 90.0, 70.0)
     free_of_limits = _at_the_truth(far, recorded(far, 0).problem)
     cases: dict[str, Callable[[], object]] = {
-        "no limit": partial(free_of_limits.told, free_of_limits.start),
-        "kept": partial(kept.told, kept.start),
-        "free": partial(free.told, free.start),
+        "no limit": partial(free_of_limits.identified, free_of_limits.start),
+        "kept": partial(kept.identified, kept.start),
+        "free": partial(free.identified, free.start),
         "value": partial(kept.value, kept.start),
         "W2": partial(evaluate, replace(work.problem, unknown_start=True), *known),
         "person": partial(evaluate, problem, np.array(law.K), np.array(law.S)),
@@ -69,7 +69,7 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
 
 
 def _at_the_truth(who: Subject, problem: Problem) -> PersonCoordinates:
-    """Gains that prices can have, from the person's own."""
+    """Gains that cost weights can have, from the person's own."""
     point = Point(np.array(who.controller.K), np.array(who.controller.S), problem)
     return PersonCoordinates(gain_space(point, None), who.person, who.recorder)
 

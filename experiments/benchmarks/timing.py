@@ -40,7 +40,7 @@ def side_by_side(
 ) -> dict[str, Timing]:
     """Run all cases `repeats` times in turn, after one run of each that is not counted.
 
-    `clock` tells the seconds: those on the wall, or `time.process_time` those of all processors.
+    `clock` says the seconds: those on the wall, or `time.process_time` those of all processors.
     """
     seconds: dict[str, list[float]] = {name: [] for name in cases}
     for repeat in range(repeats + 1):

@@ -4,8 +4,8 @@ With the wanted commands g given, recordings and g have a density in closed form
 
     log p(y, g) = sum_t  log N(y_t; C z_t, S_t) + log N(g_t; h'z_t|y, v_t)
 
-of a Kalman filter that is told y_t and then g_t itself. Here are the gains of that filter, which
-depend on neither.
+of a Kalman filter that is identified y_t and then g_t itself. Here are the gains of that filter,
+which depend on neither.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _STILL = 1e-12
 
 
 class Gains(NamedTuple):
-    """The filter that is told outputs and wanted commands, sample by sample.
+    """The filter that is identified outputs and wanted commands, sample by sample.
 
     Attributes
     ----------

@@ -142,5 +142,5 @@ def _smooth(
     for t in range(len(means)):
         P = spreads[t]
         both[:, 0], both[:, 1] = means[t] + P @ found.a[t], P @ h
-        told = np.linalg.solve(np.eye(size) + P @ found.L[t], both)
-        _line(regulator, float(h @ told[:, 0].copy()), float(h @ told[:, 1].copy()), lines[t])
+        solved = np.linalg.solve(np.eye(size) + P @ found.L[t], both)
+        _line(regulator, float(h @ solved[:, 0].copy()), float(h @ solved[:, 1].copy()), lines[t])

@@ -59,11 +59,11 @@ def differences(who: Subject, trials: int) -> tuple[Array, int]:
             return None
         trial = outputs, np.array(push, dtype=np.float64).reshape(len(push), -1)
         recording = Recording(plant, *trial, np.zeros(plant.n))
-        told = [joint_likelihoods(each, [recording])[0].value for each in filters]
+        likelihoods = [joint_likelihoods(each, [recording])[0].value for each in filters]
         exact = [
             particle_likelihood(each, *trial, start, _PARTICLES, number) for each in regulators
         ]
-        return [up - down for up, down in (told, exact)]
+        return [up - down for up, down in (likelihoods, exact)]
 
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(one, range(trials)))

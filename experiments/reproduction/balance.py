@@ -148,7 +148,7 @@ def _figures(result: dict[str, Any]) -> list[Entry]:
 
 
 def _claims(result: dict[str, Any]) -> list[Entry]:
-    told = [
+    parts = [
         Entry(
             "Claim, 2.3",
             item["statement"],
@@ -180,7 +180,8 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
         ("experiments.protocols", "experiments.normalisation"),
         "`python -m experiments.normalisation` runs both on the simulated subject.",
         Verdict.IN_KIND,
-        "Whether the last success or the first failure is the critical stiffness is not told; here"
+        "Whether the last success or the first failure is the critical stiffness is not "
+        "identified; here"
         " the first failure.",
     )
     encoder = Entry(
@@ -191,7 +192,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
         Verdict.LOST,
         "It takes the apparatus.",
     )
-    return [protocol, encoder, *told, learnt]
+    return [protocol, encoder, *parts, learnt]
 
 
 def _p_values(result: dict[str, Any], item: str, measure: str, quoted: str) -> Entry:

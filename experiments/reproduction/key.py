@@ -223,7 +223,7 @@ def _doubled() -> float:
 
 
 def _estimates(item: str, axis: str, result: dict[str, Any], quoted: str) -> Entry:
-    told = "; ".join(
+    listed = "; ".join(
         f"{row.parameter} {row.icc:.2f} [{row.icc_low:.2f}, {row.icc_high:.2f}]"
         for row in table(result, "estimates").query("free == 'chosen'").itertuples()
     )
@@ -231,7 +231,7 @@ def _estimates(item: str, axis: str, result: dict[str, Any], quoted: str) -> Ent
         item,
         f"{axis}: estimates of all and of the key parameters, by visit; {quoted}.",
         ("impc.studies.selection.key_report:key_report",),
-        f"ICC(A,k): {told}.",
+        f"ICC(A,k): {listed}.",
         Verdict.LOST,
         "The estimates are lost. " + _FORTY,
     )
@@ -260,5 +260,5 @@ def _pathways(axis: dict[str, Any]) -> tuple[str, int]:
         for path in dict.fromkeys(own.values())
     }
     delays = sum("tau" in subset for subset in subsets)
-    told = ", ".join(f"{path} {count}" for path, count in counts.items())
-    return f"{told} of {len(subsets)}; the visual delay in {delays}", counts["intrinsic"]
+    listed = ", ".join(f"{path} {count}" for path, count in counts.items())
+    return f"{listed} of {len(subsets)}; the visual delay in {delays}", counts["intrinsic"]

@@ -35,8 +35,8 @@ def page(chapters: Sequence[Chapter]) -> str:
     """Write the page: counts, a table a chapter, the figures."""
     everything = [entry for chapter in chapters for entry in chapter.entries]
     counts = Counter(entry.verdict for entry in everything)
-    told = ", ".join(f"{counts[verdict]} {verdict.value}" for verdict in Verdict)
-    parts = [_HEAD, f"Of {len(everything)} lines: {told}.\n"]
+    counted = ", ".join(f"{counts[verdict]} {verdict.value}" for verdict in Verdict)
+    parts = [_HEAD, f"Of {len(everything)} lines: {counted}.\n"]
     for chapter in chapters:
         parts.append(f"## {chapter.title}\n\n{chapter.stand_in}\n")
         parts.append("| | the dissertation | here | verdict |\n|---|---|---|---|")

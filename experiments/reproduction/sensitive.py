@@ -169,7 +169,7 @@ def _reduction(claims: dict[str, Any]) -> Entry:
         f" {lasso[2]:.0f} %.",
         kind(bool(np.all(fim[:2] < lasso[:2]) and np.max(fim[:2]) < 20)),
         "One subject, the mean of the FIM column. The two gains, whose common scaling nobody sees,"
-        " fall as in the dissertation; tau is told well even with twelve.",
+        " fall as in the dissertation; tau is identified well even with twelve.",
         "select/intervals.png",
     )
 
@@ -193,7 +193,8 @@ def _claims(
             f"At the nominal column number {place} of {len(selection.subsets)} subsets of"
             f" {selection.size}. In our cohort, common to all: {', '.join(fim)}.",
             kind(selection.size == 5),
-            "Independently drawn subjects reach extreme points at which less is told. " + _TEN,
+            "Independently drawn subjects reach extreme points at which less is identified. "
+            + _TEN,
         ),
         Entry(
             "Claim, 4.3",
@@ -252,11 +253,11 @@ def _claims(
 
 
 def _margins() -> str:
-    told = []
+    rows = []
     for name in plants.TABLE_4_3:
         poles = np.linalg.eigvals(plants.head_neck_plant(plants.table_4_3_column(name)).A)
-        told.append(f"{name} {max(poles.real):.3f}")
-    return f"Largest real part of a pole, 1/s: {', '.join(told)}."
+        rows.append(f"{name} {max(poles.real):.3f}")
+    return f"Largest real part of a pole, 1/s: {', '.join(rows)}."
 
 
 def _mean_vafs(select: dict[str, Any]) -> tuple[float, float, float]:

@@ -73,7 +73,7 @@ class Asked(Protocol):
 
 
 @dataclass(frozen=True)
-class Certainty:
+class Uncertainty:
     """What is known beside the fit itself."""
 
     intervals: tuple[Interval, ...]  # By every method that was asked for; the sandwich's come first
@@ -107,7 +107,7 @@ def assess(
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
     attempt: Attempt,
-) -> Certainty:
+) -> Uncertainty:
     """Run what the settings ask for."""
     intervals = [
         *covariance_intervals(estimate, estimate.covariance, "sandwich"),
@@ -134,7 +134,7 @@ def assess(
         alternatives = attempt("other horizons", others, ())
     replicates = functools.partial(_bootstrap, estimate, settings, done, remember)
     intervals += attempt("bootstrap", replicates, ())
-    return Certainty(tuple(intervals), *weights, tuple(limits), alternatives)
+    return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
 
 def _limit_interval(found: LimitEstimate, control: str) -> Interval:

@@ -42,7 +42,7 @@ class MethodFit(Frozen):
     vaf: Array  # (3.24) over all trials, % (p,); NaN when a simulation does not reach the end
     trial_vaf: Array  # (trials, p), the same for each
     # (trials, p), VAF of each trial predicted from the others; NaN where there is no gain or the
-    # simulation ends early; (0, p) where none was left out, as `judge` has it
+    # simulation ends early; (0, p) where none was left out, as `evaluate_method` has it
     held_out: Array
     largest_input: Array  # Largest magnitude of each input (m,)
     # Share of the samples that were reached at which an input bound is exceeded, by more than 1e-6
@@ -68,7 +68,7 @@ class MethodFit(Frozen):
         return np.concatenate([none, *(run.applied for run in self.runs)])
 
 
-def judge(estimate: Estimate, bounds: Bounds) -> MethodFit:
+def evaluate_method(estimate: Estimate, bounds: Bounds) -> MethodFit:
     """Simulate all recordings with what a method found."""
     problem = estimate.problem
     if estimate.K is None:

@@ -4,10 +4,10 @@
 
 is convex: kappa(X) <= limit says that some t has  t I <= X <= limit t I.  Nothing that the
 recordings say of the weights can be finer than this set (docs/equivalent-weights.md, section 2).
-A linear function of the weights (an entry, a difference of two prices) has a range over the set
-that two semidefinite programs find, so that a statement such as "the price of x_1 is above that of
-x_2" holds for every member, or for none, or for some. Each end has a member that is there, and a
-proof that none is beyond.
+A linear function of the weights (an entry, a difference of two cost weights) has a range over the
+set that two semidefinite programs find, so that a statement such as "the cost weight of x_1 is
+above that of x_2" holds for every member, or for none, or for some. Each end has a member that is
+there, and a proof that none is beyond.
 
 They are written as seen from the analytic centre LL' of the fibre, L^-1 X L^-T, in which
 tr(L^-1 X L^-T) is the same for every X of one scale: all members lie within n + m of it, which
@@ -196,17 +196,17 @@ def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]
     ends = [_same_for_all(found, direction) for direction in directions]
     slopes = np.tensordot(directions, found.level, ([1, 2], [1, 2]))
     scales = np.linalg.norm(slopes, axis=1)
-    told = np.flatnonzero(scales)
-    if len(told) == 0:  # or there is but one member
+    identified = np.flatnonzero(scales)
+    if len(identified) == 0:  # or there is but one member
         return ends
-    objectives = np.pad(slopes[told] / scales[told, None], ((0, 0), (0, 1)))
+    objectives = np.pad(slopes[identified] / scales[identified, None], ((0, 0), (0, 1)))
     each = solve_each(
         objectives,
         found.cones,
         reach=np.full(len(found.level) + 1, found.reach),
         tolerance=tolerance,
     )
-    for index, solved in zip(told, each, strict=True):
+    for index, solved in zip(identified, each, strict=True):
         X = _member(found, solved.y)
         ends[index] = End(
             float(np.sum(directions[index] * X)),

@@ -14,8 +14,8 @@ and, for several inputs, the metric S, which is independent of the gain. The pri
 (`fit_gain`) is left out: the result says what the recordings determine, and in a direction that
 they hardly do it is wide.
 
-To first order a direction that is not told has no part in those that are; to second order it has,
-and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
+To first order a direction that is not identified has no part in those that are; to second order it
+has, and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-#: A direction with a larger deviation, of the natural size of a gain, is not told: there the prior
+#: A direction with a larger deviation, of the natural size of a gain, is not identified: there the
+#: prior
 #: of a search and the curvature of the problem count beside the recordings.
-TOLD = 0.2
-#: An entry is told by itself when what is not told could move it by less than this share of its
+IDENTIFIED = 0.2
+#: An entry is individually identified when what is not identified could move it by less than this
+#: share of its
 #: deviation, were it wrong by the natural size of a gain. Of 275 intervals of carts with three
 #: inputs (VAF 70 %) for which that share was .2 to .25, and not in the deviation, 90 % held.
 FOREIGN = 0.2
@@ -77,8 +79,8 @@ class GainCovariance(Frozen):
     # Standard deviation of each entry of K (m, n), in its unit; infinite when a direction without a
     # value takes part in it
     entries: Array
-    # What the directions that are not told could move each entry by, were they wrong by the natural
-    # size of a gain, over its deviation by those that are (m, n)
+    # What the directions that are not identified could move each entry by, were they wrong by the
+    # natural size of a gain, over its deviation by those that are (m, n)
     foreign: Array
     parameters: Array  # Standard deviation of the logarithm of each physical parameter (k,)
     noise: ResidualNoise  # The colour of the residuals
@@ -88,13 +90,13 @@ class GainCovariance(Frozen):
         return np.asarray(self.directions @ np.ravel(np.linalg.solve(self.G, step @ self.T)))
 
     @property
-    def told(self) -> BoolArray:
-        """Which directions the recordings tell (m * n,)."""
-        return np.asarray(self.deviations < TOLD)
+    def identified(self) -> BoolArray:
+        """Which directions the recordings identify (m * n,)."""
+        return np.asarray(self.deviations < IDENTIFIED)
 
     @property
-    def told_entries(self) -> BoolArray:
-        """Which entries of K they tell by themselves, not only together with others (m, n)."""
+    def individually_identified(self) -> BoolArray:
+        """Which entries of K they say by themselves, not only together with others (m, n)."""
         return np.asarray(self.foreign < FOREIGN)
 
 
@@ -113,7 +115,7 @@ def gain_covariance(
     found = evaluation or evaluate(problem, gain, metric)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
-    metric_columns = _told_metric(found.along_metric(metric, metric_directions(metric)))
+    metric_columns = _identified_metric(found.along_metric(metric, metric_directions(metric)))
     # What the rest can explain is taken out of the gain's columns; the gain's
     # block of the inverse of H is that of what is left.
     rest = _span(problem, found, metric_columns, found.dparameters)
@@ -127,12 +129,12 @@ def gain_covariance(
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     if curvature:
-        told = np.flatnonzero(deviations < TOLD)
+        identified = np.flatnonzero(deviations < IDENTIFIED)
         reach = np.minimum(deviations, 1.0)[:, None] * directions
-        untold = reach[deviations >= TOLD]
-        shifts = _shifts(problem, gain, metric, (untold @ in_units.T).reshape(-1, m, n))
-        shifts = shifts @ unit[:, told] / values[told]
-        spread[np.ix_(told, told)] += shifts.T @ shifts / 2
+        unidentified = reach[deviations >= IDENTIFIED]
+        shifts = _shifts(problem, gain, metric, (unidentified @ in_units.T).reshape(-1, m, n))
+        shifts = shifts @ unit[:, identified] / values[identified]
+        spread[np.ix_(identified, identified)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
     return GainCovariance(
@@ -152,7 +154,7 @@ def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array
     """What steps of the gain (k, m, n), forth and back, do to the residual (2 k, r).
 
     A step that cannot be simulated is halved, and what it does scaled by the square: the first
-    order of a step that is not told has no part in those that are.
+    order of a step that is not identified has no part in those that are.
     """
     here, shifts = residual_only(problem, gain, metric), []
     for index, sign in itertools.product(range(len(steps)), (1.0, -1.0)):
@@ -165,17 +167,19 @@ def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array
 
 
 def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Array]:
-    """Deviations of the entries, and the share in each of what is not told."""
-    usable, told = np.isfinite(deviations), deviations < TOLD
-    own = spread[np.ix_(told[usable], told[usable])]
-    by_itself = np.sqrt(np.maximum(np.diag(back[:, told] @ own @ back[:, told].T), 0.0))
+    """Deviations of the entries, and the share in each of what is not identified."""
+    usable, identified = np.isfinite(deviations), deviations < IDENTIFIED
+    own = spread[np.ix_(identified[usable], identified[usable])]
+    by_itself = np.sqrt(np.maximum(np.diag(back[:, identified] @ own @ back[:, identified].T), 0.0))
     size = np.linalg.norm(back, axis=1)
-    untold = np.linalg.norm(back[:, ~told], axis=1)
-    untold[untold <= _SHARE * size] = 0.0
-    foreign = np.divide(untold, by_itself, out=np.full(len(back), np.inf), where=by_itself > 0)
+    unidentified = np.linalg.norm(back[:, ~identified], axis=1)
+    unidentified[unidentified <= _SHARE * size] = 0.0
+    foreign = np.divide(
+        unidentified, by_itself, out=np.full(len(back), np.inf), where=by_itself > 0
+    )
     whole = np.sqrt(np.maximum(np.diag(back[:, usable] @ spread @ back[:, usable].T), 0.0))
     whole[np.linalg.norm(back[:, ~usable], axis=1) > _SHARE * size] = np.inf
-    return np.where(foreign < FOREIGN, np.hypot(by_itself, untold), whole), foreign
+    return np.where(foreign < FOREIGN, np.hypot(by_itself, unidentified), whole), foreign
 
 
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
@@ -188,8 +192,8 @@ def by_trial(problem: Problem, rows: Array) -> list[Array]:
     return parts
 
 
-def _told_metric(alone: Array) -> Array:
-    """Columns of what is told of S `alone` (r, k)."""
+def _identified_metric(alone: Array) -> Array:
+    """Columns of what is identified of S `alone` (r, k)."""
     metric, sizes, _ = np.linalg.svd(alone, full_matrices=False)
     # Rounding leaves 1e-15 where S is not identified: inputs that are never at a bound.
     return np.asarray(metric[:, sizes > _SEEN * np.max(sizes, initial=0.0)])

@@ -70,13 +70,13 @@ def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> Residu
 def residual_warnings(
     found: ResidualDiagnostics, outputs: tuple[str, ...], saturated: float
 ) -> tuple[str, ...]:
-    """What to tell first: one sentence or two for each test that is positive."""
-    told = []
+    """What to say first: one sentence or two for each test that is positive."""
+    identified = []
     if found.loop is not None and found.loop.found:
-        told.append(_loop_sentence(found.loop, outputs, saturated))
+        identified.append(_loop_sentence(found.loop, outputs, saturated))
     if found.structure is not None and found.structure.found:
-        told.append(_structure_sentence(found.structure))
-    return tuple(told) if saturated > 0 else tuple(reversed(told))
+        identified.append(_structure_sentence(found.structure))
+    return tuple(identified) if saturated > 0 else tuple(reversed(identified))
 
 
 def _loop_sentence(loop: LoopNoise, outputs: tuple[str, ...], saturated: float) -> str:
@@ -88,7 +88,7 @@ def _loop_sentence(loop: LoopNoise, outputs: tuple[str, ...], saturated: float) 
     )
     if saturated > 0:
         return (
-            f"{seen} The command stands at its bound for {100 * saturated:.1f} % of the time: the "
+            f"{seen} The command is at its bound for {100 * saturated:.1f} % of the time: the "
             f"gain is then biased by as much as half, at a high VAF too, and 95 % intervals of it "
             f"held the truth in 0 to 40 % of simulated subjects. Do not rely on the gain, the "
             f"weights or their intervals."
@@ -137,8 +137,8 @@ class ResidualStructure:
     @property
     def found(self) -> bool:
         """Whether there is such a part, and more than a trifle of it."""
-        told = min(self.p_linear, self.p_nonlinear) <= _LEVEL / len(_FAMILIES)
-        return told and self.share >= _LEAST_SHARE
+        identified = min(self.p_linear, self.p_nonlinear) <= _LEVEL / len(_FAMILIES)
+        return identified and self.share >= _LEAST_SHARE
 
 
 def residual_structure(
@@ -157,7 +157,7 @@ def residual_structure(
     fitted = np.hstack([found.dK.reshape(len(weights), -1), found.dparameters])
     sizes = problem.trial_sizes
     basis = trial_span(found.dx0 * weights[:, None], sizes, fitted * weights[:, None])
-    told = np.ravel(residual / size)
+    identified = np.ravel(residual / size)
     shifted = _shifted(residual / size, lengths, np.random.default_rng(0))
     simulated = residual + recorded
     span = _settling(problem, gain)
@@ -165,7 +165,7 @@ def residual_structure(
     for columns in (_linear(problem), _nonlinear(simulated / np.std(simulated, axis=0))):
         rows: Array = np.kron(_delayed(columns, lengths, span), np.eye(p)).astype(np.float64)
         seen = _orthonormal(basis.without(rows))
-        share = float(np.sum((seen.T @ told) ** 2) / (told @ told))
+        share = float(np.sum((seen.T @ identified) ** 2) / (identified @ identified))
         null = np.sum((seen.T @ shifted) ** 2, axis=0) / np.sum(shifted**2, axis=0)
         probability = (1 + int(np.count_nonzero(null >= share))) / (1 + _SHIFTS)
         results.append((probability, max(0.0, share - float(np.mean(null)))))

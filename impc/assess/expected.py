@@ -1,10 +1,10 @@
-"""What recordings would tell that nobody has made yet: intervals before anyone is measured.
+"""What recordings would say that nobody has made yet: intervals before anyone is measured.
 
 A presumed subject is simulated, and the recordings are taken as they come out without noise. At the
 truth the residual is then zero, and the derivatives of the outputs are those of the recordings to
 come. With noise of known size and colour, e_t in the recorder, they give the deviations of gain
-and prices as `covariance` and `structured_weights` have them, and the misfit that grows away from
-the truth gives the ends of profiles:
+and cost weights as `covariance` and `structured_weights` have them, and the misfit that grows away
+from the truth gives the ends of profiles:
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),      m(v*) = 0
 
@@ -24,9 +24,9 @@ from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
 from impc.assess.covariance import GainCovariance, by_trial, gain_covariance
 from impc.assess.input_limits import on_limit
 from impc.assess.long_run_covariance import ResidualNoise, spread_of_sum
-from impc.assess.price_profiles import PriceInterval, PriceProfiles
 from impc.assess.printed_gain import LEVEL
-from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
+from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
+from impc.assess.weight_profiles import WeightInterval, WeightProfiles
 from impc.checking import checked, replace
 from impc.errors import InputError
 
@@ -44,11 +44,11 @@ _UNSEEN = 1e-12
 
 @dataclass(frozen=True)
 class Expectation(Frozen):
-    """What the recordings of a problem would tell."""
+    """What the recordings of a problem would say."""
 
-    prices: PriceCovariance  # Of the unknowns of the structure, to first order
-    # Of each unknown, by its profile; by its deviation where products of features have prices
-    intervals: tuple[PriceInterval, ...]
+    cost_weights: WeightCovariance  # Of the unknowns of the structure, to first order
+    # Of each unknown, by its profile; by its deviation where products of features have cost weights
+    intervals: tuple[WeightInterval, ...]
     # Of a gain that is fitted without a structure, to second order as a fit prints it
     gain: GainCovariance
     # Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
@@ -58,14 +58,14 @@ class Expectation(Frozen):
     @property
     def deviations(self) -> Array:
         """Standard deviation of each unknown of the structure (count,), to first order."""
-        return np.asarray(self.prices.each)
+        return np.asarray(self.cost_weights.each)
 
     @property
     def log_determinant(self) -> float:
-        """Of the covariance of the unknowns, infinite if one is not told: least where D-optimal."""
-        if not np.all(np.isfinite(self.prices.deviations)):
+        """Of the unknowns' covariance, infinite if one is not identified: least where D-optimal."""
+        if not np.all(np.isfinite(self.cost_weights.deviations)):
             return np.inf
-        return 2 * float(np.sum(np.log(self.prices.deviations)))
+        return 2 * float(np.sum(np.log(self.cost_weights.deviations)))
 
     @property
     def mean_variance(self) -> float:
@@ -76,7 +76,7 @@ class Expectation(Frozen):
 @checked
 def expected_intervals(
     problem: Problem,
-    prices: ArrayLike,
+    cost_weights: ArrayLike,
     deviation: ArrayLike,
     *,
     root: float = 0.0,
@@ -87,8 +87,8 @@ def expected_intervals(
     ----------
     problem : Problem
         Its recordings are those of the presumed subject, without noise; with a structure.
-    prices : array_like
-        The subject's unknowns of that structure (count,), logarithms of prices.
+    cost weights : array_like
+        The subject's unknowns of that structure (count,), logarithms of cost weights.
     deviation : array_like
         Standard deviation of the noise in the recorder, in the outputs' units, one or (p,).
     root : float
@@ -127,9 +127,9 @@ def expected_intervals(
     plain = ResidualNoise(frozen(np.zeros(p)), frozen(np.eye(p)[None]))
     # In units of the noise, so that its variance is one.
     scaled = replace(problem, output_scale=size)
-    unknowns = finite_array("prices", prices, (structure.count,))
+    unknowns = finite_array("cost_weights", cost_weights, (structure.count,))
     at = replace(tangent(structure, scaled, unknowns), noise=1.0)
-    found = price_covariance(at, lambda _trials, _lost: coloured, lambda _trials, _lost: plain)
+    found = weight_covariance(at, lambda _trials, _lost: coloured, lambda _trials, _lost: plain)
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     return Expectation(
         found,
@@ -139,15 +139,15 @@ def expected_intervals(
     )
 
 
-def _intervals(at: Tangent, found: PriceCovariance) -> tuple[PriceInterval, ...]:
+def _intervals(at: Tangent, found: WeightCovariance) -> tuple[WeightInterval, ...]:
     rows = np.eye(at.structure.count)
     if not at.structure.coupled:
-        profiles = PriceProfiles(at, found)
+        profiles = WeightProfiles(at, found)
         return tuple(profiles.interval(row) for row in rows)
     ends = -scipy.special.ndtri((1 - LEVEL) / 2) * np.asarray(found.each)
     values = np.asarray(found.values)
     return tuple(
-        PriceInterval(float(value), float(value - end), float(value + end), LEVEL)
+        WeightInterval(float(value), float(value - end), float(value + end), LEVEL)
         for value, end in zip(values, ends, strict=True)
     )
 

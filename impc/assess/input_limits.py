@@ -7,7 +7,7 @@ colour of the residuals widens the deviation of L (f = 1 for white ones),
     D(L) = (m(L)^2 - m(L*)^2) / (s^2 f)
 
 is chi-squared with one degree of freedom at the true limit. Where D(inf) is below its quantile the
-recordings do not tell whether there is a limit at all; they still tell that it is not below the
+recordings do not identify whether there is a limit at all; they still say that it is not below the
 least L that D allows (docs/fitting.md).
 """
 

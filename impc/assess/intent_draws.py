@@ -6,7 +6,7 @@ are drawn, each that of some weights X = L exp(D) L', LL' = blkdiag(Q, R) those 
     log p(D) = -1/2 sum_i (d_i' vec(G^-1 (K(X) - K) T) / s_i)^2 - 1/2 |D|^2 / ln(10)^2 + const
 
 K the estimate (`gain_estimate`), d_i, s_i, G and T those of its `GainCovariance`; what the
-recordings do not tell is limited to weights of the same order of magnitude by the second term.
+recordings do not identify is limited to weights of the same order of magnitude by the second term.
 Draws are made by elliptical slice sampling (Murray, Adams and MacKay 2010) about the linearised
 posterior, so that the curvature of K(X) counts.
 
@@ -24,7 +24,7 @@ import scipy.linalg
 
 from impc.arrays import Array
 from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_set
-from impc.assess.intent_statements import price_direction
+from impc.assess.intent_statements import weight_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import block_basis
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 #: Draws whose range is an interval of 95 %.
 DRAWS = 39
-# Of the logarithm of weights that nothing tells: a factor of ten.
+# Of the logarithm of weights that nothing says: a factor of ten.
 _DECADE = np.log(10.0)
 # Steps of the sampler between two draws that are used.
 _STEPS = 6
@@ -57,8 +57,8 @@ _SHARPEST = 1e-6
 
 
 @dataclass(frozen=True)
-class PriceRange:
-    """Price of a typical excursion of a state, d^2 Q_ii at trace R = m."""
+class WeightRange:
+    """Cost weight of a typical excursion of a state, d^2 Q_ii at trace R = m."""
 
     state: str  # Its name
     low: float  # Over all weights with the fitted gain, in the cost's unit
@@ -74,8 +74,8 @@ class DrawnSet:
     # Those of least condition number; None where the programs fail: nothing is known of this gain's
     # weights
     least: Weights | None
-    # Least and largest price of a typical excursion of each state that was asked for
-    prices: tuple[tuple[float, float], ...]
+    # Least and largest cost weight of a typical excursion of each state that was asked for
+    cost_weights: tuple[tuple[float, float], ...]
     agrees: tuple[bool, ...]  # Whether each statement that was asked for says the same here
 
 
@@ -149,15 +149,15 @@ def with_confidence(
     )
 
 
-def prices_over_gains(
+def weights_over_gains(
     own: Mapping[str, tuple[float, float]], sets: tuple[DrawnSet, ...]
-) -> tuple[PriceRange, ...]:
-    """Prices of some states, over the weights of the fitted gain and of those drawn."""
+) -> tuple[WeightRange, ...]:
+    """Cost weights of some states, over the weights of the fitted gain and of those drawn."""
     result = []
     for position, (name, (low, high)) in enumerate(own.items()):
-        ends = [one.prices[position] for one in sets]
+        ends = [one.cost_weights[position] for one in sets]
         widest = min([low, *(end[0] for end in ends)]), max([high, *(end[1] for end in ends)])
-        result.append(PriceRange(name, low, high, *widest))
+        result.append(WeightRange(name, low, high, *widest))
     return tuple(result)
 
 
@@ -176,8 +176,8 @@ def set_of_gain(
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
         # Nothing is searched from these: only how far they reach is asked for.
         found = weights_set(gain_fibre(plant, solution.K, own), ratio, rough=True)
-        priced = np.array([price_direction(plant, sizes, name) for name in states])
-        ranges = linear_ranges(found, priced, tolerance=_ROUGH)
+        penalised = np.array([weight_direction(plant, sizes, name) for name in states])
+        ranges = linear_ranges(found, penalised, tolerance=_ROUGH)
         against = np.array([_against(item, plant, sizes) for item in tried])
         most = linear_maxima(found, against, tolerance=_ROUGH) if tried else ()
     except (WeightsError, SolverError):
@@ -190,8 +190,8 @@ def set_of_gain(
 def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
     """The linear function that is below zero for every member of a set where a statement holds."""
     if item.kind == "order":
-        direction = price_direction(plant, sizes, item.first)
-        direction -= price_direction(plant, sizes, item.second)
+        direction = weight_direction(plant, sizes, item.first)
+        direction -= weight_direction(plant, sizes, item.second)
     else:
         i, j = plant.states.index(item.first), plant.states.index(item.second)
         direction = np.zeros((plant.n + plant.m, plant.n + plant.m))

@@ -3,10 +3,11 @@
 All weights with the fitted gain and a condition number up to a multiple of the least are equally
 good explanations (`weights_set`). A statement about them is worth making if it holds for every one.
 
-    price     d_i^2 Q_ii: what a typical excursion d_i of state i costs
-    order     price of i above price of j: the sign of a linear function, decided exactly
-    sense     Q_ij above or below zero: the two states are priced together or against each other
-    direction the dominant eigenvector of D Q D; its widest angle to that of the least condition
+    cost weight     d_i^2 Q_ii: what a typical excursion d_i of state i costs
+    order     cost weight of i above cost weight of j: the sign of a linear function, decided
+    exactly sense     Q_ij above or below zero: the two states are penalised together or against
+    each other direction the dominant eigenvector of D Q D; its widest angle to that of the least
+    condition
               number is searched for, not proved: a member that far exists, farther ones may
 
 The direction is also read from weights that three rules choose; the angle between them says how
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
 
 _FRANK_WOLFE = 12
-# A range that ends this near to zero, of its width, does not tell the sign.
+# A range that ends this near to zero, of its width, does not say the sign.
 _TOUCHES = 1e-6
 # 38 of 39, see `intent_draws`.
 _AGREE = 38 / 39 - 1e-9
@@ -54,7 +55,7 @@ class Statement:
     second: str
     says: str  # In words
     holds: bool | None  # True or False for every member of the set; None when members disagree
-    # Range of the linear function whose sign decides, relative to the price of `first` in the
+    # Range of the linear function whose sign decides, relative to the cost weight of `first` in the
     # member of least condition number
     low: float
     high: float
@@ -69,8 +70,8 @@ class Statement:
         return self.confidence is not None and self.confidence >= _AGREE
 
 
-def price_direction(plant: Plant, sizes: Array, state: str) -> Array:
-    """The linear function trace(. blkdiag(Q, R)) that is the price of a state (n + m, n + m)."""
+def weight_direction(plant: Plant, sizes: Array, state: str) -> Array:
+    """The linear function trace(. blkdiag(Q, R)) that is the weight of a state (n + m, n + m)."""
     index = plant.states.index(state)
     direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
     direction[index, index] = sizes[index] ** 2
@@ -80,13 +81,13 @@ def price_direction(plant: Plant, sizes: Array, state: str) -> Array:
 def order_statements(
     found: WeightsSet, sizes: Array, states: tuple[str, ...]
 ) -> tuple[Statement, ...]:
-    """Whether the price of one state is above that of another, for every pair of the given ones."""
+    """Whether one state's cost weight is above another's, for every pair of the given ones."""
     names = found.fibre.plant.states
     pairs = list(itertools.combinations(states, 2))
     if not pairs:
         return ()
-    prices = {name: price_direction(found.fibre.plant, sizes, name) for name in states}
-    directions = np.array([prices[one] - prices[other] for one, other in pairs])
+    cost_weights = {name: weight_direction(found.fibre.plant, sizes, name) for name in states}
+    directions = np.array([cost_weights[one] - cost_weights[other] for one, other in pairs])
     statements = []
     for (one, other), ends in zip(pairs, linear_ranges(found, directions), strict=True):
         says = f"a typical {one} costs more than a typical {other}"
@@ -102,7 +103,7 @@ def sense_statements(
     states: tuple[str, ...],
     ranges: Mapping[tuple[int, int], Range],
 ) -> tuple[Statement, ...]:
-    """Whether two states are priced together (Q_ij > 0: the same sign costs more); `sizes` (n,)."""
+    """Whether two states are penalised together (Q_ij > 0: one sign costs more); `sizes` (n,)."""
     names = found.fibre.plant.states
     statements = []
     for one, other in itertools.combinations(states, 2):
@@ -120,8 +121,8 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     D = diag(sizes), the typical excursions (n,) in the units of the states.
 
     The direction of the member of least condition number against others: from it and from the
-    members at the ends of the ranges of the largest prices, each improved by steps of Frank and
-    Wolfe (the derivative of an eigenvector is linear in Q, so a step is one program).
+    members at the ends of the ranges of the largest cost weights, each improved by steps of Frank
+    and Wolfe (the derivative of an eigenvector is linear in Q, so a step is one program).
     """
     n = found.fibre.plant.n
     if n == 1:  # one state has one direction

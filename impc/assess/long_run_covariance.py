@@ -38,13 +38,14 @@ if TYPE_CHECKING:
 
     Taken = tuple[Array, Array]
 
-# Andrews and Monahan: a root nearer to one is not told from one, and would be taken too seriously.
+# Andrews and Monahan: a root nearer to one is not distinguished from one, and would be taken too
+# seriously.
 _LARGEST_ROOT = 0.97
 # Samples before the first over which noise still has an effect: 0.97^250 is 5e-4.
 _BEFORE = 250
 # Lags up to which plain sums take less time than Fourier transforms: with eight, a seventh.
 _FEW_LAGS = 32
-# Of giving back what a fit takes, which is told by the colour that is sought.
+# Of giving back what a fit takes, which is identified by the colour that is sought.
 _ROUNDS = 3
 
 

@@ -50,7 +50,8 @@ _HANN = 35 / 18
 # below it, as of rounding, is not looked into.
 _FLOOR, _OWN = 1e-3, 1e-9
 # Unknowns beyond these are at them: arguments of tanh of reflections and of the root (.995 at most,
-# a drift is not told from a trend), logarithms of the diagonal of V's factor, and of variances.
+# a drift is not distinguished from a trend), logarithms of the diagonal of V's factor, and of
+# variances.
 _REFLECTION, _ROOT, _DIAGONAL, _VARIANCE = 5.0, 3.0, 10.0, (-25.0, 10.0)
 
 
@@ -183,9 +184,9 @@ def misfit(S: Complex, found: Spectrum) -> tuple[float, Complex]:
     eye = np.eye(S.shape[1])
     least = _FLOOR + _OWN * np.einsum("bii->b", S).real
     inverse = np.linalg.inv(S + least[:, None, None] * eye)
-    told = inverse @ found.power
-    value = np.einsum("bii->b", told).real - np.linalg.slogdet(inverse)[1]
-    W = found.counts[:, None, None] * (inverse - told @ inverse)
+    identified = inverse @ found.power
+    value = np.einsum("bii->b", identified).real - np.linalg.slogdet(inverse)[1]
+    W = found.counts[:, None, None] * (inverse - identified @ inverse)
     own = _OWN * np.einsum("bii->b", W).real
     return float(found.counts @ value), W + own[:, None, None] * eye
 
@@ -211,7 +212,7 @@ class LoopNoise:
 
     @property
     def found(self) -> bool:
-        """Whether noise inside the loop is told from noise in the recorder, and matters."""
+        """Whether noise inside the loop differs from noise in the recorder, and matters."""
         return self.statistic > self.threshold and bool(np.max(self.shares) >= _LEAST_SHARE)
 
 

@@ -1,14 +1,15 @@
-"""The gain that recordings tell: what a fit prints with intervals, and how far it is determined.
+"""The gain that recordings identify: what a fit prints with intervals, and how precise it is.
 
-The weights of a fit are chosen with a price on their condition number, which moves their gain, and
-they are confined to gains that some weights have. A gain without weights that is free in every
-direction is no better: along those that the recordings hardly tell it wanders off, often to the
-edge of stability, where every derivative is another one and deviations come out too small
+The weights of a fit are chosen with a penalty on their condition number, which moves their gain,
+and they are confined to gains that some weights have. A gain without weights that is free in every
+direction is no better: along those that the recordings hardly say it wanders off, often to the edge
+of stability, where every derivative is another one and deviations come out too small
 (docs/fitting.md has the measurements). So the gain of the weights is moved along the directions
-that the recordings tell (`gain_covariance.TOLD`), by plain least squares together with S, initial
-states and parameters, and along no other:
+that the recordings identify (`gain_covariance.IDENTIFIED`), by plain least squares together with S,
+initial states and parameters, and along no other:
 
-    K = K_weights + sum over told directions i of  w_i  direction_i      in natural coordinates
+    K = K_weights + sum over identified directions i of  w_i  direction_i      in natural
+    coordinates
 
 The directions are taken anew at the gain that was found, until the misfit stays. Along them the
 estimate is that of least squares without prior, and the interval from its covariance is its own.
@@ -54,12 +55,12 @@ _TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
-class ToldGain:
-    """The gain that the recordings tell."""
+class IdentifiedGain:
+    """The gain that the recordings identify."""
 
     problem: Problem  # At the initial states and parameters found with this gain
-    K: Array  # (m, n); the weights' along what the recordings do not tell
-    S: Array  # (m, m); the weights' where the recordings do not tell it
+    K: Array  # (m, n); the weights' along what the recordings do not identify
+    S: Array  # (m, m); the weights' where the recordings do not identify it
     misfit: float  # 2-norm of the residual
 
     @property
@@ -72,8 +73,8 @@ class ToldGain:
 
 
 @dataclass(frozen=True)
-class GainEstimate(ToldGain):
-    """The gain that the recordings tell, and how far it is determined."""
+class GainEstimate(IdentifiedGain):
+    """The gain that the recordings identify, and how far it is determined."""
 
     linear: GainCovariance  # To first order
     covariance: GainCovariance  # For noise of the colour that the residuals show, with curvature
@@ -93,14 +94,14 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
     )
 
 
-def told_gain(problem: Problem, gain: Array, metric: Array) -> ToldGain:
+def identified_gain(problem: Problem, gain: Array, metric: Array) -> IdentifiedGain:
     """Estimate the gain behind recordings from one near it: that of the weights of a fit."""
     here = _search(problem, gain, metric)
-    return ToldGain(here.problem, frozen(here.K), frozen(here.S), here.misfit)
+    return IdentifiedGain(here.problem, frozen(here.K), frozen(here.S), here.misfit)
 
 
 @dataclass(frozen=True)
-class _Here(ToldGain):
+class _Here(IdentifiedGain):
     """A gain of the search, with what the recordings say of it to first order."""
 
     evaluation: Evaluation
@@ -115,7 +116,9 @@ def _search(problem: Problem, gain: Array, metric: Array) -> _Here:
         if there is None:  # it leaves what can be described: the last gain stands
             break
         before, here = here, there
-        same = np.count_nonzero(here.linear.told) == np.count_nonzero(before.linear.told)
+        same = np.count_nonzero(here.linear.identified) == np.count_nonzero(
+            before.linear.identified
+        )
         gained = len(here.evaluation.residual) * np.log(before.misfit / here.misfit)
         if same and gained < _TOLERANCE:
             break
@@ -136,7 +139,7 @@ def _round(here: _Here) -> _Here | None:
     """
     space = Coordinates(here.problem, here.K, here.S)
     space.evaluated(space.start, here.evaluation)
-    identified = here.linear.directions[here.linear.told]
+    identified = here.linear.directions[here.linear.identified]
     beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
     along = scipy.linalg.block_diag(identified.T, np.eye(beside))
     shared = np.concatenate([np.zeros(len(identified)), np.ones(beside)])
@@ -172,7 +175,7 @@ class Interval:
     # covariance's interval is that of a plain least-squares estimate, while the value is kept near
     # where the search began: it covers the truth more often than its level. A bootstrap's has no
     # ends.
-    told: bool = True
+    identified: bool = True
 
     @property
     def excludes_zero(self) -> bool:
@@ -192,12 +195,14 @@ def covariance_intervals(
     z = float(scipy.special.ndtri(0.5 + LEVEL / 2))
     names = entry_names(estimate.problem.plant)
     found = [
-        Interval(name, method, LEVEL, float(value), float(value - half), float(value + half), told)
-        for name, value, half, told in zip(
+        Interval(
+            name, method, LEVEL, float(value), float(value - half), float(value + half), identified
+        )
+        for name, value, half, identified in zip(
             names,
             np.ravel(estimate.K),
             z * np.ravel(covariance.entries),
-            np.ravel(covariance.told_entries).tolist(),
+            np.ravel(covariance.individually_identified).tolist(),
             strict=True,
         )
     ]
@@ -207,8 +212,8 @@ def covariance_intervals(
             family.names, estimate.parameters, covariance.parameters, strict=True
         ):
             low, high = _around(value, z * float(deviation))
-            told = bool(deviation < PARAMETER)
-            found.append(Interval(name, method, LEVEL, float(value), low, high, told))
+            identified = bool(deviation < PARAMETER)
+            found.append(Interval(name, method, LEVEL, float(value), low, high, identified))
     return tuple(found)
 
 
@@ -228,7 +233,7 @@ def interval_table(fitted: Estimate) -> pd.DataFrame:
     items = covariance_intervals(found, found.covariance, "sandwich")
     units += [UNKNOWN] * (len(items) - len(units))  # of parameters
     rows = [
-        (item.name, unit, item.value, item.low, item.high, item.told)
+        (item.name, unit, item.value, item.low, item.high, item.identified)
         for item, unit in zip(items, units, strict=True)
     ]
     return pd.DataFrame(rows, columns=["name", "unit", "value", "low", "high", "identified"])

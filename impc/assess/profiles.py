@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
 
-# A prior this much wider than any gain that can be keeps free directions from wandering off.
+# A prior this much wider than any gain that can be keeps free directions from drifting off.
 _WIDTH = 100.0
 # Steps, in deviations, of the walk that looks for the ends; where D is still low at the last one
 # the recordings set no end.

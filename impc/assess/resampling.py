@@ -9,8 +9,8 @@ The disturbance is known and the same in every replicate; only the residuals are
                     of its innovations drawn one by one, so that outputs keep their correlation
 
 Replicate k draws from the k-th child of the seed: the same numbers in any order, on any machine.
-Its search begins at the estimate and moves the gain alone (`told_gain`): fitting weights anew would
-take most of its time, and their gain is not what is printed.
+Its search begins at the estimate and moves the gain alone (`identified_gain`): fitting weights anew
+would take most of its time, and their gain is not what is printed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.printed_gain import Interval, entry_names, told_gain
+from impc.assess.printed_gain import Interval, entry_names, identified_gain
 from impc.checking import replace
 from impc.inverse.problem import simulated
 
@@ -44,7 +44,7 @@ _BEFORE = 500
 class Replicate(Frozen):
     """Estimates of one replicate."""
 
-    K: Array  # (m, n), of `told_gain`
+    K: Array  # (m, n), of `identified_gain`
     parameters: Array  # Physical parameters in their units (k,)
 
 
@@ -78,26 +78,29 @@ def replicate(model: BootstrapModel, index: int, seed: int, resample: Draw) -> R
         replace(trial, outputs=frozen(outputs + noise))
         for trial, outputs, noise in zip(recordings, model.outputs, drawn, strict=True)
     )
-    again = told_gain(replace(model.problem, recordings=trials), model.K, model.S)
+    again = identified_gain(replace(model.problem, recordings=trials), model.K, model.S)
     return Replicate(again.K, frozen(again.parameters))
 
 
 def bootstrap_intervals(
     estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of the entries of K and of the parameters; no ends where not told."""
+    """Percentile intervals of entries of K and of parameters; no ends where not identified."""
     names = list(entry_names(estimate.problem.plant))
     if estimate.problem.family is not None:
         names += estimate.problem.family.names
     values = np.append(np.ravel(estimate.K), estimate.parameters)
     drawn = np.array([np.append(np.ravel(item.K), item.parameters) for item in replicates])
     low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
-    told = np.append(np.ravel(estimate.covariance.told_entries), np.isfinite(estimate.parameters))
-    # Replicates stay where the search began along what is not told: their spread says nothing.
-    low, high = np.where(told, low, -np.inf), np.where(told, high, np.inf)
+    identified = np.append(
+        np.ravel(estimate.covariance.individually_identified), np.isfinite(estimate.parameters)
+    )
+    # Replicates stay where the search began along what is not identified: their spread says
+    # nothing.
+    low, high = np.where(identified, low, -np.inf), np.where(identified, high, np.inf)
     return tuple(
         Interval(name, method, level, float(value), float(one), float(other), bool(known))
-        for name, value, one, other, known in zip(names, values, low, high, told, strict=True)
+        for name, value, one, other, known in zip(names, values, low, high, identified, strict=True)
     )
 
 

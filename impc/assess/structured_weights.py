@@ -1,13 +1,13 @@
-"""How far the prices of a structure are told: deviations for any colour of the residuals.
+"""How far the weights of a structure are identified: deviations for any colour of the residuals.
 
 As `covariance` has it for a gain: with J_t the derivative of the outputs at sample t with respect
 to the unknowns, once initial states and physical parameters have taken what they can,
 
     cov = H^-1 cov( sum_t J_t' e_t ) H^-1,      H = sum_t J_t' J_t,
 
-of the logarithms of prices, and of the correlations where products of features have prices too
-(`Structure.reported`). A physical parameter moves the gain too, because the weights stay. A price
-of zero stands at its limit and is left out; `price_profiles` gives its upper end
+of the logarithms of cost weights, and of the correlations where products of features have cost
+weights too (`Structure.reported`). A physical parameter moves the gain too, because the weights
+stay. A cost weight of zero is at its limit and is left out; `weight_profiles` gives its upper end
 (docs/structures.md).
 """
 
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
     NoiseModel = Callable[[list[Array], TrialSpan], ResidualNoise]
 
-#: A combination of logarithms is told when its interval of 95 % ends within this factor.
-TOLD_FACTOR = 10.0
+#: A combination of logarithms is identified when its interval of 95 % ends within this factor.
+IDENTIFIED_FACTOR = 10.0
 # Of an unknown: a smaller share in a direction without a value is rounding's.
 _SHARE = 1e-3
 
@@ -58,18 +58,19 @@ class Tangent(Frozen):
     structure: Structure
     problem: Problem  # At the initial states and the parameters
     solution: LqrSolution  # The regulator of the weights
-    prices: Array  # Unknowns (count,); minus infinity is a price of zero
+    cost_weights: Array  # Unknowns (count,); minus infinity is a cost weight of zero
     residual: Array  # (r,)
     found: Evaluation
-    # Derivative with respect to the unknowns (r, count), or to a price itself where it is zero
-    on_prices: Array
+    # Derivative with respect to the unknowns (r, count), or to a cost weight itself where it is
+    # zero
+    on_cost_weights: Array
     on_parameters: Array  # With respect to the parameters, the weights held (r, k)
     noise: float  # Root-mean-square of the noise: of the residual, where recordings were made
 
     @property
     def moving(self) -> BoolArray:
-        """Unknowns that are not prices of zero (count,)."""
-        return np.isfinite(self.prices)
+        """Unknowns that are not cost weights of zero (count,)."""
+        return np.isfinite(self.cost_weights)
 
     def without_nuisance(self, columns: Array, *beside: Array) -> Array:
         """What initial states, parameters and others cannot make up of columns."""
@@ -88,12 +89,12 @@ class Tangent(Frozen):
         return self.found.along_gain(T, G), on_metric
 
 
-def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
-    """Residual and derivatives at unknowns `prices` (count,) and a problem's other unknowns."""
-    solution = solve_lqr(problem.plant, structure.weights(prices))
+def tangent(structure: Structure, problem: Problem, cost_weights: Array) -> Tangent:
+    """Residual and derivatives at `cost_weights` (count,) and a problem's other unknowns."""
+    solution = solve_lqr(problem.plant, structure.weights(cost_weights))
     K, S = np.array(solution.K), np.array(solution.S)
     found = evaluate(problem, K, S)
-    dK, dS = regulator_slopes(problem, structure, prices, solution)
+    dK, dS = regulator_slopes(problem, structure, cost_weights, solution)
     seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), K.size).T
     seen += found.along_metric(S, dS)
     count = structure.count
@@ -101,7 +102,7 @@ def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
         structure,
         problem,
         solution,
-        frozen(prices),
+        frozen(cost_weights),
         frozen(found.residual),
         found,
         frozen(seen[:, :count]),
@@ -111,11 +112,12 @@ def tangent(structure: Structure, problem: Problem, prices: Array) -> Tangent:
 
 
 @dataclass(frozen=True)
-class PriceCovariance(Frozen):
+class WeightCovariance(Frozen):
     """What the recordings say of the unknowns of a structure, to first order."""
 
     structure: Structure
-    # As told: logarithms of prices, and correlations (count,); minus infinity for a price of 0
+    # As identified: logarithms of cost weights, and correlations (count,); minus infinity for a
+    # cost weight of 0
     values: Array
     # Of the residual's derivative with respect to those that move, once initial states and
     # parameters have taken what they can; largest first (a,)
@@ -126,7 +128,7 @@ class PriceCovariance(Frozen):
     # Over all unknowns (count, count), without the directions that have no deviation
     covariance: Array
     # Standard deviation of each unknown (count,); infinite where a direction without a value takes
-    # part, and for a price of zero
+    # part, and for a cost weight of zero
     each: Array
     white: Array  # The covariance as if the residuals were white (count, count)
     noise: ResidualNoise  # The colour of the residuals
@@ -137,9 +139,9 @@ class PriceCovariance(Frozen):
         return int(np.count_nonzero(np.isfinite(self.deviations)))
 
     @property
-    def told(self) -> BoolArray:
-        """Which directions the recordings tell to a factor of `TOLD_FACTOR` at 95 % (a,)."""
-        return np.asarray(TWO_SIDED * self.deviations < np.log(TOLD_FACTOR))
+    def identified(self) -> BoolArray:
+        """Which directions are known to within a factor of `IDENTIFIED_FACTOR` at 95 % (a,)."""
+        return np.asarray(TWO_SIDED * self.deviations < np.log(IDENTIFIED_FACTOR))
 
     def spread(self, combination: Array) -> tuple[float, float]:
         """Deviation of a combination of unknowns (count,), and over that for white residuals."""
@@ -153,15 +155,15 @@ class PriceCovariance(Frozen):
         return own, own / plain
 
 
-def price_covariance(
+def weight_covariance(
     at: Tangent, noise: NoiseModel = residual_noise, white: NoiseModel = white_noise
-) -> PriceCovariance:
+) -> WeightCovariance:
     """Covariance of the unknowns of a structured fit; `noise, white` (samples, p)."""
-    values, chain = at.structure.reported(at.prices)
+    values, chain = at.structure.reported(at.cost_weights)
     moving = at.moving
     slopes = np.linalg.inv(chain[np.ix_(moving, moving)])
     beside = at.span()
-    seen = beside.without(at.on_prices[:, moving]) @ slopes
+    seen = beside.without(at.on_cost_weights[:, moving]) @ slopes
     _, sizes, rows = np.linalg.svd(seen, full_matrices=False)
     usable = sizes > DETERMINED * np.max(sizes, initial=0.0)
     residuals = by_trial(at.problem, np.array(at.residual))
@@ -179,7 +181,7 @@ def price_covariance(
     each = _roots(covariance)
     blind = np.linalg.norm(directions[~usable], axis=0) > _SHARE
     each[blind | ~moving] = np.inf
-    return PriceCovariance(
+    return WeightCovariance(
         at.structure,
         frozen(values),
         frozen(sizes),

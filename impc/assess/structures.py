@@ -1,8 +1,8 @@
-"""What recordings say of structures: prices with intervals, whether each is true, which is better.
+"""What recordings say of structures: weights with intervals, whether each is true, which is better.
 
 Each structure is fitted from the weights that fit at all, and again without each trial in turn. The
 criterion is Akaike's for the innovations of the residuals (`variance_accounted_for`), with two
-combination of unknowns that the recordings tell (docs/structures.md).
+combination of unknowns that the recordings identify (docs/structures.md).
 
 Is a structure true? A score test of it against any gain, for residuals of any colour.
 
@@ -13,10 +13,11 @@ initial states and parameters. If the structure holds, U'e is a sum of noise alo
     T = (U'e)' V^-1 U'e,      V = cov(U'e) for the colour that the residuals show
 
 is chi-squared with as many degrees of freedom as U has columns (docs/structures.md). Nothing is
-fitted outside of the structure: a free gain wanders along what recordings hardly tell, and a ratio
+fitted outside of the structure: a free gain wanders along what recordings hardly say, and a ratio
 of misfits is no chi-squared for coloured residuals. Only directions are used that the recordings
-tell of a gain (`covariance.TOLD`), which depends on their derivatives and not on e. What a price of
-zero would do below zero is one of them: a structure is refused too when it wants negative prices.
+say of a gain (`covariance.IDENTIFIED`), which depends on their derivatives and not on e. What a
+cost weight of zero would do below zero is one of them: a structure is refused too when it wants
+negative cost weights.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.covariance import TOLD, by_trial
+from impc.assess.covariance import IDENTIFIED, by_trial
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
-from impc.assess.price_profiles import NearFit, PriceInterval, PriceProfiles
 from impc.assess.printed_gain import LEVEL
-from impc.assess.structured_weights import PriceCovariance, price_covariance, tangent
+from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.variance_accounted_for import (
     innovations_criterion,
     left_out_vaf,
     residuals_of,
     vaf,
 )
+from impc.assess.weight_profiles import NearFit, WeightInterval, WeightProfiles
 from impc.control.closed_loop import simulate
 from impc.inverse.problem import EXPLAINED, recorded_size, scenarios
 from impc.inverse.structured_fit import feature_sizes, structured_estimate
@@ -60,7 +61,7 @@ class Ratio:
 
     first: str  # Labels of the features
     second: str
-    interval: PriceInterval  # Of the logarithm of the ratio
+    interval: WeightInterval  # Of the logarithm of the ratio
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,10 @@ class StructureFit(Frozen):
     # Root-mean-square of each feature of the states in the simulation (k,), in its unit
     sizes: Array
     effort: float  # Mean square of the first feature of the inputs
-    covariance: PriceCovariance | None
-    # Of each unknown, as told: of logarithms of prices, or of correlations
-    intervals: tuple[PriceInterval, ...]
-    # Of each two features that have a price, when they are priced one by one
+    covariance: WeightCovariance | None
+    # Of each unknown, as identified: of logarithms of cost weights, or of correlations
+    intervals: tuple[WeightInterval, ...]
+    # Of each two features that have a cost weight, when they are penalised one by one
     ratios: tuple[Ratio, ...]
     test: StructureTest | None
     vaf: Array  # Of each output, all trials together (p,), %
@@ -89,9 +90,9 @@ class StructureFit(Frozen):
         return self.test is None or self.test.refused
 
     @property
-    def told(self) -> int:
-        """Number of combinations of its unknowns that the recordings tell."""
-        return 0 if self.covariance is None else int(np.count_nonzero(self.covariance.told))
+    def identified(self) -> int:
+        """Number of combinations of its unknowns that the recordings identify."""
+        return 0 if self.covariance is None else int(np.count_nonzero(self.covariance.identified))
 
 
 def no_structure(structure: Structure, outputs: int, reason: str) -> StructureFit:
@@ -111,10 +112,10 @@ def assess_structure(
     *,
     held_out: bool,
 ) -> StructureFit:
-    """Say what recordings tell of a structure."""
-    there, prices = found.problem, np.array(found.prices)
-    at = tangent(structure, there, prices)
-    covariance = price_covariance(at)
+    """Say what recordings identify of a structure."""
+    there, cost_weights = found.problem, np.array(found.cost_weights)
+    at = tangent(structure, there, cost_weights)
+    covariance = weight_covariance(at)
     sizes = feature_sizes(there, structure, np.array(found.gain), np.array(found.metric))
     runs = [simulate(found.controller(), drive) for drive in scenarios(there)]
     u = np.concatenate([run.applied for run in runs]) @ structure.input_features[0]
@@ -135,12 +136,12 @@ def assess_structure(
         structure_test(at),
         frozen(vaf(recorded, np.concatenate([run.x @ there.plant.C.T for run in runs]))),
         frozen(np.mean(left, axis=0) if left else nothing),
-        criterion_of(found, roots, int(np.count_nonzero(covariance.told))),
+        criterion_of(found, roots, int(np.count_nonzero(covariance.identified))),
     )
 
 
-def criterion_of(found: Estimate, roots: Array, told: int) -> float:
-    """Akaike's criterion of an estimate: innovations for given `roots` (p,), and 2 a told unknown.
+def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
+    """Akaike's criterion of an estimate: innovations for `roots` (p,), and 2 an identified unknown.
 
     What is below rounding is no difference: 1e-9 of an output's size is added to the innovations.
     """
@@ -149,38 +150,38 @@ def criterion_of(found: Estimate, roots: Array, told: int) -> float:
         part + EXPLAINED * floor.standard_normal(part.shape)
         for part in residuals_of(found, found.problem)
     ]
-    return innovations_criterion(residuals, roots) + 2 * told
+    return innovations_criterion(residuals, roots) + 2 * identified
 
 
 def _left_out(problem: Problem, structure: Structure, end: Estimate, settle: float) -> list[Array]:
     """VAF of each trial under the structure fitted to the others."""
     start, found = problem.at(end.problem.starts, end.problem.logarithms), []
-    prices = _moving(np.array(end.prices))
+    cost_weights = _moving(np.array(end.cost_weights))
     for index in range(len(problem.recordings) if len(problem.recordings) > 1 else 0):
         others = start.leaving_out(index)
-        one = search_from(others, structure, prices)
+        one = search_from(others, structure, cost_weights)
         other = structured_estimate(others, structure, one)
         found.append(left_out_vaf(other, problem.recordings[index], settle).vaf)
     return found
 
 
-def _moving(prices: Array) -> Array:
-    """Prices of zero made small instead, so that a search may find that other trials want them."""
-    least = np.min(prices[np.isfinite(prices)])
-    return np.where(np.isfinite(prices), prices, least - np.log(100.0))
+def _moving(cost_weights: Array) -> Array:
+    """Cost weights of zero made small instead: a search may find that other trials want them."""
+    least = np.min(cost_weights[np.isfinite(cost_weights)])
+    return np.where(np.isfinite(cost_weights), cost_weights, least - np.log(100.0))
 
 
 def _intervals(
-    at: Tangent, covariance: PriceCovariance, sizes: Array
-) -> tuple[tuple[PriceInterval, ...], tuple[Ratio, ...]]:
+    at: Tangent, covariance: WeightCovariance, sizes: Array
+) -> tuple[tuple[WeightInterval, ...], tuple[Ratio, ...]]:
     structure, rows = at.structure, np.eye(at.structure.count)
     if structure.coupled or structure.input_coupled:
         z = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
         return tuple(
-            PriceInterval(float(value), float(value - z * own), float(value + z * own), LEVEL)
+            WeightInterval(float(value), float(value - z * own), float(value + z * own), LEVEL)
             for value, own in zip(covariance.values, covariance.each, strict=True)
         ), ()
-    profiles = PriceProfiles(at, covariance)
+    profiles = WeightProfiles(at, covariance)
     intervals = tuple(
         profiles.interval(rows[index]) if moving else profiles.zero(index)
         for index, moving in enumerate(at.moving)
@@ -188,9 +189,9 @@ def _intervals(
     ratios = []
     for i, j in itertools.permutations(np.flatnonzero(at.moving[: len(structure.labels)]), 2):
         shift = 2 * float(np.log(sizes[i] / sizes[j]))
-        if at.prices[i] - at.prices[j] + shift >= 0:  # the dearer one first
+        if at.cost_weights[i] - at.cost_weights[j] + shift >= 0:  # the dearer one first
             found = profiles.interval(rows[i] - rows[j])
-            moved = PriceInterval(
+            moved = WeightInterval(
                 found.value + shift, found.low + shift, found.high + shift, found.level
             )
             ratios.append(Ratio(structure.labels[i], structure.labels[j], moved))
@@ -199,7 +200,7 @@ def _intervals(
 
 #: Of the test.
 SIGNIFICANCE = 0.05
-# Of the geometric mean of two prices: the departure whose detection is told.
+# Of the geometric mean of two cost weights: the departure whose detection is identified.
 _CROSS = 0.5
 
 
@@ -207,7 +208,7 @@ _CROSS = 0.5
 class CrossTerm:
     """A departure from the structure, and how probably the test would refuse it."""
 
-    # Features that are priced together too, with half the geometric mean of their prices
+    # Features that are penalised together too, with half the geometric mean of their cost weights
     first: str
     second: str
     power: float  # Probability that the test refuses it at its level, between 0 and 1
@@ -218,12 +219,12 @@ class StructureTest(Frozen):
     """Result of `structure_test`."""
 
     statistic: float  # T
-    # Degrees of freedom; 0 where the recordings tell nothing of the gain beyond the structure, or
-    # the structure explains them to the last digit
+    # Degrees of freedom; 0 where the recordings identify nothing of the gain beyond the structure,
+    # or the structure explains them to the last digit
     freedom: int
     # Of a T at least as large if the structure holds; 1 where there is nothing to test
     probability: float
-    powers: tuple[CrossTerm, ...]  # For each pair of features that both have a price
+    powers: tuple[CrossTerm, ...]  # For each pair of features that both have a cost weight
 
     @property
     def refused(self) -> bool:
@@ -234,12 +235,12 @@ class StructureTest(Frozen):
 def structure_test(at: Tangent) -> StructureTest:
     """Test a structure at its fit, against all gains."""
     on_gain, on_metric = at.gain_columns()
-    fitted = at.span(np.array(at.on_prices[:, at.moving]))
+    fitted = at.span(np.array(at.on_cost_weights[:, at.moving]))
     beyond = fitted.without(np.hstack([on_gain, on_metric, at.found.dparameters]))
     gain = beyond[:, : on_gain.shape[1]]
     left, sizes, _ = np.linalg.svd(gain, full_matrices=False)
-    told = sizes > at.noise / TOLD
-    U = left[:, told]
+    identified = sizes > at.noise / IDENTIFIED
+    U = left[:, identified]
     exact = EXPLAINED * recorded_size(at.problem)
     if U.shape[1] == 0 or np.linalg.norm(at.residual) <= exact:
         return StructureTest(0.0, 0, 1.0, ())
@@ -257,21 +258,21 @@ def structure_test(at: Tangent) -> StructureTest:
 
 
 def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]:
-    """What the test would see: how far prices one by one stay from what a cross term does."""
+    """What the test would see: how far cost weights one by one stay from what a cross term does."""
     structure, near = at.structure, NearFit(at)
     if structure.coupled:
         return ()
-    priced = np.flatnonzero(at.moving[: len(structure.labels)])
+    penalised = np.flatnonzero(at.moving[: len(structure.labels)])
     quantile = float(scipy.stats.chi2.ppf(1 - SIGNIFICANCE, freedom))
     found = []
-    for i, j in itertools.combinations(priced, 2):
+    for i, j in itertools.combinations(penalised, 2):
         one, other = structure.features[i], structure.features[j]
-        half = _CROSS * np.exp((at.prices[i] + at.prices[j]) / 2)
+        half = _CROSS * np.exp((at.cost_weights[i] + at.cost_weights[j]) / 2)
         given = at.solution.weights
         crossed = Weights(given.Q + half * (np.outer(one, other) + np.outer(other, one)), given.R)
         there = solve_lqr(at.problem.plant, crossed)
-        prices = np.array(at.prices)
-        apart, _ = near.least(prices, np.eye(int(np.sum(at.moving))), there)
+        cost_weights = np.array(at.cost_weights)
+        apart, _ = near.least(cost_weights, np.eye(int(np.sum(at.moving))), there)
         power = float(scipy.stats.ncx2.sf(quantile, freedom, apart / variance))
         found.append(CrossTerm(structure.labels[i], structure.labels[j], power))
     return tuple(found)

@@ -7,7 +7,7 @@ from the fit itself; over T rows of innovations with covariance V
 
     AIC = T log det V + 2 k,
 
-k numbers fitted. Every alternative fits as many, so only differences count. Below 2 nobody tells
+k numbers fitted. Every alternative fits as many, so only differences count. Below 2 nobody says
 two models apart; above 10 the worse one has no support (Burnham and Anderson 2002, 70).
 """
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
 
 
-# One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
+# One second of lags says a rhythm that was missed; fewer than ten say nothing.
 _LEAST_LAGS = 10
 
 
@@ -177,7 +177,7 @@ class HeldOut(Frozen):
 def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
     """VAF of a trial under the controller that was found without it."""
     gain, metric = np.array(other.gain), np.array(other.metric)
-    alone = replace(other.problem.known(), recordings=(trial,))
+    alone = replace(other.problem.with_nuisance_fixed(), recordings=(trial,))
     first = round(settle / alone.plant.dt)
     started = alone
     if other.problem.unknown_start:
@@ -239,7 +239,7 @@ def verdict(one: Alternative, other: Alternative) -> str:
     distance = worse.aic - better.aic
     pair = f"{better.name} and {worse.name}"
     if distance < _SAME:
-        return f"the recordings cannot tell {pair} apart (AIC differs by {distance:.1f})"
+        return f"the recordings cannot say {pair} apart (AIC differs by {distance:.1f})"
     strength = "rule out" if distance > _RULED_OUT else "speak weakly against"
     return (
         f"the recordings {strength} {worse.name} beside {better.name} (AIC +{distance:.0f}, "

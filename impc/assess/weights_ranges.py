@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.bounded_weights import entry_ranges, weights_set
-from impc.assess.intent_draws import prices_over_gains, set_of_gain, with_confidence
+from impc.assess.intent_draws import set_of_gain, weights_over_gains, with_confidence
 from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
@@ -20,7 +20,7 @@ from impc.inverse.solution_set import gain_fibre
 if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.bounded_weights import WeightsSet
-    from impc.assess.intent_draws import DrawnSet, PriceRange
+    from impc.assess.intent_draws import DrawnSet, WeightRange
     from impc.assess.intent_statements import Statement
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
@@ -56,7 +56,7 @@ class WeightsSummary:
     # in another, degrees; D the typical sizes of the states
     widest_angle: float
     drawn: int  # Number of gains drawn beside the fitted one, for all that follows
-    prices: tuple[PriceRange, ...]  # Of the named states; empty without draws
+    cost_weights: tuple[WeightRange, ...]  # Of the named states; empty without draws
     # Widest angle, over the drawn gains, of the dominant direction of the least conditioned member
     # from that of the fitted gain, degrees; NaN without draws
     angle_of_gain: float
@@ -81,7 +81,7 @@ def summarise_weights(
     sets = tuple(
         set_of_gain(plant, item, metrics, RATIO, sizes, names, statements) for item in draws
     )
-    prices = {
+    cost_weights = {
         plant.states[k]: (sizes[k] ** 2 * ranges[k, k].low, sizes[k] ** 2 * ranges[k, k].high)
         for k in named
     }
@@ -96,7 +96,7 @@ def summarise_weights(
         with_confidence(statements, sets) if sets else statements,
         angle,
         len(sets),
-        prices_over_gains(prices, sets) if sets else (),
+        weights_over_gains(cost_weights, sets) if sets else (),
         _angle_of_gain(found, sets, sizes),
     )
 
@@ -133,7 +133,7 @@ def _dominant(weights: Weights, sizes: Array) -> Array:
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:
     """States that are recorded, then those that cost most."""
-    prices = np.diag(weights.Q) * np.asarray(sizes) ** 2
+    cost_weights = np.diag(weights.Q) * np.asarray(sizes) ** 2
     recorded = [index for index, name in enumerate(plant.states) if name in plant.outputs]
-    others = [int(index) for index in np.argsort(-prices, kind="stable")]
+    others = [int(index) for index in np.argsort(-cost_weights, kind="stable")]
     return sorted(list(dict.fromkeys([*recorded, *others]))[:_NAMED])

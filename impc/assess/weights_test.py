@@ -115,7 +115,7 @@ def weights_test(
 ) -> WeightsTest:
     """Compare the gain of the fitted weights with the gain that is identified."""
     covariance, plant = estimate.covariance, estimate.problem.plant
-    identified = covariance.told
+    identified = covariance.identified
     steps = covariance.along(estimate.K - fitted.gain)[identified]
     exact = fitted.explained
     statistic = 0.0 if exact else float(np.sum((steps / covariance.deviations[identified]) ** 2))
@@ -123,7 +123,7 @@ def weights_test(
     p_value = float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
     try:
         exist = weights_margin(gain_fibre(plant, estimate.K)).exist
-    except (WeightsError, SolverError):  # unstable, or at the edge of what a program can tell
+    except (WeightsError, SolverError):  # unstable, or at the edge of what a program can determine
         exist = False
     more = 1.0 if exact else fitted.misfit / estimate.misfit
     difference = return_difference(plant, estimate.K)
@@ -200,8 +200,8 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     >>> bounds, weights = impc.Bounds(plant, u_min=-1, u_max=1), impc.Weights([[1, 0], [0, 1]], 1)
     >>> truth = impc.Controller(plant, weights, bounds, horizon=3)
     >>> trial = impc.Recording(plant, truth.simulate([1, 3], steps=20).x)
-    >>> told = impc.identifiability(impc.Problem(plant, bounds, 3, [trial]), weights)
-    >>> told.free, told.rank, told.chosen
+    >>> identified = impc.identifiability(impc.Problem(plant, bounds, 3, [trial]), weights)
+    >>> identified.free, identified.rank, identified.chosen
     (3, 2, 1)
     """
     plant = problem.plant
@@ -238,7 +238,7 @@ def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> 
 def _others(problem: Problem, fibre: GainFibre) -> tuple[OtherWeights, ...]:
     try:
         return tuple(_explain(problem, item) for item in other_weights(fibre, 2))
-    except (WeightsError, SolverError):  # weights at the edge of what a program can tell
+    except (WeightsError, SolverError):  # weights at the edge of what a program can determine
         return ()
 
 

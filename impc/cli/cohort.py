@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Of the settings that ask for more, those that a worker takes.
 _USED = ("replicates", "structure")
-# Seconds between two lines of cohort.log that tell the time left.
+# Seconds between two lines of cohort.log that say the time left.
 _LOGGED = 10.0
 
 
@@ -108,7 +108,7 @@ def _run(
 
     with progress(total, "task", said) as tell, connected(cluster) as pool:
 
-        def told(result: Result) -> None:
+        def stated(result: Result) -> None:
             nonlocal ended, here, logged
             ended, here = ended + 1, here + (not result.found)
             tell(result.task.name, found=result.found)
@@ -127,7 +127,7 @@ def _run(
             if cluster.scheduler:  # memory is not this machine's
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)
-        failures = run_study(study, tasks, store, pool, told)
+        failures = run_study(study, tasks, store, pool, stated)
     store.log(
         f"end: {len(failures.units)} of {len(study.units)} units without a result, "
         f"{sum(map(len, failures.replicates.values()))} replicates failed"

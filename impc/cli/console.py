@@ -88,7 +88,7 @@ def progress(
             if bar.disable and not quiet and now - said >= _PAUSE:
                 said = now
                 left = (now - began) * (total - count) / max(count - begun, 1)
-                # The first step may have compiled what the others use: it tells nothing of them.
+                # The first step may have compiled what the others use: it says nothing of them.
                 time_left = f", about {left:.0f} s left" if count - begun > 1 else ""
                 which = f" ({name})" if name else ""
                 line = f"{count} of {total} {unit}s{which}{time_left}"

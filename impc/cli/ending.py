@@ -1,4 +1,4 @@
-"""How every command ends: one line on stderr for whatever goes wrong, and a status that tells what.
+"""How every command ends: one line on stderr for whatever goes wrong, and a status that says what.
 
 What nobody has foreseen is a defect: its line names the place in the code and a log for the report.
 
@@ -49,8 +49,8 @@ def ended(run: Callable[[], Any]) -> int:
         kept = f"; {error}" if error.args else ""
         return _say(f"interrupted{kept}", ExitStatus.INTERRUPTED)
     except (ImpcError, click.ClickException) as error:
-        told = error.format_message() if isinstance(error, click.ClickException) else error
-        return _say(f"error: {told}", ExitStatus.BAD_INPUT)
+        stated = error.format_message() if isinstance(error, click.ClickException) else error
+        return _say(f"error: {stated}", ExitStatus.BAD_INPUT)
     except BaseException as error:  # the net itself
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             where = error.filename or "output"
@@ -60,7 +60,7 @@ def ended(run: Callable[[], Any]) -> int:
 
 @contextlib.contextmanager
 def interruptions() -> Iterator[None]:
-    """Turn what click would end the program for into what `ended` tells."""
+    """Turn what click would end the program for into what `ended` says."""
     try:
         yield
     except KeyboardInterrupt as interruption:
@@ -101,7 +101,7 @@ def own_process() -> Iterator[None]:
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()
         return
-    # What nobody takes would be tried again, and told, when the interpreter ends.
+    # What nobody takes would be tried again, and said, when the interpreter ends.
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -157,7 +157,7 @@ def _logged(error: BaseException, heard: list[str]) -> str:
         handle, path = tempfile.mkstemp(prefix="impc-", suffix=".log")
         with open(handle, "w", encoding="utf-8", errors="backslashreplace") as stream:
             stream.write("\n".join(lines))
-    except Exception as fault:  # a full disk, no memory: the line is told all the same
+    except Exception as fault:  # a full disk, no memory: the line is said all the same
         if path:
             with contextlib.suppress(OSError):
                 os.remove(path)

@@ -64,8 +64,8 @@ def command(
     truth = read_truth(files, problem.plant)
     # One more: the page with its figures takes ten seconds.
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
-        told = FitProgress(done, memory.estimate, memory.replicate, memory.part)
-        result = fit_recordings(problem, settings, told)
+        stated = FitProgress(done, memory.estimate, memory.replicate, memory.part)
+        result = fit_recordings(problem, settings, stated)
         with angles_in(subject.angles):
             content = fit_report(result, subject.provenance, truth, unknown).files()
         done("page")
@@ -122,8 +122,8 @@ def _print(result: FitResult) -> None:
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
-    told = (*structure_sentences(result), *result.person_sentences, *result.warnings)
-    for line in dict.fromkeys((verdict(result), *told)):
+    stated = (*structure_sentences(result), *result.person_sentences, *result.warnings)
+    for line in dict.fromkeys((verdict(result), *stated)):
         click.echo(line)
     plant = result.fitted.problem.plant
     click.echo(methods_finding(result.methods).text())

@@ -89,7 +89,7 @@ def warm() -> None:
     `make env` ends with it; after an installation by pip it is yours to call. Without it the first
     command compiles what it needs and says so.
     """
-    say_when_compiling(lambda _: None)  # nobody has to be told here
+    say_when_compiling(lambda _: None)  # nobody has to be said here
     from impc.control.warm import compiled_parts  # noqa: PLC0415  # loads numba
 
     for part in compiled_parts():

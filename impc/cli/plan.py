@@ -1,4 +1,4 @@
-"""`impc plan`: what an experiment would tell, before anyone is measured."""
+"""`impc plan`: what an experiment would say, before anyone is measured."""
 
 from __future__ import annotations
 
@@ -97,9 +97,9 @@ def _person(
     from impc.studies.fit.asked import fit_bounds, moving_body  # noqa: PLC0415
     from impc.studies.plan.designs import Person  # noqa: PLC0415
     from impc.studies.plan.settings import (  # noqa: PLC0415
+        assumed_cost_weights,
         mechanical_stops,
         noise_deviations,
-        presumed_prices,
     )
 
     recorded = tuple(settings.perturbed or configuration.recorded)
@@ -110,16 +110,20 @@ def _person(
         raise InputError("[plan] perturbed", "names no input of the plant", f"known: {known}")
     if "data" in fit.bounded_states.values():
         raise InputError("[fit] bounded_states", 'is "data"', "give numbers: there are no data yet")
-    structure, prices = presumed_prices(plant, settings, fit)
+    structure, cost_weights = assumed_cost_weights(plant, settings, fit)
     bounds = fit_bounds(plant, fit, ())
     controller = Controller(
-        plant, structure.weights(prices), bounds, fit.horizon, terminal_set=fit.terminal_set is True
+        plant,
+        structure.weights(cost_weights),
+        bounds,
+        fit.horizon,
+        terminal_set=fit.terminal_set is True,
     )
     tau = settings.correlation
     return Person(
         controller,
         structure,
-        prices,
+        cost_weights,
         noise_deviations(plant, settings),
         float(np.exp(-plant.dt / tau)) if tau > 0 else 0.0,
         mechanical_stops(plant, settings, configuration.signals),

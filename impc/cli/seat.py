@@ -60,8 +60,8 @@ def numbered(subjects: int) -> Iterator[str]:
             done("")
 
 
-def seat_weights(plant: Plant, price: float = 1.0) -> Weights:
-    """The intent: one direction of angles and rates of the `plant` at a `price`, little else."""
+def seat_weights(plant: Plant, cost_weight: float = 1.0) -> Weights:
+    """The intent: one direction of angles and rates of `plant` at a `cost_weight`, little else."""
     import numpy as np  # noqa: PLC0415
 
     from impc.model.weights import Weights  # noqa: PLC0415
@@ -69,19 +69,19 @@ def seat_weights(plant: Plant, price: float = 1.0) -> Weights:
     v = np.array([0.70, 0.65, 0.22, 0.20])
     v /= np.linalg.norm(v)
     Q = 1e-2 * np.eye(plant.n)
-    Q[:4, :4] = price * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
+    Q[:4, :4] = cost_weight * (6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500]))
     return Weights(Q, 1)
 
 
-def seat_controller(person: dict[str, Any], limit: float, price: float = 1.0) -> Controller:
-    """The controller of a `person` with a torque `limit` (Nm) and a `price` of angles and rates."""
+def seat_controller(person: dict[str, Any], limit: float, cost_weight: float = 1.0) -> Controller:
+    """The controller of a `person`: torque `limit` (Nm), `cost_weight` of angles and rates."""
     from impc.control.controller import Controller  # noqa: PLC0415
     from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
     from impc.model.bounds import Bounds  # noqa: PLC0415
 
     plant = make_plant(plant_source(PLANT, person), ("perturbation",))
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    return Controller(plant, seat_weights(plant, price), bounds, HORIZON, terminal_set=False)
+    return Controller(plant, seat_weights(plant, cost_weight), bounds, HORIZON, terminal_set=False)
 
 
 def between_samples(torque: Array) -> Array:

@@ -1,4 +1,4 @@
-"""`impc select` and `impc key-parameters`: which parameters of a model recordings can tell."""
+"""`impc select` and `impc key-parameters`: which parameters of a model recordings can say."""
 
 from __future__ import annotations
 

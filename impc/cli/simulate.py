@@ -112,7 +112,7 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
     """A person on a seat that tilts sideways, holding it by a constrained controller.
 
     1000 samples a second; the nonlinear plant of the dissertation with parameters from body mass
-    and height; the weights of the intent that truth.json tells.
+    and height; the weights of the intent that truth.json says.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
@@ -271,7 +271,7 @@ def _observer_table(given: dict[str, Any]) -> str:
 sensed = {json.dumps(_SENSED)}
 known = {json.dumps(not given["unknown_perturbation"])}
 
-[fit.structure]              # what may have a price: not the delay, nor the muscle
+[fit.structure]              # what may have a cost weight: not the delay, nor the muscle
 Q = "full"
 over = {json.dumps(_SENSED)}
 name = "posture"

@@ -30,7 +30,8 @@ _WITHIN = 10
 _NOISE = 0.03
 _STOP = 12.0  # deg
 _LIMIT = f"limit = {_STOP}\n"
-# Spread of the prices between subjects, and of one subject between visits: of their logarithm.
+# Spread of the cost weights between subjects, and of one subject between visits: of their
+# logarithm.
 _BETWEEN, _AGAIN = 0.2, 0.05
 
 
@@ -46,7 +47,7 @@ _BETWEEN, _AGAIN = 0.2, 0.05
     "--difference",
     type=Number(min=0.05, max=20),
     default=0.4,
-    help="The second group's prices of angles and rates over the first's; 1 for none.",
+    help="The second group's cost weights of angles and rates over the first's; 1 for none.",
 )
 @click.option(
     "--torque-limit",
@@ -67,8 +68,8 @@ def cohort(out: Path, **given: Any) -> None:
     """Subjects on the seat, half of them in each of two groups, in folders named as BIDS has it.
 
     The groups differ in one thing: what angles and rates cost the second one, compared with its
-    effort. Body mass and height differ between subjects, prices between subjects and visits. 100
-    samples a second.
+    effort. Body mass and height differ between subjects, cost weights between subjects and visits.
+    100 samples a second.
     """
     import numpy as np  # noqa: PLC0415
 
@@ -89,8 +90,8 @@ def cohort(out: Path, **given: Any) -> None:
         factor *= float(np.exp(_BETWEEN * rng.standard_normal()))
         truth[name] = {"group": group, "gain": {}}
         for visit in range(1, given["visits"] + 1):
-            price = factor * float(np.exp(_AGAIN * rng.standard_normal()))
-            files, gain, falls = _visit(name, visit, person, price, given, rng)
+            cost_weight = factor * float(np.exp(_AGAIN * rng.standard_normal()))
+            files, gain, falls = _visit(name, visit, person, cost_weight, given, rng)
             truth[name]["gain"][str(visit)] = gain
             truth[name].setdefault("fell", {}).update(falls)
             for file, when in falls.items():
@@ -105,7 +106,7 @@ def _visit(
     name: str,
     visit: int,
     person: dict[str, Any],
-    price: float,
+    cost_weight: float,
     given: dict[str, Any],
     rng: np.random.Generator,
 ) -> tuple[dict[str, bytes], list[list[float]], dict[str, float]]:
@@ -116,7 +117,7 @@ def _visit(
     from impc.files.plant_sources import import_function, plant_source  # noqa: PLC0415
     from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
 
-    controller = seat_controller(person, given["torque_limit"], price)
+    controller = seat_controller(person, given["torque_limit"], cost_weight)
     step = plant_source(STEP, person | {"sample_time": 1 / (_WITHIN * _RATE)})
     make, torque = step.make(**step.arguments), import_function(TORQUE)
     files, falls = {}, {}

@@ -35,9 +35,9 @@ _CONDITIONS = {
     "EC": (0.6, 6.0, (0.12, 0.40)),
     "VIB": (0.75, 7.0, (0.15, 0.60)),
 }
-# Deviations of logarithms: of prices and of sway between subjects, of both at a visit, of sway in a
-# trial; each visit lowers the sway by the learning.
-_PRICE, _SWAY, _AT_A_VISIT, _TRIAL, _LEARNING = 0.8, 0.4, 0.25, 0.10, -0.03
+# Deviations of logarithms: of cost weights and of sway between subjects, of both at a visit, of
+# sway in a trial; each visit lowers the sway by the learning.
+_COST_WEIGHT, _SWAY, _AT_A_VISIT, _TRIAL, _LEARNING = 0.8, 0.4, 0.25, 0.10, -0.03
 # Lean of seat and trunk at a visit, degrees: RMS is about upright and counts it.
 _LEAN = (0.1, 0.8)
 
@@ -53,7 +53,8 @@ def reliability_study(out: Path, **given: Any) -> None:
 
     Subjects differ in body; subjects and visits in what angles and rates cost and in how much the
     body sways; visits in how the body leans; trials in the sway. Closed eyes and vibration change
-    prices, sway and noise. 29.04 s a trial, one period of the ternary torque, 100 samples a second.
+    cost weights, sway and noise. 29.04 s a trial, one period of the ternary torque, 100 samples a
+    second.
     """
     import numpy as np  # noqa: PLC0415
 
@@ -68,13 +69,13 @@ def reliability_study(out: Path, **given: Any) -> None:
     truth: dict[str, Any] = {}
     for name in numbered(given["subjects"]):
         plant = make_plant(plant_source(PLANT, random_person(rng)), ("perturbation",))
-        price, sway = np.exp(np.array([_PRICE, _SWAY]) * rng.standard_normal(2))
-        truth[name] = {"price": float(price), "sway": float(sway)}
+        cost_weight, sway = np.exp(np.array([_COST_WEIGHT, _SWAY]) * rng.standard_normal(2))
+        truth[name] = {"cost_weight": float(cost_weight), "sway": float(sway)}
         for visit in range(given["visits"]):
             files: dict[str, bytes] = {}
             lean = np.array(_LEAN) * rng.standard_normal(2)
             for condition in _CONDITIONS:
-                here, level = np.exp(_AT_A_VISIT * rng.standard_normal(2)) * (price, sway)
+                here, level = np.exp(_AT_A_VISIT * rng.standard_normal(2)) * (cost_weight, sway)
                 level *= float(np.exp(_LEARNING * visit))
                 cell = _cell(plant, torque, condition, (float(here), level), lean, given, rng)
                 stem = f"sub-{name}_ses-{visit + 1}_task-{condition}"
@@ -82,7 +83,7 @@ def reliability_study(out: Path, **given: Any) -> None:
                     files[f"{stem}_run-{run}_motion.csv"] = content
             write_files(out / f"sub-{name}" / f"ses-{visit + 1}", files)
     settings = {
-        "price": _PRICE, "sway": _SWAY, "visit": _AT_A_VISIT, "trial": _TRIAL,
+        "cost_weight": _COST_WEIGHT, "sway": _SWAY, "visit": _AT_A_VISIT, "trial": _TRIAL,
         "learning": _LEARNING, "lean": _LEAN, "conditions": _CONDITIONS, **given,
     }  # fmt: skip
     study = _SEAT_STUDY + SIGNALS.replace("LIMIT", "")
@@ -104,8 +105,8 @@ def _cell(
     from impc.files.formats import encode_table  # noqa: PLC0415
     from impc.model.riccati import solve_lqr  # noqa: PLC0415
 
-    (price, sway), (factor, own, noise) = size, _CONDITIONS[condition]
-    K = solve_lqr(plant, seat_weights(plant, factor * price)).K
+    (cost_weight, sway), (factor, own, noise) = size, _CONDITIONS[condition]
+    K = solve_lqr(plant, seat_weights(plant, factor * cost_weight)).K
     files = []
     for _ in range(given["trials"]):
         here = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))

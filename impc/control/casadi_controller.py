@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 # Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take; its proximal
 # iterations called feasible programs infeasible. Its slacks get a quadratic cost of this share of
-# their price instead: a relative excess s changes the price by 1e-8 s.
+# their cost weight instead: a relative excess s changes the cost weight by 1e-8 s.
 _DAQP_SLACK = 1e-8
 # A row that is exceeded by this share of its bound is not kept, whatever the solver's flag says.
 _EXCEEDED = 1e-6
@@ -82,14 +82,14 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
     slack = ca.SX.sym("s", int(soft.sum()))
     metric = scipy.linalg.block_diag(*[controller.S] * controller.horizon)
     placed = np.eye(len(rows.b))[:, soft]
-    price = ca.DM(rows.limit[soft])
+    cost_weight = ca.DM(rows.limit[soft])
     curvature = ca.DM(rows.limit[soft] / rows.b[soft] * (_DAQP_SLACK if solver == "daqp" else 0))
     program = {
         "x": ca.vertcat(v, slack),
         "p": x,
         "f": (
             ca.mtimes([v.T, ca.DM(metric), v]) / 2
-            + ca.dot(price, slack)
+            + ca.dot(cost_weight, slack)
             + ca.dot(curvature, slack**2) / 2
         ),
         # Divided by b, so that a solver's absolute tolerance is relative to the bound.
@@ -195,8 +195,8 @@ def mpc_function(controller: Controller) -> ca.Function:
     planned = reached + ca.mtimes(ca.DM(rows.M / rows.b[:, None]), v)
     hard = np.flatnonzero(~mpc.soft).tolist()
     kept = ca.mmax(planned[hard]) <= 1 + _EXCEEDED if hard else ca.MX(1)
-    told = ca.if_else(kept, gain + v[: controller.plant.m], np.nan)
-    busy = ca.Function("program", [x], [told])
+    answer = ca.if_else(kept, gain + v[: controller.plant.m], np.nan)
+    busy = ca.Function("program", [x], [answer])
     branch = ca.Function.if_else("branch", free, busy)
     return ca.Function("mpc", [x], [branch(ca.mmax(reached) <= 1, x)], ["x"], ["u"])
 

@@ -41,7 +41,7 @@ LARGEST = 1e100
 _KEPT = 1e-13
 # Share of its bound within which a row is about to become active, or to become free.
 _WEAK = 1e-8
-# The answer must keep every row, and tell the first input, to this share of the bound, whatever the
+# The answer must keep every row, and say the first input, to this share of the bound, whatever the
 # multipliers are, or it is not given out.
 _CHECKED = 1e-9
 # Rounding of a row at the answer, relative to the sum of the magnitudes of its terms.
@@ -378,16 +378,16 @@ def answer(
     lam: Buffer,
     active: int,
 ) -> tuple[int, bool]:
-    """Write v and dv0 of `work` from the multipliers of one sample, where they tell the input.
+    """Write v and dv0 of `work` from the multipliers of one sample, where they say the input.
 
     `unit` (m,); `x` (n,); `dx` (n, p); `lam` (r,).
     """
     _recover(rows, lam, work)
-    soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
-    if not told:
+    soft, near, solved = _check(loop.K, rows, lam, work, active, x, unit)
+    if not solved:
         _tighten(rows, work, active)
-        soft, near, told = _check(loop.K, rows, lam, work, active, x, unit)
-    if not told:
+        soft, near, solved = _check(loop.K, rows, lam, work, active, x, unit)
+    if not solved:
         return UNSOLVED, False
     if dx.shape[1]:
         _differentiate(loop, dloop, rows, drows, lam, work, active, x, dx)
@@ -412,7 +412,7 @@ def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
 def _tighten(rows: Rows, work: Workspace, active: int) -> None:
     """Correct v so that the tight rows are tight.
 
-    The price of a soft row is a million and more: what is left of v has lost as many digits.
+    The cost weight of a soft row is a million and more: what is left of v has lost as many digits.
     """
     slack, free, v = work.slack, work.free, work.v
     column = np.empty(active)
@@ -434,10 +434,10 @@ def _check(
     x: Buffer,
     unit: Buffer,
 ) -> tuple[bool, bool, bool]:
-    """Whether a soft row was given up, a row is tight without a multiplier, the answer is told.
+    """Whether a soft row was given up, a row is tight without a multiplier, it is solved.
 
-    It is told when every row is kept, and every multiplier has its sign, to a share of the bound
-    that no multiplier enters, and when that and rounding move the first v by no more: by the
+    It is identified when every row is kept, and every multiplier has its sign, to a share of the
+    bound that no multiplier enters, and when that and rounding move the first v by no more: by the
     derivative of v along the right sides of the tight rows (docs/theory.md, section 4).
     """
     soft, near, m = False, False, len(unit)
@@ -535,14 +535,14 @@ def _reach(rows: Rows, r: int, m: int) -> int:
 
 @njit(cache=True)
 def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer) -> None:
-    """Add dM' lam to q, and what the price of soft rows does."""
+    """Add dM' lam to q, and what the cost weight of soft rows does."""
     for r in range(len(lam)):
         if lam[r] != 0.0:
             for i in range(_reach(rows, r, m)):
                 for c in range(q.shape[1]):
                     q[i, c] += lam[r] * drows.M[r, i, c]
             if lam[r] == rows.limit[r]:
-                # The price of a soft row is penalty / b: it moves with the bound.
+                # The cost weight of a soft row is penalty / b: it moves with the bound.
                 for i in range(len(q)):
                     for c in range(q.shape[1]):
                         q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]

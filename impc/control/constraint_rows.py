@@ -40,8 +40,8 @@ class Rows(NamedTuple):
     W: Array  # M L^-T with S = L L', (r, N m): the rows in coordinates in which S is the identity
     gram: Array  # W W' = M S^-1 M', (r, r)
     b: Array  # (r,)
-    # Largest multiplier of each row (r,): infinite for a hard row, the price of a unit of excess
-    # for a soft one
+    # Largest multiplier of each row (r,): infinite for a hard row, the cost weight of a unit of
+    # excess for a soft one
     limit: Array
     family: IntArray  # Which bound, and how many samples ahead (r,)
     stage: IntArray

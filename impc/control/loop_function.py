@@ -160,7 +160,7 @@ class _Matrices(ca.Callback):
         return self._slopes is not None
 
     def get_jacobian(
-        self, name: str, names: Sequence[str], told: Sequence[str], _: Any
+        self, name: str, names: Sequence[str], identified: Sequence[str], _: Any
     ) -> ca.Function:
         """Blocks of entries column after column; the outputs are inputs of it too."""
         ins, outs = list(self._inputs.values()), list(self._outputs.values())
@@ -175,7 +175,7 @@ class _Matrices(ca.Callback):
             ]
 
         given = dict(zip(names, ins + outs, strict=True))
-        return _Matrices(name, given, dict(zip(told, blocks, strict=True)), evaluate)
+        return _Matrices(name, given, dict(zip(identified, blocks, strict=True)), evaluate)
 
 
 def _loop_of_gain(controller: Controller, given: Array, fixed: bool) -> ca.Function:

@@ -1,16 +1,16 @@
 """The least-distance problem of one sample, built and solved by CasADi with a solver by its name.
 
 `compiled_dual` has a method of its own for it (docs/theory.md, section 4). Any other finds the same
-answer, and is asked for what only a solver can tell: which rows hold. With those the input and its
-derivative follow from the equations of the active set (`closed_loop`), and a solver whose own
+answer, and is asked for what only a solver can determine: which rows hold. With those the input and
+its derivative follow from the equations of the active set (`closed_loop`), and a solver whose own
 answer is not that one, to 1e-4 of its size, is not believed. What a solver says of its success is
 not asked for.
 
-    minimise  z'z / 2 + price sum(t)   subject to  A z <= d + t,  t >= 0 for soft rows
+    minimise  z'z / 2 + cost weight sum(t)   subject to  A z <= d + t,  t >= 0 for soft rows
 
 is the problem in numbers of size one: z is v in coordinates in which S is the identity, over the
 distance of a typical row; rows are divided by their bounds. Soft rows enter it only where the hard
-problem has no answer, or one whose multipliers exceed the price of the rows.
+problem has no answer, or one whose multipliers exceed the cost weight of the rows.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ _IPOPT: dict[str, Any] = {
 #: Plugin of CasADi and its options, of each solver that may be asked for.
 # Active-set methods end at round-off, IPOPT's interior-point method at
 # its tolerance, which is tightened from 1e-8. Of 180 random loops (hard state bounds, soft ones,
-# soft ones at a price of a million) these three find every input. Not offered: qrqp, which had no
-# answer in 2 of 30 loops with hard rows and in most with soft ones; OSQP, in 7 of 90; fatrop, which
-# wants the stages apart and prints.
+# soft ones at a cost weight of a million) these three find every input. Not offered: qrqp, which
+# had no answer in 2 of 30 loops with hard rows and in most with soft ones; OSQP, in 7 of 90;
+# fatrop, which wants the stages apart and prints.
 PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
     "daqp": ("daqp", {"error_on_fail": False}),
     "qpoases": (
@@ -77,14 +77,15 @@ PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
 SOLVERS = tuple(PLUGINS)
 
 # Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take. They get a
-# quadratic cost about a centre, of this share of their price, and the problem is solved again about
-# what was found until that no longer moves: then the quadratic cost has no effect (proximal point).
+# quadratic cost about a centre, of this share of their cost weight, and the problem is solved again
+# about what was found until that no longer moves: then the quadratic cost has no effect (proximal
+# point).
 _PROXIMAL, _ROUNDS = 1e-3, 10
 # Relative to 1 and to the largest slack.
 _SETTLED = 1e-7
 # What the conditions of optimality may be broken by in a solver's own answer, and what its z may
 # differ from that of the equations by, relative to the larger of 1 and z. DAQP keeps rows to 1e-5
-# where a price of a million is paid. The answer of the equations is checked to 1e-9.
+# where a cost weight of a million is paid. The answer of the equations is checked to 1e-9.
 _AGREES = 1e-4
 
 # Share of their bounds by which rows that no plan keeps are exceeded at least: HiGHS ends at 1e-7.
@@ -106,7 +107,7 @@ class Program:
     unit: float  # What z is multiplied by to become L'v, S = LL'
     b: Array  # Bounds (r,)
     soft: BoolArray  # Which rows may be exceeded (r,)
-    price: float  # Of the excess, in the problem's numbers
+    cost_weight: float  # Of the excess, in the problem's numbers
     # H, rows and least y of  min y'H y / 2 + g'y,  with all rows hard and with slacks
     hard: tuple[ca.DM, ...]
     softened: tuple[ca.DM, ...]
@@ -173,9 +174,9 @@ def build_program(solver: str, rows: Rows) -> Program:
     unit = float(np.median(distances)) if reaching.any() else 1.0
     A = unit * rows.W / rows.b[:, None]
     soft = np.isfinite(rows.limit)
-    price = float(np.max(rows.limit[soft] * rows.b[soft], initial=0.0)) / unit**2
+    cost_weight = float(np.max(rows.limit[soft] * rows.b[soft], initial=0.0)) / unit**2
     width, slacks = rows.W.shape[1], int(soft.sum())
-    curvature = np.r_[np.ones(width), np.full(slacks, _PROXIMAL * np.sqrt(price))]
+    curvature = np.r_[np.ones(width), np.full(slacks, _PROXIMAL * np.sqrt(cost_weight))]
     wide = np.column_stack([A, -np.eye(len(A))[:, soft]])
     least = np.r_[np.full(width, -np.inf), np.zeros(slacks)]
     hard, softened = (
@@ -183,7 +184,7 @@ def build_program(solver: str, rows: Rows) -> Program:
         for size in (width, width + slacks)
     )
     lengths = unit**2 * squares / rows.b**2
-    return Program(solver, A, lengths, unit, rows.b, soft, price, hard, softened)
+    return Program(solver, A, lengths, unit, rows.b, soft, cost_weight, hard, softened)
 
 
 def active_set(program: Program, d: Array) -> ActiveSet | None:
@@ -192,16 +193,18 @@ def active_set(program: Program, d: Array) -> ActiveSet | None:
         return None
     A, right, soft = program.A, d / program.b, program.soft
     found = _solve(program, program.hard, right, np.zeros(len(d)))
-    if soft.any() and (found is None or np.any(found[1][soft] > program.price)):
+    if soft.any() and (found is None or np.any(found[1][soft] > program.cost_weight)):
         found = _solve_softened(program, right)
     if found is None:
         return None
     z, multipliers, excess, size = found
     # The rule of the primal-dual active-set method: a multiplier, as the share of the bound that it
-    # stands for, against the slack; and what the price leaves of it against the excess.
-    given_up = soft & (excess > np.maximum(program.price - multipliers, 0.0) * program.squares)
+    # stands for, against the slack; and what the cost weight leaves of it against the excess.
+    given_up = soft & (
+        excess > np.maximum(program.cost_weight - multipliers, 0.0) * program.squares
+    )
     held = np.flatnonzero((multipliers * program.squares > right - A @ z) & ~given_up)
-    pull = -z - A.T @ (program.price * given_up)
+    pull = -z - A.T @ (program.cost_weight * given_up)
     tight = _independent(A, held, multipliers, pull)
     return ActiveSet(tight, given_up, program.unit * z, _AGREES * program.unit * size)
 
@@ -248,7 +251,7 @@ def _solve(
     A, soft = program.A, program.soft
     H, rows, least = given
     (count, width) = A.shape
-    pull = program.price - _PROXIMAL * np.sqrt(program.price) * centre[soft]
+    pull = program.cost_weight - _PROXIMAL * np.sqrt(program.cost_weight) * centre[soft]
     g = np.r_[np.zeros(width), pull][: H.size1()]
     function = _function(program.solver, H.size1(), count)
     with silent():

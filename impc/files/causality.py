@@ -128,11 +128,11 @@ def misaligned(disturbance: Array, response: Array, dt: float) -> str:
     cause, effect = (_averaged(values, width) for values in (disturbance, response))
     order = min(round(_ORDER / step), len(cause) // 10)
     if order < 2 or np.ptp(cause) == 0 or np.ptp(effect) == 0:
-        return ""  # too short to tell
+        return ""  # too short to say
     cause, effect = _whitened(cause, effect, order)
     lags = min(round(_LONGEST / step), len(cause) // 4)
     if np.abs(_correlation(cause, cause, 2 * lags)[2 * lags + 1 :]).max() > _REPEATS:
-        return ""  # a sinusoid: a lead cannot be told from a lag
+        return ""  # a sinusoid: a lead cannot be said from a lag
     strength = np.abs(_correlation(cause, effect, lags)) * np.sqrt(len(cause))
     before, behind = strength[:lags], strength[lags:]
     if strength.max() < _DEVIATIONS:

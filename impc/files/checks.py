@@ -63,24 +63,25 @@ class Channel:
         return f"sample {index + 1} ({self.time[index]:.6g} s)"
 
 
-def unit_of_the_file(channel: Channel, told: Unit | None, overruled: bool) -> str:
+def unit_of_the_file(channel: Channel, stated: Unit | None, overruled: bool) -> str:
     """The unit that the file gives must be that of the configuration, unless it is overruled.
 
     A file that says "1" gives none.
     """
-    if told is None or (
-        told.base == channel.unit.base and np.isclose(told.factor, channel.unit.factor)
+    if stated is None or (
+        stated.base == channel.unit.base and np.isclose(stated.factor, channel.unit.factor)
     ):
         return ""
     key = f"signals.{channel.signal}"
-    if overruled or (told.base == "dimensionless" and told.factor == 1):
+    if overruled or (stated.base == "dimensionless" and stated.factor == 1):
         return (
             f"{channel.name}: taken in {channel.unit.written!r} by {key}, where the file says "
-            f"{told.written!r}"
+            f"{stated.written!r}"
         )
     raise DataError(
         channel.name,
-        f"is in {channel.unit.written!r} by the configuration and in {told.written!r} by the file",
+        f"is in {channel.unit.written!r} by the configuration and in {stated.written!r} by the "
+        "file",
         f"correct {key}.unit, or write {key}.overrule_unit = true if the file is wrong",
     )
 

@@ -49,7 +49,7 @@ class Clock:
 def read_clock(table: Table, recording: RecordingTable) -> Clock:
     """Read the clock, cut the recording, and check that its instants are even."""
     if recording.time is None:
-        rate = _told_rate(table, recording)
+        rate = _stated_rate(table, recording)
         _require_period(table.source, 1 / rate)
         time = np.arange(table.samples) / rate
         rows = _cut(table.source, time, recording)
@@ -58,9 +58,9 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
     name, values = column_of(table, recording.time, "recording.time")
     subject = f"{table.source}: clock {name!r}"
     days = not recording.time_unit and name not in table.units and counts_days(values)
-    told = recording.time_unit or table.units.get(name) or ("day" if days else "s")
+    stated = recording.time_unit or table.units.get(name) or ("day" if days else "s")
     try:
-        unit = si_unit(told)
+        unit = si_unit(stated)
     except InputError as error:
         remedy = 'write recording.time_unit = "s" or "ms"'
         raise DataError(subject, f"is in {error.subject}, which {error.problem}", remedy) from None
@@ -129,21 +129,21 @@ def on_even_instants(clock: Clock, values: Array) -> Array:
     return np.asarray(spline(inside), dtype=np.float64)
 
 
-def _told_rate(table: Table, recording: RecordingTable) -> float:
-    given, told = recording.rate, table.rate
-    if given is None and told is None:
+def _stated_rate(table: Table, recording: RecordingTable) -> float:
+    given, stated = recording.rate, table.rate
+    if given is None and stated is None:
         raise DataError(
             table.source,
-            "tells no clock and no rate",
+            "says no clock and no rate",
             "name the column with recording.time, or give recording.rate",
         )
-    if given is not None and told is not None and abs(given - told) > _RATE * told:
+    if given is not None and stated is not None and abs(given - stated) > _RATE * stated:
         raise DataError(
             table.source,
-            f"says {told:g} samples per second and recording.rate {given:g}",
+            f"says {stated:g} samples per second and recording.rate {given:g}",
             "correct recording.rate or leave it out",
         )
-    rate = given if given is not None else told
+    rate = given if given is not None else stated
     assert rate is not None
     return rate
 

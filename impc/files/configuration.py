@@ -26,7 +26,7 @@ from impc.files.units import si_unit
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-#: What `impc inspect` writes where nothing tells; it has to be filled in.
+#: What `impc inspect` writes where nothing says; it has to be filled in.
 FILL_IN = "?"
 
 _LARGEST = 1_000_000
@@ -47,7 +47,7 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The [recording] table."""
 
     time: str | None = None  # Column with the clock
-    time_unit: str | None = None  # Its unit; None takes the one that the file tells, or seconds
+    time_unit: str | None = None  # Its unit; None takes the one that the file says, or seconds
     # Samples per second, where there is no clock. Neither is needed for TDMS and C3D.
     rate: Positive | None = None
     subject: str = ""  # The label of the trial; empty where it is not said

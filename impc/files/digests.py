@@ -1,6 +1,6 @@
 """What a result depends on, as one number: recordings, plant, settings and versions, all of them.
 
-A result that is kept carries the digest of everything that went into it, and result.json tells it
+A result that is kept carries the digest of everything that went into it, and result.json says it
 (`Inputs`). `digest` takes values, `content_digest` a file from its first byte to its last,
 `source_digest` the code or the file of a plant or model, and `versions` what computes. A file that
 a plant's own code opens is known when its name is an argument of the plant, and not otherwise
@@ -99,7 +99,7 @@ def source_digest(name: str, arguments: Mapping[str, Any] | None = None) -> str:
     """Of the plant or model `name`: a file's content, or the user's code that it is made of.
 
     The code is the module that is named, imported already, and the modules in its folder and below
-    that it imports: this package and what is installed are told by `versions`. Of `arguments` that
+    that it imports: this package and what is installed are said by `versions`. Of `arguments` that
     name a file its content counts.
     """
     given = {

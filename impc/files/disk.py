@@ -69,8 +69,8 @@ def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> Output
     """
     number = getattr(error, "errno", None)
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    told = "make room and start again" if number in NO_ROOM else remedy
-    return OutputError(subject, f"cannot be written ({reason})", told)
+    stated = "make room and start again" if number in NO_ROOM else remedy
+    return OutputError(subject, f"cannot be written ({reason})", stated)
 
 
 def require_ordinary(path: Path) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
-# Units of a clock that tells none, and how many make a second: the first in which the steps are
+# Units of a clock that says none, and how many make a second: the first in which the steps are
 # shorter than those of any recording of movement, s.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
@@ -79,7 +79,7 @@ def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
     """
     lines = [
         f"# What the columns of {Path(table.source).name!r} mean. Check every line; what neither",
-        f'# file nor plant tells is "{FILL_IN}" and must be filled in.',
+        f'# file nor plant says is "{FILL_IN}" and must be filled in.',
         "",
         "[recording]",
         *_clock_lines(table),
@@ -104,7 +104,7 @@ def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
         lines += ["", *_signal_lines(table, signal, column, kind, why)]
     unused = [name for name in rest if name not in [column for column, _ in chosen.values()]]
     if unused:
-        named = ", ".join(_told(table, name) for name in unused)
+        named = ", ".join(_stated(table, name) for name in unused)
         lines += ["", f"# Columns that are not used: {named}"]
     return "\n".join([*lines, "", *_plant_lines(wanted), "", *_fit_lines(wanted)]) + "\n"
 
@@ -134,7 +134,7 @@ def _fit_lines(wanted: Wanted) -> list[str]:
     ]
 
 
-def _told(table: Table, column: str) -> str:
+def _stated(table: Table, column: str) -> str:
     about = ", ".join(filter(None, (table.units.get(column), _idle(table, column))))
     return f"{_quoted(column)} ({about})" if about else _quoted(column)
 
@@ -148,22 +148,22 @@ def _span(table: Table, column: str) -> str:
 def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> int:
     """Whether the unit of a column may be one of the signal: 0 it may not, 2 it is of its kind."""
     try:
-        told = si_unit(_column_unit(table, column)[0])
+        stated = si_unit(_column_unit(table, column)[0])
         needed = si_unit(wanted.units[signal])
     except (KeyError, InputError):  # one of the two says nothing that is known
         return 1
-    return 2 if told.base == needed.base else int(told.base == "dimensionless")
+    return 2 if stated.base == needed.base else int(stated.base == "dimensionless")
 
 
 def _column_unit(table: Table, column: str) -> tuple[str, str]:
     """The unit of a column and how it is known: by the file, or by the end of its name."""
-    told = table.units.get(column)
-    if told:
+    stated = table.units.get(column)
+    if stated:
         try:
-            si_unit(told)
+            si_unit(stated)
         except InputError:
-            return FILL_IN, f"the file says {told!r}, which is not known"
-        return told, "as the file says"
+            return FILL_IN, f"the file says {stated!r}, which is not known"
+        return stated, "as the file says"
     last = re.split(r"[_ .]", column)[-1]
     if last != column and last in _IN_NAMES:
         return _IN_NAMES[last], "a guess: by its name"
@@ -227,7 +227,7 @@ _OPTIONS = (
 def _clock_lines(table: Table) -> list[str]:
     clock = clock_column(table)
     if clock is None and table.rate is not None:
-        return [_line(f"# rate = {table.rate!r}", "samples per second; the file tells it itself")]
+        return [_line(f"# rate = {table.rate!r}", "samples per second; the file says it itself")]
     if clock is None:
         return [
             _line('# time = "..."', "no column rises evenly: name the one with the clock,"),

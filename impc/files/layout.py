@@ -186,7 +186,7 @@ def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[st
     """Names from the `heads` of all columns, made distinct, and units of those that have one.
 
     `units` is a row of their own, empty where there is none; `level` the row above the heads, which
-    names what has no name, and tells apart what has the same.
+    names what has no name, and distinguishes what has the same.
     """
     split = [split_heading(item) for item in heads]
     names = [name or above for (name, _), above in zip(split, level, strict=True)]
@@ -194,13 +194,13 @@ def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[st
         names = [head or above for head, above in zip(heads, level, strict=True)]  # angle (rad) too
     found = _distinct(names, level)
     changed = [f"{new!r}" for old, new in zip(names, found, strict=True) if old != new]
-    note = f"columns of one name are told apart: {', '.join(changed[:12])}"
-    told = {
+    note = f"columns of one name are distinguished: {', '.join(changed[:12])}"
+    stated = {
         name: _bare(below) or own
         for name, (_, own), below in zip(found, split, units, strict=True)
         if name and (_bare(below) or own)
     }
-    return Headings(tuple(found), told, (note,) if changed else ())
+    return Headings(tuple(found), stated, (note,) if changed else ())
 
 
 def _distinct(names: Sequence[str], level: Sequence[str]) -> list[str]:

@@ -25,7 +25,7 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _USER_BLOCK = 512
 _DEPTH = 8
 _MOST = 10_000  # names in a file
-_MOST_TOLD = 256  # bytes of an attribute of MATLAB's: it has one word
+_MOST_IDENTIFIED = 256  # bytes of an attribute of MATLAB's: it has one word
 _NUMERIC = {"double", "single", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
@@ -167,6 +167,6 @@ def _attribute(item: Any, name: str) -> Any:
     if name not in item.attrs:
         return None
     attribute = item.attrs.get_id(name)
-    if attribute.shape != () or attribute.get_storage_size() > _MOST_TOLD:
+    if attribute.shape != () or attribute.get_storage_size() > _MOST_IDENTIFIED:
         raise ValueError(f"the attribute {name} is too long")
     return item.attrs[name]

@@ -78,7 +78,7 @@ def consented_name(
     module = name.partition(":")[0]
     data = option == "plant" and Path(name).suffix in SAVED  # a model is never a file
     if name in known or data or module == "plants" or ":" not in name:
-        return name  # the last: no name of code at all, and told so by who looks for it
+        return name  # the last: no name of code at all, and said so by who looks for it
     if given is None and not allowed:
         raise InputError(
             where, f"names code that would be run, {name!a}",

@@ -335,7 +335,7 @@ def label_of(source: str, entry: RecordingTable) -> Label:
 def channel_of(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
     """The column of the signal `name`, in its own unit, after offset and sign."""
     column, values = column_of(table, entry.column, f"signals.{name}.column")
-    # Beyond the largest number, or a NaN that signals: not finite, and told below.
+    # Beyond the largest number, or a NaN that signals: not finite, and said below.
     with np.errstate(over="ignore", invalid="ignore"):
         used = entry.sign * (values[clock.rows] - entry.offset)
     return checks.Channel(table.source, name, column, si_unit(entry.unit), clock.time, used)
@@ -350,7 +350,7 @@ def _checked(
 ) -> list[str]:
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
-        checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
+        checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
         checks.missing(channel, recorded.fill_gaps),
         checks.constant(channel),
@@ -363,12 +363,12 @@ def _checked(
     return [finding for finding in found if finding]
 
 
-def told_unit(table: Table, column: str) -> Unit | None:
-    """The unit that a file tells of a `column`, if it tells one that is known."""
+def stated_unit(table: Table, column: str) -> Unit | None:
+    """The unit that a file says of a `column`, if it says one that is known."""
     try:
         return si_unit(table.units[column])
     except (KeyError, InputError):
-        return None  # the file tells none, or one that only its maker knows
+        return None  # the file says none, or one that only its maker knows
 
 
 def _slower(source: str, clock: Clock, plant: Plant) -> list[str]:

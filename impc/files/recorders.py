@@ -126,14 +126,14 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
             timed[name] = channel.properties
     _require_together(source, timed)
     table = make_table(source, columns, units, None, skipped)
-    told = {1 / float(timed[name]["wf_increment"]) for name in table.columns if name in timed}
-    if len(told) > 1:
+    stated = {1 / float(timed[name]["wf_increment"]) for name in table.columns if name in timed}
+    if len(stated) > 1:
         raise DataError(
             source,
-            f"has channels of {min(told):g} and {max(told):g} samples per second",
+            f"has channels of {min(stated):g} and {max(stated):g} samples per second",
             "export those of one rate into a file of their own",
         )
-    return make_table(source, table.columns, table.units, next(iter(told), None), table.skipped)
+    return make_table(source, table.columns, table.units, next(iter(stated), None), table.skipped)
 
 
 def _require_together(source: str, timed: dict[str, Any]) -> None:

@@ -135,7 +135,7 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
         "fit": Goodness(**kept["fit"]),
         **{
             name: None if kept[name] is None else frozen(kept[name])
-            for name in ("K", "S", "prices")
+            for name in ("K", "S", "cost_weights")
         },
     }
     return Estimate(**{item.name: values[item.name] for item in fields(Estimate)})

@@ -27,9 +27,9 @@ class Table(Frozen):
     source: str  # Where they come from, for messages
     # By name, in the order of the file, each (samples,). NaN where the file has no value.
     columns: Mapping[str, Array]
-    # Units of the columns for which the file tells them, as it writes them
+    # Units of the columns for which the file says them, as it writes them
     units: Mapping[str, str]
-    rate: float | None  # Samples per second, where the file tells it itself (TDMS, C3D)
+    rate: float | None  # Samples per second, where the file says it itself (TDMS, C3D)
     # What else the file holds, and why it is no column
     skipped: Mapping[str, str] = field(default_factory=dict)
     # What a user of the columns has to know of the file: names that were changed, rows that were
@@ -62,7 +62,7 @@ def make_table(
     units : mapping of str to str, optional
         As the file writes them, of the columns that have one.
     rate : float, optional
-        Samples per second, where the file tells it.
+        Samples per second, where the file says it.
     skipped : mapping of str to str, optional
         What was not read, and why.
     notes : tuple of str, optional
@@ -100,8 +100,8 @@ def make_table(
             kept[name] = values if not values.flags.writeable else frozen(values)
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
-    told = {name: unit for name, unit in units.items() if name in kept and unit}
-    return Table(source, kept, told, rate, left_out, tuple(map(_line, notes)))
+    stated = {name: unit for name, unit in units.items() if name in kept and unit}
+    return Table(source, kept, stated, rate, left_out, tuple(map(_line, notes)))
 
 
 def _line(text: str) -> str:

@@ -49,8 +49,8 @@ def cross_checked(problem: Problem, found: dict[str, Estimate]) -> dict[str, Est
         if winner is not None and name != "inverse_mpc":
             last = _searched_again(problem, found["inverse_mpc"], first, winner)
             winner = _winner(last, found)
-        beaten = "" if winner is None else winner.method
-        checked[name] = replace(last, fit=replace(last.fit, beaten=beaten))
+        beaten_by = "" if winner is None else winner.method
+        checked[name] = replace(last, fit=replace(last.fit, beaten_by=beaten_by))
     return checked
 
 

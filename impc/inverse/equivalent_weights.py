@@ -30,7 +30,7 @@ from impc.model.weights import Weights, condition_number, normalised
 # Least eigenvalue, of a mean of 1, from which weights are said to exist: Clarabel errs by 1e-10.
 _MARGIN = 1e-9
 #: By how much, relatively, the condition number of a convention may exceed the least: with less
-#: the members differ by less than the programs can tell.
+#: the members differ by less than the programs can determine.
 SLACK = 1e-5
 # Relative distance to the dual bound at which a program is not solved again, and counts as failed.
 _GAP, _LARGEST_GAP = 1e-9, 1e-4
@@ -109,7 +109,8 @@ def least_condition_weights(
     fibre : GainFibre
     member : Weights, optional
         Weights known to have the gain: where to begin when no program finds any. Weights at the
-        edge of what a program can tell from none (a margin below 1e-9) are found again like this.
+        edge of what a program can determine from none (a margin below 1e-9) are found again like
+        this.
     rough : bool
         Whether a least condition number that is proved to 1e-4 is enough, and programs are left as
         they stand and not scaled once more: half of the time or less. Over 150 random plants they

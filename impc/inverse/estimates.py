@@ -80,9 +80,11 @@ class Goodness:
     softened: int  # How many samples exceed a soft bound or the terminal set, and of how many
     samples: int
     rank: int  # Directions of the gain that the recordings identify
-    lone: bool = False  # Whether the best of several searches was alone: the others ended at more
+    unconfirmed: bool = (
+        False  # Whether the best of several searches was alone: the others ended at more
+    )
     # Method whose answer leaves less in the model of this one; empty where there is none
-    beaten: str = ""
+    beaten_by: str = ""
 
 
 @dataclass(frozen=True, eq=False)  # itself alone: so what is derived from one may be cached
@@ -101,7 +103,7 @@ class Estimate(Frozen):
     weights : Weights or None
         Scaled to R[0, 0] = 1; None where the method seeks or finds none.
     metrics : Array
-        Basis of the metrics that the recordings do not tell from S (k, m, m), see `GainFit`.
+        Basis of the metrics that the recordings do not identify from S (k, m, m), see `GainFit`.
     misfit : float
         2-norm of the output residual, each output over its scale; NaN without a gain.
     noise : float
@@ -115,9 +117,9 @@ class Estimate(Frozen):
         Time of the method, given what it starts from, s.
     fit : Goodness
         What its simulation of the recordings says against it.
-    prices : Array or None
+    cost weights : Array or None
         Unknowns of the problem's structure (count,), for the method that searches them; minus
-        infinity is a price of zero.
+        infinity is a cost weight of zero.
 
     Examples
     --------
@@ -152,7 +154,7 @@ class Estimate(Frozen):
     evaluations: int
     seconds: float
     fit: Goodness
-    prices: Array | None = None
+    cost_weights: Array | None = None
 
     def __str__(self) -> str:
         ended = f"{self.reason}." if self.reason else ""
@@ -190,9 +192,9 @@ class Estimate(Frozen):
             doubts.append(
                 f"But another gain leaves less, {self.noise:.3g}: not all of it is noise."
             )
-        if found.beaten:
-            doubts.append(f"The answer of {found.beaten} leaves less here: the search failed.")
-        if found.lone:
+        if found.beaten_by:
+            doubts.append(f"The answer of {found.beaten_by} leaves less here: the search failed.")
+        if found.unconfirmed:
             doubts.append("Of several searches one ended here: a better answer may exist.")
         if not found.white:
             doubts.append(
@@ -293,9 +295,9 @@ class Estimate(Frozen):
     @property
     def vaf(self) -> Array:
         """Variance accounted for (3.24), over all trials, % (p,)."""
-        from impc.assess.assessments import judge  # noqa: PLC0415  # as all below: where used
+        from impc.assess.assessments import evaluate_method  # noqa: PLC0415  # as all below: where used
 
-        return judge(self, self.problem.bounds).vaf
+        return evaluate_method(self, self.problem.bounds).vaf
 
     def intervals(self) -> pd.DataFrame:
         """The gain, and fitted parameters, with 95 % intervals, a row each.
@@ -361,8 +363,8 @@ def simulated_estimate(
     reason: str = "",
     evaluations: int = 0,
     settled: bool = True,
-    lone: bool = False,
-    prices: Array | None = None,
+    unconfirmed: bool = False,
+    cost_weights: Array | None = None,
 ) -> Estimate:
     """What a method found, simulated; the last arguments are fields of `Estimate`."""
     misfit, fit = goodness(problem, K, S)
@@ -385,8 +387,8 @@ def simulated_estimate(
         reason,
         evaluations,
         0.0,
-        replace(fit, lone=lone),
-        None if prices is None else frozen(prices),
+        replace(fit, unconfirmed=unconfirmed),
+        None if cost_weights is None else frozen(cost_weights),
     )
 
 

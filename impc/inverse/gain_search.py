@@ -84,7 +84,9 @@ class GainFit(Frozen):
     # states and parameters have taken what they can (g,); largest first
     singular_values: Array
     evaluations: int  # Simulations with derivatives
-    lone: bool = False  # Whether several searches were made, and one only ended at this misfit
+    unconfirmed: bool = (
+        False  # Whether several searches were made, and one only ended at this misfit
+    )
 
 
 @checked
@@ -120,7 +122,7 @@ def fit_gain(problem: Problem) -> GainFit:
             "gain", f"no start can be simulated: {reason}", "check the plant and the bounds"
         )
     best, agreed = _best(found)
-    return replace(best, evaluations=evaluations, lone=len(found) > agreed == 1)
+    return replace(best, evaluations=evaluations, unconfirmed=len(found) > agreed == 1)
 
 
 @checked(max_evaluations=1, prior=0)

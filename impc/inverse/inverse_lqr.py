@@ -103,7 +103,7 @@ def inverse_lqr_gradient(
 
     Levenberg-Marquardt in a trust region over the Cholesky factors of Q and R, with the exact
     derivatives of K. The infimum need not be attained: Q then tends to a singular matrix, slowly,
-    and the condition number of the result tells. Two limits keep that orderly, neither of which
+    and the condition number of the result says. Two limits keep that orderly, neither of which
     touches a problem whose minimum is attained: evaluations are capped, and Q = LL' + f I,
     R = GG' + f I with f 1e-9 times the mean eigenvalue of the start.
 

@@ -58,7 +58,7 @@ class Method:
     label: str  # In tables and figures
     sentence: str  # For readers who do not know it
     # The problem as posed -> as the method sees it: inverse LQR knows no bounds
-    sees: Callable[[Problem], Problem]
+    restrict: Callable[[Problem], Problem]
     # The problem as posed, the estimate of inverse MPC -> its own
     find: Callable[[Problem, Estimate], Estimate]
 
@@ -68,7 +68,9 @@ class Method:
         try:
             found = self.find(problem, start)
         except ImpcError as error:
-            found = no_estimate(self.name, self.sees(start.problem.known()), str(error))
+            found = no_estimate(
+                self.name, self.restrict(start.problem.with_nuisance_fixed()), str(error)
+            )
         return replace(found, seconds=time.perf_counter() - started)
 
 
@@ -90,7 +92,7 @@ def of_gain(
     parameters of its own.
     """
     metric = start.metric if S is None else S
-    settled = METHODS[name].sees(start.problem.known()) if seen is None else seen
+    settled = METHODS[name].restrict(start.problem.with_nuisance_fixed()) if seen is None else seen
     if problem.unknown_start:
         settled = with_fitted_starts(settled, K, metric)
     return simulated_estimate(
@@ -122,7 +124,7 @@ def feedback_gain(problem: Problem, start: Estimate) -> Estimate:
 
 def of_fitted_gain(problem: Problem, start: Estimate, found: GainFit) -> Estimate:
     """The estimate of a gain without bounds."""
-    K, seen = np.array(found.K), found.problem.known()
+    K, seen = np.array(found.K), found.problem.with_nuisance_fixed()
     evaluations = found.evaluations
     return of_gain("feedback_gain", problem, start, K, seen=seen, evaluations=evaluations)
 
@@ -173,7 +175,7 @@ def _auxiliary(start: Estimate) -> Weights:
 
 def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = None) -> Estimate:
     """(3.16), from some weights, or those of inverse MPC."""
-    loose, noise = start.problem.known().without_bounds(), noise_of(_feedback(start))
+    loose, noise = start.problem.with_nuisance_fixed().without_bounds(), noise_of(_feedback(start))
     found = inverse_mpc_natural(loose, begin or start.stage_weights, noise)
     name = "inverse_lqr_output"
     return of_weights(name, problem, start, found.weights, found.evaluations)
@@ -181,7 +183,7 @@ def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = No
 
 def _reduced(problem: Problem, start: Estimate) -> Estimate:
     """Gain under the bounds, then weights with that gain."""
-    behind = weights_behind(free_gain(start.problem.known(), start.stage_weights))
+    behind = weights_behind(free_gain(start.problem.with_nuisance_fixed(), start.stage_weights))
     weights = None if behind.equivalent is None else behind.equivalent.weights
     gain = behind.gain
     # What the gain leaves too is noise, and no fault of the weights.
@@ -200,7 +202,7 @@ def _reduced(problem: Problem, start: Estimate) -> Estimate:
 
 def _preliminary(problem: Problem, start: Estimate) -> Estimate:
     K, there = preliminary_gain(problem, problem.feedback_states)
-    return of_gain("preliminary", problem, start, K, seen=there.known())
+    return of_gain("preliminary", problem, start, K, seen=there.with_nuisance_fixed())
 
 
 def _structured(problem: Problem, start: Estimate) -> Estimate:
@@ -260,7 +262,8 @@ _TABLE = (
     Method(
         "inverse_lqr_auxiliary",
         "inverse LQR, gain penalty (3.7)",
-        "The same, with a price on the condition number that keeps the weights away from singular.",
+        "The same, with a penalty on the condition number that keeps the weights away from "
+        "singular.",
         _without_bounds,
         lambda problem, start: of_weights(
             "inverse_lqr_auxiliary", problem, start, _auxiliary(start)
@@ -310,7 +313,8 @@ _TABLE = (
     Method(
         "structured",
         "inverse MPC within a structure",
-        "Prices of the features that the user names, whose controller, with its bounds, fits the "
+        "Cost weights of the features that the user names, whose controller, with its bounds, "
+        "fits the "
         "outputs best.",
         _as_posed,
         _structured,

@@ -51,7 +51,8 @@ _ROUNDS, _WORSE = 3, 1.05
 _ITERATIONS = 40
 # A step that promises less than this, of the objective, is below what the noise decides.
 _TOLERANCE = 1e-5
-#: Condition number, in natural coordinates, of the weights that a search begins with. Prices of a
+#: Condition number, in natural coordinates, of the weights that a search begins with. Cost weights
+#: of a
 #: diagonal start may lie at the edge of what any weights have (1e9 and more): the penalty, which is
 #: relative to the start, then regularises nothing and the search stays at that edge. Of 15 random
 #: plants with three inputs that ended short of the truth, 13 end at it from 1e3, 8 from 1e5.
@@ -112,7 +113,7 @@ def in_natural_units(weights: Weights, T: Array, G: Array) -> Weights:
 
 
 def best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
-    """The member of least condition number, or the known one where no program tells it."""
+    """The member of least condition number, or the known one where no program says it."""
     try:
         return least_condition_weights(fibre, member).weights
     except (WeightsError, SolverError):  # at the edge of the cone, in double precision
@@ -120,7 +121,7 @@ def best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
 
 
 def _away_from_the_edge(weights: Weights) -> Weights:
-    """The weights, if need be with a price on every direction, at most `WORST_START` apart."""
+    """The weights, if need be with a penalty on every direction, at most `WORST_START` apart."""
     if condition_number(weights) <= WORST_START:
         return weights
     floor = float(np.linalg.eigvalsh(weights.block)[-1]) / WORST_START

@@ -219,7 +219,7 @@ def _finish(
         noise=noise_of(free),
         evaluations=free.evaluations + evaluations,
         settled=converged,
-        lone=free.lone,
+        unconfirmed=free.unconfirmed,
     )
 
 
@@ -228,7 +228,7 @@ def _by_convention(plant: Plant, weights: Weights, metrics: Array) -> Weights:
     solution = solve_lqr(plant, weights)
     try:
         return least_condition_weights(gain_fibre(plant, solution.K, metrics), weights).weights
-    except (WeightsError, SolverError):  # at the edge of what a program can tell
+    except (WeightsError, SolverError):  # at the edge of what a program can determine
         return normalised(weights)
 
 

@@ -73,8 +73,8 @@ class Problem(Value):
         `impc fit` decide by which explains the recordings better, and the problem of their answer
         says which; everything else takes None for False.
     softening : float
-        Price of exceeding a state bound or the terminal set during the search, see `Controller`.
-        An answer says how many of its samples do.
+        Cost weight of exceeding a state bound or the terminal set during the search, see
+        `Controller`. An answer says how many of its samples do.
     output_scale : Array
         What each output is divided by in the residual (p,), in its unit.
     unknown_start : bool
@@ -86,8 +86,8 @@ class Problem(Value):
     logarithms : Array
         Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
     structure : Structure or None
-        What may be costed, for the method "structured" and the gain of a person (`fit_person`);
-        other methods do not ask.
+        What may be costed, for the method "structured" and the gain of a person
+        (`fit_output_feedback`); other methods do not ask.
     feedback_states : tuple of str
         States on which the preliminary gain (3.20) acts, for the method "preliminary".
     solver : str
@@ -178,7 +178,7 @@ class Problem(Value):
         """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
         return replace(self, bounds=Bounds(self.plant), terminal_set=False)
 
-    def known(self) -> Problem:
+    def with_nuisance_fixed(self) -> Problem:
         """Return the problem with its initial states and parameters taken as they stand."""
         return replace(self, unknown_start=False, family=None, logarithms=frozen([]))
 

@@ -62,10 +62,10 @@ def block_basis(n: int, m: int) -> Array:
 def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
     """Solve for the step d (k,), at most `radius` long, and the objective that it predicts."""
     count, kappa = len(program.basis), float(scipy.linalg.eigvalsh(program.X)[-1])
-    price, effort = program.condition_weight * kappa, program.fit_weight
-    scale = max(price, effort)
+    cost_weight, effort = program.condition_weight * kappa, program.fit_weight
+    scale = max(cost_weight, effort)
     linear, squares = np.zeros(count + 2), np.zeros(count + 2)
-    linear[count] = price / scale
+    linear[count] = cost_weight / scale
     (squares if program.squared else linear)[-1] = effort / scale
     cones = [*_inequalities(program, kappa), _ball(count, radius), _epigraph(program)]
     step = solve_semidefinite(linear, cones, squares=squares).y[:count]

@@ -1,13 +1,13 @@
 """The gains that weights of a structure have, with one input: the linear space that holds them.
 
-A state without a price is not steered for its own sake. Where the command passes a delay, its
+A state without a cost weight is not steered for its own sake. Where the command passes a delay, its
 states have no say in the gain: the controller predicts over them, and what it does about them
 follows from what it does about the rest. On the seat the gains of all weights over angles and
 rates make five dimensions of ten (docs/structures.md has the theorem).
 
 The space is computed: regulators at three sizes of the weights, in natural coordinates, and all
-their derivatives with respect to prices of products of features. With several inputs there is no
-theorem, and with two the singular values fell without a gap: all gains are searched then.
+their derivatives with respect to cost weights of products of features. With several inputs there is
+no theorem, and with two the singular values fell without a gap: all gains are searched then.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def regulators_alone(plant: Plant, structure: Structure, T: Array) -> Array:
 
 
 def _regulators(plant: Plant, structure: Structure, T: Array) -> Array:
-    """Gains of regulators and their changes with prices, in natural coordinates (k, n)."""
+    """Gains of regulators and their changes with cost weights, in natural coordinates (k, n)."""
     _, values, rows = np.linalg.svd(structure.features @ T, full_matrices=False)
     features = rows[values > RANK * values[0]] @ np.linalg.inv(T)
     first, second = np.tril_indices(len(features))

@@ -93,9 +93,9 @@ def gain_fibre(plant: Plant, gain: ArrayLike, metric: ArrayLike | None = None) -
         K (m, n) of u = -Kx.
     metric : array_like, optional
         S (m, m), known up to scale: only pairs whose R + B'PB (continuous: R) is a multiple of
-        it. Where the recordings tell less of it, a basis (k, m, m) of the metrics that they leave
-        (`GainFit.metrics`): only pairs whose R + B'PB is in its span. With a single input it says
-        nothing.
+        it. Where the recordings identify less of it, a basis (k, m, m) of the metrics that they
+        leave (`GainFit.metrics`): only pairs whose R + B'PB is in its span. With a single input it
+        says nothing.
 
     Raises
     ------

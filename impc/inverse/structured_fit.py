@@ -1,13 +1,14 @@
-"""Weights of a structure behind recordings: from any gain that fits to the prices that fit best.
+"""Weights of a structure behind recordings: from any gain that fits to the weights that fit best.
 
-    a gain near the recordings  ->  prices whose gain comes nearest, from many starts -> searches
+    a gain near the recordings  ->  cost weights whose gain comes nearest, from many starts ->
+    searches
 
-The misfit of trajectories has local minima in the prices. Near a gain that fits it is all but a
-quadratic form of the gain, known from one simulation: |J (K(z) - K)|^2, J the derivative of the
+The misfit of trajectories has local minima in the cost weights. Near a gain that fits it is all but
+a quadratic form of the gain, known from one simulation: |J (K(z) - K)|^2, J the derivative of the
 residual with respect to the gain, without what initial states and parameters can make up for. The
-regulators of this small problem take a millisecond, so it is solved from prices by Bryson's rule at
-many prices of the command; from the few ends that differ the recordings themselves are searched
-(docs/structures.md).
+regulators of this small problem take a millisecond, so it is solved from cost weights by Bryson's
+rule at many cost weights of the command; from the few ends that differ the recordings themselves
+are searched (docs/structures.md).
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.structure import Structure
 
-# Decades of the price of the command, as in `bryson_weights`.
+# Decades of the cost weight of the command, as in `bryson_weights`.
 _EFFORTS = np.log(10.0) * np.arange(-6, 7, 2)
-# Logarithm of a price: a factor of 150 about Bryson's, where the nearest gain leaves it free.
+# Logarithm of a cost weight: a factor of 150 about Bryson's, where the nearest gain leaves it free.
 _SPREAD = 5.0
 _ATTEMPTS = 3
 # Two searches that end at the same misfit, to a third of chi-squared's unit on 18000 samples.
@@ -55,12 +56,14 @@ def fit_structure(
 ) -> StructuredEnd:
     """Fit the unknowns of a structure; `gain` (m, n); `metric` (m, m); `*starts` (count,)."""
     target = _Target(problem, structure, gain, metric)
-    ladder = bryson_prices(problem, structure, gain, metric)
-    ends = _distinct([target.nearest(prices) for prices in ladder])
-    ranked = _ranked(problem, structure, [*starts, *(prices for _, prices in ends), *ladder])
+    ladder = bryson_cost_weights(problem, structure, gain, metric)
+    ends = _distinct([target.nearest(cost_weights) for cost_weights in ladder])
+    ranked = _ranked(
+        problem, structure, [*starts, *(cost_weights for _, cost_weights in ends), *ladder]
+    )
     best, spent = None, 0
-    for prices in ranked[:_ATTEMPTS]:
-        found = search_from(problem, structure, prices)
+    for cost_weights in ranked[:_ATTEMPTS]:
+        found = search_from(problem, structure, cost_weights)
         spent += found.evaluations
         again = best is not None and abs(found.misfit - best.misfit) < _AGREE * best.misfit
         if best is None or found.misfit < best.misfit:
@@ -71,7 +74,7 @@ def fit_structure(
         raise SolverError(
             f"structure {structure.name}",
             "none of its regulators can be simulated on the recordings",
-            "price other features",
+            "cost weight other features",
         )
     return dataclasses.replace(best, evaluations=spent)
 
@@ -83,8 +86,10 @@ def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Es
     given = np.array(problem.logarithms)
     if np.any(np.abs(near.problem.logarithms - given) > _RUNAWAY):
         there = problem.at(np.array(end.problem.starts), given)
-        with contextlib.suppress(WeightsError):  # a price of zero may leave no regulator there
-            again = search_from(there, structure, end.prices)
+        with contextlib.suppress(
+            WeightsError
+        ):  # a cost weight of zero may leave no regulator there
+            again = search_from(there, structure, end.cost_weights)
             spent = end.evaluations + again.evaluations
             best = min(end, again, key=lambda one: one.misfit)
             end = dataclasses.replace(best, evaluations=spent)
@@ -102,7 +107,7 @@ def feature_sizes(problem: Problem, structure: Structure, gain: Array, metric: A
     return np.asarray(np.maximum(sizes, np.min(sizes[sizes > 0], initial=np.inf)))
 
 
-def bryson_prices(
+def bryson_cost_weights(
     problem: Problem, structure: Structure, gain: Array, metric: Array
 ) -> list[Array]:
     """Unknowns (count,) by which every feature costs a multiple of the command, at its size."""
@@ -114,7 +119,7 @@ def bryson_prices(
     k, first = len(structure.labels), np.zeros(structure.count)
     states = np.log(efforts[0]) - 2 * np.log(sizes)
     first[:k] = states / (2 if structure.coupled else 1)
-    inputs = np.flatnonzero(structure.is_price)[k:]
+    inputs = np.flatnonzero(structure.is_cost_weight)[k:]
     first[inputs] = np.log(efforts[0] / efforts[1:]) / (2 if structure.input_coupled else 1)
     step = np.zeros(structure.count)
     step[:k] = 1 / (2 if structure.coupled else 1)
@@ -137,19 +142,19 @@ class _Target:
         seen = self.space.without_nuisance(start)
         samples = problem.recorded_numbers
         self.noise = float(np.linalg.norm(self.space.at(start).residual)) / np.sqrt(samples)
-        # Of the gain alone: the metric shows only where commands stand at their limits.
+        # Of the gain alone: the metric shows only where commands are at their limits.
         count = len(self.space.gains)
         here = self.space.natural(self.space.changes(self.space.unpack(start), start)[0][:count])
         self.form = np.linalg.qr(seen[:, :count], mode="r") @ here.reshape(count, -1)
         self.gain = self.space.natural(gain)
 
-    def nearest(self, prices: Array) -> tuple[_Nearest, Array] | None:
-        """The prices whose gain comes nearest, from a start; None where there is no regulator."""
+    def nearest(self, cost_weights: Array) -> tuple[_Nearest, Array] | None:
+        """The weights whose gain comes nearest, from a start; None where there is no regulator."""
         weight = max(self.noise, 1e-9) / _SPREAD
 
         @functools.lru_cache(maxsize=1)  # the search asks for residual and derivative one by one
         def regulated(step: tuple[float, ...]) -> tuple[Array, Array]:
-            z = prices + np.array(step)
+            z = cost_weights + np.array(step)
             solution = solve_lqr(self.problem.plant, self.structure.weights(z))
             dK, _ = regulator_slopes(self.problem, self.structure, z, solution)
             far = self.space.natural(np.array(solution.K)) - self.gain
@@ -167,13 +172,13 @@ class _Target:
 
         try:
             found = scipy.optimize.least_squares(
-                residual, np.zeros(len(prices)), jac=derivative, ftol=1e-6, max_nfev=40
+                residual, np.zeros(len(cost_weights)), jac=derivative, ftol=1e-6, max_nfev=40
             )
             far, _ = regulated(tuple(found.x))
         except WeightsError:
             return None
         scale = max(self.noise, 1e-9)
-        return _Nearest(float(np.linalg.norm(far)) / scale, far / scale), prices + found.x
+        return _Nearest(float(np.linalg.norm(far)) / scale, far / scale), cost_weights + found.x
 
 
 def _distinct(
@@ -190,16 +195,16 @@ def _distinct(
 def _ranked(problem: Problem, structure: Structure, starts: Sequence[Array]) -> list[Array]:
     """Those that can be simulated, the least misfit first."""
     usable = []
-    for prices in starts:
+    for cost_weights in starts:
         try:
-            solution = solve_lqr(problem.plant, structure.weights(prices))
+            solution = solve_lqr(problem.plant, structure.weights(cost_weights))
         except WeightsError:
             continue
         size, reason = misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))
         if not reason:
-            usable.append((size, prices))
+            usable.append((size, cost_weights))
     usable.sort(key=lambda item: item[0])
-    return [prices for _, prices in usable]
+    return [cost_weights for _, cost_weights in usable]
 
 
 def structured_estimate(problem: Problem, structure: Structure, end: StructuredEnd) -> Estimate:
@@ -209,9 +214,9 @@ def structured_estimate(problem: Problem, structure: Structure, end: StructuredE
         replace(end.problem, structure=structure),
         np.array(end.K),
         np.array(end.S),
-        weights=structure.weights(np.array(end.prices)),
+        weights=structure.weights(np.array(end.cost_weights)),
         noise=max(end.misfit, EXPLAINED * recorded_size(problem)),
         evaluations=end.evaluations,
         settled=end.settled,
-        prices=np.array(end.prices),
+        cost_weights=np.array(end.cost_weights),
     )

@@ -1,14 +1,15 @@
-"""The search for the unknowns of a structure: prices, initial states, physical parameters.
+"""The search for the unknowns of a structure: cost weights, initial states, physical parameters.
 
     minimise |Y_sim(z) - Y|^2 over z = (unknowns of the structure | x0 of each trial | parameters)
 
 by trust-region least squares with exact derivatives: unknowns -> (Q, R) -> Riccati -> (K, S) ->
 residual. A change of a parameter moves the gain too, because the weights stay. The unknowns are
-logarithms, so a price that the recordings want to be zero slides down without end. Such a price is
-set to zero and the search goes on without it; the answer stands when the misfit is no larger.
+logarithms, so a cost weight that the recordings want to be zero slides down without end. Such a
+cost weight is set to zero and the search goes on without it; the answer stands when the misfit is
+no larger.
 
 Noise leaves combinations of unknowns all but free. They keep a weak prior while the search looks
-for its basin; at its end what the recordings tell to a factor of e^3 is fitted without
+for its basin; at its end what the recordings identify to a factor of e^3 is fitted without
 (docs/structures.md).
 """
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.model.structure import Structure
 
-# Logarithm of a price: a factor of 150 about the start, while the basin is looked for.
+# Logarithm of a cost weight: a factor of 150 about the start, while the basin is looked for.
 _SPREAD = 5.0
 # A combination with a larger deviation keeps that prior to the end.
 _FREE = 3.0
@@ -46,7 +47,7 @@ _ROUNDS = 8
 _NOISY_TOLERANCE = 1e-6
 # Least share of the misfit of exact recordings, up to which they are explained (`gain_search`).
 _EXACT = 1e-9
-# A price whose logarithm has a deviation beyond this is tried at zero.
+# A cost weight whose logarithm has a deviation beyond this is tried at zero.
 _NEARLY_ZERO = 2.0
 _EVALUATIONS = 60
 _MOST = 120
@@ -77,14 +78,14 @@ def regulator_slopes(
     return regulator_changes(solution, dQ, dR, dA, dB)
 
 
-class PriceCoordinates(Coordinates):
+class WeightCoordinates(Coordinates):
     """The unknowns of a structure in the place of gain and metric; z is the way from the start."""
 
-    def __init__(self, problem: Problem, structure: Structure, prices: Array) -> None:
-        first = solve_lqr(problem.plant, structure.weights(prices))
+    def __init__(self, problem: Problem, structure: Structure, cost_weights: Array) -> None:
+        first = solve_lqr(problem.plant, structure.weights(cost_weights))
         super().__init__(problem, np.array(first.K), np.array(first.S))
-        self.structure, self.prices = structure, np.array(prices)
-        self.moving: BoolArray = np.isfinite(self.prices)
+        self.structure, self.cost_weights = structure, np.array(cost_weights)
+        self.moving: BoolArray = np.isfinite(self.cost_weights)
         count = int(np.count_nonzero(self.moving))
         starts, parameters = np.diff(self.ends)[1:]
         self.ends = np.cumsum([count, 0, starts, parameters])
@@ -92,7 +93,7 @@ class PriceCoordinates(Coordinates):
         self.solved: tuple[bytes, LqrSolution] = (self.start.tobytes(), first)
 
     def placed(self, there: Problem) -> Array:
-        """z (q,) of the prices of the start and the initial states and parameters of a problem."""
+        """z (q,) of the weights of the start and the initial states and parameters of a problem."""
         z = self.start.copy()
         first, last = int(self.ends[1]), int(self.ends[2])
         if last > first:
@@ -103,7 +104,7 @@ class PriceCoordinates(Coordinates):
 
     def unknowns(self, z: Array) -> Array:
         """Unknowns of the structure at z (q,): (count,)."""
-        found = self.prices.copy()
+        found = self.cost_weights.copy()
         found[self.moving] += z[: self.ends[0]]
         return found
 
@@ -147,7 +148,7 @@ class PriceCoordinates(Coordinates):
         return dK, scaled_changes(here.S, dS)
 
     def deviations(self, z: Array, noise: float) -> tuple[Array, Array]:
-        """How far the unknowns that move (a,) are told, once all else has taken what it can."""
+        """How far the moving unknowns (a,) are identified, once all else has taken what it can."""
         _, values, rows = np.linalg.svd(self.without_nuisance(z), full_matrices=False)
         return rows, noise / np.maximum(values, 1e-300)
 
@@ -156,7 +157,9 @@ class PriceCoordinates(Coordinates):
 class StructuredEnd:
     """Where a search ended."""
 
-    prices: Array  # Unknowns of the structure (count,); minus infinity is a price of zero
+    cost_weights: (
+        Array  # Unknowns of the structure (count,); minus infinity is a cost weight of zero
+    )
     K: Array  # (m, n)
     S: Array  # (m, m)
     problem: Problem  # At the initial states and the parameters
@@ -165,9 +168,9 @@ class StructuredEnd:
     settled: bool  # Whether it ended by itself
 
 
-def search_from(problem: Problem, structure: Structure, prices: Array) -> StructuredEnd:
-    """One search from given unknowns; `prices` (count,)."""
-    space = PriceCoordinates(problem, structure, prices)
+def search_from(problem: Problem, structure: Structure, cost_weights: Array) -> StructuredEnd:
+    """One search from given unknowns; `cost_weights` (count,)."""
+    space = WeightCoordinates(problem, structure, cost_weights)
     beside = len(problem.logarithms)
     shared = np.concatenate([np.full(int(space.ends[0]), 1 / _SPREAD), np.ones(beside)])
     stop = _stop(space, _MOST)
@@ -185,17 +188,17 @@ class _Place:
 
     posed: Problem
     structure: Structure
-    prices: Array
+    cost_weights: Array
     there: Problem
 
-    def space(self) -> tuple[PriceCoordinates, Array]:
-        """Coordinates that begin at these prices, the prior about what was posed; and z here."""
-        space = PriceCoordinates(self.posed, self.structure, self.prices)
+    def space(self) -> tuple[WeightCoordinates, Array]:
+        """Coordinates that begin at these weights, the prior about what was posed; and z here."""
+        space = WeightCoordinates(self.posed, self.structure, self.cost_weights)
         return space, space.placed(self.there)
 
 
 def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
-    """Without the prior along what the recordings tell of the prices, with one about here."""
+    """Without the prior along what the recordings identify of the weights, with one about here."""
     space, z = place.space()
     noise = _misfit(space, z) / np.sqrt(space.problem.recorded_numbers)
     rows, deviations = space.deviations(z, noise)
@@ -215,24 +218,26 @@ def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
     )
 
 
-def _stop(space: PriceCoordinates, budget: int) -> Stop:
+def _stop(space: WeightCoordinates, budget: int) -> Stop:
     return Stop(_FINE, (_ROUNDING * recorded_size(space.problem)) ** 2, max(budget, 1))
 
 
 def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:
-    """The same with prices of zero where the recordings want none smaller than any number."""
+    """The same with cost weights of zero where the recordings want none smaller than any number."""
     tried: set[int] = set()
     while end.evaluations < budget:
-        here = replace(place, prices=np.array(end.prices), there=end.problem)
+        here = replace(place, cost_weights=np.array(end.cost_weights), there=end.problem)
         index = _widest(here, end.misfit, tried)
         if index is None:
             break
         tried.add(index)
-        prices = np.array(end.prices)
-        prices[index] = -np.inf
+        cost_weights = np.array(end.cost_weights)
+        cost_weights[index] = -np.inf
         try:
-            without = _polished(replace(here, prices=prices), end.evaluations, end.settled)
-        except WeightsError:  # the loop stands on that price
+            without = _polished(
+                replace(here, cost_weights=cost_weights), end.evaluations, end.settled
+            )
+        except WeightsError:  # the loop stands on that cost weight
             continue
         if without.misfit <= end.misfit * (1 + _NOISY_TOLERANCE):
             end = without
@@ -240,13 +245,13 @@ def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd
 
 
 def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:
-    """The same with a price where zero was not the best: other prices had to move for it."""
-    for index in np.flatnonzero(np.isneginf(end.prices) & np.isfinite(place.prices)):
+    """The same with a cost weight where zero was not the best: other weights had to move for it."""
+    for index in np.flatnonzero(np.isneginf(end.cost_weights) & np.isfinite(place.cost_weights)):
         if end.evaluations >= budget:
             break
-        prices = np.array(end.prices)
-        prices[index] = _seen_from(end, place, int(index))
-        here = replace(place, prices=prices, there=end.problem)
+        cost_weights = np.array(end.cost_weights)
+        cost_weights[index] = _seen_from(end, place, int(index))
+        here = replace(place, cost_weights=cost_weights, there=end.problem)
         try:
             found = _polished(here, end.evaluations, end.settled)
         except WeightsError:  # on the edge of what has a regulator
@@ -257,9 +262,9 @@ def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> Structured
 
 
 def _seen_from(end: StructuredEnd, place: _Place, index: int) -> float:
-    """Logarithm of the price that moves the outputs by one deviation, all else held."""
-    solution = solve_lqr(end.problem.plant, place.structure.weights(np.array(end.prices)))
-    dK, dS = regulator_slopes(end.problem, place.structure, np.array(end.prices), solution)
+    """Logarithm of the cost weight that moves the outputs by one deviation, all else held."""
+    solution = solve_lqr(end.problem.plant, place.structure.weights(np.array(end.cost_weights)))
+    dK, dS = regulator_slopes(end.problem, place.structure, np.array(end.cost_weights), solution)
     found = evaluate(end.problem, np.array(solution.K), np.array(solution.S))
     size = len(found.residual)
     column = found.dK.reshape(size, -1) @ dK[index].ravel()
@@ -273,7 +278,7 @@ def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> Stru
     for _ in range(_ROUNDS):
         if end.evaluations >= budget:
             break
-        here = _Place(end.problem, structure, np.array(end.prices), end.problem)
+        here = _Place(end.problem, structure, np.array(end.cost_weights), end.problem)
         found = _polished(here, end.evaluations, end.settled)
         fell = samples * (1 - (found.misfit / end.misfit) ** 2)
         if fell > 0:
@@ -284,7 +289,7 @@ def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> Stru
 
 
 def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
-    """The price of a state with the widest deviation, if it is wide, not the last, and untried."""
+    """The weight of a state with the widest deviation, if it is wide, not the last, and untried."""
     structure = place.structure
     space, z = place.space()
     if structure.coupled or np.count_nonzero(space.moving[: len(structure.labels)]) < 2:
@@ -298,5 +303,5 @@ def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
     return index if own[index] > _NEARLY_ZERO else None
 
 
-def _misfit(space: PriceCoordinates, z: Array) -> float:
+def _misfit(space: WeightCoordinates, z: Array) -> float:
     return float(np.linalg.norm(space.at(z).residual))

@@ -8,7 +8,7 @@ disturbances has an E with no columns. What the controller makes of it: docs/the
 A plant may also offer the body that really moves, x_{t+1} = f(x_t, u_t, d_t), whose linearisation
 at rest the matrices are: every simulation moves that one, and the controller predicts with these.
 Units of gains and weights follow from those of the signals: a gain takes a state to an input, a
-weight prices a product of two against R[0, 0] = 1, the square of the first input.
+weight cost weights a product of two against R[0, 0] = 1, the square of the first input.
 """
 
 from __future__ import annotations
@@ -303,7 +303,7 @@ def gain_unit(plant: Plant, control: str, state: str) -> str:
     return _ratio(plant.unit(control), plant.unit(state))
 
 
-def price_unit(plant: Plant, one: str, other: str) -> str:
+def weight_unit(plant: Plant, one: str, other: str) -> str:
     """Unit of the weight on the product of two signals, `one` and `other`: "(N m)²/rad²"."""
     first = _power(plant.unit(plant.controls[0]))
     pair = plant.unit(one), plant.unit(other)

@@ -4,7 +4,7 @@ The parameters are positive (masses, lengths, stiffnesses, time constants) and a
 their logarithms about the nominal values. The plant's matrices are analytic functions of them, so
 the derivative is taken by Richardson's extrapolation of central differences of step h and h/2 in
 the logarithm: an error of order h^4 and of rounding/h. At h = 1e-3 both are 1e-12, and the two
-central differences tell how far the extrapolation can be trusted. docs/fitting.md says how a
+central differences say how far the extrapolation can be trusted. docs/fitting.md says how a
 parameter is freed.
 """
 

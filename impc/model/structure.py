@@ -1,12 +1,12 @@
-"""What may be costed: weights that are made of a few named prices.
+"""What may be costed: weights that are made of a few named cost weights.
 
     Q = F' W F,   R = G' V G,     rows of F (k, n) and G (l, m) given, W, V made of the unknowns z
 
 Each row is a feature of the states or of the inputs, a linear combination by name. Where features
-are priced one by one, W = diag(exp(z)); a price of zero is z = -inf. Where their products have
-prices too, W = L L' with L = diag(exp(z_1 .. z_k)) C and C lower triangular, ones on its diagonal.
-The entries below it are the other unknowns, which do not depend on units. The first price of the
-inputs is one, for scale (docs/structures.md).
+are penalised one by one, W = diag(exp(z)); a cost weight of zero is z = -inf. Where their products
+have cost weights too, W = L L' with L = diag(exp(z_1 .. z_k)) C and C lower triangular, ones on its
+diagonal. The entries below it are the other unknowns, which do not depend on units. The first cost
+weight of the inputs is one, for scale (docs/structures.md).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _WORDS = ("diagonal", "full", "outputs")
-# Features whose prices differ by less than this, of their own size, make the same weights.
+# Features whose cost weights differ by less than this, of their own size, make the same weights.
 _SAME = 1e-9
 # A mode that is nearer to the limit of stability than this does not decay.
 _DECAYS = 1e-9
@@ -37,15 +37,16 @@ _DECAYS = 1e-9
 
 @dataclass(frozen=True, init=False)
 class Structure(Value):
-    """Which states and inputs have a price, and which prices are unknown.
+    """Which states and inputs have a cost weight, and which cost weights are unknown.
 
     Parameters
     ----------
     plant : Plant
         Whose states and inputs are meant.
     Q : "diagonal", "full", "outputs", or sequence of str
-        A price for each feature; prices of all products of two features; a price for each output;
-        or the features themselves, as in ``["theta1", "theta2 - theta1"]``, each with a price.
+        A cost weight for each feature; cost weights of all products of two features; a cost weight
+        for each output; or the features themselves, as in ``["theta1", "theta2 - theta1"]``, each
+        with a cost weight.
     R : "diagonal", "full", or sequence of str
         The same for the inputs. With one input there is nothing to choose.
     over : sequence of str, optional
@@ -62,14 +63,14 @@ class Structure(Value):
     features : Array
         One a row (k, n).
     coupled : bool
-        Whether their products have prices too.
+        Whether their products have cost weights too.
     input_labels, input_features, input_coupled
         The same of the inputs: (l,) and (l, m).
 
     Raises
     ------
     InputError
-        When a feature cannot be read, or prices of different features make the same weights.
+        When a feature cannot be read, or cost weights of different features make the same weights.
     WeightsError
         When no feature sees a mode that does not decay by itself, or one sees no input.
 
@@ -128,36 +129,36 @@ class Structure(Value):
 
     @property
     def unknowns(self) -> tuple[str, ...]:
-        """Their names (count,): prices of features, then of pairs; the states' first."""
+        """Their names (count,): cost weights of features, then of pairs; the states' first."""
         inputs = _names(self.input_labels, coupled=self.input_coupled)
         return (*_names(self.labels, coupled=self.coupled), *inputs[1:])
 
     @property
-    def is_price(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Which unknowns are logarithms of prices, not entries of C (count,)."""
+    def is_cost_weight(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
+        """Which unknowns are logarithms of cost weights, not entries of C (count,)."""
         k, rest = len(self.labels), len(self.input_labels) - 1
         each = (k, self._split - k, rest, self.count - self._split - rest)
         return np.repeat([True, False, True, False], each)
 
     def weights(self, z: Array) -> Weights:
-        """The weights at the unknowns z (count,); minus infinity is a price of zero.
+        """The weights at the unknowns z (count,); minus infinity is a cost weight of zero.
 
         Raises
         ------
         WeightsError
-            When a price is no number any more.
+            When a cost weight is no number any more.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             states, inputs = self._factors(np.asarray(z, dtype=np.float64))
             Q, R = states.T @ states, inputs.T @ inputs
         if not (np.all(np.isfinite(Q)) and np.all(np.isfinite(R))):
-            raise WeightsError("Q, R", "a price is beyond all numbers", "start elsewhere")
+            raise WeightsError("Q, R", "a cost weight is beyond all numbers", "start elsewhere")
         return Weights(Q, R)
 
     def changes(self, z: Array) -> tuple[Array, Array]:
         """Change of Q (count, n, n) and R (count, m, m) with each unknown, at z (count,).
 
-        Where a price is zero, with the price itself: its logarithm moves nothing.
+        Where a cost weight is zero, with the cost weight itself: its logarithm moves nothing.
         """
         z = np.asarray(z, dtype=np.float64)
         own, beside = z[: self._split], np.concatenate([[0.0], z[self._split :]])
@@ -170,9 +171,9 @@ class Structure(Value):
         )
 
     def reported(self, z: Array) -> tuple[Array, Array]:
-        """The unknowns as they are told.
+        """The unknowns as they are identified.
 
-        Logarithms of the prices of features, W_ii; where they are coupled, of each pair the
+        Logarithms of the cost weights of features, W_ii; where they are coupled, of each pair the
         correlation W_ij / sqrt(W_ii W_jj), between -1 and 1.
 
         Parameters
@@ -189,8 +190,8 @@ class Structure(Value):
         """
         z = np.asarray(z, dtype=np.float64)
         beside = np.concatenate([[0.0], z[self._split :]])
-        first, along = _told(len(self.labels), z[: self._split], coupled=self.coupled)
-        rest, slope = _told(len(self.input_labels), beside, coupled=self.input_coupled)
+        first, along = _identified(len(self.labels), z[: self._split], coupled=self.coupled)
+        rest, slope = _identified(len(self.input_labels), beside, coupled=self.input_coupled)
         both = scipy.linalg.block_diag(along, slope[1:, 1:])
         return np.concatenate([first, rest[1:]]), np.asarray(both)
 
@@ -236,7 +237,9 @@ def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
     rows = [linear_combination(text, plant.controls) for text in chosen]
     features = np.array(rows).reshape(-1, plant.m)
     if np.linalg.matrix_rank(features) < plant.m:
-        raise WeightsError("R", "leaves a combination of the inputs without a price", "add one")
+        raise WeightsError(
+            "R", "leaves a combination of the inputs without a cost weight", "add one"
+        )
     return chosen, features
 
 
@@ -255,14 +258,14 @@ def _default_name(Q: Any, over: Sequence[str] | None, labels: tuple[str, ...]) -
 def _require_different(
     which: str, labels: tuple[str, ...], features: Array, *, coupled: bool
 ) -> None:
-    """Features whose squares (coupled: which themselves) are linearly dependent have no prices."""
+    """Features whose squares (coupled: which themselves) are linearly dependent have no weights."""
     unit = features / np.linalg.norm(features, axis=1)[:, None]
     products = np.array([np.outer(row, row).ravel() for row in unit])
     values = np.linalg.svd(unit if coupled else products, compute_uv=False)
     if len(values) < len(labels) or values[-1] < _SAME * values[0]:
         raise InputError(
             which,
-            f"different prices of {', '.join(labels)} make the same weights",
+            f"different cost weights of {', '.join(labels)} make the same weights",
             "leave one out",
         )
 
@@ -281,8 +284,9 @@ def _require_detectable(plant: Plant, features: Array) -> None:
             names = [plant.states[index] for index in np.argsort(-part) if part[index] > 0.1]
             raise WeightsError(
                 "Q",
-                f"leaves the mode {_number(mode)}, which does not decay by itself, without a price",
-                f"price one of {', '.join(names)}",
+                f"leaves the mode {_number(mode)}, which does not decay by itself, without a cost "
+                "weight",
+                f"penalise one of {', '.join(names)}",
             )
 
 
@@ -305,27 +309,27 @@ def _factor(size: int, z: Array, *, coupled: bool) -> Array:
     return np.asarray(scale @ C)
 
 
-def _told(size: int, z: Array, *, coupled: bool) -> tuple[Array, Array]:
+def _identified(size: int, z: Array, *, coupled: bool) -> tuple[Array, Array]:
     """Logarithms of W_ii and correlations, and their derivative with respect to z."""
     if not coupled:
         return z, np.eye(size)
     L, steps = _factor(size, z, coupled=True), _steps(size, z)
     W, dW = L @ L.T, steps @ L.T + L @ steps.transpose(0, 2, 1)
-    price, root = np.diag(W), np.sqrt(np.diag(W))
-    d_price = np.einsum("kii->ik", dW) / price[:, None]
+    cost_weight, root = np.diag(W), np.sqrt(np.diag(W))
+    d_weight = np.einsum("kii->ik", dW) / cost_weight[:, None]
     rows, columns = np.tril_indices(size, -1)
     size_of = root[rows] * root[columns]
     pair = W[rows, columns] / size_of
     d_pair = dW[:, rows, columns].T / size_of[:, None]
-    d_pair -= pair[:, None] * (d_price[rows] + d_price[columns]) / 2
-    return np.concatenate([np.log(price), pair]), np.vstack([d_price, d_pair])
+    d_pair -= pair[:, None] * (d_weight[rows] + d_weight[columns]) / 2
+    return np.concatenate([np.log(cost_weight), pair]), np.vstack([d_weight, d_pair])
 
 
 def _changes(features: Array, z: Array, *, coupled: bool) -> Array:
     size = len(features)
     if not coupled:
-        price = np.where(np.isneginf(z), 1.0, np.exp(z))
-        return np.asarray(np.einsum("k,ki,kj->kij", price, features, features))
+        cost_weight = np.where(np.isneginf(z), 1.0, np.exp(z))
+        return np.asarray(np.einsum("k,ki,kj->kij", cost_weight, features, features))
     half = _steps(size, z) @ _factor(size, z, coupled=True).T
     return np.asarray(features.T @ (half + half.transpose(0, 2, 1)) @ features)
 

@@ -1,4 +1,4 @@
-"""Which combinations of the parameters the recordings tell: singular values, with names.
+"""Which combinations of the parameters the recordings identify: singular values, with names.
 
 To first order the residual moves by J dphi, phi the logarithms of the positive parameters and the
 signed ones themselves. Directions of J with a singular value of nothing are combinations that the
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
     from impc.nonlinear.problem import OptimalControlProblem
 
-# Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest told
-# direction has 3e-4 and the strongest untold one, of a bound that nothing touches, 5e-11.
+# Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest
+# identified direction has 3e-4 and the strongest unidentified one, of a bound that nothing touches,
+# 5e-11.
 _NOTHING = 1e-8
 _ROUGH = 0.5  # of a logarithm: twice that is a factor of e
 _ROUND = 1e-3  # of an exponent: nearer to nothing, or to a multiple of a sixth, it is that
@@ -49,8 +50,8 @@ class Combination:
     """A product of powers of parameters."""
 
     exponents: dict[str, float]  # By name; of a signed parameter the factor of its difference
-    value: float  # Of the product at the estimate, 1 for an untold one
-    deviation: float  # Standard deviation of its logarithm; infinite for an untold one
+    value: float  # Of the product at the estimate, 1 for an unidentified one
+    deviation: float  # Standard deviation of its logarithm; infinite for an unidentified one
     # Whether it is a signed parameter by itself, and deviation that of its value
     difference: bool = False
     # Of an unidentified one: whether any factor is possible, as simulated; else it holds near these
@@ -58,7 +59,7 @@ class Combination:
     scaling: bool = True
 
     @property
-    def told(self) -> str:
+    def identified(self) -> str:
         """Whether it is: "yes", "roughly" (to a factor of more than e only, at 95 %) or "no"."""
         if np.isinf(self.deviation):
             return "no"
@@ -73,7 +74,7 @@ class Combination:
 
     @property
     def sentence(self) -> str:
-        """What an untold one leaves open."""
+        """What an unidentified one leaves open."""
         if len(self.exponents) == 1:
             (name,) = self.exponents
             return (
@@ -88,29 +89,29 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class Combinations(Frozen):
-    """What is told and what is not."""
+    """What is identified and what is not."""
 
-    told: tuple[Combination, ...]  # Together as many as there are parameters
-    untold: tuple[Combination, ...]
+    identified: tuple[Combination, ...]  # Together as many as there are parameters
+    unidentified: tuple[Combination, ...]
     singular_values: Array  # (p,), falling
     # Standard deviation of each logarithm or signed parameter (p,); infinite where it is part of an
-    # untold combination
+    # unidentified combination
     deviations: Array
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """One for each untold combination, one for those told, and one for those told roughly."""
-        found = [one.sentence for one in self.untold]
+        """One for each unidentified combination, one for the others, and one for those rough."""
+        found = [one.sentence for one in self.unidentified]
         kinds = {"yes": "Identified", "roughly": "Identified roughly (see the intervals)"}
         for kind, words in kinds.items():
             values = [
                 f"{one.name} = {one.value:.6g}"
-                for one in self.told
+                for one in self.identified
                 # Of larger exponents nobody could mean the product.
-                if one.told == kind and np.max(np.abs([*one.exponents.values()])) <= _LARGEST
+                if one.identified == kind and np.max(np.abs([*one.exponents.values()])) <= _LARGEST
             ]
             found += [f"{words}: {', '.join(values)}."] if values else []
-        return (*found, *(() if self.told else ("Nothing is identified.",)))
+        return (*found, *(() if self.identified else ("Nothing is identified.",)))
 
 
 def combinations(
@@ -131,21 +132,21 @@ def combinations(
         own = own - rest @ np.linalg.lstsq(rest, own, rcond=None)[0]
     _, values, right = np.linalg.svd(own, full_matrices=True)
     values = np.append(values, np.zeros(p - len(values)))
-    # Not by the noise: what it leaves open by a factor of ten is told that roughly, and which
-    # products are told does not change from one recording to the next (docs/nonlinear.md).
-    told = values > _NOTHING * values[0]
-    covariance = _covariance(jacobian, residual, signals, int(np.sum(~told)))[:p, :p]
-    basis, pivots = _sparse(right[~told])
+    # Not by the noise: what it leaves open by a factor of ten is identified that roughly, and which
+    # products are identified does not change from one recording to the next (docs/nonlinear.md).
+    identified = values > _NOTHING * values[0]
+    covariance = _covariance(jacobian, residual, signals, int(np.sum(~identified)))[:p, :p]
+    basis, pivots = _sparse(right[~identified])
 
     def named(row: Array) -> dict[str, float]:
         pairs = zip(problem.parameter_names, row, strict=True)
         return {name: float(item) for name, item in pairs if item != 0}
 
-    untold = []
+    unidentified = []
     for row in basis:
         scaled = row / np.min(np.abs(row[row != 0]))
         scaling = _is_scaling(scaled, theta, positive, holds)
-        untold.append(Combination(named(scaled), 1.0, np.inf, scaling=scaling))
+        unidentified.append(Combination(named(scaled), 1.0, np.inf, scaling=scaling))
     kept = []
     logarithms = np.where(positive, np.log(np.abs(theta)), theta)
     for index in sorted(set(range(p)) - set(pivots)):
@@ -157,7 +158,7 @@ def combinations(
         kept.append(Combination(named(exponents), value, deviation, single))
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     deviations[np.any(basis != 0, axis=0)] = np.inf
-    return Combinations(tuple(kept), tuple(untold), values, deviations)
+    return Combinations(tuple(kept), tuple(unidentified), values, deviations)
 
 
 def _is_scaling(
@@ -170,10 +171,10 @@ def _is_scaling(
     return all(holds(theta * factor**row) for factor in _FACTORS)
 
 
-def _covariance(jacobian: Array, residual: Array, signals: IntArray, untold: int) -> Array:
-    """Of the estimate along told directions, each signal with the noise that is left of it."""
+def _covariance(jacobian: Array, residual: Array, signals: IntArray, unidentified: int) -> Array:
+    """Of the estimate along identified directions, each signal with the noise left of it."""
     left, values, right = np.linalg.svd(jacobian, full_matrices=False)
-    rank = len(values) - untold
+    rank = len(values) - unidentified
     gains = right[:rank].T @ (left[:, :rank] / values[:rank]).T
     freedom = max(len(residual) - rank, 1)
     variance = np.zeros(len(residual))

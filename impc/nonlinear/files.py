@@ -29,7 +29,7 @@ from impc.files.reading import (
     require_distinct,
     require_filled_in,
     require_kind,
-    told_unit,
+    stated_unit,
 )
 from impc.files.resampling import held_means, instants, same_rate
 from impc.files.units import si_unit
@@ -195,7 +195,7 @@ def _series(
     entry = configuration.signals[name]
     channel = channel_of(table, clock, name, entry)
     found = [
-        checks.unit_of_the_file(channel, told_unit(table, channel.column), entry.overrule_unit),
+        checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]

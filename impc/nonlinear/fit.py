@@ -50,7 +50,7 @@ _UNMOVED, _LITTLE = 1e-5, 0.3
 
 @dataclass(frozen=True, eq=False)
 class OptimalControlEstimate(Frozen):
-    """What was found, and which part of it the recordings tell."""
+    """What was found, and which part of it the recordings identify."""
 
     problem: OptimalControlProblem
     recordings: tuple[OptimalRecording, ...]
@@ -64,7 +64,9 @@ class OptimalControlEstimate(Frozen):
     # Of each residual the index of its state, or n and the index of its input (r,)
     signals: IntArray
     scales: Array  # Root-mean-square of each state and input in the recordings (n + m,)
-    combinations: Combinations  # What is told and what is not, with the singular values that say so
+    combinations: (
+        Combinations  # What is identified and what is not, with the singular values that say so
+    )
     x0: tuple[Array, ...]  # Initial state of each recording (n,)
     # Of each recording the states (steps + 1, n) and inputs (steps, m) that the estimate has
     runs: tuple[tuple[Array, Array], ...]
@@ -84,7 +86,7 @@ class OptimalControlEstimate(Frozen):
         """Low and high end of each parameter by its name, at a `level` between 0 and 1.
 
         Normal in the logarithms of positive parameters; the noise of each signal is the root mean
-        square of what is left of it. A parameter that is part of an untold combination has an
+        square of what is left of it. A parameter that is part of an unidentified combination has an
         infinite interval.
         """
         if not 0 < level < 1:
@@ -156,7 +158,7 @@ def fit_optimal_control(
     >>> found = impc.fit_optimal_control(problem, [recording], {"drag": 0.5, "price": 3.0})
     >>> {name: round(value, 6) for name, value in found.theta.items()}
     {'drag': 0.3, 'price': 5.0}
-    >>> found.combinations.untold
+    >>> found.combinations.unidentified
     ()
     """
     solver = require_solver(solver)

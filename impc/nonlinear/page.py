@@ -99,23 +99,23 @@ def verdict(fit: OptimalFit) -> str:
             f"The problem explains less than half of {', '.join(poor)}: its equations, its cost or "
             "its limits are not those of the recordings."
         )
-    if not estimate.combinations.told:
-        return "The recordings tell none of the parameters."
+    if not estimate.combinations.identified:
+        return "The recordings identify none of the parameters."
     ends = estimate.intervals().items()
     open_ones = [name for name, (low, high) in ends if not high - low < np.inf]
     if not open_ones:
         return (
-            "The problem explains the recordings, which tell every parameter by itself, as far as "
+            "The problem explains the recordings, which say every parameter by itself, as far as "
             "the intervals say."
         )
     return (
-        "The problem explains the recordings, but they do not tell all of its parameters: "
+        "The problem explains the recordings, but they do not say all of its parameters: "
         f"{', '.join(open_ones)} may be others, alone or together, as the sentences below say."
     )
 
 
 def abstract(fit: OptimalFit) -> tuple[str, ...]:
-    """A few plain sentences with numbers: what was done, and what is told."""
+    """A few plain sentences with numbers: what was done, and what is identified."""
     estimate, problem = fit.estimate, fit.estimate.problem
     count, loops = len(estimate.recordings), sum(one.closed_loop for one in estimate.recordings)
     samples = sum(len(one.u) for one in estimate.recordings)
@@ -155,9 +155,9 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
         pictures[0],
         *([Details("The other recordings", pictures[1:])] if pictures[1:] else []),
     ]
-    told = (
-        "A product that is told has one value whatever the others have. Along a direction that is "
-        "not told the parameters may change together, and the recordings stay what they are."
+    meaning = (
+        "A product that is identified has one value whatever the others have. Along a direction "
+        "that is not the parameters may change together, and the recordings stay what they are."
     )
     checks = [(name, found or ("Nothing found.",))
               for name, found in zip(fit.trials, fit.findings, strict=True)]  # fmt: skip
@@ -179,7 +179,7 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
         (Verdict(verdict(fit)), Lines(abstract(fit))),
         [
             Section("1. The parameters", (_parameters(fit),), "Parameters", together=True),
-            Section("2. What is told", (told, _combinations(fit)), "What is told"),
+            Section("2. What is identified", (meaning, _combinations(fit)), "What is identified"),
             Section("3. Recorded and simulated", agreement, "Trajectories"),
             Section("4. Checks of the recordings", (Terms(checks),), "Checks", folded=True),
             Section("5. Settings and versions", (terms,), "Settings", folded=True),
@@ -218,7 +218,7 @@ def _trajectories(fit: OptimalFit, index: int) -> dict[str, Any]:
 
 def _draw_intervals(fit: OptimalFit) -> Figure:
     rows = {one.name: interval(1.0, one.deviation, False, _LEVEL)
-            for one in fit.estimate.combinations.told if not one.difference}  # fmt: skip
+            for one in fit.estimate.combinations.identified if not one.difference}  # fmt: skip
     figure = new_figure(SINGLE_COLUMN, 0.7 + 0.24 * len(rows))
     ax = figure.subplots()
     for place, ends in enumerate(rows.values()):
@@ -234,17 +234,17 @@ def _draw_intervals(fit: OptimalFit) -> Figure:
     ax.set_yticks(range(len(rows)), list(rows))
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.set_xlabel("95 % interval over the value (-)")
-    ax.set_ylabel("told (-)")
+    ax.set_ylabel("identified (-)")
     return figure
 
 
 def _parameters(fit: OptimalFit) -> Finding:
     estimate, units = fit.estimate, fit.estimate.problem.units
     ends, found = estimate.intervals(_LEVEL), estimate.combinations
-    told = {one.name: one.told for one in found.told}
-    told |= {name: "no" for one in found.untold for name in one.exponents}
+    identified = {one.name: one.identified for one in found.identified}
+    identified |= {name: "no" for one in found.unidentified for name in one.exponents}
     rows = [
-        (name, units.get(name, ""), value, *ends[name], _LEVEL, told.get(name, "yes"),
+        (name, units.get(name, ""), value, *ends[name], _LEVEL, identified.get(name, "yes"),
          estimate.start[name])
         for name, value in estimate.theta.items()
     ]  # fmt: skip
@@ -252,15 +252,16 @@ def _parameters(fit: OptimalFit) -> Finding:
         (name, unit, value, np.nan, np.nan, np.nan, "known", np.nan)
         for name, (value, unit) in fit.known.items()
     ]
-    heads = ["parameter", "unit", "value", "low", "high", "level", "told", "start"]
+    heads = ["parameter", "unit", "value", "low", "high", "level", "identified", "start"]
     caption = (
-        "Value with its 95 % interval, and where the search began. One that is not told by itself "
-        "stays near its start; section 2 says what of it is told."
+        "Value with its 95 % interval, and where the search began. One that is not individually "
+        "identified "
+        "stays near its start; section 2 says what of it is identified."
     )
     figure = Picture(
         "parameters",
-        "Intervals of the parameters and products of parameters that the recordings tell",
-        "Parameters, and products of them, that the recordings tell: 95 % intervals over the "
+        "Intervals of the parameters and products of parameters that the recordings identify",
+        "Parameters, and products of them, that the recordings identify: 95 % intervals over the "
         "value. One that ends at the edge goes on.",
         narrow=True,
     )
@@ -272,10 +273,10 @@ def _combinations(fit: OptimalFit) -> Finding:
     free = {True: "any factor of these", False: "near these values"}
     rows = [
         (one.name, one.value, *interval(one.value, one.deviation, one.difference, _LEVEL), _LEVEL,
-         one.told, free[one.scaling] if one.told == "no" else "")
-        for one in (*found.told, *found.untold)
+         one.identified, free[one.scaling] if one.identified == "no" else "")
+        for one in (*found.identified, *found.unidentified)
     ]  # fmt: skip
-    heads = ["product", "value", "low", "high", "level", "told", "free"]
+    heads = ["product", "value", "low", "high", "level", "identified", "free"]
     caption = "Products of parameters with their 95 % intervals, in the problem's units."
     return Finding("combinations", pd.DataFrame(rows, columns=heads), caption)
 
@@ -306,15 +307,15 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
         "sentences": abstract(fit),
         "combinations": {
             kind: [{key: getattr(one, key) for key in ("name", "exponents", "value", "deviation")}
-                   for one in items]
-            for kind, items in (("told", found.told), ("untold", found.untold))
+                   for one in getattr(found, kind)]
+            for kind in ("identified", "unidentified")
         },
         "singular_values": found.singular_values,
         "loss": estimate.loss,
         "x0": estimate.x0,
         "trials": [
-            {"trial": name, "samples": len(one.u), "closed_loop": one.closed_loop, "findings": told}
-            for name, one, told in trials
+            {"trial": name, "samples": len(one.u), "closed_loop": one.closed_loop, "findings": said}
+            for name, one, said in trials
         ],
         "methods": {
             METHOD: {

@@ -73,7 +73,7 @@ def weigh(joint: JointLoop, djoint: JointLoop, room: Room) -> None:
                 if plant:
                     for c in range(k):
                         dS[a, b, c] += dC[a, i, c] * CP[b, i]
-    noise_products(inverse, dS, room.way.told, here.half)
+    noise_products(inverse, dS, room.way.identified, here.half)
 
 
 @njit(cache=True, inline="always")

@@ -42,16 +42,16 @@ def _four_lines(weights: Buffer, rows: Buffer, i: int, end: int, result: Buffer)
         y, z = _four(weights, i + 2, j), _four(weights, i + 3, j)
         if j == 0:
             for b in range(end):
-                told = rows[0, b], rows[1, b], rows[2, b], rows[3, b]
-                one[b], two[b] = _times(w, told), _times(x, told)
-                three[b], four[b] = _times(y, told), _times(z, told)
+                identified = rows[0, b], rows[1, b], rows[2, b], rows[3, b]
+                one[b], two[b] = _times(w, identified), _times(x, identified)
+                three[b], four[b] = _times(y, identified), _times(z, identified)
         elif _any(w) or _any(x) or _any(y) or _any(z):
             for b in range(end):
-                told = rows[j, b], rows[j + 1, b], rows[j + 2, b], rows[j + 3, b]
-                one[b] += _times(w, told)
-                two[b] += _times(x, told)
-                three[b] += _times(y, told)
-                four[b] += _times(z, told)
+                identified = rows[j, b], rows[j + 1, b], rows[j + 2, b], rows[j + 3, b]
+                one[b] += _times(w, identified)
+                two[b] += _times(x, identified)
+                three[b] += _times(y, identified)
+                four[b] += _times(z, identified)
     for j in range(count - count % 4, count):
         for line in range(i, i + 4):
             for b in range(end):
@@ -128,24 +128,24 @@ def add_both(rest: Buffer, dP: Buffer) -> None:
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def noise_products(inverse: Buffer, dS: Buffer, told: Buffer, half: Buffer) -> None:
+def noise_products(inverse: Buffer, dS: Buffer, identified: Buffer, half: Buffer) -> None:
     """Write tr(S^-1 dS S^-1 dS) / 2 for each pair of directions, the lower half.
 
-    `inverse` (p, p); `dS` (p, p, k); `told` (p, p, k); `half` (k, k).
+    `inverse` (p, p); `dS` (p, p, k); `identified` (p, p, k); `half` (k, k).
     """
     p, k = len(inverse), dS.shape[2]
-    told[:] = 0.0
+    identified[:] = 0.0
     for a in range(p):
         for b in range(p):
             for j in range(p):
                 for c in range(k):
-                    told[a, b, c] += inverse[a, j] * dS[j, b, c]
+                    identified[a, b, c] += inverse[a, j] * dS[j, b, c]
     half[:] = 0.0
     for a in range(p):
         for b in range(p):
             for c in range(k):
                 for d in range(c + 1):
-                    half[c, d] += told[a, b, c] * told[b, a, d] / 2
+                    half[c, d] += identified[a, b, c] * identified[b, a, d] / 2
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)

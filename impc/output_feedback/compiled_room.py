@@ -51,7 +51,7 @@ class Way(NamedTuple):
     # width of `Moves`
     picked: Buffer
     moved: Buffer
-    told: Buffer  # S^-1 dS (p, p, k)
+    identified: Buffer  # S^-1 dS (p, p, k)
     product: Buffer  # (z, z, k)
     known: Buffer  # What is seen of the outputs (p,), and of z before them (1, z)
     before: Buffer

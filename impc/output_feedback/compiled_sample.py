@@ -27,7 +27,7 @@ _FORGOTTEN = 1e-9
 class FilterResult(NamedTuple):
     """What the filter writes, sample by sample of one trial."""
 
-    told: Buffer  # Log-likelihood of each sample given the earlier ones (samples,)
+    identified: Buffer  # Log-likelihood of each sample given the earlier ones (samples,)
     score: Buffer  # Its derivatives along the q directions (samples, q)
     # The sum of their expected products (q, q), the lower half
     information: Buffer
@@ -37,8 +37,8 @@ class FilterResult(NamedTuple):
     filtered: Buffer  # Expected z given all outputs so far (samples, z)
     u: Buffer  # Command expected there (samples, m)
     status: Buffer  # Of each sample: the value of `closed_loop.Status` (samples,)
-    # The first sample of a trial that is told: those before it tell nothing, and are what the
-    # others are told given
+    # The first sample of a trial that is identified: those before it say nothing, and are what the
+    # others are identified given
     counted: int
 
 
@@ -102,7 +102,7 @@ def _tell(room: Room, result: FilterResult, t: int) -> None:
                 moved[a, c] += dS[a, b, c] * we[b]
     if t < result.counted:
         return
-    result.told[t] = -(np.dot(e, we) + here.volume[0] + p * np.log(2 * np.pi)) / 2
+    result.identified[t] = -(np.dot(e, we) + here.volume[0] + p * np.log(2 * np.pi)) / 2
     score = result.score[t, :q]
     for a in range(p):
         for c in range(q):
@@ -150,7 +150,7 @@ def _forgotten(room: Room, lasting: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _inform(information: Buffer, de: Buffer, wde: Buffer, half: Buffer) -> None:
-    """Add what one sample tells, the lower half: of its mean de' S^-1 de, of its covariance."""
+    """Add what one sample says, the lower half: of its mean de' S^-1 de, of its covariance."""
     for c in range(de.shape[1]):
         for a in range(len(de)):
             for d in range(c + 1):

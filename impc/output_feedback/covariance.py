@@ -5,8 +5,8 @@ With I the information of all recordings about all that was searched, initial st
     expected   I^-1                    Fisher's information, which the search has
     sandwich   I^-1 cov(sum s_t) I^-1  s_t the score of a sample; its sum by Newey and West
 
-agree where the model is true. Where it is not, the last still tells how estimates scatter. The
-prior of the search is left out but for a trace: what is not told has a deviation of hundreds
+agree where the model is true. Where it is not, the last still says how estimates scatter. The
+prior of the search is left out but for a trace: what is not identified has a deviation of hundreds
 (docs/noisy-people.md).
 """
 
@@ -22,7 +22,7 @@ from impc.assess.covariance import TWO_SIDED
 from impc.errors import InputError
 
 if TYPE_CHECKING:
-    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.fit import OutputFeedbackFit
 
 #: Ways to a covariance.
 KINDS = ("expected", "sandwich")
@@ -39,7 +39,8 @@ class PersonCovariance(Frozen):
     names: tuple[str, ...]  # Of the levels (l,)
     levels: Array  # Standard deviations of the logarithms of the levels (l,)
     entries: Array  # Standard deviations of the entries of the gain (m, n), in their units
-    directions: Array  # Of the coordinates of gain or prices, one a row (g, g), the best told first
+    # Of the coordinates of gain or cost weights, one a row (g, g), the best identified first
+    directions: Array
     deviations: Array  # Standard deviation along each (g,)
 
     def level_intervals(self, values: Array) -> Array:
@@ -61,7 +62,7 @@ class PersonCovariance(Frozen):
 
 @dataclass(frozen=True)
 class Confusion(Frozen):
-    """The step of gain and levels together that the recordings tell least apart."""
+    """The step of gain and levels together that the recordings distinguish least."""
 
     # Largest correlation of a combination of gain coordinates with one of levels
     correlation: float
@@ -69,23 +70,23 @@ class Confusion(Frozen):
     levels: Array  # The logarithms of the levels that go with it (l,)
 
 
-def person_covariance(fit: PersonFit, kind: str = "sandwich") -> PersonCovariance:
-    """Covariance of a fit of `fit_person`."""
+def person_covariance(fit: OutputFeedbackFit, kind: str = "sandwich") -> PersonCovariance:
+    """Covariance of a fit of `fit_output_feedback`."""
     if kind not in KINDS:
         raise InputError("kind", f"got {kind!r}", f"give one of {', '.join(KINDS)}")
-    information = np.array(fit.told.information)
+    information = np.array(fit.identified.information)
     values, vectors = np.linalg.eigh(information)
     kept = np.maximum(values, _FARTHEST**-2)
     unit = vectors / np.sqrt(kept)
     if kind != "sandwich":
         return _described(fit, kind, unit @ unit.T)
     # As seen where the information is one, and with as much of the prior as it needs for that: of a
-    # direction that is not told scores are rounding, and the bread is the square of 1e6.
+    # direction that is not identified scores are rounding, and the bread is the square of 1e6.
     middle = _meat(fit, unit) + np.diag(1 - values / kept)
     return _described(fit, kind, unit @ middle @ unit.T)
 
 
-def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance:
+def _described(fit: OutputFeedbackFit, kind: str, covariance: Array) -> PersonCovariance:
     """What follows from a covariance (q, q) of all unknowns."""
     space, shared = fit.space, fit.space.gain
     dK, _ = space.changes(fit.theta)
@@ -102,14 +103,14 @@ def _described(fit: PersonFit, kind: str, covariance: Array) -> PersonCovariance
     )
 
 
-def confusion(fit: PersonFit) -> Confusion:
-    """What of gain and levels the recordings tell least apart, by the first canonical pair.
+def confusion(fit: OutputFeedbackFit) -> Confusion:
+    """What of gain and levels the recordings distinguish least, by the first canonical pair.
 
-    Coordinates that are hardly told keep the deviation of one that the search gives them.
+    Coordinates that are hardly identified keep the deviation of one that the search gives them.
     """
     space = fit.space
     about = np.diag(np.where(np.arange(len(fit.theta)) < space.own, 1.0, _FARTHEST**-2))
-    covariance = np.linalg.inv(np.array(fit.told.information) + about)
+    covariance = np.linalg.inv(np.array(fit.identified.information) + about)
     gain, levels = slice(0, space.gain), slice(space.own, None)
     left = np.linalg.cholesky(covariance[gain, gain])
     right = np.linalg.cholesky(covariance[levels, levels])
@@ -120,13 +121,13 @@ def confusion(fit: PersonFit) -> Confusion:
     return Confusion(float(values[0]), frozen(step), frozen(right @ v[0]))
 
 
-def _meat(fit: PersonFit, unit: Array) -> Array:
+def _meat(fit: OutputFeedbackFit, unit: Array) -> Array:
     """Covariance of the sum of all scores along the columns of `unit` (q, q).
 
     By Newey and West (1987), up to the root of the length.
     """
     total = np.zeros((len(fit.theta),) * 2)
-    for own in fit.told.scores:
+    for own in fit.identified.scores:
         scores, lags = own @ unit, int(np.sqrt(len(own)))
         total += scores.T @ scores
         for lag in range(1, lags + 1):

@@ -3,8 +3,8 @@
 The search starts from a fit that takes all that it does not explain for noise in the recorder, or
 from a regulator by Bryson's rule where that is likelier once levels of both have been found, and
 climbs from there. Beside where it ended it looks with all senses as noisy as any could be. One that
-does not settle is begun from the other too, and one for prices of somebody who estimates always,
-from larger prices (`start`, `search`; docs/noisy-people.md).
+does not settle is begun from the other too, and one for cost weights of somebody who estimates
+always, from larger cost weights (`start`, `search`; docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from impc.output_feedback.prior import Place, Prior
 from impc.output_feedback.search import climb
 from impc.output_feedback.start import (
     Asked,
+    cost_weights_at,
     gain_space,
     likeliest_start,
-    prices_at,
     prior_about,
 )
 from impc.output_feedback.unknowns import PersonCoordinates
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.output_feedback.observer import Observer
-    from impc.output_feedback.unknowns import Told
+    from impc.output_feedback.unknowns import LikelihoodTerms
 
-# Likelihoods for all but the gain, or the prices, at first: while levels are far off the gain that
-# explains most is on the border of those that stabilise, and three searches of 21 ended there.
+# Likelihoods for all but the gain, or the cost weights, at first: while levels are far off the gain
+# that explains most is on the border of those that stabilise, and three searches of 21 ended there.
 _FIRST = 10
 # A search that comes farther in a round, of the prior's deviation, begins anew from there: its
 # coordinates and prior are those of a gain that is not the person's (docs/noisy-people.md).
@@ -49,13 +49,14 @@ _NEAR, _ROUND = 0.5, 30
 # than where one ended, nats: from four ends 18 to 90 nats too low ten were enough. A likelihood
 # that jumps is known to no less.
 _LOOK, _HIGHER = 15, 0.5
-# Logarithm by which prices are larger at the other start: a low price and a noisy sense both answer
-# late, and a search from least squares, which knows no such sense, may end at the first.
+# Logarithm by which cost weights are larger at the other start: a low cost weight and a noisy sense
+# both answer late, and a search from least squares, which knows no such sense, may end at the
+# first.
 _FAR = 4.0
 
 
 @dataclass(frozen=True)
-class PersonFit(Frozen):
+class OutputFeedbackFit(Frozen):
     """A person behind recordings, at the largest likelihood."""
 
     K: Array  # Gain (m, n)
@@ -63,7 +64,7 @@ class PersonFit(Frozen):
     problem: Problem  # At the initial states, as the person takes them, and the parameters
     observer: Observer  # At the levels found; a level of zero was not searched
     recorder: Array  # Standard deviations of the recorder's noise (p,), in the outputs' units
-    prices: Array | None  # Unknowns of the problem's structure, where it has one (count,)
+    cost_weights: Array | None  # Unknowns of the problem's structure, where it has one (count,)
     log_likelihood: float  # Of all samples of all trials, nats; without the prior
     # What the search made largest: likelihood times prior, less what levels lose, nats
     value: float
@@ -71,7 +72,7 @@ class PersonFit(Frozen):
     converged: bool  # Whether the search ended by itself
     evaluations: int  # Filters of all recordings with derivatives, about
     theta: Array  # The unknowns, in the coordinates of `space` (count,)
-    told: Told  # What the recordings say there
+    identified: LikelihoodTerms  # What the recordings say there
     unseen: Array  # Slope that scores do not have (q,), nats: of what levels lose
     prior: Prior  # What the search was held by
 
@@ -92,7 +93,7 @@ class PersonFit(Frozen):
 
 
 @checked(spread=0, max_evaluations=1, recorder="p", counted=0)
-def fit_person(
+def fit_output_feedback(
     found: Estimate,
     observer: Observer,
     *,
@@ -101,16 +102,16 @@ def fit_person(
     max_evaluations: int = 250,
     held: Sequence[str] = (),
     counted: int = 0,
-) -> PersonFit:
-    """Fit gain or prices, levels of noise, initial states and parameters by maximum likelihood.
+) -> OutputFeedbackFit:
+    """Fit gain or weights, levels of noise, initial states and parameters by maximum likelihood.
 
     Parameters
     ----------
     found : Estimate
-        Where the search begins; of the method "structured", prices are searched and not a gain, of
-        somebody who estimates from larger ones too.
-        Of another method, where the problem has a structure that leaves states without a price and
-        no parameters are searched, the gain keeps to the span of gains that such weights have.
+        Where the search begins; of the method "structured", cost weights are searched and not a
+        gain, of somebody who estimates from larger ones too. Of another method, where the problem
+        has a structure that leaves states without a cost weight and no parameters are searched, the
+        gain keeps to the span of gains that such weights have.
     observer : Observer
         What is sensed, and which noise there is: a level that is not zero is searched, from there
         and from what the residuals of the first fit suggest.
@@ -119,15 +120,16 @@ def fit_person(
         units; by default of the size of the residuals.
     spread : float
         Standard deviation of a normal prior about the start, of each coordinate (`Coordinates`)
-        of gain, initial states and parameters, or of each price's logarithm; infinite for none.
+        of gain, initial states and parameters, or of each cost weight's logarithm; infinite for
+        none.
     max_evaluations : int
         Filters of all recordings with derivatives, about; those of both starts together.
     held : sequence of str
         Kinds of levels that are not searched but known: of "motor", "share", "process", "sensory"
         and "walk".
     counted : int
-        The first sample of each trial that is told: those before are given, so that how a person
-        began is not taken for how the person goes on.
+        The first sample of each trial that is identified: those before are given, so that how a
+        person began is not taken for how the person goes on.
 
     Returns
     -------
@@ -136,7 +138,7 @@ def fit_person(
     Raises
     ------
     InputError
-        When a kind of levels is none of these, or a trial has no sample that is told.
+        When a kind of levels is none of these, or a trial has no sample that is identified.
     SolverError
         When no start has a likelihood.
 
@@ -158,7 +160,7 @@ def fit_person(
     >>> y = simulate_person(law, person, push, recorder=0.01).outputs
     >>> trial = impc.Recording(plant, y, push)
     >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial], terminal_set=False))
-    >>> likely = impc.fit_person(found, person)
+    >>> likely = impc.fit_output_feedback(found, person)
     >>> likely.converged, bool(0.4 < likely.observer.motor[0] < 0.6)
     (True, True)
     """
@@ -171,29 +173,29 @@ def fit_person(
         raise InputError("counted", left, "give fewer")
     asked = Asked(observer, recorder, held, spread, counted)
     first = [Point(np.array(found.gain), np.array(found.metric), problem)]
-    starts: list[tuple[list[Point], Array | None]] = [(first, found.prices)]
-    if found.prices is None:
+    starts: list[tuple[list[Point], Array | None]] = [(first, found.cost_weights)]
+    if found.cost_weights is None:
         begun_at = [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)]
         starts.append((begun_at, None))
     elif observer.estimates:
-        starts.append((first, np.array(found.prices) + _FAR))
+        starts.append((first, np.array(found.cost_weights) + _FAR))
     begun, reasons = [], []
-    for points, prices in starts:
+    for points, cost_weights in starts:
         try:
-            prior, theta = likeliest_start(points, prices, asked)
+            prior, theta = likeliest_start(points, cost_weights, asked)
             begun.append(_levelled(prior, theta, min(_FIRST, max_evaluations)))
         except ImpcError as error:
             reasons.append(error)
     if not begun:
         raise reasons[0]
     spent, ends = sum(one.spent for one in begun), []
-    for start in sorted(begun, key=lambda one: -one.place.told.value):
+    for start in sorted(begun, key=lambda one: -one.place.identified.value):
         end = _searched(start, asked, max_evaluations - spent)
         ends.append(_looked_beside(end, asked, max_evaluations - spent - end.spent))
         spent += ends[-1].spent
-        if ends[-1].settled and found.prices is None:
+        if ends[-1].settled and found.cost_weights is None:
             break
-    end = max(ends, key=lambda one: one.place.told.value)
+    end = max(ends, key=lambda one: one.place.identified.value)
     return person_at(end.prior, end.place, end.unseen, end.settled, spent)
 
 
@@ -243,8 +245,11 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
         spent += more - 1
         if np.linalg.norm((place.theta - prior.center)[: prior.space.gain]) <= _NEAR * asked.spread:
             break
-        there, prices = prior.space.unpack(place.theta), prices_at(prior.space, place.theta)
-        own = gain_space(there.point, prices)
+        there, cost_weights = (
+            prior.space.unpack(place.theta),
+            cost_weights_at(prior.space, place.theta),
+        )
+        own = gain_space(there.point, cost_weights)
         parts = there.observer, there.recorder, asked.held, asked.counted
         prior = prior_about(PersonCoordinates(own, *parts), asked)
         place, spent = prior.at(prior.space.start), spent + 1
@@ -252,27 +257,29 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
     return _End(prior, place, unseen, spent + more - 1, settled)
 
 
-def person_at(prior: Prior, place: Place, unseen: Array, settled: bool, spent: int) -> PersonFit:
+def person_at(
+    prior: Prior, place: Place, unseen: Array, settled: bool, spent: int
+) -> OutputFeedbackFit:
     """What is said of a person where a search has come to.
 
     `unseen` (q,).
     """
     space = prior.space
-    person, prices = space.unpack(place.theta), prices_at(space, place.theta)
-    return PersonFit(
+    person, cost_weights = space.unpack(place.theta), cost_weights_at(space, place.theta)
+    return OutputFeedbackFit(
         frozen(person.point.K),
         frozen(person.point.S),
         person.point.problem,
         person.observer,
         person.recorder,
-        None if prices is None else frozen(prices),
-        place.told.value,
+        None if cost_weights is None else frozen(cost_weights),
+        place.identified.value,
         place.value,
         len(place.theta),
         settled,
         spent,
         frozen(place.theta),
-        place.told,
+        place.identified,
         frozen(unseen),
         prior,
     )

@@ -1,6 +1,6 @@
 """A subject that was fitted, as values that JSON keeps: an interrupted command goes on from there.
 
-What the recordings say at its unknowns is not kept: one likelihood tells it again, to the last
+What the recordings say at its unknowns is not kept: one likelihood says it again, to the last
 digit.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.arrays import frozen
 from impc.inverse.coordinates import Point
-from impc.inverse.structured_search import PriceCoordinates
+from impc.inverse.structured_search import WeightCoordinates
 from impc.output_feedback.fit import person_at
 from impc.output_feedback.page import PersonModel
 from impc.output_feedback.start import Asked, gain_space, prior_about
@@ -20,7 +20,7 @@ from impc.output_feedback.unknowns import PersonCoordinates
 
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
-    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.fit import OutputFeedbackFit
     from impc.output_feedback.observer import Observer
 
 
@@ -38,14 +38,14 @@ def decode_model(
     return PersonModel(name, fit, kept["reason"])
 
 
-def encode_person(fit: PersonFit) -> dict[str, Any]:
+def encode_person(fit: OutputFeedbackFit) -> dict[str, Any]:
     """What coordinates and prior of the search began with, and where it ended."""
     own, space = fit.space.space, fit.space
     K, S = own.given
     return {
         "K": np.asarray(K).tolist(),
         "S": np.asarray(S).tolist(),
-        "prices": own.prices.tolist() if isinstance(own, PriceCoordinates) else None,
+        "cost_weights": own.cost_weights.tolist() if isinstance(own, WeightCoordinates) else None,
         "starts": own.problem.starts.tolist(),
         "logarithms": own.problem.logarithms.tolist(),
         "levels": space.first.tolist(),
@@ -56,12 +56,12 @@ def encode_person(fit: PersonFit) -> dict[str, Any]:
     }
 
 
-def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) -> PersonFit:
+def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) -> OutputFeedbackFit:
     """Make the fit again."""
     posed = problem.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64))
     point = Point(np.array(kept["K"]), np.array(kept["S"]), posed)
     levels, split = np.array(kept["levels"]), len(observer.levels)
-    own = gain_space(point, None if kept["prices"] is None else frozen(kept["prices"]))
+    own = gain_space(point, None if kept["cost_weights"] is None else frozen(kept["cost_weights"]))
     space = PersonCoordinates(own, observer.with_levels(levels[:split]), levels[split:])
     prior = prior_about(space, Asked(observer, None, (), 1.0, 0))
     place = prior.at(np.array(kept["theta"]))

@@ -76,7 +76,7 @@ class PreparedFilter:
 class Likelihood(Frozen):
     """What a recording says, sample by sample."""
 
-    told: Array  # Log-likelihood of each sample given those before (samples,), nats
+    identified: Array  # Log-likelihood of each sample given those before (samples,), nats
     score: Array  # Its derivatives along q directions (samples, q)
     information: Array  # Fisher's, expected (q, q)
     # Recorded outputs minus what the filter expects (samples, p), in the outputs' units
@@ -89,7 +89,7 @@ class Likelihood(Frozen):
     @property
     def value(self) -> float:
         """Log-likelihood, nats."""
-        return float(np.sum(self.told))
+        return float(np.sum(self.identified))
 
 
 def prepare_filter(
@@ -178,7 +178,7 @@ def _checked(result: FilterResult) -> Likelihood:
         )
     information = result.information
     return Likelihood(
-        frozen(result.told),
+        frozen(result.identified),
         frozen(result.score),
         frozen(np.tril(information) + np.tril(information, -1).T),
         frozen(result.innovation),

@@ -26,7 +26,7 @@ from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
 from impc.output_feedback import profile
 from impc.output_feedback.covariance import confusion, person_covariance
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.joint_loop import joint_loop
 from impc.output_feedback.kept import decode_model, encode_model
 from impc.output_feedback.observer import Observer
@@ -48,7 +48,7 @@ _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 _ASKED, _BESIDE = 250, 60
 # Of the command that is noise, where the search begins: what isometric force has, and less.
 _SHARE = 0.1
-# One second of lags tells a rhythm that was missed; fewer than ten tell nothing.
+# One second of lags says a rhythm that was missed; fewer than ten say nothing.
 _LEAST_LAGS = 10
 
 
@@ -120,7 +120,7 @@ def _nothing(models: tuple[PersonModel, ...], found: Estimate, *, profiled: bool
 
 def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonModel:
     try:
-        return PersonModel(name, fit_person(first, person, max_evaluations=budget), "")
+        return PersonModel(name, fit_output_feedback(first, person, max_evaluations=budget), "")
     except ImpcError as error:
         return PersonModel(name, None, str(error))
 
@@ -179,18 +179,18 @@ def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, P
     return models
 
 
-def _white(fit: PersonFit) -> Array:
+def _white(fit: OutputFeedbackFit) -> Array:
     """Of all trials together: standardised innovations, trial by trial, in a row."""
     lags = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt))
     rows = []
-    for trial in fit.told.trials:
+    for trial in fit.identified.trials:
         deviations = np.sqrt(np.einsum("tpp->tp", trial.spreads))
         rows.append(trial.innovations / deviations)
     joined = np.concatenate(rows)
     return whiteness(joined, min(lags, len(joined) - 1))
 
 
-def prediction_errors(fit: PersonFit, ahead: tuple[int, ...]) -> Array:
+def prediction_errors(fit: OutputFeedbackFit, ahead: tuple[int, ...]) -> Array:
     """Root-mean-square errors (k, p) of what the filter expects k numbers of samples `ahead`.
 
     From the expectation at a sample the plant runs on without noise, perturbations as recorded.
@@ -202,11 +202,11 @@ def prediction_errors(fit: PersonFit, ahead: tuple[int, ...]) -> Array:
     farthest = max(ahead)
     quiet = np.zeros((farthest, len(joint.F))), np.zeros((farthest, plant.m))
     errors = []
-    for trial, told in zip(problem.recordings, fit.told.trials, strict=True):
+    for trial, identified in zip(problem.recordings, fit.identified.trials, strict=True):
         starts = range(0, trial.samples - farthest, max(1, trial.samples // _STARTS))
         for t in starts:
             driven = np.array(trial.disturbance[t : t + farthest])
-            z, _, _ = run_joint(law, joint, told.filtered[t], driven, quiet)
+            z, _, _ = run_joint(law, joint, identified.filtered[t], driven, quiet)
             expected = z[list(ahead)] @ joint.C.T
             errors.append(expected - trial.outputs[t + np.array(ahead)])
     if not errors:

@@ -21,11 +21,11 @@ from impc.reporting.shown_units import shown_unit
 if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.output_feedback.covariance import Confusion, PersonCovariance
-    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.fit import OutputFeedbackFit
 
-# A level whose interval of 95 % ends beyond a factor of ten is not told.
-_TOLD = np.log(10)
-# Gain and noise that go together by more than this are hardly told apart.
+# A level whose interval of 95 % ends beyond a factor of ten is not identified.
+_IDENTIFIED = np.log(10)
+# Gain and noise that go together by more than this are hardly distinguished.
 _CONFUSED = 0.9
 # Criteria that differ by less do not decide (Burnham and Anderson 2002).
 _UNDECIDED = 4.0
@@ -48,8 +48,8 @@ class _Level(NamedTuple):
     high: float
 
     @property
-    def told(self) -> bool:
-        return bool(np.log(self.high / self.value) < _TOLD)
+    def identified(self) -> bool:
+        return bool(np.log(self.high / self.value) < _IDENTIFIED)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PersonModel:
     """One model."""
 
     name: str  # In words
-    fit: PersonFit | None  # None where it has no likelihood
+    fit: OutputFeedbackFit | None  # None where it has no likelihood
     reason: str  # Why it has none
 
 
@@ -68,17 +68,17 @@ class PersonReport(Frozen):
     models: tuple[PersonModel, ...]  # The first is the one that was asked for
     plant: Plant
     least: Array  # Gain of least squares (m, n)
-    fit: PersonFit | None  # That one; None where it has no likelihood
+    fit: OutputFeedbackFit | None  # That one; None where it has no likelihood
     # Of `fit`, by the sandwich; None where it has no likelihood
     covariance: PersonCovariance | None
     profiled: bool  # Whether intervals follow the likelihood
     # Intervals of 95 % of its levels (l, 2), in their units: by the sandwich, or where profiled by
-    # profile for a level that is weakly told
+    # profile for a level that is weakly identified
     levels: Array
     # The same of the entries of its gain (entries, 2); where profiled all by profile, NaN where an
-    # entry is not told by itself
+    # entry is not individually identified
     entries: Array
-    confusion: Confusion | None  # What of gain and noise is told least apart
+    confusion: Confusion | None  # What of gain and noise is distinguished least
     whiteness: Array  # p-values that the innovations of each output are white (p,)
     ahead: tuple[int, ...]  # Samples ahead
     # Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units
@@ -88,7 +88,7 @@ class PersonReport(Frozen):
     def at_limit(self) -> bool:
         """Whether a bound was met, so that the likelihood is an approximation."""
         return self.fit is not None and any(
-            np.any(trial.status != Status.FREE) for trial in self.fit.told.trials
+            np.any(trial.status != Status.FREE) for trial in self.fit.identified.trials
         )
 
     @property
@@ -105,18 +105,18 @@ class PersonReport(Frozen):
         if asked.fit is None:
             return (f"Nothing can be said of a person who senses with noise: {asked.reason}.",)
         lines = [_compared(self)]
-        told = [item for item in _levels(self) if item.told]
-        if told:
+        identified = [item for item in _levels(self) if item.identified]
+        if identified:
             each = ", ".join(
                 f"{item.name} {number(item.value)} {item.unit} ({number(item.low, 2)} to "
                 f"{number(item.high, 2)})"
-                for item in told
+                for item in identified
             )
             lines.append(
                 f"As one who {asked.name}: {each}, standard deviations of a sample (95 %)."
             )
         limited = [_AT_LIMIT] if self.at_limit else []
-        return (*lines, *_gain_told(self), *limited, *_apart(self, sizes), *_left(self))
+        return (*lines, *_gain_identified(self), *limited, *_apart(self, sizes), *_left(self))
 
     def section(self) -> Section:
         """Section of the page."""
@@ -169,12 +169,14 @@ def _compared(report: PersonReport) -> str:
     asked = report.models[0]
     others = sorted((item for item in report.models[1:] if item.fit is not None), key=_criterion)
     if not others:
-        return f"As one who {asked.name} the recordings can be told; nothing stands beside it."
+        return (
+            f"As one who {asked.name} the recordings can be identified; nothing stands beside it."
+        )
     best = others[0]
     apart = _criterion(best) - _criterion(asked)
     if abs(apart) < _UNDECIDED:
         return (
-            f"Whether the person {asked.name}, or {best.name}, the recordings do not tell "
+            f"Whether the person {asked.name}, or {best.name}, the recordings do not identify "
             f"(Akaike's criterion {abs(apart):.1f} apart)."
         )
     if apart > 0:
@@ -188,19 +190,21 @@ def _compared(report: PersonReport) -> str:
     )
 
 
-def _gain_told(report: PersonReport) -> list[str]:
+def _gain_identified(report: PersonReport) -> list[str]:
     """How much of the gain may be read as a number, and whether its search settled."""
     fit, entries = report.fit, np.array(report.entries)
     if fit is None or not len(entries):
         return []
-    told = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
+    identified = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
     said = (
-        f"{told} of the {len(entries)} entries of this person's gain are told from zero: their "
+        f"{identified} of the {len(entries)} entries of this person's gain are distinguishable "
+        "from zero: their "
         "intervals (95 %) leave it out."
     )
-    if told == 0:
+    if identified == 0:
         said = (
-            f"None of the {len(entries)} entries of this person's gain is told from zero (95 %): "
+            f"None of the {len(entries)} entries of this person's gain is distinguishable from "
+            "zero (95 %): "
             "the values stand for gains that are several times as large or as small."
         )
     loose = "" if fit.converged else " The search did not settle: another may end beside it."
@@ -208,7 +212,7 @@ def _gain_told(report: PersonReport) -> list[str]:
 
 
 def _apart(report: PersonReport, sizes: Array) -> list[str]:
-    """Which step of gain and noise is told least apart, where that is not told."""
+    """Which step of gain and noise is distinguished least, where that is not identified."""
     fit, found = report.fit, report.confusion
     if fit is None or found is None or found.correlation < _CONFUSED:
         return []
@@ -218,7 +222,8 @@ def _apart(report: PersonReport, sizes: Array) -> list[str]:
     level = int(np.argmax(np.abs(found.levels)))
     more = "more" if found.levels[level] * sizes[entry] > 0 else "less"
     return [
-        f"Gain and noise are hardly told apart here (correlation {found.correlation:.2f}): a gain "
+        f"Gain and noise are hardly distinguished here (correlation {found.correlation:.2f}): a "
+        "gain "
         f"{names[entry]} that is {100 * abs(sizes[entry]):.0f} % larger goes with "
         f"{100 * abs(np.expm1(abs(found.levels[level]))):.0f} % {more} of the noise "
         f"{fit.space.names[level]}."
@@ -263,7 +268,8 @@ def _model_finding(report: PersonReport) -> Finding:
     )
     caption = (
         "Models of sensing on the same recordings, the one that was asked for first. The criterion "
-        "is Akaike's, over the least; searched: gain or prices, initial states, levels of noise."
+        "is Akaike's, over the least; searched: gain or cost weights, initial states, levels of "
+        "noise."
     )
     return Finding("person_models", table, caption, digits=6)
 
@@ -274,8 +280,8 @@ def _level_finding(report: PersonReport) -> Finding:
         _levels(report),
         {
             "noise": lambda item: item.name,
-            "level": lambda item: item.value if item.told else np.nan,
-            "low": lambda item: item.low if item.told else 0.0,
+            "level": lambda item: item.value if item.identified else np.nan,
+            "low": lambda item: item.low if item.identified else 0.0,
             "high": lambda item: item.high if np.log(item.high / item.value) < FARTHEST else np.inf,
             "unit": lambda item: item.unit,
         },

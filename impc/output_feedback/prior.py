@@ -19,10 +19,11 @@ from impc.errors import ImpcError
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.output_feedback.unknowns import PersonCoordinates, Told
+    from impc.output_feedback.unknowns import LikelihoodTerms, PersonCoordinates
 
-#: A number of the gain is told by itself when its deviation is below this, of a coordinate.
-TOLD = 0.25
+#: A number of the gain is individually identified when its deviation is below this, of a
+#: coordinate.
+IDENTIFIED = 0.25
 
 # Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
 # what is so flat a step of ten is as far as a promise is believed.
@@ -39,15 +40,15 @@ class Place(NamedTuple):
     """A point of a search."""
 
     theta: Array  # (q,)
-    told: Told  # What the recordings say there
+    identified: LikelihoodTerms  # What the recordings say there
     value: float  # What is to be largest, nats
     lost: float  # What levels lose there (`Prior.lost`), nats
 
 
 class Prior:
-    """What holds directions that nothing tells, as a share of a log-likelihood.
+    """What holds directions that nothing says, as a share of a log-likelihood.
 
-    A normal number about the start for each coordinate of gain, prices and parameters, and a
+    A normal number about the start for each coordinate of gain, cost weights and parameters, and a
     barrier before gains that do not stabilise. Initial states are as any other state of their
     trials. With x a level over its scale the density of its logarithm is a power of
     that of a half-Cauchy level (Gelman 2006), x / (1 + x^2): far away, a quarter of a nat for each
@@ -77,12 +78,12 @@ class Prior:
 
     def at(self, theta: Array) -> Place:
         """What is to be largest, at theta (q,): likelihood times prior, less what levels lose."""
-        return self.placed(theta, self.space.told(theta))
+        return self.placed(theta, self.space.identified(theta))
 
-    def placed(self, theta: Array, told: Told) -> Place:
+    def placed(self, theta: Array, identified: LikelihoodTerms) -> Place:
         """The same, with what the recordings say at theta (q,)."""
-        lost = self.lost(theta, told)
-        return Place(theta, told, told.value + self.value(theta) - lost, lost)
+        lost = self.lost(theta, identified)
+        return Place(theta, identified, identified.value + self.value(theta) - lost, lost)
 
     def tried(self, theta: Array) -> Place | None:
         """The same, or None where there is no likelihood at theta (q,), or no number."""
@@ -104,13 +105,13 @@ class Prior:
         `unseen` (q,).
         """
         slope, bend = self.slopes(here.theta)
-        gradient = here.told.gradient + slope + unseen
-        return gradient, here.told.information + bend + _FLAT * np.eye(len(gradient))
+        gradient = here.identified.gradient + slope + unseen
+        return gradient, here.identified.information + bend + _FLAT * np.eye(len(gradient))
 
-    def lost(self, theta: Array, told: Told) -> float:
+    def lost(self, theta: Array, identified: LikelihoodTerms) -> float:
         """What levels lose because all else is fitted to the same noise, nats, at theta (q,).
 
-        `told` is what the recordings say there.
+        `identified` is what the recordings say there.
 
         The likelihood of the levels alone, all else integrated out, is by Laplace's method the
         largest over all else, less half of the logarithm of the determinant of the information on
@@ -119,7 +120,7 @@ class Prior:
         if not self.used:
             return 0.0
         own = slice(0, self.space.own)
-        information = told.information[own, own] + self.slopes(theta)[1][own, own]
+        information = identified.information[own, own] + self.slopes(theta)[1][own, own]
         return float(np.linalg.slogdet(information)[1]) / 2
 
     def value(self, theta: Array) -> float:

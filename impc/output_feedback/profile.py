@@ -1,8 +1,8 @@
 """Profiles of a person's levels of noise and of the gain: intervals that need no parabola.
 
-The logarithm of a level that is weakly told is not normal, for its likelihood falls on one side and
-stays on the other; and where half of a gain is hardly told the other half bends with it, by many of
-its deviations. The interval of 95 % of v'theta is where, with v'theta held,
+The logarithm of a level that is weakly identified is not normal, for its likelihood falls on one
+side and stays on the other; and where half of a gain is hardly identified the other half bends with
+it, by many of its deviations. The interval of 95 % of v'theta is where, with v'theta held,
 
     2 (max F - max_held F) <= 1.96^2
 
@@ -21,20 +21,21 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, frozen
-from impc.output_feedback.prior import TOLD
+from impc.output_feedback.prior import IDENTIFIED
 from impc.output_feedback.search import climb
 
 if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.output_feedback.covariance import PersonCovariance
-    from impc.output_feedback.fit import PersonFit
+    from impc.output_feedback.fit import OutputFeedbackFit
     from impc.output_feedback.prior import Place, Prior
 
-# A level whose logarithm has a larger deviation is weakly told.
+# A level whose logarithm has a larger deviation is weakly identified.
 _HARDLY = 0.25
 # Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
 _FALLEN, _CLOSE = 1.385903, 0.04
-#: No end is looked for farther away, and what is told to no more is not told: some thousands of a
+#: No end is looked for farther away, and what is identified to no more is not identified: some
+#: thousands of a
 #: level, which is then none, or that of a sense which is not used.
 FARTHEST = 9.0
 # A step is no longer than this.
@@ -43,15 +44,15 @@ _LONGEST = 2.0
 _TRIES, _BUDGET = 12, 25
 
 
-def level_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
-    """Intervals of 95 % of all levels (l, 2), in their units: by profile if weakly told."""
+def level_intervals(fit: OutputFeedbackFit, covariance: PersonCovariance) -> Array:
+    """Intervals of 95 % of all levels (l, 2), in their units: by profile if weakly identified."""
     found = np.array(covariance.level_intervals(fit.levels))
     for k in np.flatnonzero(covariance.levels > _HARDLY):
         found[k] = level_interval(fit, int(k))
     return frozen(found)
 
 
-def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
+def entry_intervals(fit: OutputFeedbackFit, covariance: PersonCovariance) -> Array:
     """Intervals of 95 % of the entries of the gain (entries, 2) by profile, in their units."""
     dK, _ = fit.space.changes(fit.theta)
     found = []
@@ -59,7 +60,7 @@ def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
         np.ravel(fit.K), dK.reshape(len(dK), -1).T, np.ravel(covariance.entries), strict=True
     ):
         length = float(np.linalg.norm(slopes))
-        if not deviation < TOLD * length:
+        if not deviation < IDENTIFIED * length:
             found.append((np.nan, np.nan))
             continue
         along = np.zeros(len(fit.theta))
@@ -69,13 +70,13 @@ def entry_intervals(fit: PersonFit, covariance: PersonCovariance) -> Array:
     return frozen(found)
 
 
-def level_interval(fit: PersonFit, index: int) -> tuple[float, float]:
+def level_interval(fit: OutputFeedbackFit, index: int) -> tuple[float, float]:
     """Interval of 95 % of a level by profile."""
     low, high = profile(fit, np.eye(len(fit.theta))[fit.space.own + index])
     return float(np.exp(low)), float(np.exp(high))
 
 
-def profile(fit: PersonFit, along: Array) -> tuple[float, float]:
+def profile(fit: OutputFeedbackFit, along: Array) -> tuple[float, float]:
     """Interval of 95 % of along'theta by profile.
 
     `along` (q,).
@@ -84,18 +85,18 @@ def profile(fit: PersonFit, along: Array) -> tuple[float, float]:
     return low, high
 
 
-def fallen(fit: PersonFit, along: Array, value: float) -> float:
+def fallen(fit: OutputFeedbackFit, along: Array, value: float) -> float:
     """By how much the likelihood falls with along'theta held at a value, all else at its best.
 
     `along` (q,).
     """
     prior, unseen = fit.prior.freed(along), np.array(fit.unseen)
-    top = prior.placed(np.array(fit.theta), fit.told)
+    top = prior.placed(np.array(fit.theta), fit.identified)
     found = held_person(prior, top, along, value - float(along @ top.theta), unseen, _BUDGET)
     return np.inf if found is None else top.value - found[0].value
 
 
-def _end(fit: PersonFit, along: Array, side: int) -> float:
+def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
     """Where the profile has fallen by enough on one side.
 
     With all else at its best the slope along the value is that of the profile, and the information
@@ -103,7 +104,7 @@ def _end(fit: PersonFit, along: Array, side: int) -> float:
     search begins on its ridge.
     """
     prior, begin = fit.prior.freed(along), float(along @ fit.theta)
-    here, unseen = prior.placed(np.array(fit.theta), fit.told), np.array(fit.unseen)
+    here, unseen = prior.placed(np.array(fit.theta), fit.identified), np.array(fit.unseen)
     top, inside, outside, value = here.value, begin, side * np.inf, begin
     for _ in range(_TRIES):
         gradient, curvature = prior.parabola(here, unseen)

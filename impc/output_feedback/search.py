@@ -145,7 +145,7 @@ def unseen_slope(prior: Prior, here: Place) -> Array:
 
 
 def learned_slope(prior: Prior, slope: Array, here: Place, there: Place) -> Array:
-    """That slope (q,) after a step, by Broyden's update, damped: short steps tell little.
+    """That slope (q,) after a step, by Broyden's update, damped: short steps say little.
 
     `slope` (q,).
     """
@@ -165,7 +165,7 @@ def _lost(prior: Prior, here: Place) -> Array:
     way has a likelihood the slope is taken for zero.
     """
     own, slopes = prior.space.own, np.zeros(len(prior.scales))
-    information = here.told.information + prior.slopes(here.theta)[1]
+    information = here.identified.information + prior.slopes(here.theta)[1]
     ridges = -np.linalg.solve(information[:own, :own], information[:own, own:])
     ways = _DIFFERENCE * np.hstack([ridges.T, np.eye(len(slopes))])
     for (index, way), sign in itertools.product(enumerate(ways), (1, -1)):

@@ -17,7 +17,7 @@ from impc.inverse.coordinates import Coordinates
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.structured_search import PriceCoordinates
+from impc.inverse.structured_search import WeightCoordinates
 from impc.model.riccati import lyapunov_series
 from impc.output_feedback.observer import LEVELS
 from impc.output_feedback.prior import Prior
@@ -46,14 +46,14 @@ class Asked:
     recorder: Array | None
     held: Sequence[str]  # Kinds of levels that are not searched
     spread: float  # Standard deviation of the prior
-    counted: int  # The first sample of each trial that is told
+    counted: int  # The first sample of each trial that is identified
 
 
-def gain_space(point: Point, prices: Array | None) -> Coordinates:
-    """Coordinates of gain or prices about a point; `prices` (count,) where these are searched."""
+def gain_space(point: Point, cost_weights: Array | None) -> Coordinates:
+    """Coordinates of gain or cost weights about a point; `cost_weights` (count,) if searched."""
     structure = point.problem.structure
-    if prices is not None and structure is not None:
-        return PriceCoordinates(point.problem, structure, np.array(prices))
+    if cost_weights is not None and structure is not None:
+        return WeightCoordinates(point.problem, structure, np.array(cost_weights))
     kept, gains = kept_to(point.problem), None
     if kept is not None:
         T, _ = natural_coordinates(point.problem.plant, point.K)
@@ -61,10 +61,10 @@ def gain_space(point: Point, prices: Array | None) -> Coordinates:
     return Coordinates(point.problem, point.K, point.S, gains)
 
 
-def prices_at(space: PersonCoordinates, theta: Array) -> Array | None:
-    """Prices (count,) at theta (q,), where they are searched."""
+def cost_weights_at(space: PersonCoordinates, theta: Array) -> Array | None:
+    """Cost weights (count,) at theta (q,), where they are searched."""
     own = space.space
-    return own.unknowns(theta[: space.own]) if isinstance(own, PriceCoordinates) else None
+    return own.unknowns(theta[: space.own]) if isinstance(own, WeightCoordinates) else None
 
 
 def prior_about(space: PersonCoordinates, asked: Asked) -> Prior:
@@ -78,16 +78,16 @@ def _prior(space: PersonCoordinates, asked: Asked, size: _Sizes) -> Prior:
 
 
 def likeliest_start(
-    points: Sequence[Point], prices: Array | None, asked: Asked
+    points: Sequence[Point], cost_weights: Array | None, asked: Asked
 ) -> tuple[Prior, Array]:
     """Where a search begins, of several points.
 
-    `prices` (count,); returns (q,).
+    `cost_weights` (count,); returns (q,).
     """
     found, highest, reason = None, -np.inf, "no number"
     for point in points:
         try:
-            own = gain_space(point, prices)
+            own = gain_space(point, cost_weights)
             size = _sizes(own.unpack(own.start))
             white = size.recorder if asked.recorder is None else np.asarray(asked.recorder)
             space = PersonCoordinates(own, asked.observer, white, asked.held, asked.counted)

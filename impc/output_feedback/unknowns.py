@@ -1,6 +1,6 @@
-"""The unknowns of a likelihood: those of a search for a gain or for prices, then levels of noise.
+"""The unknowns of a likelihood: those of a search for a gain or for weights, then levels of noise.
 
-    theta = (coordinates of `Coordinates` or `PriceCoordinates` | logarithms of the levels)
+    theta = (coordinates of `Coordinates` or `WeightCoordinates` | logarithms of the levels)
 
 A level of zero stays zero and one that is held stays as it is, all others are searched: of the
 person's noise, and of the recorder's (docs/noisy-people.md).
@@ -18,7 +18,7 @@ from impc.control.constraint_rows import directions
 from impc.errors import SolverError
 from impc.inverse.coordinates import PARAMETER_UNIT
 from impc.inverse.problem import controller_for
-from impc.inverse.structured_search import PriceCoordinates
+from impc.inverse.structured_search import WeightCoordinates
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import is_stable, lyapunov_series, stabilises
@@ -48,7 +48,7 @@ class Person:
 
 
 @dataclass(frozen=True)
-class Told:
+class LikelihoodTerms:
     """What all recordings say at a point."""
 
     value: float  # Log-likelihood, nats
@@ -78,7 +78,8 @@ class PersonCoordinates:
         free = np.array([*(kind not in held for kind in kinds), *[True] * len(recorder)])
         self.moving = np.flatnonzero((self.first > 0) & free)
         self.start = np.concatenate([space.start, np.log(self.first[self.moving])])
-        #: How many coordinates gain or prices have, where initial states begin and end, and how
+        #: How many coordinates gain or cost weights have, where initial states begin and end, and
+        #: how
         #: many unknowns are not levels.
         self.gain = int(space.ends[0])
         self.shared, self.after = int(space.ends[1]), int(space.ends[2])
@@ -115,12 +116,12 @@ class PersonCoordinates:
         return Person(self.space.unpack(theta[: self.own]), person, frozen(levels[split:]))
 
     def value(self, theta: Array) -> float:
-        """Log-likelihood at theta (q,), in a fraction of the time of `told`."""
+        """Log-likelihood at theta (q,), in a fraction of the time of `identified`."""
         person = self.unpack(theta)
         nothing = _Moved(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
         return sum(item.value for item in self._trials(theta, person, [nothing]))
 
-    def told(self, theta: Array) -> Told:
+    def identified(self, theta: Array) -> LikelihoodTerms:
         """Log-likelihood and its derivatives at theta (q,)."""
         person, q = self.unpack(theta), len(theta)
         columns = [self._columns(trial) for trial in range(self.space.trials)]
@@ -130,21 +131,21 @@ class PersonCoordinates:
         for moved, found in zip(columns, trials, strict=True):
             gradient[moved.all] += found.score.sum(axis=0)
             information[np.ix_(moved.all, moved.all)] += found.information
-            score: Array = np.zeros((len(found.told), q))
+            score: Array = np.zeros((len(found.identified), q))
             score[:, moved.all] = found.score
             scores.append(score)
         value = sum(item.value for item in trials)
-        return Told(value, gradient, information, scores, trials)
+        return LikelihoodTerms(value, gradient, information, scores, trials)
 
     def wandering(self, theta: Array) -> tuple[float, Array]:
         """Logarithm of how far white noise at the inputs drives the loop, beside the start's.
 
-        It grows without end towards the border of gains that stabilise. Prices never meet it.
+        It grows without end towards the border of gains that stabilise. Cost weights never meet it.
 
         `theta` (q,); returns (q,).
         """
         space, gradient = self.space, np.zeros(len(theta))
-        if isinstance(space, PriceCoordinates):
+        if isinstance(space, WeightCoordinates):
             return 0.0, gradient
         here = space.unpack(theta[: self.own])
         plant = here.problem.plant

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
-# Of plants that say no units, angles are told by their names.
+# Of plants that say no units, angles are identified by their names.
 _ANGLES = ("theta", "angle", "yaw", "pitch", "roll")
 _CHOSEN: ContextVar[str] = ContextVar("angles", default="degrees")
 

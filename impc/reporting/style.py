@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from matplotlib.ticker import Formatter
 
-# Their lightness (46, 56, 60 of 100) is too near to tell them apart in grey, hence the markers
+# Their lightness (46, 56, 60 of 100) is too near to distinguish them in grey, hence the markers
 # and line styles beside them.
 #: Colours of Okabe and Ito (2008).
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"

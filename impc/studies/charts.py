@@ -5,9 +5,10 @@ A chart is a dictionary that `impc/reporting/page.js` reads:
     title, label, step    what it shows, of its time axis, and s between two of its samples
     curves                label, color and dash of each; the first is drawn thick
     panels                a signal each: label, bounds, and values of every curve (null: none)
-    positions             weights to walk through: label, difference, prices, mixed prices over
+    positions             weights to walk through: label, difference, cost weights, mixed cost
+    weights over
                           the root of both (-1 to 1), values of the last curve in every panel
-    prices, mixed         names of these numbers
+    cost weights, mixed         names of these numbers
 
 Long trials are drawn with every k-th sample (docs/results.md).
 """
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 # Samples that are drawn of a trial. Of the weights' chart, which has a curve a position: how many
 # are simulated, and each how many-th is drawn.
 _SAMPLES, _FEW, _EACH = 1500, 400, 2
-# Mixed prices that are shown.
+# Mixed cost weights that are shown.
 _MIXED = 3
 # Weights between one rule's and the next.
 _BETWEEN = 3
@@ -126,7 +127,7 @@ def weights_chart(problem: Problem, found: Intent) -> dict[str, Any]:
             {
                 "label": f"{label}.",
                 "difference": f"The command differs by {moved:.0e} of its largest value at most.",
-                "prices": plain(np.diag(scaled[place])),
+                "cost_weights": plain(np.diag(scaled[place])),
                 "mixed": plain(mixed[place]),
                 "panels": [panel["curves"][0] for panel in panels],
             }
@@ -141,13 +142,13 @@ def weights_chart(problem: Problem, found: Intent) -> dict[str, Any]:
         ],
         "panels": own,
         "positions": positions,
-        "prices": [f"price of {name}" for name in plant.states],
+        "cost_weights": [f"cost weight of {name}" for name in plant.states],
         "mixed": names,
     }
 
 
 def _mixed(scaled: Array, states: tuple[str, ...]) -> tuple[Array, list[str]]:
-    """Of the mixed prices of Q (k, n, n) over their roots the few that move most, and names."""
+    """Of the mixed weights of Q (k, n, n) over their roots the few that move most, and names."""
     roots = np.sqrt(np.maximum(np.diagonal(scaled, axis1=1, axis2=2), np.finfo(float).tiny))
     shares = scaled / (roots[:, :, None] * roots[:, None, :])
     rows, columns = np.triu_indices(len(states), 1)

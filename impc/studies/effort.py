@@ -1,4 +1,4 @@
-"""What a command will take, told before it is begun: seconds and memory, by orders of magnitude.
+"""What a command will take, said before it is begun: seconds and memory, by orders of magnitude.
 
 The largest arrays are the rows of the constraints, r = 2 N m for bounded inputs, and their
 derivatives along p directions, r x N m x p; and those of the states, samples x n x p
@@ -38,7 +38,7 @@ _A_TRIAL = 1e-3
 _FIT, _REPLICATE, _PROFILE = 300, 40, 1000
 # Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
 # LASSO with its refit, and of Table C.1 (of the outputs alone: a few thousand a solve). Counted on
-# the drug: 7, 5, 74; on the head, whose twelve parameters are hardly told: 200, 17, 23.
+# the drug: 7, 5, 74; on the head, whose twelve parameters are hardly said: 200, 17, 23.
 _START, _REFIT, _LASSO, _TABLE = 30, 9, 100, 4000
 # Arrays of the size of the derivative that a fit holds, and fits at a time in a bootstrap.
 _COPIES, _THREADS = 6, 2

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from impc.assess.assessments import judge
+from impc.assess.assessments import evaluate_method
 from impc.checking import checked
 from impc.control.named_solver import described
 from impc.errors import InputError
@@ -107,7 +107,7 @@ def report(
     if estimate.K is None:
         raise InputError("estimate", f"has no gain: {estimate.reason}", "try another method")
     if settings is None:
-        document = _document(judge(estimate, estimate.problem.bounds))
+        document = _document(evaluate_method(estimate, estimate.problem.bounds))
     else:
         kept = FitProgress(estimate=lambda name, make: estimate if name == _OURS else make())
         result = fit_recordings(estimate.problem, settings, kept)
@@ -189,7 +189,7 @@ def _findings(fit: MethodFit) -> list[str]:
         lines.append(
             Markup(
                 "Other weights have the same gain and behave alike: "
-                "<code>impc.identifiability</code> says how many numbers the recordings tell."
+                "<code>impc.identifiability</code> says how many numbers the recordings identify."
             )
         )
     return lines

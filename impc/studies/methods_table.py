@@ -12,7 +12,7 @@ import pandas as pd
 
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.inverse.methods import METHODS
-from impc.model.plant import gain_unit, price_unit
+from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.document import Terms
 from impc.reporting.finding import Finding
 
@@ -75,7 +75,7 @@ def _data(fit: MethodFit) -> dict[str, Any]:
 def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, str, float]]:
     """The lower triangles of Q and R, one row an entry: matrix, two names, unit, value."""
     return [
-        (which, one, other, price_unit(plant, one, other), float(matrix[i, j]))
+        (which, one, other, weight_unit(plant, one, other), float(matrix[i, j]))
         for which, names, matrix in (
             ("Q", plant.states, weights.Q),
             ("R", plant.controls, weights.R),

@@ -44,16 +44,16 @@ def test_every_interval_holds_the_truth(result: FitResult) -> None:
     """Seeds 11 and 12, chosen before the run; 95 % intervals of two entries and the limit."""
     truth = dict(zip(("K.force.x[0]", "K.force.x[1]"), true_controller().K[0], strict=True))
     truth["u_max.force"] = 1.0
-    methods = {item.method for item in result.certainty.intervals}
+    methods = {item.method for item in result.uncertainty.intervals}
     assert methods == {"sandwich", "cramer-rao", "model", "profile"}
-    for item in result.certainty.intervals:
+    for item in result.uncertainty.intervals:
         assert item.low < truth[item.name] < item.high, item
         assert item.value is not None
 
 
 @pytest.mark.full
 def test_the_set_of_weights_is_described(result: FitResult) -> None:
-    found = result.certainty.weights
+    found = result.uncertainty.weights
     assert found is not None
     assert found.dimension == 1
     Q = result.intent.reported.weights.Q
@@ -66,18 +66,18 @@ def test_the_set_of_weights_is_described(result: FitResult) -> None:
 
 @pytest.mark.full
 def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -> None:
-    """The truth has a limit of 1 and N = 10: no limit is ruled out, N = 20 is not told apart."""
-    by_name = {item.name: item for item in result.certainty.alternatives}
+    """The truth has a limit of 1 and N = 10: no limit is ruled out, N = 20 is not distinguished."""
+    by_name = {item.name: item for item in result.uncertainty.alternatives}
     assert list(by_name) == ["as fitted", "no limit", "horizon 1", "horizon 20"]
     first = by_name["as fitted"]
     assert "rule out no limit" in verdict(first, by_name["no limit"])
     assert by_name["no limit"].held_out < first.held_out
-    assert "cannot tell" in verdict(first, by_name["horizon 20"])
+    assert "cannot say" in verdict(first, by_name["horizon 20"])
 
 
 def test_verdicts() -> None:
     one = Alternative("as fitted", 10, 1.0, 0.0, 90.0, "")
-    assert "cannot tell" in verdict(one, replace(one, name="b", aic=1.9))
+    assert "cannot say" in verdict(one, replace(one, name="b", aic=1.9))
     assert "speak weakly against b" in verdict(one, replace(one, name="b", aic=5.0))
     assert "rule out b" in verdict(one, replace(one, name="b", aic=50.0))
     assert "rule out as fitted" in verdict(replace(one, aic=50.0), replace(one, name="b"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial
-from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed, judge
+from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed, evaluate_method
 from impc.checking import replace
 from impc.inverse import methods
 from impc.studies.fit.settings import FitSettings
@@ -18,7 +18,7 @@ def fit() -> MethodFit:
     """A gain that exceeds the bound of the cart."""
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], settings)
-    return judge(methods.fit(problem, "feedback_gain"), problem.bounds)
+    return evaluate_method(methods.fit(problem, "feedback_gain"), problem.bounds)
 
 
 def test_numbers_of_a_gain(fit: MethodFit) -> None:
@@ -40,7 +40,7 @@ def test_numbers_of_a_gain(fit: MethodFit) -> None:
 
 
 def test_a_method_without_a_gain(fit: MethodFit) -> None:
-    none = judge(replace(fit.estimate, K=None, S=None), fit.estimate.problem.bounds)
+    none = evaluate_method(replace(fit.estimate, K=None, S=None), fit.estimate.problem.bounds)
     for item in ASSESSMENTS.values():
         values = item.find(none)
         assert len(values) == len(item.signals(none.estimate.problem.plant))
@@ -53,6 +53,6 @@ def test_the_condition_number_is_that_of_both_weights(fit: MethodFit) -> None:
     values = np.concatenate(
         [np.linalg.eigvalsh(found.stage_weights.Q), np.linalg.eigvalsh(found.stage_weights.R)]
     )
-    assert assessed(judge(found, problem.bounds))["condition_number"] == pytest.approx(
+    assert assessed(evaluate_method(found, problem.bounds))["condition_number"] == pytest.approx(
         values.max() / values.min()
     )

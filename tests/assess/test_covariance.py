@@ -108,29 +108,29 @@ def test_deviations_where_a_parameter_is_fitted(m: int, seed: int) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("seed", [52])
 def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> None:
-    """A random plant on which the free gain wanders off, and takes its told directions along."""
+    """A random plant on which the free gain drifts, and takes its identified directions along."""
     controller, trial = random_recording(seed, 1, 90.0)
     fitted = fit(controller, trial)
     truth = controller.K
     estimate = gain_estimate(fitted)
     found = estimate.covariance
     off = np.abs(found.along(estimate.K - truth) / found.deviations)
-    assert np.max(off[found.told]) < 3.5
-    assert not np.all(found.told)
-    # What is not told stays where the weights are.
+    assert np.max(off[found.identified]) < 3.5
+    assert not np.all(found.identified)
+    # What is not identified stays where the weights are.
     step = found.along(estimate.K - fitted.gain)
-    assert np.max(np.abs(step[~found.told])) < 0.2
+    assert np.max(np.abs(step[~found.identified])) < 0.2
 
 
 @pytest.mark.full
 def test_told_directions_count_what_is_not_told_to_second_order() -> None:
-    """Three inputs and one output: to first order the best told direction is 2.4 deviations off."""
+    """Three inputs and one output: to first order the best direction is 2.4 deviations off."""
     controller, trial = random_recording(1, 3, 90.0)
     estimate = gain_estimate(fit(controller, trial))
     found, error = estimate.covariance, estimate.K - controller.K
     linear = gain_covariance(estimate.problem, np.array(estimate.K), np.array(estimate.S))
-    assert np.max(np.abs(linear.along(error) / linear.deviations)[linear.told]) > 1.96
-    assert np.max(np.abs(found.along(error) / found.deviations)[found.told]) < 1.96
+    assert np.max(np.abs(linear.along(error) / linear.deviations)[linear.identified]) > 1.96
+    assert np.max(np.abs(found.along(error) / found.deviations)[found.identified]) < 1.96
     assert np.all(found.deviations >= linear.deviations * (1 - 1e-9))
 
 
@@ -143,7 +143,7 @@ def test_told_directions_count_what_is_not_told_to_second_order() -> None:
     ],
 )
 def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -> None:
-    """Seeds from 0; all told entries and all told directions together, first-order noise (0.8).
+    """Seeds from 0; all identified entries and directions together, first-order noise (0.8).
 
     With the 95 % that they say, fewer than 86 % of 50 or of 64 fall inside once in a hundred, of 32
     once in forty; the scores have unit variance within their own spread.
@@ -161,7 +161,7 @@ def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -
 @pytest.mark.parametrize("inputs", [1, 2, 3])
 @pytest.mark.parametrize("vaf", [90.0, 70.0])
 def test_two_hundred_recordings(inputs: int, vaf: float) -> None:
-    """White noise: every entry and every direction that is told in 50 and more, 92 to 98 %."""
+    """White noise: every entry and direction that is identified in 50 and more, 92 to 98 %."""
     found = [score_carts(seed, inputs, vaf, 0.0) for seed in range(200)]
     for scores in ([item.entries for item in found], [item.directions for item in found]):
         table = np.array(scores)

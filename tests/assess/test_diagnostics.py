@@ -1,4 +1,4 @@
-"""Noise inside the loop and model error, told from the residuals of subjects who are known."""
+"""Noise inside the loop and model error, from the residuals of subjects who are known."""
 
 from __future__ import annotations
 
@@ -161,19 +161,19 @@ def test_the_default_subject_is_told_from_the_same_on_a_linear_plant() -> None:
     assert default.structure.found
     assert default.structure.share > 0.1
     assert not linear.structure.found
-    told = residual_warnings(default, ("theta1", "theta2"), 0.1)
-    assert any("do not contain this error" in line for line in told)
+    identified = residual_warnings(default, ("theta1", "theta2"), 0.1)
+    assert any("do not contain this error" in line for line in identified)
 
 
 @pytest.mark.full
 def test_motor_noise_with_saturation_leads_the_page() -> None:
-    """Motor noise of 1 Nm, at the limit for part of the time; noise on the angles is not told."""
+    """Motor noise of 1 Nm, at the limit for part of the time; noise on the angles is not found."""
     found = diagnosed(0, "motor", **SHORT)
     assert found.loop is not None
     assert found.loop.found
-    told = residual_warnings(found, ("theta1", "theta2"), 0.12)
-    assert "noise inside the loop and not in the recorder" in told[0]
-    assert "stands at its bound for 12.0 %" in told[0]
+    identified = residual_warnings(found, ("theta1", "theta2"), 0.12)
+    assert "noise inside the loop and not in the recorder" in identified[0]
+    assert "is at its bound for 12.0 %" in identified[0]
     recorder = diagnosed(0, "recorder", **SHORT)
     assert recorder.loop is not None
     assert not recorder.loop.found

@@ -1,4 +1,4 @@
-"""What recordings would tell: against derivatives by differences and dense covariances."""
+"""What recordings would say: against derivatives by differences and dense covariances."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
 
-PRICES = np.log([4.0, 1.5])
+COST_WEIGHTS = np.log([4.0, 1.5])
 NOISE = 0.03
 SAMPLES = 160
 
 
 def cart() -> tuple[Plant, Structure, Array]:
-    """A cart, prices of its position and speed, and a push that takes it to its limit."""
+    """A cart, cost weights of its position and speed, and a push that takes it to its limit."""
     plant = carts(1)
     push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 1)), 10, axis=0)
     return plant, Structure(plant, "diagonal"), push
 
 
-def outputs(prices: Array, x0: Array, limit: float) -> Array:
+def outputs(cost_weights: Array, x0: Array, limit: float) -> Array:
     """Recorded positions (samples,), by the controller."""
     plant, structure, push = cart()
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    law = Controller(plant, structure.weights(prices), bounds, 8, terminal_set=False)
+    law = Controller(plant, structure.weights(cost_weights), bounds, 8, terminal_set=False)
     run = simulate(law, scenario(plant, x0, disturbance=push))
     return np.asarray((run.x @ plant.C.T)[:SAMPLES, 0])
 
 
 def cart_problem() -> Problem:
     plant, structure, push = cart()
-    trial = Recording(plant, outputs(PRICES, np.zeros(2), 1.0)[:, None], push)
+    trial = Recording(plant, outputs(COST_WEIGHTS, np.zeros(2), 1.0)[:, None], push)
     return Problem(
         plant, Bounds(plant, u_min=-1, u_max=1), 8, [trial],
         terminal_set=False, unknown_start=True, structure=structure,
@@ -57,16 +57,19 @@ def differences(points: list[tuple[Array, Array, float]], step: float) -> Array:
 
 
 def columns() -> tuple[Array, Array, Array]:
-    """Derivatives with respect to logarithms of prices, initial state, logarithm of the limit."""
+    """Derivatives with respect to logarithms of weights, initial state, logarithm of the limit."""
     # At 1e-4 a sample comes to its limit in between.
     h, still = 1e-5, np.zeros(2)
     ways = (1.0, -1.0, 2.0, -2.0)
-    on_prices = [
-        differences([(PRICES + way * h * row, still, 1.0) for way in ways], h) for row in np.eye(2)
+    on_cost_weights = [
+        differences([(COST_WEIGHTS + way * h * row, still, 1.0) for way in ways], h)
+        for row in np.eye(2)
     ]
-    on_start = [differences([(PRICES, way * h * row, 1.0) for way in ways], h) for row in np.eye(2)]
-    on_limit = differences([(PRICES, still, float(np.exp(way * h))) for way in ways], h)
-    return np.array(on_prices).T, np.array(on_start).T, on_limit
+    on_start = [
+        differences([(COST_WEIGHTS, way * h * row, 1.0) for way in ways], h) for row in np.eye(2)
+    ]
+    on_limit = differences([(COST_WEIGHTS, still, float(np.exp(way * h))) for way in ways], h)
+    return np.array(on_cost_weights).T, np.array(on_start).T, on_limit
 
 
 def dense(root: float) -> Array:
@@ -76,9 +79,9 @@ def dense(root: float) -> Array:
 
 @pytest.mark.parametrize("root", [0.0, 0.6])
 def test_deviations_are_those_of_least_squares(root: float) -> None:
-    found = expected_intervals(cart_problem(), PRICES, NOISE, root=root)
-    on_prices, on_start, _ = columns()
-    both = np.hstack([on_prices, on_start])
+    found = expected_intervals(cart_problem(), COST_WEIGHTS, NOISE, root=root)
+    on_cost_weights, on_start, _ = columns()
+    both = np.hstack([on_cost_weights, on_start])
     back = np.linalg.pinv(both)
     truth = np.sqrt(np.diag(back @ dense(root) @ back.T))[:2]
     # The package's own noise reaches 250 samples back, and differences are good to 1e-7.
@@ -91,10 +94,10 @@ def test_deviations_are_those_of_least_squares(root: float) -> None:
 
 
 def test_the_limit_is_told_as_least_squares_with_a_free_gain_tells_it() -> None:
-    found = expected_intervals(cart_problem(), PRICES, NOISE)
-    on_prices, on_start, on_limit = columns()
-    # Two prices move this gain in both of its directions: the same span.
-    others = np.hstack([on_prices, on_start])
+    found = expected_intervals(cart_problem(), COST_WEIGHTS, NOISE)
+    on_cost_weights, on_start, on_limit = columns()
+    # Two cost weights move this gain in both of its directions: the same span.
+    others = np.hstack([on_cost_weights, on_start])
     rest = on_limit - others @ np.linalg.lstsq(others, on_limit)[0]
     assert found.limits[0] == pytest.approx(NOISE / np.linalg.norm(rest), rel=2e-5)
 
@@ -103,10 +106,12 @@ def test_a_limit_that_is_never_met_is_not_told() -> None:
     problem = cart_problem()
     plant = problem.plant
     wide = Bounds(plant, u_min=-9, u_max=9)
-    law = Controller(plant, cart()[1].weights(PRICES), wide, 8, terminal_set=False)
+    law = Controller(plant, cart()[1].weights(COST_WEIGHTS), wide, 8, terminal_set=False)
     run = simulate(law, scenario(plant, np.zeros(2), disturbance=cart()[2]))
     trial = Recording(plant, (run.x @ plant.C.T)[:SAMPLES], cart()[2])
-    found = expected_intervals(replace(problem, bounds=wide, recordings=[trial]), PRICES, NOISE)
+    found = expected_intervals(
+        replace(problem, bounds=wide, recordings=[trial]), COST_WEIGHTS, NOISE
+    )
     assert np.isinf(found.limits[0])
 
 
@@ -118,7 +123,7 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
             [[item.low - item.value, item.high - item.value] for item in found.intervals]
         )
 
-    small, large = (expected_intervals(cart_problem(), PRICES, x) for x in (1e-4, 1e-3))
+    small, large = (expected_intervals(cart_problem(), COST_WEIGHTS, x) for x in (1e-4, 1e-3))
     assert large.deviations == pytest.approx(10 * small.deviations, rel=1e-9)
     wanted = 1.959964 * np.outer(small.deviations, [-1.0, 1.0])
     np.testing.assert_allclose(ends(small), wanted, rtol=0.02)
@@ -127,8 +132,8 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
 def test_what_cannot_be_meant_is_refused() -> None:
     problem = cart_problem()
     with pytest.raises(InputError, match="structure"):
-        expected_intervals(replace(problem, structure=None), PRICES, NOISE)
+        expected_intervals(replace(problem, structure=None), COST_WEIGHTS, NOISE)
     with pytest.raises(InputError, match="deviation"):
-        expected_intervals(problem, PRICES, 0.0)
+        expected_intervals(problem, COST_WEIGHTS, 0.0)
     with pytest.raises(InputError, match="root"):
-        expected_intervals(problem, PRICES, NOISE, root=1.0)
+        expected_intervals(problem, COST_WEIGHTS, NOISE, root=1.0)

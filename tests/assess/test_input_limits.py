@@ -59,7 +59,7 @@ def test_a_limit_that_is_never_met_is_not_determined() -> None:
 
 @pytest.mark.slow
 def test_limits_of_noisy_subjects() -> None:
-    """The seat at 6 Nm, an eighth of its samples saturated, seeds 0 to 4; at 70 Nm: not told.
+    """The seat at 6 Nm, an eighth of its samples saturated, seeds 0 to 4; at 70 Nm: not identified.
 
     With noise that leaves a VAF of 90 % the limit itself has a deviation of 1 %: of five subjects
     the median must be within 2 % and no interval may miss by more than its own half.

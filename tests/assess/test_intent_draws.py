@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial
-from experiments.cursor_tracking import ConditionResult, price_ratio
+from experiments.cursor_tracking import ConditionResult, weight_ratio
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.weights_ranges import summarise_weights
@@ -17,7 +17,11 @@ from impc.model.riccati import solve_lqr
 from impc.studies.fit.result import FittedParameter
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
-from impc.studies.fit.weight_findings import price_findings, set_sentences, statement_finding
+from impc.studies.fit.weight_findings import (
+    set_sentences,
+    statement_finding,
+    weight_interval_findings,
+)
 
 SIZES = np.array([1.0, 1.0])
 
@@ -49,15 +53,18 @@ def test_drawn_gains_spread_as_their_covariance(
 def test_a_statement_is_made_only_when_other_gains_agree(
     fitted: tuple[Estimate, GainCovariance],
 ) -> None:
-    """The same gain and the same weights: told to its deviations, and all but unknown."""
+    """The same gain and the same weights: identified to its deviations, and all but unknown."""
     found, covariance = fitted
     K, metrics = np.array(found.gain), np.array(found.metrics)
     bare = summarise_weights(cart(), K, metrics, SIZES)
     held = [item for item in bare.statements if item.holds is not None]
-    assert held, "at the fitted gain a price is above the other"
+    assert held, "at the fitted gain a cost weight is above the other"
     assert not any(item.made for item in bare.statements), "nothing was tried"
     outcomes = {}
-    for name, deviations in (("told", covariance.deviations), ("unknown", np.full(2, np.inf))):
+    for name, deviations in (
+        ("identified", covariance.deviations),
+        ("unknown", np.full(2, np.inf)),
+    ):
         draws = drawn_gains(
             cart(), found.stage_weights, K, replace(covariance, deviations=deviations)
         )
@@ -65,19 +72,21 @@ def test_a_statement_is_made_only_when_other_gains_agree(
         assert [item.holds for item in outcomes[name].statements] == [
             item.holds for item in bare.statements
         ]
-    assert any(item.made for item in outcomes["told"].statements)
+    assert any(item.made for item in outcomes["identified"].statements)
     assert not any(item.made for item in outcomes["unknown"].statements)
-    assert outcomes["unknown"].angle_of_gain > outcomes["told"].angle_of_gain
-    for near, far in zip(outcomes["told"].prices, outcomes["unknown"].prices, strict=True):
+    assert outcomes["unknown"].angle_of_gain > outcomes["identified"].angle_of_gain
+    for near, far in zip(
+        outcomes["identified"].cost_weights, outcomes["unknown"].cost_weights, strict=True
+    ):
         assert far.low_drawn <= near.low_drawn <= near.low <= near.high <= near.high_drawn
         assert near.high_drawn < far.high_drawn
-    told, unknown = (statement_finding(outcomes[name]) for name in ("told", "unknown"))
-    assert any(row[1] == "true for all" or row[1] == "false for all" for row in told.rows)
+    identified, unknown = (statement_finding(outcomes[name]) for name in ("identified", "unknown"))
+    assert any(row[1] == "true for all" or row[1] == "false for all" for row in identified.rows)
     assert all(row[1] not in ("true for all", "false for all") for row in unknown.rows)
-    assert "39 other gains" in told.caption
+    assert "39 other gains" in identified.caption
     assert "none may be made" in statement_finding(bare).caption
-    assert price_findings(bare) == []
-    assert any("over 39 others" in line for line in set_sentences(outcomes["told"]))
+    assert weight_interval_findings(bare) == []
+    assert any("over 39 others" in line for line in set_sentences(outcomes["identified"]))
 
 
 def test_a_parameter_that_stays_where_it_began_is_not_determined() -> None:
@@ -92,8 +101,8 @@ def test_the_ratio_of_prices_has_an_interval() -> None:
         11.0, 9, 0.1, 0.08, True, False, [], [], [], [], [1.0, 1.0], 3, 1e6, 1e6, 1e6,
         [5e5, 2e6], [1.0, 2.0], "", [], [], [],
     )  # fmt: skip
-    other = replace(one, blur=29.0, price_of_error=1e3, resampled_price=[1e2, 1e4])
-    assert "falls by a factor of 1e+03 (33 %: 200 to 5e+03)" in price_ratio([one, other])
-    crossing = replace(other, resampled_price=[1e2, 1e7])
-    assert "is not told from constant" in price_ratio([one, crossing])
-    assert "nothing is said" in price_ratio([replace(one, resampled_price=[]), other])
+    other = replace(one, blur=29.0, weight_of_error=1e3, resampled_weight=[1e2, 1e4])
+    assert "falls by a factor of 1e+03 (33 %: 200 to 5e+03)" in weight_ratio([one, other])
+    crossing = replace(other, resampled_weight=[1e2, 1e7])
+    assert "is not distinguished from constant" in weight_ratio([one, crossing])
+    assert "nothing is said" in weight_ratio([replace(one, resampled_weight=[]), other])

@@ -22,7 +22,7 @@ from impc.model.plant import Plant
 from tests.support import extrapolated_slope
 
 
-def told(seed: int = 0) -> Spectrum:
+def identified(seed: int = 0) -> Spectrum:
     rng = np.random.default_rng(seed)
     found = spectrum([rng.standard_normal((400, 2)) * [1.0, 30.0] for _ in range(3)])
     assert found is not None
@@ -51,7 +51,7 @@ def both(theta: Array, found: Spectrum) -> tuple[float, Array]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_slopes_are_those_of_differences(seed: int) -> None:
-    found, theta = told(seed), drawn(seed)
+    found, theta = identified(seed), drawn(seed)
     way = np.random.default_rng(seed + 50).standard_normal(len(theta))
 
     def along(t: float) -> Array:
@@ -62,7 +62,7 @@ def test_slopes_are_those_of_differences(seed: int) -> None:
 
 
 def test_an_unknown_beyond_its_end_does_not_move() -> None:
-    found, theta = told(), drawn(1)
+    found, theta = identified(), drawn(1)
     ends = {0: 9.0, 2 * ORDER: 12.0, size(2) - 1: -40.0, size(2): 20.0, size(2) + 1: 5.0}
     for index, value in ends.items():
         there = theta.copy()
@@ -74,7 +74,7 @@ def test_an_unknown_beyond_its_end_does_not_move() -> None:
 
 
 def test_an_output_of_one_reflection_is_an_autoregression_of_order_one() -> None:
-    found, k = told(), 0.6
+    found, k = identified(), 0.6
     theta = np.zeros(size(2))
     theta[0], theta[size(2) - 2 :] = np.arctanh(k), -60.0  # white variances at their least
     S, _ = outputs(theta, found)
@@ -85,7 +85,7 @@ def test_an_output_of_one_reflection_is_an_autoregression_of_order_one() -> None
 
 def test_a_loop_answers_as_its_transfer_function() -> None:
     plant, K = cart()
-    found = told()
+    found = identified()
     theta = np.array([np.log(2.0), 0.3])
     S, _ = loops(theta, loop_shapes(plant, K, found), found)
     r = root_of(theta)
@@ -100,7 +100,7 @@ def test_a_loop_answers_as_its_transfer_function() -> None:
 
 
 def test_of_all_spectra_the_recorded_one_is_likeliest() -> None:
-    found = told()
+    found = identified()
     value, W = misfit(found.power - 1e-3 * np.eye(2), found)
     logs = np.linalg.slogdet(found.power)[1]
     assert value == pytest.approx(float(found.counts @ (logs + 2)), rel=1e-5)

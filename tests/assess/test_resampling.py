@@ -134,7 +134,7 @@ def test_what_is_not_determined_has_no_end() -> None:
     names = entry_names(plant)
     assert np.isinf(profile_likelihood(estimate, names[2]).interval.high)
     assert np.isfinite(profile_likelihood(estimate, names[0]).interval.high)
-    assert estimate.covariance.told_entries.tolist() == [[True, True, False]]
+    assert estimate.covariance.individually_identified.tolist() == [[True, True, False]]
 
 
 def test_an_unknown_name_is_told(fitted: Estimate) -> None:
@@ -150,7 +150,7 @@ def test_a_replicate_depends_on_seed_and_number_only(fitted: Estimate) -> None:
 
 
 def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(fitted: Estimate) -> None:
-    """Weights first, then the gain that is told: within a hundredth of its deviation.
+    """Weights first, then the gain that is identified: within a hundredth of its deviation.
 
     The whole fit is given the recordings that the replicate has drawn.
     """

@@ -1,4 +1,4 @@
-"""What recordings tell of a structure: rank, deviations, intervals, and whether it holds."""
+"""What recordings identify of a structure: rank, deviations, intervals, and whether it holds."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import scipy.optimize
 import plants
 from experiments.printed_intervals import carts, with_noise
 from experiments.structure_study import cart_person, seat_person
-from impc.assess.price_profiles import NearFit, PriceProfiles
-from impc.assess.structured_weights import Tangent, price_covariance, tangent
+from impc.assess.structured_weights import Tangent, tangent, weight_covariance
 from impc.assess.structures import structure_test
+from impc.assess.weight_profiles import NearFit, WeightProfiles
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -37,31 +37,33 @@ def seat_tangent(kind: str) -> Tangent:
     """The seat without noise, at the true weights of a structure that holds them."""
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, kind, over=BODY)
-    prices = SEAT if kind == "diagonal" else np.concatenate([SEAT / 2, np.zeros(6)])
-    truth = Controller(plant, structure.weights(prices), Bounds(plant), 20, terminal_set=False)
+    cost_weights = SEAT if kind == "diagonal" else np.concatenate([SEAT / 2, np.zeros(6)])
+    truth = Controller(
+        plant, structure.weights(cost_weights), Bounds(plant), 20, terminal_set=False
+    )
     torque = plants.ternary_torque(duration=10.0, rate=100)
     run = truth.simulate(np.zeros(plant.n), disturbance=torque)
     rng = np.random.default_rng(0)
     outputs = (run.x @ plant.C.T)[:-1] + 1e-9 * rng.standard_normal((1000, 2))
     trial = Recording(plant, outputs, torque)
     problem = Problem(plant, truth.bounds, 20, [trial], terminal_set=False, unknown_start=True)
-    return tangent(structure, problem, prices)
+    return tangent(structure, problem, cost_weights)
 
 
 def test_the_seat_tells_four_prices_of_four() -> None:
-    found = price_covariance(seat_tangent("diagonal"))
-    assert (found.rank, int(np.sum(found.told))) == (4, 4)
+    found = weight_covariance(seat_tangent("diagonal"))
+    assert (found.rank, int(np.sum(found.identified))) == (4, 4)
     assert np.all(np.isfinite(found.each))
 
 
 def test_of_ten_prices_and_products_the_seat_tells_four() -> None:
     """The controller predicts over the delay, so the gain has four numbers (docs/structures.md)."""
-    found = price_covariance(seat_tangent("full"))
+    found = weight_covariance(seat_tangent("full"))
     assert found.rank == 4
     sizes = np.array(found.singular_values)
     assert sizes[3] / sizes[0] > 1e-2  # 1.5e-2, and 1e-7 after it
     assert sizes[4] / sizes[0] < 1e-6
-    # No unknown is told by itself: each price can be made up for by others.
+    # No unknown is individually identified: each cost weight can be made up for by others.
     assert np.all(np.isinf(found.each))
 
 
@@ -69,8 +71,8 @@ def test_of_ten_prices_and_products_the_seat_tells_four() -> None:
 def fitted(seed: int = 0, cross: float = 0.0) -> Tangent:
     """Two carts at a VAF of 90 %, initial state unknown, from the truth."""
     person = cart_person(seed, 90.0, 0.0, cross)
-    end = search_from(person.problem, person.structure, person.prices)
-    return tangent(person.structure, end.problem, np.array(end.prices))
+    end = search_from(person.problem, person.structure, person.cost_weights)
+    return tangent(person.structure, end.problem, np.array(end.cost_weights))
 
 
 def test_deviations_are_those_of_the_whole_normal_matrix() -> None:
@@ -80,9 +82,9 @@ def test_deviations_are_those_of_the_whole_normal_matrix() -> None:
     starts = np.asarray(problem.starts)
 
     def residual(step: np.ndarray) -> np.ndarray:
-        prices, moved = np.split(step, [structure.count])
+        cost_weights, moved = np.split(step, [structure.count])
         there = problem.at(starts + moved.reshape(starts.shape), np.zeros(0))
-        found = solve_lqr(there.plant, structure.weights(at.prices + prices))
+        found = solve_lqr(there.plant, structure.weights(at.cost_weights + cost_weights))
         return residual_only(there, np.array(found.K), np.array(found.S))
 
     size, h = structure.count + starts.size, 1e-5
@@ -91,50 +93,52 @@ def test_deviations_are_those_of_the_whole_normal_matrix() -> None:
     ).T
     s2 = float(at.residual @ at.residual) / (len(at.residual) - size)
     whole = s2 * np.linalg.inv(columns.T @ columns)[: structure.count, : structure.count]
-    found = price_covariance(at)
+    found = weight_covariance(at)
     # White noise is estimated for each output, so their noise differs by a few per cent.
     white = np.sqrt(np.diag(found.white))
     np.testing.assert_allclose(white, np.sqrt(np.diag(whole)), rtol=0.03)
 
 
 def test_an_interval_ends_where_the_misfit_has_grown() -> None:
-    """Against searches of the recordings themselves with the price held at the end."""
+    """Against searches of the recordings themselves with the cost weight held at the end."""
     at = fitted()
-    covariance = price_covariance(at)
-    structure, prices = at.structure, np.array(at.prices)
-    found = PriceProfiles(at, covariance).interval(np.eye(structure.count)[0])
+    covariance = weight_covariance(at)
+    structure, cost_weights = at.structure, np.array(at.cost_weights)
+    found = WeightProfiles(at, covariance).interval(np.eye(structure.count)[0])
     wider = covariance.spread(np.eye(structure.count)[0])[1]
-    best = _held(at, prices, float(prices[0]))  # without the weak prior on the initial states
+    best = _held(
+        at, cost_weights, float(cost_weights[0])
+    )  # without the weak prior on the initial states
     for end in (found.low, found.high):
-        grown = len(at.residual) * (_held(at, prices, end) / best - 1)
+        grown = len(at.residual) * (_held(at, cost_weights, end) / best - 1)
         # The bisection ends within a fiftieth of a deviation, 2 % of D.
         assert grown == pytest.approx(3.84 * wider**2, rel=0.05)
 
 
 @pytest.mark.full
 def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -> None:
-    """One trial of a subject whose prices are told to a factor of ten: far from linear.
+    """One trial of a subject whose weights are known to within a factor of ten: far from linear.
 
     The quadratic form of the gain at the fit ends 1.3 of a logarithm short of here.
     """
     person = seat_person(4, 99.0, 0.0)
     one = replace(person.problem, recordings=person.problem.recordings[:1])
-    end = search_from(one, person.structure, person.prices)
-    at = tangent(person.structure, end.problem, np.array(end.prices))
-    covariance = price_covariance(at)
+    end = search_from(one, person.structure, person.cost_weights)
+    at = tangent(person.structure, end.problem, np.array(end.cost_weights))
+    covariance = weight_covariance(at)
     row = np.eye(person.structure.count)[0]
-    found = PriceProfiles(at, covariance).interval(row)
+    found = WeightProfiles(at, covariance).interval(row)
     rows, rank = len(at.residual), covariance.rank
-    best = _least(at, 0, float(at.prices[0]))
+    best = _least(at, 0, float(at.cost_weights[0]))
     for value in (found.low, found.high):
         grown = (rows - rank) * (_least(at, 0, value) / best - 1)
         assert grown == pytest.approx(3.84 * covariance.spread(row)[1] ** 2, rel=0.1)
 
 
 def test_an_interval_ends_where_the_body_all_but_falls() -> None:
-    """An unstable plant near its limit, so noisy that a line sees no price that is too low.
+    """An unstable plant near its limit, so noisy that a line sees no cost weight that is too low.
 
-    Its misfit grows without end towards the price at which it falls.
+    Its misfit grows without end towards the cost weight at which it falls.
     """
     system = control.ss(
         [[1.2]], [[1, 1]], [[1]], 0, 1, inputs=["u", "d"], states=["x"], outputs=["x"]
@@ -149,18 +153,18 @@ def test_an_interval_ends_where_the_body_all_but_falls() -> None:
     end = search_from(
         Problem(plant, bounds, 5, [trial], terminal_set=False), structure, np.zeros(1)
     )
-    at = tangent(structure, end.problem, np.array(end.prices))
-    covariance = price_covariance(at)
-    found = PriceProfiles(at, covariance).interval(np.eye(1)[0])
+    at = tangent(structure, end.problem, np.array(end.cost_weights))
+    covariance = weight_covariance(at)
+    found = WeightProfiles(at, covariance).interval(np.eye(1)[0])
 
-    def misfit(price: float) -> float:
+    def misfit(cost_weight: float) -> float:
         other = Controller(
-            plant, structure.weights(np.array([price])), bounds, 5, terminal_set=False
+            plant, structure.weights(np.array([cost_weight])), bounds, 5, terminal_set=False
         )
         run = simulate(other, scenario(plant, [0.0], disturbance=push))
         return float(np.sum((run.x[:-1] - outputs) ** 2)) if run.complete else np.inf
 
-    best = misfit(float(end.prices[0]))
+    best = misfit(float(end.cost_weights[0]))
     grown = (len(x) - covariance.rank) * (misfit(found.low) / best - 1)
     assert grown == pytest.approx(3.84 * covariance.spread(np.eye(1)[0])[1] ** 2, rel=0.1)
     assert misfit(found.low - 2.0) == np.inf
@@ -168,12 +172,12 @@ def test_an_interval_ends_where_the_body_all_but_falls() -> None:
 
 
 def _least(at: Tangent, index: int, value: float) -> float:
-    """Least squares over the other prices by the recordings, any initial state being allowed."""
+    """Least squares over the other weights by the recordings, any initial state being allowed."""
     free = np.delete(np.arange(at.structure.count), index)
 
     def place(others: np.ndarray) -> Tangent:
-        prices = np.insert(others, index, value)
-        return tangent(at.structure, at.problem, prices)
+        cost_weights = np.insert(others, index, value)
+        return tangent(at.structure, at.problem, cost_weights)
 
     def residual(others: np.ndarray) -> np.ndarray:
         there = place(others)
@@ -181,23 +185,23 @@ def _least(at: Tangent, index: int, value: float) -> float:
 
     def slopes(others: np.ndarray) -> np.ndarray:
         there = place(others)
-        return there.without_nuisance(np.array(there.on_prices[:, free])) / at.noise
+        return there.without_nuisance(np.array(there.on_cost_weights[:, free])) / at.noise
 
     found = [
         scipy.optimize.least_squares(residual, start, jac=slopes, max_nfev=30).cost
-        for start in (np.array(at.prices)[free], SEAT[free])
+        for start in (np.array(at.cost_weights)[free], SEAT[free])
     ]
     return float(2 * min(found) * at.noise**2)
 
 
-def _held(at: Tangent, prices: np.ndarray, end: float) -> float:
-    """Least squares with the first price held at `end`, by Gauss-Newton on the recordings."""
+def _held(at: Tangent, cost_weights: np.ndarray, end: float) -> float:
+    """Least squares with the first cost weight held at `end`, by Gauss-Newton on the recordings."""
     structure, problem, free = at.structure, at.problem, np.arange(1, at.structure.count)
-    here = prices.copy()
+    here = cost_weights.copy()
     here[0] = end
     for _ in range(6):
         place = tangent(structure, problem, here)
-        columns = np.hstack([place.on_prices[:, free], _start_columns(place)])
+        columns = np.hstack([place.on_cost_weights[:, free], _start_columns(place)])
         step = np.linalg.lstsq(columns, -np.array(place.residual), rcond=None)[0]
         here[free] += step[: len(free)]
         starts = np.asarray(problem.starts)
@@ -220,15 +224,15 @@ def _start_columns(place: Tangent) -> np.ndarray:
 
 def test_a_price_of_zero_has_an_upper_end() -> None:
     at = fitted()
-    prices = np.array(at.prices)
-    prices[3] = -np.inf  # the price of a speed is left out, whatever the recordings say
-    bare = search_from(at.problem, at.structure, prices)
-    assert bare.prices[3] == -np.inf
-    place = tangent(at.structure, bare.problem, np.array(bare.prices))
-    covariance = price_covariance(place)
+    cost_weights = np.array(at.cost_weights)
+    cost_weights[3] = -np.inf  # the cost weight of a speed is left out, whatever the recordings say
+    bare = search_from(at.problem, at.structure, cost_weights)
+    assert bare.cost_weights[3] == -np.inf
+    place = tangent(at.structure, bare.problem, np.array(bare.cost_weights))
+    covariance = weight_covariance(place)
     assert np.isinf(covariance.each[3])
     assert covariance.values[3] == -np.inf
-    found = PriceProfiles(place, covariance).zero(3)
+    found = WeightProfiles(place, covariance).zero(3)
     assert (found.low, found.value) == (-np.inf, -np.inf)
     assert np.isfinite(found.high)
     assert found.holds(-np.inf)
@@ -259,7 +263,9 @@ def test_the_statistic_is_the_one_step_fall_of_the_misfit() -> None:
         found = np.linalg.lstsq(rest / np.linalg.norm(rest, axis=0), e, rcond=1e-10)[0]
         return float(np.sum((e - rest / np.linalg.norm(rest, axis=0) @ found) ** 2))
 
-    fall = left(np.array(at.on_prices), starts) - left(gain, np.array(at.on_prices), starts)
+    fall = left(np.array(at.on_cost_weights), starts) - left(
+        gain, np.array(at.on_cost_weights), starts
+    )
     s2 = float(e @ e) / len(e)
     assert metric.shape[1] >= 1
     # The window of the sandwich, and outputs of unequal noise: a tenth.
@@ -267,7 +273,7 @@ def test_the_statistic_is_the_one_step_fall_of_the_misfit() -> None:
 
 
 def test_nothing_to_test_where_prices_make_every_gain() -> None:
-    """One cart: two prices, a gain of two numbers."""
+    """One cart: two cost weights, a gain of two numbers."""
     plant = carts(1)
     structure = Structure(plant)
     truth = Controller(
@@ -279,7 +285,7 @@ def test_nothing_to_test_where_prices_make_every_gain() -> None:
     trial = with_noise(truth, push, rng, 90.0, 0.0)
     problem = Problem(plant, truth.bounds, 6, [trial], terminal_set=False)
     end = search_from(problem, structure, np.log([4.0, 1.0]))
-    found = structure_test(tangent(structure, end.problem, np.array(end.prices)))
+    found = structure_test(tangent(structure, end.problem, np.array(end.cost_weights)))
     assert (found.freedom, found.probability, found.refused) == (0, 1.0, False)
 
 
@@ -287,12 +293,18 @@ def test_near_a_fit_the_misfit_is_that_of_the_recordings() -> None:
     """A few deviations away, against a simulation with the initial states fitted again."""
     at = fitted()
     near = NearFit(at)
-    moved = np.array(at.prices) + 0.3 * np.array(price_covariance(at).each) * [1, -1, 0.5, 0.5, 1]
+    moved = np.array(at.cost_weights) + 0.3 * np.array(weight_covariance(at).each) * [
+        1,
+        -1,
+        0.5,
+        0.5,
+        1,
+    ]
     nothing = np.zeros((at.structure.count, 0))
-    here, there = (near.least(z, nothing)[0] for z in (np.array(at.prices), moved))
+    here, there = (near.least(z, nothing)[0] for z in (np.array(at.cost_weights), moved))
     found = []
-    for prices in (np.array(at.prices), moved):
-        place = tangent(at.structure, at.problem, prices)
+    for cost_weights in (np.array(at.cost_weights), moved):
+        place = tangent(at.structure, at.problem, cost_weights)
         columns, e = _start_columns(place), np.array(place.residual)
         least = e - columns @ np.linalg.lstsq(columns, e, rcond=None)[0]
         found.append(float(least @ least))

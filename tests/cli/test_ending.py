@@ -1,4 +1,4 @@
-"""However a command ends: one line, a status that tells what, nothing half-written."""
+"""However a command ends: one line, a status that says what, nothing half-written."""
 
 from __future__ import annotations
 
@@ -202,6 +202,6 @@ def test_output_that_nobody_takes(tmp_path: Path) -> None:
 
 def test_statuses_are_distinct_and_documented() -> None:
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
-    told = {int(value) for value in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
-    assert told == {status.value for status in ExitStatus}
+    stated = {int(value) for value in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
+    assert stated == {status.value for status in ExitStatus}
     assert len(ExitStatus) == 6

@@ -31,7 +31,7 @@ Q = "diagonal"
 over = ["theta1", "theta2"]
 
 [plan]
-prices = { theta1 = 6e3, theta2 = 9e3 }
+cost weights = { theta1 = 6e3, theta2 = 9e3 }
 noise = { theta1 = "0.05 deg", theta2 = "0.05 deg" }
 correlation = 0.02
 stops = { theta1 = "12 deg" }
@@ -78,7 +78,7 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
     for sentence in found["sentences"]:
         assert sentence in text
     assert read_result(folder / "out").content["best"] == found["best"]
-    for name in ("prices", "experiments"):
+    for name in ("cost_weights", "experiments"):
         assert (folder / "out" / f"{name}.png").stat().st_size > 10_000
 
 
@@ -119,9 +119,9 @@ def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
         (("amplitude = [2, 4]", "amplitude = [90]"), "falls in 100 % of the trials or more"),
         (('"0.05 deg", theta2', '"0.05 kg", theta2'), "noise theta1: is in kg"),
         (('"0.05 deg", theta2', '"deg", theta2'), "noise theta1: got deg"),
-        (("theta1 = 6e3, ", ""), "[plan] prices: lacks 'theta1'"),
-        (("theta1 = 6e3", "theta1 = 0"), "prices theta1: got 0"),
-        (("theta1 = 6e3", "angle = 1, theta1 = 6e3"), "prices angle: is not a feature"),
+        (("theta1 = 6e3, ", ""), "[plan] cost_weights: lacks 'theta1'"),
+        (("theta1 = 6e3", "theta1 = 0"), "cost weights theta1: got 0"),
+        (("theta1 = 6e3", "angle = 1, theta1 = 6e3"), "cost weights angle: is not a feature"),
         (("u_max = 6.0", 'bounded_states = { theta1 = "data" }'), 'bounded_states: is "data"'),
         (("[plan]", "[plann]"), "plann: is not known"),
     ],

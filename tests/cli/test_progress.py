@@ -1,4 +1,4 @@
-"""The bar of all commands: what is told when it is interrupted, also where no bar is drawn."""
+"""The bar of all commands: what is said when it is interrupted, also where no bar is drawn."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_an_interruption_says_how_much_is_kept() -> None:
 def test_lines_stand_in_a_pipe_every_ten_seconds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The clock is made: a step takes four seconds; what was found tells nothing of the others."""
+    """The clock is made: a step takes four seconds; what was found says nothing of the others."""
 
     def clock() -> Iterator[float]:
         yield from range(0, 1000, 4)

@@ -58,14 +58,14 @@ def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path
             table[int(unit.subject) - 1, int(unit.visit) - 1] = np.mean(scores)
     expected = icc(table, "A,k", method="generalised")
     shown = pd.DataFrame(found["findings"]["icc-rms"]["table"])
-    told = shown.query("output == 'theta1' and condition == 'EC'").iloc[0]
+    stated = shown.query("output == 'theta1' and condition == 'EC'").iloc[0]
     for key, name in (("icc", "value"), ("low", "low"), ("high", "high")):
-        assert told[key] == pytest.approx(getattr(expected, name))
+        assert stated[key] == pytest.approx(getattr(expected, name))
     # The error of a single visit, not of the mean over visits that ICC(A,k) is of.
     complete = table[np.all(np.isfinite(table), axis=1)]
     within = np.rad2deg(1) * np.sqrt(np.mean(np.var(complete, axis=1, ddof=1)))
-    assert told["sem"] == pytest.approx(within)
-    assert told["mdc"] > 1.96 * np.sqrt(2) * within
+    assert stated["sem"] == pytest.approx(within)
+    assert stated["mdc"] > 1.96 * np.sqrt(2) * within
     assert {"within_visits", "between_visits"} <= set(found["findings"]["cmc"]["table"])
     assert all(0 <= p <= 1 for p in found["findings"]["visits-rms"]["table"]["p"])
 

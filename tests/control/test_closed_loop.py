@@ -42,7 +42,7 @@ def moved(
 
 
 def with_bound(controller: Controller, row: int, step: float) -> Controller:
-    """One bound moved by a step, the price of its excess kept."""
+    """One bound moved by a step, the cost weight of its excess kept."""
     rows = bound_rows(controller.bounds, controller.plant)
     names = ("x_min", "x_max", "u_min", "u_max")
     sides = {name: np.array(getattr(controller.bounds, name)) for name in names}
@@ -251,14 +251,14 @@ def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
     assert 30 < seen.count(INCONSISTENT) < 270
 
 
-@pytest.mark.parametrize("price", [np.inf, 0.5])
-def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(price: float) -> None:
+@pytest.mark.parametrize("cost_weight", [np.inf, 0.5])
+def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(cost_weight: float) -> None:
     """Rows at their limits are given up at some samples and kept at the next."""
     rng, begun, limited = np.random.default_rng(8), 0, 0
     for _ in range(40):
         rows, width = int(rng.integers(3, 16)), int(rng.integers(4, 9))
         W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
-        given = W, W @ W.T, np.full(rows, price), np.full(rows, 1e-12)
+        given = W, W @ W.T, np.full(rows, cost_weight), np.full(rows, 1e-12)
         warm, count = dual_workspace(rows, width), 0
         for _ in range(20):
             d = d + 0.1 * rng.normal(size=rows)
@@ -270,15 +270,15 @@ def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(price: flo
             if code != CONVERGED:
                 count = 0
                 continue
-            limited += bool(np.any(cold[0] == price))
+            limited += bool(np.any(cold[0] == cost_weight))
             np.testing.assert_allclose(
                 W.T @ warm[0], W.T @ cold[0], rtol=0, atol=1e-9 * (1 + np.max(cold[0]))
             )
             assert sorted(warm[1][:count]) == list(
-                np.flatnonzero((warm[0] > 0) & (warm[0] < price))
+                np.flatnonzero((warm[0] > 0) & (warm[0] < cost_weight))
             )
     assert begun > 300
-    assert limited > (100 if price < np.inf else -1)
+    assert limited > (100 if cost_weight < np.inf else -1)
 
 
 def test_dual_solver_begins_anew_where_the_slack_is_no_number() -> None:

@@ -69,14 +69,14 @@ def test_two_thousand_random_plants_are_right_or_say_no(block: int) -> None:
 
 
 def check(seeds: range, largest: int, samples: int) -> None:
-    """No fault in any; what is not told in double precision is a small part."""
-    wrong, untold = {}, 0
+    """No fault in any; what is not identified in double precision is a small part."""
+    wrong, unidentified = {}, 0
     for seed in seeds:
         case = hard_case(seed, largest)
         run = simulate(case.controller, case.drive)
-        untold += Status.UNSOLVED in run.status
+        unidentified += Status.UNSOLVED in run.status
         found = faults(case, run, samples)
         if found:
             wrong[seed] = found
     assert wrong == {}
-    assert untold <= 0.3 * len(seeds)  # 8 of the 60: plants that run away
+    assert unidentified <= 0.3 * len(seeds)  # 8 of the 60: plants that run away

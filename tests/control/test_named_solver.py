@@ -45,8 +45,8 @@ def check_against_compiled(solver: str, seed: int, softening: float | None) -> N
     run, found = simulate_and_differentiate(replace(controller, solver=solver), drive, along)
     np.testing.assert_array_equal(run.status, ours.status)
     assert run.weakly_active == ours.weakly_active
-    # Measured: 7e-12 of the states, 1e-13 of the derivatives; at a price of 1e6, whose multipliers
-    # have lost as many digits, 9e-9 and 3e-9.
+    # Measured: 7e-12 of the states, 1e-13 of the derivatives; at a cost weight of 1e6, whose
+    # multipliers have lost as many digits, 9e-9 and 3e-9.
     tolerance = 1e-7 if softening == 1e6 else 1e-10
     assert np.max(np.abs(run.x - ours.x)) <= tolerance * np.max(np.abs(ours.x))
     for one, other in ((found.x, derivative.x), (found.u, derivative.u)):

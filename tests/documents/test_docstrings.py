@@ -69,22 +69,22 @@ def item_faults(value: Any, doc: NumpyDocString, prose: str) -> Iterator[str]:
     if inspect.isfunction(value):
         given = inspect.signature(value).parameters
         items = {name: str(one.annotation) for name, one in given.items()}
-    told = {
+    identified = {
         name.strip(" *"): " ".join([each.type, "-", *each.desc])
         for each in doc["Attributes" if fields else "Parameters"]
         for name in each.name.split(",")
     }
     if inspect.isfunction(value) or fields:
-        yield from (f"{name}: there is none" for name in told if name not in items)
+        yield from (f"{name}: there is none" for name in identified if name not in items)
     for name, kind in items.items():
         if name in ("self", "cls"):
             continue
         # A class of the package describes itself.
         known = re.search(r"\b[A-Z]\w+", kind) and not ARRAY.search(kind)
-        if name not in told and (fields or not (known or re.search(rf"\b{name}\b", prose))):
+        if name not in identified and (fields or not (known or re.search(rf"\b{name}\b", prose))):
             yield f"{name}: not described"
-        shape = SHAPE if name in told else rf"\b{name}\b[^.]{{0,40}}?{SHAPE}"
-        if ARRAY.search(kind) and not re.search(shape, told.get(name, prose)):
+        shape = SHAPE if name in identified else rf"\b{name}\b[^.]{{0,40}}?{SHAPE}"
+        if ARRAY.search(kind) and not re.search(shape, identified.get(name, prose)):
             yield f"{name}: no shape"
 
 

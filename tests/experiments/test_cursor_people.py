@@ -23,7 +23,7 @@ from tests.support import nelder_mead
 
 pytestmark = pytest.mark.full
 
-DELAY, LAG, OFFSET, PRICE = 8, 0.03, 3.0, 20.0
+DELAY, LAG, OFFSET, COST_WEIGHT = 8, 0.03, 3.0, 20.0
 #: And how near logarithms are found, some four of their deviations, whatever noise is drawn: that
 #: depends on the processor's eigenvectors.
 LEVELS = {"motor command": (50.0, 0.4), "sensory error": (10.0, 1.0)}
@@ -37,7 +37,7 @@ def simulated() -> Condition:
     plant = Plant(plants.pursuit_plant(DELAY, LAG), ["command"])
     law = Controller(
         plant,
-        Structure(plant, ["error"]).weights(np.log([PRICE])),
+        Structure(plant, ["error"]).weights(np.log([COST_WEIGHT])),
         Bounds(plant),
         20,
         terminal_set=False,
@@ -64,8 +64,8 @@ def test_what_a_follower_senses_is_found() -> None:
     follower = fitted()
     levels = follower.fit.levels
     found = dict(zip(follower.fit.space.names, levels, strict=True))
-    told = person_covariance(follower.fit, "expected")
-    deviations = dict(zip(told.names, told.levels, strict=True))
+    identified = person_covariance(follower.fit, "expected")
+    deviations = dict(zip(identified.names, identified.levels, strict=True))
     assert follower.offset == pytest.approx(OFFSET, abs=1.5)
     for name, (value, near) in LEVELS.items():
         assert abs(np.log(found[name] / value)) < min(near, 3.5 * deviations[name]), name
@@ -87,7 +87,7 @@ def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
         place = prior.tried(np.insert(rest, index, value))
         return 1e6 if place is None else fit_value - place.value
 
-    fit_value = prior.placed(np.array(fit.theta), fit.told).value
+    fit_value = prior.placed(np.array(fit.theta), fit.identified).value
     rest = np.delete(np.array(fit.theta), index)
     # Half of 1.96^2; the root of what has fallen is found to .04 of 1.39.
     assert nelder_mead(lower, rest, 400) == pytest.approx(1.92, abs=0.15)
@@ -110,6 +110,6 @@ def test_a_free_regression_is_that_of_its_normal_equations() -> None:
     deviation = float(np.sqrt(np.mean((y - X @ found) ** 2)))
     X, y = table(others)
     expected = float(np.mean(scipy.stats.norm(X @ found, deviation).logpdf(y)))
-    told = regression_nats(condition, mine, others)
-    assert told == pytest.approx(expected, abs=1e-6)
-    assert told < nats(judged(fitted(), condition, others))
+    identified = regression_nats(condition, mine, others)
+    assert identified == pytest.approx(expected, abs=1e-6)
+    assert identified < nats(judged(fitted(), condition, others))

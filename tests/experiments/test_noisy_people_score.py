@@ -9,7 +9,7 @@ from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import Score, above_truth, blind, score
 from impc.inverse.methods import fit
 from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import fit_person
+from impc.output_feedback.fit import fit_output_feedback
 
 pytestmark = pytest.mark.full
 
@@ -41,7 +41,7 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
     trials, truth = recorded(who, 2), np.array(who.controller.K)
     first = fit(trials.problem)
     assert np.array(first.gain)[0, 0] > 4 * truth[0, 0]
-    found = fit_person(first, blind(who))
+    found = fit_output_feedback(first, blind(who))
     assert found.converged
     assert found.space.gain == 5
     np.testing.assert_allclose(found.K[0, :4], truth[0, :4], rtol=0.2)
@@ -56,7 +56,7 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
 def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
     """The likeliest start leads there, 80 nats below the truth, and settles."""
     who = subject("seat", 16, "motor", 70.0, 70.0)
-    found = fit_person(fit(recorded(who, 16).problem), blind(who))
+    found = fit_output_feedback(fit(recorded(who, 16).problem), blind(who))
     truth = np.array(who.controller.K)
     assert found.converged
     assert above_truth(found, who) > 0

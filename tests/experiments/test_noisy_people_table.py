@@ -51,5 +51,5 @@ def test_means_have_the_standard_errors_of_draws() -> None:
     assert mean == pytest.approx(np.mean(drawn[:, 0]))
     assert error == pytest.approx(0.05, rel=0.1)
     assert other == pytest.approx(0.05, rel=0.1)
-    # A direction that few are told along has no mean.
+    # A direction that few are identified along has no mean.
     assert len(means([[(1.0, 1.0)], [(1.0, 1.0)], [(1.0, 1.0), (2.0, 1.0)]])) == 1

@@ -16,14 +16,14 @@ def test_a_start_a_third_off_ends_at_what_is_told() -> None:
     found = fit_from(system, demonstration(system), system.truth, 0.3, 3)
     assert found.loss < 1e-10
     assert found.error < 1e-5
-    assert found.untold == "Jx, Jy Jz l"
+    assert found.unidentified == "Jx, Jy Jz l"
 
 
 def test_a_start_without_a_plan_is_a_line_and_not_a_loss() -> None:
     system = SYSTEMS["robot arm"]()
     found = fit_from(system, demonstration(system), system.truth, 0.3, 7)
     assert np.isnan(found.loss)
-    assert found.untold.startswith("constraint angle[1]: no plan was found that keeps it")
+    assert found.unidentified.startswith("constraint angle[1]: no plan was found that keeps it")
 
 
 def test_intervals_of_noisy_recordings_hold_the_truth() -> None:

@@ -45,7 +45,7 @@ def test_four_hundred_recordings() -> None:
 def test_the_truth_of_a_short_default_subject_is_found(tmp_path: Path) -> None:
     """Seed 0, a trial of 10 s: the nonlinear body explains what the linear plant cannot.
 
-    So short a trial tells little, and the intervals of either are wide.
+    So short a trial says little, and the intervals of either are wide.
     """
     files = simulated_files(tmp_path / "one", 0, "--trials", "1", "--duration", "10")
     own, linear = (fitted_subject(files, body) for body in ("nonlinear", "linear"))
@@ -112,10 +112,10 @@ def test_deviations_are_those_of_a_hundred_fits_and_the_best_is_the_best() -> No
 def test_the_grid_of_a_study_can_be_planned(make: object) -> None:
     assert callable(make)
     person, perturbation, grid, trials = make()
-    told = try_design(person, grid[0], perturbation, trials=trials, draws=trials)
-    assert told.falls == 0
-    assert told.expected is not None
-    assert np.all(np.isfinite(told.expected.deviations))
+    identified = try_design(person, grid[0], perturbation, trials=trials, draws=trials)
+    assert identified.falls == 0
+    assert identified.expected is not None
+    assert np.all(np.isfinite(identified.expected.deviations))
 
 
 def test_a_subject_is_scored_against_its_truth() -> None:

@@ -26,7 +26,7 @@ __all__ = ["DAMAGED", "PLANT", "written", "written_by_impc"]
 PLANT = "plants:seated_balance_plant"
 Make = Callable[[Path], tuple[Path, str]]
 Change = tuple[str, str]
-#: TDMS and C3D tell their rate: the clock is taken out of the configuration.
+#: TDMS and C3D say their rate: the clock is taken out of the configuration.
 OWN_RATE = ('time = "time"', "")
 SEAT = pushed_seat()
 TEXT = csv_text(SEAT)
@@ -273,7 +273,7 @@ DAMAGED: dict[str, tuple[str, Make]] = {
     ),
     "uneven clock": ("is uneven", seat(time=UNEVEN)),
     "absent clock": ("column 'clock': is not in the file", seat(('"time"', '"clock"'))),
-    "unknown rate": ("tells no clock and no rate", seat(OWN_RATE)),
+    "unknown rate": ("says no clock and no rate", seat(OWN_RATE)),
     "clock in degrees": ("is no time", seat(('"time"', '"time"\ntime_unit = "deg"'))),
     "cut behind the end": (
         "does not reach recording.stop = 60 s", seat(('"time"', '"time"\nstop = 60.0'))

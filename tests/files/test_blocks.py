@@ -152,9 +152,9 @@ def test_columns_of_one_name_are_told_apart(
     table = read_table(path)
     assert list(table.columns) == names
     heads = head[-1].replace("[s]", "").replace(" [mV]", "").split(",")
-    told = [name for old, name in zip(heads, names, strict=True) if old not in (name, "")]
-    assert all(repr(name) in "".join(table.notes) for name in told)
-    assert bool(told) == bool(table.notes)
+    stated = [name for old, name in zip(heads, names, strict=True) if old not in (name, "")]
+    assert all(repr(name) in "".join(table.notes) for name in stated)
+    assert bool(stated) == bool(table.notes)
 
 
 def test_names_of_rows_without_a_head(tmp_path: Path) -> None:

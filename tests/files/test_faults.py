@@ -112,7 +112,7 @@ work(Path(sys.argv[1]), NEW)
 
 
 def test_a_kill_at_each_rename(tmp_path: Path) -> None:
-    kills, told = 0, 0
+    kills, stated = 0, 0
     while True:
         folder = tmp_path / str(kills)
         work(folder, OLD)
@@ -121,7 +121,7 @@ def test_a_kill_at_each_rename(tmp_path: Path) -> None:
             cwd=Path(__file__).parents[2], timeout=120,
         )  # fmt: skip
         found = shown(folder)
-        told += "INCOMPLETE.txt" in found
+        stated += "INCOMPLETE.txt" in found
         assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
         assert found_in(folder).items() <= STAGES.items()
         work(folder, NEW)
@@ -132,7 +132,7 @@ def test_a_kill_at_each_rename(tmp_path: Path) -> None:
         assert done.returncode == 9
         kills += 1
     assert kills >= 6
-    assert told >= 3
+    assert stated >= 3
 
 
 MINE = {"notes.txt": b"mine", "sub/ole.csv": b"mine"}  # one bit from a name of the old run

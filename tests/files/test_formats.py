@@ -108,7 +108,7 @@ def test_headings() -> None:
         # The decimal sign is a comma: a point can only divide thousands.
         (["0,5;999", "1,5;1.000"], "text in 1 of 2 rows, the first '1.000' in line 3"),
         (["0,5;999,5", "1,5;1.000,5"], "text in 1 of 2 rows, the first '1.000,5' in line 3"),
-        # Nothing tells which sign is the decimal one.
+        # Nothing says which sign is the decimal one.
         (["0;999", "1;1.000"], "has whole numbers and '1.000' in line 3, which may be a thousand"),
         (["0;999", "1;-1,000"], "has whole numbers and '-1,000' in line 3"),
         (["0;999", "1;12.345", "2;998"], "has whole numbers and '12.345' in line 3"),
@@ -401,7 +401,7 @@ def test_files_cut_anywhere_give_no_wrong_number(tmp_path: Path, ending: str) ->
             refused += 1
             assert "\n" not in found
             continue
-        # Text that is cut behind the last comma of a row cannot be told from a shorter recording,
+        # Text that is cut behind the last comma of a row cannot be said from a shorter recording,
         # but for its last number; a .mat between two variables, from a file with fewer of them.
         for name, values in found.columns.items():
             rows = len(values) - 1 if ending == ".csv" else len(values)
@@ -410,7 +410,7 @@ def test_files_cut_anywhere_give_no_wrong_number(tmp_path: Path, ending: str) ->
 
 
 def test_strings_of_matlab_beside_signals(tmp_path: Path) -> None:
-    # MATLAB saves each string as an object without a name that scipy can tell.
+    # MATLAB saves each string as an object without a name that scipy can say.
     path = tmp_path / "trial.mat"
     save_mat(path, {"seat": SEAT["seat"]})
     with path.open("ab") as file:

@@ -24,7 +24,7 @@ from tests.files.samples import hdf5_mat
 def test_one_line_and_little_memory(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A reader that took the memory would be told so, and not the reason that its header gives.
+    # A reader that took the memory would be said so, and not the reason that its header gives.
     monkeypatch.setattr(apart, "_ROOM", 250_000_000)
     phrase, make = HOSTILE[name]
     path = make(tmp_path)

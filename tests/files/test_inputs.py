@@ -73,7 +73,7 @@ def run(command: str, study: Path, out: str = "out") -> Result:
     return CliRunner().invoke(main, words)
 
 
-def told(study: Path, out: str = "out") -> dict[str, Any]:
+def stated(study: Path, out: str = "out") -> dict[str, Any]:
     found: dict[str, Any] = json.loads((study.parent / out / "result.json").read_text())
     found["findings"].get("methods", {}).get("table", {}).pop("seconds_a_subject", None)
     return {key: value for key, value in found.items() if key not in _TIMES}
@@ -88,7 +88,7 @@ def sha(path: Path) -> str:
 def test_a_result_names_what_it_was_made_of(command: str, study: Path) -> None:
     done = run(command, study)
     assert done.exit_code == 0, done.output
-    first = told(study)
+    first = stated(study)
     digests = first["sha256"]
     assert digests["configuration"] == sha(study)
     assert digests["recordings"] == {
@@ -97,7 +97,7 @@ def test_a_result_names_what_it_was_made_of(command: str, study: Path) -> None:
     assert set(digests) == {"recordings", "configuration", "model", "versions", "all"}
     assert MODEL in first["command"]
     assert run(command, study).exit_code == 0
-    assert told(study) == first
+    assert stated(study) == first
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -146,7 +146,7 @@ def test_an_interrupted_study_goes_on_with_what_is_the_same(
     assert run(command, study).exit_code == 0
     fresh = here(monkeypatch)
     assert run(command, study, "fresh").exit_code == 0
-    assert told(study) == told(study, "fresh")
+    assert stated(study) == stated(study, "fresh")
     # A changed recording leaves those of the others as they are.
     spared = {"recording": 2, "nothing": 3}.get(changed, 0)
     assert len(again) == len(fresh) - spared

@@ -1,7 +1,7 @@
 """`python -m tests.fuzz [--seed N] [--cases N] [--only TARGET]`: hours of mutated input.
 
 Prints its seed first. A case that ends in anything but one line is kept in results/fuzz and named;
-the count of reasons tells how often a reading process ended, or took too much memory or time.
+the count of reasons says how often a reading process ended, or took too much memory or time.
 """
 
 from __future__ import annotations

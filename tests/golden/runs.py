@@ -125,7 +125,7 @@ def _arm(_folder: Path) -> Numbers:
     found = impc.fit_optimal_control(arm.problem, [trial], start)
     combined = {
         " ".join(f"{name}^{power:g}" for name, power in one.exponents.items()): one.value
-        for one in found.combinations.told
+        for one in found.combinations.identified
     }
     return {name: _within(value, 1e-5 * abs(value)) for name, value in combined.items()} | {
         "settled": found.settled

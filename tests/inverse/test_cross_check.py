@@ -54,7 +54,7 @@ def test_a_method_that_loses_begins_again(problem: Problem) -> None:
     checked = cross_checked(problem, changed)
     for name in names:
         assert checked[name].misfit <= found[name].misfit * (1 + 2e-3)
-        assert not checked[name].fit.beaten
+        assert not checked[name].fit.beaten_by
     worse = replace(found["inverse_mpc"], K=poor.K, S=poor.S, weights=poor.weights)
     worse = replace(worse, misfit=at(worse.problem, np.array(poor.K), np.array(poor.S)))
     checked = cross_checked(problem, found | {"inverse_mpc": worse})

@@ -42,7 +42,7 @@ def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
 
 
 def test_a_metric_is_come_near_too() -> None:
-    """Without a price on conditioning, weights of a known pair are found again: gain and metric."""
+    """Without a penalty on conditioning, weights of a known pair are found again."""
     rng = np.random.default_rng(3)
     plant = random_plant(rng, 3, 2, 0.9)
     truth = solve_lqr(plant, Weights(random_weights(rng, 3), random_weights(rng, 2)))

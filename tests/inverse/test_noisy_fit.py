@@ -8,7 +8,7 @@ import pytest
 import plants
 from experiments.benchmarks.workloads import Workload, seat
 from experiments.simulated_subjects import simulated_subject
-from impc.assess.assessments import judge
+from impc.assess.assessments import evaluate_method
 from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
@@ -69,7 +69,7 @@ def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, Estimate]) -> No
     names = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr", OURS)
     bounds = fitted.problem.bounds
     found = {name: fit(fitted.problem, name, start=fitted) for name in names[:-1]} | {OURS: fitted}
-    methods = {name: judge(item, bounds) for name, item in found.items()}
+    methods = {name: evaluate_method(item, bounds) for name, item in found.items()}
     mpc = methods["inverse_mpc"]
     limit = float(work.controller.bounds.u_max[0])
     assert mpc.keeps_bounds

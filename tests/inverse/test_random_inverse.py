@@ -22,10 +22,10 @@ def random_problem(seed: int) -> tuple[Weights, Controller, Problem]:
 
 
 def solved(seed: int) -> bool:
-    """Misfit below 1e-8; the true metric told as far as it is said to be; least condition to 1e-4.
+    """Misfit below 1e-8; the true metric as far as it is identified; least condition to 1e-4.
 
     The least condition number is that of the true gain, with a metric that the recording does not
-    tell from the true one.
+    say from the true one.
     """
     weights, _, problem = random_problem(seed)
     found = inverse_mpc_reduced(problem)

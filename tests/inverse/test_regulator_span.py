@@ -21,7 +21,7 @@ from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
 from impc.model.weights import Weights
-from impc.output_feedback.fit import fit_person
+from impc.output_feedback.fit import fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
 from tests.support import extrapolated_slope
@@ -66,7 +66,7 @@ def outside(found: Array, gain: Array) -> float:
 
 
 def test_over_a_delay_the_controller_predicts() -> None:
-    """K = K_b (A^3, A^2 b, A b, b), whatever the body's prices are: two numbers of five."""
+    """K = K_b (A^3, A^2 b, A b, b), whatever the body's cost weights are: two numbers of five."""
     plant, rng = late_body(), np.random.default_rng(0)
     found = spanned(plant, Structure(plant, "full", over=["p", "v"]), weighed(plant, rng))
     assert len(found) == 2
@@ -144,7 +144,7 @@ def test_a_person_is_searched_within_the_span() -> None:
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
     person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
     first = fit(problem)
-    found = fit_person(first, person)
+    found = fit_output_feedback(first, person)
     assert found.converged
     assert found.space.gain == 2
     truth = Controller(
@@ -159,7 +159,7 @@ def test_a_person_is_searched_within_the_span() -> None:
         return np.array([found.space.value(found.theta + t * step)])
 
     slope = extrapolated_slope(moved, 1e-3)[0]
-    assert found.told.gradient @ step == pytest.approx(slope, rel=1e-6)
+    assert found.identified.gradient @ step == pytest.approx(slope, rel=1e-6)
 
 
 def test_the_search_begins_next_to_the_gain_that_is_given() -> None:

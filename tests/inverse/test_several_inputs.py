@@ -135,7 +135,7 @@ def test_ninety_nine_in_a_hundred_are_reproduced_and_no_miss_is_silent(path: str
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 3), (3, 2)])
 def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
-    """The recording alone leaves more than one S; consistency with K tells the rest of it."""
+    """The recording alone leaves more than one S; consistency with K says the rest of it."""
     controller, problem = random_problem(seed, m)
     plant = problem.plant
     fit = refine_gain(problem, np.array(controller.K), np.array(controller.S))
@@ -159,7 +159,7 @@ def test_set_of_weights_has_the_metric_in_it() -> None:
     plant, K = problem.plant, np.array(fitted.gain)
     numbers = plant.n * (plant.n + 1) // 2 + plant.m * (plant.m + 1) // 2
     found = summarise_weights(plant, K, np.array(fitted.metrics), np.ones(plant.n))
-    # n m + m - 1 numbers are told, and one is the scale.
+    # n m + m - 1 numbers are identified, and one is the scale.
     assert found.dimension == numbers - (plant.n * plant.m + plant.m - 1) - 1
 
 
@@ -298,7 +298,7 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     here = evaluate(printed.problem, np.array(printed.K), np.array(printed.S))
     T, G = natural_coordinates(clean.plant, np.array(printed.K))
     on_gain = here.dK.reshape(len(here.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
-    along = on_gain @ printed.linear.directions[printed.linear.told].T
+    along = on_gain @ printed.linear.directions[printed.linear.identified].T
     step = along @ np.linalg.lstsq(along, here.residual)[0]
     assert step @ step < 0.1 * printed.misfit**2 / len(here.residual)
 

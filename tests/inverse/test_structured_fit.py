@@ -1,4 +1,4 @@
-"""Prices of a structure behind recordings: exact ones, prices of zero, and the best there is."""
+"""Cost weights of a structure behind recordings: exact ones, zeros, and the best there is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from impc.errors import InputError, SolverError
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.structured_fit import fit_structure
-from impc.inverse.structured_search import PriceCoordinates, search_from
+from impc.inverse.structured_search import WeightCoordinates, search_from
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
@@ -30,13 +30,17 @@ SEAT = np.log([6e3, 9e3, 6e2, 4e2])
 
 
 def pushed(
-    structure: Structure, plant: Plant, prices: np.ndarray, samples: int = 300, limit: float = 1.0
+    structure: Structure,
+    plant: Plant,
+    cost_weights: np.ndarray,
+    samples: int = 300,
+    limit: float = 1.0,
 ) -> tuple[Controller, np.ndarray]:
     """A controller of the structure, and a push that drives it to its limits."""
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
     rng = np.random.default_rng(5)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (samples // 10, plant.E.shape[1])), 10, axis=0)
-    truth = Controller(plant, structure.weights(prices), bounds, 6, terminal_set=False)
+    truth = Controller(plant, structure.weights(cost_weights), bounds, 6, terminal_set=False)
     return truth, push
 
 
@@ -73,7 +77,7 @@ def test_the_prices_of_the_seat_without_noise() -> None:
     structure = problem.structure
     assert structure is not None
     found = fit_structure(problem, structure, 1.05 * truth.K, np.array(truth.S))
-    assert np.max(np.abs(found.prices - SEAT)) < 1e-6
+    assert np.max(np.abs(found.cost_weights - SEAT)) < 1e-6
     assert found.misfit < 1e-9 * np.sqrt(2000)
 
 
@@ -82,8 +86,8 @@ def test_derivatives_through_the_riccati_equation(family: bool) -> None:
     """Two inputs at their limits; with a family the plant moves the gain too."""
     plant = carts(2)
     structure = Structure(plant, ["x[0]", "x[1] - x[0]", "x[2]", "x[3]"], "full")
-    prices = np.concatenate([np.log([4.0, 5.0, 1.0, 1.0]), [0.1, 0.2]])
-    truth, push = pushed(structure, plant, prices)
+    cost_weights = np.concatenate([np.log([4.0, 5.0, 1.0, 1.0]), [0.1, 0.2]])
+    truth, push = pushed(structure, plant, cost_weights)
     trial = with_noise(truth, push, np.random.default_rng(0), 90.0, 0.0)
 
     def stronger(values: np.ndarray) -> Plant:
@@ -95,7 +99,7 @@ def test_derivatives_through_the_riccati_equation(family: bool) -> None:
 
     known = {"family": PlantFamily(stronger, ["strength"], [1.0])} if family else {}
     problem = posed(truth, trial, unknown_start=True, **known)
-    space = PriceCoordinates(problem, structure, prices + 0.3)
+    space = WeightCoordinates(problem, structure, cost_weights + 0.3)
     z = space.start + 0.05
     exact = space.at(z).jacobian.T @ space.at(z).residual
     for index in range(len(z)):
@@ -110,20 +114,20 @@ def test_derivatives_through_the_riccati_equation(family: bool) -> None:
 
 
 def test_a_price_that_is_not_needed_is_zero() -> None:
-    """Truth without a price of the second speed; noise decides that its estimate is zero."""
+    """Truth without a cost weight of the second speed; noise decides that its estimate is zero."""
     plant = carts(2)
     structure = Structure(plant)
-    prices = np.concatenate([np.log([4.0, 5.0, 1.0]), [-np.inf, 0.0]])
-    truth, push = pushed(structure, plant, prices, 800)
+    cost_weights = np.concatenate([np.log([4.0, 5.0, 1.0]), [-np.inf, 0.0]])
+    truth, push = pushed(structure, plant, cost_weights, 800)
     zeros = 0
     for seed in range(4):
         trial = with_noise(truth, push, np.random.default_rng(seed), 90.0, 0.0)
         problem = posed(truth, trial)
         found = search_from(problem, structure, np.log([4.0, 5.0, 1.0, 0.3, 1.0]))
-        zeros += int(found.prices[3] == -np.inf)
-        if found.prices[3] == -np.inf:  # no small price is better
+        zeros += int(found.cost_weights[3] == -np.inf)
+        if found.cost_weights[3] == -np.inf:  # no small cost weight is better
             for small in (1e-3, 1e-2):
-                tried = np.array(found.prices)
+                tried = np.array(found.cost_weights)
                 tried[3] = np.log(small)
                 solution = solve_lqr(plant, structure.weights(tried))
                 size, _ = misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))
@@ -134,8 +138,8 @@ def test_a_price_that_is_not_needed_is_zero() -> None:
 def test_no_search_without_derivatives_does_better() -> None:
     plant = carts(1)
     structure = Structure(plant)
-    prices = np.log([4.0, 1.0])
-    truth, push = pushed(structure, plant, prices)
+    cost_weights = np.log([4.0, 1.0])
+    truth, push = pushed(structure, plant, cost_weights)
     trial = with_noise(truth, push, np.random.default_rng(1), 80.0, 0.0)
     problem = posed(truth, trial, unknown_start=False)
     found = fit_structure(problem, structure, 0.8 * truth.K, np.array(truth.S))
@@ -144,13 +148,13 @@ def test_no_search_without_derivatives_does_better() -> None:
         solution = solve_lqr(plant, structure.weights(z))
         return misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))[0]
 
-    best = min(nelder_mead(objective, start, 200) for start in (prices, prices + 1.0))
+    best = min(nelder_mead(objective, start, 200) for start in (cost_weights, cost_weights + 1.0))
     # The polish ends when the misfit falls by less than 1e-8 of itself.
     assert found.misfit == pytest.approx(best, rel=1e-7)
 
 
 def test_the_method_of_the_registry() -> None:
-    """Through `impc.fit`, with an estimate that knows its prices."""
+    """Through `impc.fit`, with an estimate that knows its cost weights."""
     plant = carts(1)
     structure = Structure(plant)
     truth, push = pushed(structure, plant, np.log([4.0, 1.0]))
@@ -158,8 +162,8 @@ def test_the_method_of_the_registry() -> None:
     trial = Recording(plant, (run.x @ plant.C.T)[:-1], push)
     found = impc.fit(posed(truth, trial, structure=structure), "structured")
     assert found.explained
-    assert found.prices is not None
-    np.testing.assert_allclose(found.prices, np.log([4.0, 1.0]), atol=1e-6)
+    assert found.cost_weights is not None
+    np.testing.assert_allclose(found.cost_weights, np.log([4.0, 1.0]), atol=1e-6)
     np.testing.assert_allclose(found.stage_weights.Q, np.diag([4.0, 1.0]), rtol=1e-6)
     without = impc.fit(posed(truth, trial), "structured")
     assert without.K is None
@@ -175,7 +179,7 @@ def test_a_structure_of_another_plant_is_refused() -> None:
 
 
 def test_no_regulator_that_can_be_simulated() -> None:
-    """A push that is far beyond the limit: whatever the prices, the plant runs away."""
+    """A push that is far beyond the limit: whatever the cost weights, the plant runs away."""
     system = control.ss([[3.0]], [[1.0, 1.0]], [[1.0]], 0, 1, inputs=["u", "push"])
     plant = Plant(system, ["u"])
     structure = Structure(plant)

@@ -10,7 +10,7 @@ import pint
 import pytest
 
 from impc.errors import PlantError
-from impc.model.plant import Plant, gain_unit, price_unit
+from impc.model.plant import Plant, gain_unit, weight_unit
 from impc.reporting.shown_units import angles_in, axis_label, shown_angle, shown_unit
 from plants import cursor_plant, seated_balance_plant, yalmip_example
 
@@ -36,18 +36,18 @@ def test_units_are_those_of_the_algebra() -> None:
     assert gain_unit(found, "torque", "angle") == "N m/rad"
     assert gain_unit(found, "torque", "rate") == "N m/(rad/s)"
     assert gain_unit(found, "torque", "share") == "N m"
-    assert price_unit(found, "angle", "angle") == "(N m)²/rad²"
-    assert price_unit(found, "torque", "torque") == "1"
-    assert price_unit(found, "rate", "rate") == "(N m)²/(rad/s)²"
+    assert weight_unit(found, "angle", "angle") == "(N m)²/rad²"
+    assert weight_unit(found, "torque", "torque") == "1"
+    assert weight_unit(found, "rate", "rate") == "(N m)²/(rad/s)²"
     assert same(gain_unit(found, "torque", "rate"), "N*m*s/rad")
-    assert same(price_unit(found, "rate", "rate"), "(N*m)**2*s**2/rad**2")
-    assert same(price_unit(found, "angle", "angle"), "(N*m)**2/rad**2")
+    assert same(weight_unit(found, "rate", "rate"), "(N*m)**2*s**2/rad**2")
+    assert same(weight_unit(found, "angle", "angle"), "(N*m)**2/rad**2")
 
 
 def test_what_is_not_known_is_si() -> None:
     found = plant({"angle": "rad"})
     assert found.unit("rate") == "SI"
-    assert gain_unit(found, "torque", "angle") == price_unit(found, "rate", "angle") == "SI"
+    assert gain_unit(found, "torque", "angle") == weight_unit(found, "rate", "angle") == "SI"
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_named_structures(plant: Plant) -> None:
     assert shape(["p", "v"], name="mine")[0] == "mine"
     full = Structure(plant, "full", "full")
     assert full.unknowns[3:] == ("p with v", "p with w", "v with w", "g", "f with g")
-    assert full.is_price.tolist() == [True, True, True, False, False, False, True, False]
+    assert full.is_cost_weight.tolist() == [True, True, True, False, False, False, True, False]
 
 
 @pytest.mark.parametrize("given", [("full", "full"), ("diagonal", "diagonal"), (["p", "v-p"],)])
@@ -87,7 +87,7 @@ def test_changes_are_derivatives(plant: Plant, given: tuple[Any, ...]) -> None:
     dQ, dR = shape.changes(z)
     values, chain = shape.reported(z)
     weights = shape.weights(z)
-    if shape.coupled:  # what is told, from the weights themselves: all states are features
+    if shape.coupled:  # what is identified, from the weights themselves: all states are features
         d = np.sqrt(np.diag(weights.Q))
         np.testing.assert_allclose(values[:3], 2 * np.log(d), rtol=1e-12)
         pairs = (weights.Q / np.outer(d, d))[np.tril_indices(3, -1)]
@@ -97,8 +97,8 @@ def test_changes_are_derivatives(plant: Plant, given: tuple[Any, ...]) -> None:
 
         def moved(h: float, step: np.ndarray = step) -> np.ndarray:
             found = shape.weights(z + h * step)
-            told = shape.reported(z + h * step)[0]
-            return np.concatenate([found.Q.ravel(), found.R.ravel(), told])
+            identified = shape.reported(z + h * step)[0]
+            return np.concatenate([found.Q.ravel(), found.R.ravel(), identified])
 
         exact = np.concatenate([dQ[index].ravel(), dR[index].ravel(), chain[:, index]])
         np.testing.assert_allclose(exact, extrapolated_slope(moved), rtol=1e-9, atol=1e-10)
@@ -115,7 +115,7 @@ def test_changes_are_derivatives(plant: Plant, given: tuple[Any, ...]) -> None:
         ({"Q": ["p", "v", "p + v", "p - v"]}, InputError, "make the same weights; leave one out"),
         ({"Q": "full", "over": ["p", "v", "p + v"]}, InputError, "make the same weights"),
         ({"Q": ["v", "w"]}, WeightsError, "leaves the mode 1.1, which does not decay by itself"),
-        ({"R": ["f"]}, WeightsError, "R: leaves a combination of the inputs without a price"),
+        ({"R": ["f"]}, WeightsError, "R: leaves a combination of the inputs without a cost weight"),
         ({"R": "outputs"}, InputError, "R: got 'outputs'"),
         ({"Q": ["q"]}, InputError, "feature 'q': expected a name at 'q'"),
     ],

@@ -159,11 +159,11 @@ def test_the_parameters_are_those_that_made_the_recordings(folder: Path, done: R
         one = table.loc[name]
         assert one["value"] == pytest.approx(TRUTH[name], rel=1e-5)
         assert one["low"] <= one["value"] <= one["high"]
-        assert one["told"] == "yes"
-    assert dict(table.loc["mass"].dropna()) == {"unit": "kg", "value": 1.5, "told": "known"}
-    assert table.loc["far", "told"] == "no"
+        assert one["identified"] == "yes"
+    assert dict(table.loc["mass"].dropna()) == {"unit": "kg", "value": 1.5, "identified": "known"}
+    assert table.loc["far", "identified"] == "no"
     assert table["high"].isna()["far"]
-    assert found["combinations"]["untold"][0]["exponents"] == {"far": 1.0}
+    assert found["combinations"]["unidentified"][0]["exponents"] == {"far": 1.0}
     np.testing.assert_allclose(found["x0"], [[1.0, 0.5], [-0.8, 0.5]], atol=1e-5)
     limits = result.table("limits").set_index("constraint")["at_its_limit"]
     assert limits["force"] > 5
@@ -181,12 +181,12 @@ def test_page_tables_terminal_and_numbers_say_the_same(folder: Path, done: Resul
     for sentence in (found.content["verdict"], *found.content["sentences"]):
         assert sentence in page
         assert sentence in done.stdout
-    assert "they do not tell all of its parameters: far may be others" in found.content["verdict"]
+    assert "they do not say all of its parameters: far may be others" in found.content["verdict"]
     assert "far is not identified: near its value nothing that was measured depends on it." in page
     table = pd.read_csv(out / "parameters.csv").set_index("parameter")
     kept = found.table("parameters").set_index("parameter")
     np.testing.assert_array_equal(table["value"], kept["value"])
-    assert list(table["told"]) == list(kept["told"])
+    assert list(table["identified"]) == list(kept["identified"])
     assert table.loc["mass", "unit"] == "kg"
     assert "2 samples are missing, the first sample 8 (0.7 s); they count as not measured" in page
     assert "The international units" not in page  # a word that stands nowhere is not explained
@@ -216,15 +216,15 @@ def test_one_plan_by_another_solver(folder: Path, done: Result) -> None:
     text = CONFIG.replace('"loop"', '"plan"\nhorizon = 25\nunknown_start = false')
     (folder / "plan.toml").write_text(text, encoding="utf-8")
     given = ("plan.csv", "--plant", "own_point:point", "--config", "plan.toml")
-    told = run("fit", *given, "--solver", "fatrop", "--out", "plan-out")
-    assert told.exit_code == 0, told.stderr
+    identified = run("fit", *given, "--solver", "fatrop", "--out", "plan-out")
+    assert identified.exit_code == 0, identified.stderr
     found = read_result(folder / "plan-out")
     assert found.command.endswith("--solver fatrop")
     assert found.content["settings"]["solver"] == "fatrop"
     for name in ("drag", "price", "limit"):
         values = found.table("parameters").set_index("parameter")["value"]
         assert values[name] == pytest.approx(TRUTH[name], rel=1e-4)
-    assert "was fitted to one recording of one plan, 25 samples in all" in told.stdout
+    assert "was fitted to one recording of one plan, 25 samples in all" in identified.stdout
 
 
 def test_the_same_page_from_python(folder: Path, done: Result, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_the_same_page_from_python(folder: Path, done: Result, tmp_path: Path) -
         ".impc", "trajectories-2.png", "trajectories-2.pdf",
     }  # fmt: skip
     content = read_result(tmp_path).content
-    assert content["verdict"].startswith("The problem explains the recordings, which tell every")
+    assert content["verdict"].startswith("The problem explains the recordings, which say every")
     assert content["findings"]["parameters"]["table"]["start"][0] == 0.5
     with pytest.raises(impc.InputError, match="estimate: expected a Estimate, got dict of 3"):
         impc.report(start, tmp_path)  # type: ignore[arg-type]

@@ -21,8 +21,8 @@ from impc.nonlinear.problem import OptimalControlProblem
 from tests.nonlinear.linear_twin import linear_twin
 from tests.support import random_plant
 
-#: System -> sentences of what is not told; by the mechanics, see docs/nonlinear.md.
-UNTOLD = {
+#: System -> sentences of what is not identified; by the mechanics, see docs/nonlinear.md.
+UNIDENTIFIED = {
     "cart-pole": [],
     "robot arm": [{"max_q": 1.0}, {"l1": 1.0, "m1": -2.0, "l2": 1.0, "m2": -2.0}],
     "quadrotor": [{"max_r": 1.0}],
@@ -42,10 +42,10 @@ def test_a_demonstration_gives_back_what_it_tells(name: str) -> None:
     )
     assert found.settled
     assert found.loss < 1e-10
-    told = found.combinations
-    assert [one.exponents for one in told.untold] == UNTOLD[name]
-    assert len(told.told) == len(truth) - len(told.untold)
-    for one in told.told:
+    identified = found.combinations
+    assert [one.exponents for one in identified.unidentified] == UNIDENTIFIED[name]
+    assert len(identified.identified) == len(truth) - len(identified.unidentified)
+    for one in identified.identified:
         expected = np.prod([system.truth[key] ** power for key, power in one.exponents.items()])
         assert one.value == pytest.approx(expected, rel=1e-5)
 
@@ -102,7 +102,7 @@ def test_several_recordings_of_both_kinds_with_missing_samples_and_disturbances(
     )
     for name, value in TRUTH.items():
         assert found.theta[name] == pytest.approx(value, rel=1e-6)
-    assert found.combinations.untold == ()
+    assert found.combinations.unidentified == ()
 
 
 @pytest.mark.full
@@ -230,9 +230,9 @@ def test_a_scaling_is_one_where_it_holds_far_from_the_estimate(bend: float) -> N
     loop = problem.closed_loop(truth, [1.0], 12)
     recording = problem.recorded_loop(loop.x, loop.u)
     found = fit_optimal_control(problem, [recording], truth).combinations
-    (one,) = found.untold
+    (one,) = found.unidentified
     assert set(one.exponents) == {"force", "mass"}
     assert one.scaling == (bend == 0.0)
     words = "any factor a is possible" if one.scaling else "Near these values"
     assert any(words in sentence for sentence in found.sentences)
-    assert all(abs(item) <= 4 for said in found.told for item in said.exponents.values())
+    assert all(abs(item) <= 4 for said in found.identified for item in said.exponents.values())

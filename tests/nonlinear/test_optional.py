@@ -74,9 +74,9 @@ def test_the_rest_works_without_the_folder(tmp_path: Path) -> None:
     done = run(EXAMPLE)
     assert done.returncode == 0, done.stderr
     line = "impc.OptimalControlProblem: needs impc.nonlinear, which is not there; install all"
-    shape, told = done.stdout.strip().splitlines()
+    shape, identified = done.stdout.strip().splitlines()
     assert shape == "(1, 1)"
-    assert line in told
+    assert line in identified
     given = ("fit", "own.csv", "--plant", "own:own", "--config", "own.toml")
     typed = run("import runpy; runpy.run_module('impc', run_name='__main__')", *given)
     assert typed.returncode == 2

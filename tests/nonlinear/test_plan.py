@@ -113,7 +113,7 @@ def test_a_weakly_active_row_is_named_and_has_a_slope_between_its_sides() -> Non
 
 
 def test_dependent_rows_do_no_harm() -> None:
-    """A cap that is written twice: the plan is told, each multiplier is not."""
+    """A cap that is written twice: the plan is identified, each multiplier is not."""
     u, p = ca.SX.sym("u"), ca.SX.sym("p")
     plan = one_step({"cap": u - 1, "again": 2 * u - 2}, u, p).plan({"p": 2.0}, [0.0])
     assert plan.u[0, 0] == pytest.approx(1)

@@ -10,7 +10,7 @@ from experiments.noisy_people_score import blind
 from impc.errors import InputError
 from impc.inverse.methods import fit
 from impc.output_feedback.covariance import confusion, person_covariance
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from tests.output_feedback.test_fit import cart, posed
 
@@ -18,19 +18,19 @@ pytestmark = pytest.mark.full
 
 
 @pytest.fixture(scope="module")
-def fitted() -> PersonFit:
+def fitted() -> OutputFeedbackFit:
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
-    return fit_person(fit(posed(person, 0.01, 3.0, trials=4)), person)
+    return fit_output_feedback(fit(posed(person, 0.01, 3.0, trials=4)), person)
 
 
-def test_both_agree_where_the_model_is_true(fitted: PersonFit) -> None:
+def test_both_agree_where_the_model_is_true(fitted: OutputFeedbackFit) -> None:
     expected, sandwich = (person_covariance(fitted, kind) for kind in ("expected", "sandwich"))
-    # 1600 samples: a deviation is itself told to a tenth or two.
+    # 1600 samples: a deviation is itself identified to a tenth or two.
     np.testing.assert_allclose(sandwich.entries, expected.entries, rtol=0.4)
     np.testing.assert_allclose(sandwich.levels, expected.levels, rtol=0.4)
 
 
-def test_the_step_that_is_least_told_apart(fitted: PersonFit) -> None:
+def test_the_step_that_is_least_told_apart(fitted: OutputFeedbackFit) -> None:
     """Moved along it together, gain and levels cost less than each of them alone."""
     found = confusion(fitted)
     assert 0 < found.correlation < 1
@@ -43,7 +43,7 @@ def test_the_step_that_is_least_told_apart(fitted: PersonFit) -> None:
     assert inside <= direction @ covariance[levels, levels] @ direction
 
 
-def test_an_unknown_kind_is_refused(fitted: PersonFit) -> None:
+def test_an_unknown_kind_is_refused(fitted: OutputFeedbackFit) -> None:
     with pytest.raises(InputError, match="expected, sandwich"):
         person_covariance(fitted, "robust")
 
@@ -54,8 +54,8 @@ def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
     Deviations by the sandwich had been none along four directions of seven.
     """
     who = subject("pair", 0, "motor", 90.0, 5.0)
-    found = fit_person(fit(recorded(who, 0).problem), blind(who))
-    assert np.linalg.eigvalsh(found.told.information)[0] < 1e-8
+    found = fit_output_feedback(fit(recorded(who, 0).problem), blind(who))
+    assert np.linalg.eigvalsh(found.identified.information)[0] < 1e-8
     robust, expected = person_covariance(found), person_covariance(found, "expected")
     assert np.linalg.eigvalsh(robust.covariance)[0] > 0
     np.testing.assert_allclose(robust.deviations, expected.deviations, rtol=0.3)

@@ -1,4 +1,4 @@
-"""Fits by maximum likelihood: the limit of no noise, derivatives, a known person, prices."""
+"""Fits by maximum likelihood: the limit of no noise, derivatives, a known person, cost weights."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from impc.model.structure import Structure
 from impc.model.weights import Weights
 from impc.output_feedback import likelihood
 from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.search import unseen_slope
 from impc.output_feedback.simulation import simulate_person
@@ -63,22 +63,22 @@ def noisy() -> tuple[Observer, Estimate]:
 
 
 @pytest.fixture(scope="module")
-def fitted(noisy: tuple[Observer, Estimate]) -> PersonFit:
-    return fit_person(noisy[1], noisy[0])
+def fitted(noisy: tuple[Observer, Estimate]) -> OutputFeedbackFit:
+    return fit_output_feedback(noisy[1], noisy[0])
 
 
 def test_the_gradient_is_that_of_the_likelihood(noisy: tuple[Observer, Estimate]) -> None:
     """Along gain, initial states of both trials, and levels together."""
-    space = fit_person(noisy[1], noisy[0], max_evaluations=1).space
-    told = space.told(space.start)
-    assert told.value == pytest.approx(space.value(space.start), rel=1e-12)
+    space = fit_output_feedback(noisy[1], noisy[0], max_evaluations=1).space
+    identified = space.identified(space.start)
+    assert identified.value == pytest.approx(space.value(space.start), rel=1e-12)
     for step in np.random.default_rng(1).normal(size=(3, len(space.start))):
 
         def moved(t: float, step: Array = step) -> Array:
             return np.array([space.value(space.start + t * step)])
 
         slope = extrapolated_slope(moved, 1e-3)
-        assert told.gradient @ step == pytest.approx(slope[0], rel=1e-6)
+        assert identified.gradient @ step == pytest.approx(slope[0], rel=1e-6)
 
 
 def test_trials_side_by_side_say_what_they_say_one_after_the_other(
@@ -86,18 +86,18 @@ def test_trials_side_by_side_say_what_they_say_one_after_the_other(
 ) -> None:
     problem = posed(noisy[0], 0.01, 0.9, trials=6)
     found = replaced(noisy[1], problem=problem)
-    space = fit_person(found, noisy[0], max_evaluations=1).space
-    beside = [space.told(space.start) for _ in range(5)]
+    space = fit_output_feedback(found, noisy[0], max_evaluations=1).space
+    beside = [space.identified(space.start) for _ in range(5)]
     monkeypatch.setattr(likelihood, "ThreadPoolExecutor", lambda _: ThreadPoolExecutor(1))
-    alone = space.told(space.start)
-    for told in beside:
-        assert told.value == alone.value
-        for ours, theirs in zip(told.scores, alone.scores, strict=True):
+    alone = space.identified(space.start)
+    for identified in beside:
+        assert identified.value == alone.value
+        for ours, theirs in zip(identified.scores, alone.scores, strict=True):
             assert_array_equal(ours, theirs)
 
 
 def test_a_person_is_found_and_told_better_than_without_the_noise(
-    noisy: tuple[Observer, Estimate], fitted: PersonFit
+    noisy: tuple[Observer, Estimate], fitted: OutputFeedbackFit
 ) -> None:
     person, first = noisy
     truth = Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), first.problem.bounds, 5).K
@@ -108,13 +108,13 @@ def test_a_person_is_found_and_told_better_than_without_the_noise(
     # With the prior, and what scores do not have, its gradient is none, to a tenth of a deviation.
     slope, bend = fitted.prior.slopes(np.array(fitted.theta))
     unseen = unseen_slope(fitted.prior, fitted.prior.at(np.array(fitted.theta)))
-    gradient = fitted.told.gradient + slope + unseen
-    assert gradient @ np.linalg.solve(fitted.told.information + bend, gradient) < 1e-2
+    gradient = fitted.identified.gradient + slope + unseen
+    assert gradient @ np.linalg.solve(fitted.identified.information + bend, gradient) < 1e-2
 
 
 def test_the_barrier_is_how_far_noise_drives_the_loop(noisy: tuple[Observer, Estimate]) -> None:
     """Against a sum over all samples after a push; its gradient against differences."""
-    space = fit_person(noisy[1], noisy[0], max_evaluations=1).space
+    space = fit_output_feedback(noisy[1], noisy[0], max_evaluations=1).space
     theta = space.start + np.array([0.1, -0.2, *np.zeros(len(space.start) - 2)])
     plant, T = space.space.problem.plant, space.space.T
     closed = plant.A - plant.B @ space.unpack(theta).point.K
@@ -134,38 +134,38 @@ def test_the_barrier_is_how_far_noise_drives_the_loop(noisy: tuple[Observer, Est
 
 
 def test_a_level_of_zero_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
-    seeing = fit_person(noisy[1], Observer(cart(), motor=0.4))
+    seeing = fit_output_feedback(noisy[1], Observer(cart(), motor=0.4))
     assert seeing.observer.share[0] == 0
     assert np.all(seeing.observer.process == 0)
     assert seeing.space.names == ["motor u", "recorder x"]
 
 
 def test_a_level_that_is_known_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
-    held = fit_person(noisy[1], noisy[0], held=["sensory"])
+    held = fit_output_feedback(noisy[1], noisy[0], held=["sensory"])
     assert held.observer.sensory[0] == noisy[0].sensory[0]
     assert held.space.names == ["motor u", "recorder x"]
-    free = fit_person(noisy[1], noisy[0])
+    free = fit_output_feedback(noisy[1], noisy[0])
     assert free.count == held.count + 1
     assert 0 <= free.log_likelihood - held.log_likelihood < 4  # chi-squared's, of one number
     with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
-        fit_person(noisy[1], noisy[0], held=["noise"])
+        fit_output_feedback(noisy[1], noisy[0], held=["noise"])
 
 
 def test_a_trial_of_which_nothing_is_told_is_refused(noisy: tuple[Observer, Estimate]) -> None:
     """Everything would be given, and the prior taken for what was found."""
     with pytest.raises(InputError, match="counted: got 400, and the shortest trial has 400"):
-        fit_person(noisy[1], noisy[0], counted=400)
+        fit_output_feedback(noisy[1], noisy[0], counted=400)
 
 
 @pytest.mark.parametrize("logarithm", [400.0, -400.0, 1000.0, np.nan])
 def test_a_level_that_cannot_be_squared_has_no_likelihood(
-    fitted: PersonFit, logarithm: float
+    fitted: OutputFeedbackFit, logarithm: float
 ) -> None:
     """A profile came there along its ridge, and numpy's warning to the screen."""
     space = fitted.space
     theta = space.start.copy()
     theta[space.own] = logarithm
-    for said in (space.told, space.value):
+    for said in (space.identified, space.value):
         with pytest.raises(SolverError, match="level of noise: has no square"):
             said(theta)
 
@@ -178,7 +178,7 @@ def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
     start = replace(found, K=least.K, problem=least.problem)
     tiny = Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
     for person in (Observer(cart()), tiny):
-        likely = fit_person(start, person, recorder=np.array([0.01]), spread=np.inf)
+        likely = fit_output_feedback(start, person, recorder=np.array([0.01]), spread=np.inf)
         assert likely.converged
         np.testing.assert_allclose(likely.K, least.K, rtol=1e-6)
         np.testing.assert_allclose(likely.problem.starts, least.problem.starts, atol=1e-6)
@@ -186,11 +186,11 @@ def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
 
 @pytest.mark.parametrize(("along", "units"), [(0, 3.0), (1, 3.0), (1, 5.0)])
 def test_a_gain_that_cannot_be_the_persons_is_left_behind(
-    noisy: tuple[Observer, Estimate], fitted: PersonFit, along: int, units: float
+    noisy: tuple[Observer, Estimate], fitted: OutputFeedbackFit, along: int, units: float
 ) -> None:
     """From three natural units away a search had ended at ten times the gain, from five in none."""
     far = np.array(noisy[1].gain) + units * fitted.space.space.gains[along]
-    found = fit_person(replaced(noisy[1], K=far), noisy[0])
+    found = fit_output_feedback(replaced(noisy[1], K=far), noisy[0])
     assert found.converged
     deviations = np.array(person_covariance(fitted, "expected").entries)
     assert np.all(np.abs(np.array(found.K) - fitted.K) < 0.1 * deviations)
@@ -203,16 +203,16 @@ def test_prices_of_a_structure_are_searched() -> None:
         given.plant, given.bounds, 5, given.recordings, terminal_set=False, unknown_start=True,
         structure=Structure(given.plant, ["x", "v"]),
     )  # fmt: skip
-    found = fit_person(fit(problem, "structured"), person)
-    assert found.prices is not None
+    found = fit_output_feedback(fit(problem, "structured"), person)
+    assert found.cost_weights is not None
     assert found.converged
-    weights = found.problem.structure.weights(found.prices)  # type: ignore[union-attr]
+    weights = found.problem.structure.weights(found.cost_weights)  # type: ignore[union-attr]
     law = Controller(given.plant, weights, given.bounds, 5, terminal_set=False)
     np.testing.assert_allclose(law.K, found.K, rtol=1e-9)
-    # In two trials of 20 s prices are told to a factor of two.
-    assert np.all(np.abs(np.array(found.prices) - np.log([8.0, 1.0])) < 1.0)
+    # In two trials of 20 s cost weights are known to within a factor of two.
+    assert np.all(np.abs(np.array(found.cost_weights) - np.log([8.0, 1.0])) < 1.0)
 
 
 def test_what_cannot_be_estimated_is_an_error(noisy: tuple[Observer, Estimate]) -> None:
     with pytest.raises(ImpcError, match="no start has a likelihood"):
-        fit_person(noisy[1], Observer(cart(), ["v"], sensory=0.1, motor=0.4))
+        fit_output_feedback(noisy[1], Observer(cart(), ["v"], sensory=0.1, motor=0.4))

@@ -7,7 +7,7 @@ import pytest
 import scipy.optimize
 
 from impc.inverse.methods import fit
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.profile import held_person
 from tests.output_feedback.test_fit import cart, posed
@@ -16,22 +16,25 @@ pytestmark = pytest.mark.full
 
 
 @pytest.fixture(scope="module")
-def fitted() -> PersonFit:
+def fitted() -> OutputFeedbackFit:
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
-    return fit_person(fit(posed(person, 0.01, 3.0)), person)
+    return fit_output_feedback(fit(posed(person, 0.01, 3.0)), person)
 
 
-def test_all_else_is_at_its_best(fitted: PersonFit) -> None:
+def test_all_else_is_at_its_best(fitted: OutputFeedbackFit) -> None:
     """Against a search without derivatives, along a combination of gain and motor noise."""
     prior, unseen = fitted.prior, np.array(fitted.unseen)
-    here, along = prior.placed(np.array(fitted.theta), fitted.told), np.zeros(len(fitted.theta))
+    here, along = (
+        prior.placed(np.array(fitted.theta), fitted.identified),
+        np.zeros(len(fitted.theta)),
+    )
     along[[0, 1, fitted.space.own]] = np.array([2.0, -1.0, 2.0]) / 3
     found = held_person(prior, here, along, 0.1, unseen, 60)
     assert found is not None
     place, _ = found
     assert along @ (place.theta - here.theta) == pytest.approx(0.1, abs=1e-12)
     across = scipy.linalg.null_space(along[None])
-    information = across.T @ (here.told.information + 0.1 * np.eye(len(along))) @ across
+    information = across.T @ (here.identified.information + 0.1 * np.eye(len(along))) @ across
     scale = np.linalg.inv(np.linalg.cholesky(information)).T
 
     def lower(steps: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
@@ -44,8 +47,8 @@ def test_all_else_is_at_its_best(fitted: PersonFit) -> None:
     assert here.value - place.value == pytest.approx(best.fun, abs=0.02)
 
 
-def test_where_there_is_nobody_there_is_none(fitted: PersonFit) -> None:
+def test_where_there_is_nobody_there_is_none(fitted: OutputFeedbackFit) -> None:
     """A level whose square double precision does not have."""
-    prior, here = fitted.prior, fitted.prior.placed(np.array(fitted.theta), fitted.told)
+    prior, here = fitted.prior, fitted.prior.placed(np.array(fitted.theta), fitted.identified)
     level = np.eye(len(fitted.theta))[fitted.space.own]
     assert held_person(prior, here, level, 1e3, np.array(fitted.unseen), 10) is None

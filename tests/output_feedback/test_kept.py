@@ -14,7 +14,7 @@ from impc.inverse.methods import fit
 from impc.inverse.structured_fit import fit_structured
 from impc.model.structure import Structure
 from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import fit_person
+from impc.output_feedback.fit import fit_output_feedback
 from impc.output_feedback.kept import decode_person, encode_person
 from impc.output_feedback.observer import Observer
 from tests.inverse.test_regulator_span import late_body, late_problem
@@ -33,7 +33,7 @@ def gain_of_a_structure() -> tuple[Estimate, Observer]:
     return fit(problem), Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
 
 
-def prices() -> tuple[Estimate, Observer]:
+def cost_weights() -> tuple[Estimate, Observer]:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
     problem = posed(person, 0.01, 0.9)
     structure = Structure(problem.plant, ["x", "v"])
@@ -41,11 +41,11 @@ def prices() -> tuple[Estimate, Observer]:
     return fit_structured(problem, structure, fit(problem)), person
 
 
-@pytest.mark.parametrize("make", [any_gain, gain_of_a_structure, prices])
+@pytest.mark.parametrize("make", [any_gain, gain_of_a_structure, cost_weights])
 def test_it_is_the_one_that_was_fitted(make: object) -> None:
     assert callable(make)
     found, person = make()
-    fit = fit_person(found, person, max_evaluations=30)
+    fit = fit_output_feedback(found, person, max_evaluations=30)
     kept = json.loads(json.dumps(encode_person(fit)))
     again = decode_person(found.problem, person, kept)
     for name in ("K", "S", "recorder", "theta", "unseen"):

@@ -167,8 +167,8 @@ def test_without_bounds_it_is_that_of_statsmodels(who: Someone) -> None:
     other.tolerance = 0.0
     found = likelihood(who, outputs)
     # 1e-9 is asked for; statsmodels and this filter differ by rounding, 1e-13 here.
-    np.testing.assert_allclose(np.sum(found.told), other.loglike(), rtol=1e-11)
-    np.testing.assert_allclose(found.told, other.loglikeobs(), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.sum(found.identified), other.loglike(), rtol=1e-11)
+    np.testing.assert_allclose(found.identified, other.loglikeobs(), rtol=0, atol=1e-9)
 
 
 SATURATING = Someone(limit=0.6)
@@ -214,7 +214,15 @@ def test_recordings_together_tell_what_each_tells(who: Someone) -> None:
     for found, trial in zip(joint_likelihoods(prepared, trials), trials, strict=True):
         alone = joint_likelihoods(prepared, [trial])[0]
         np.testing.assert_array_equal(found.status, alone.status)
-        for name in ("told", "score", "information", "innovations", "spreads", "filtered", "u"):
+        for name in (
+            "identified",
+            "score",
+            "information",
+            "innovations",
+            "spreads",
+            "filtered",
+            "u",
+        ):
             np.testing.assert_allclose(getattr(found, name), getattr(alone, name), 1e-12, 1e-12)
 
 
@@ -224,7 +232,7 @@ def test_a_stationary_covariance_says_what_that_of_every_sample_does() -> None:
     own = likelihood(QUIET._replace(share=1e-12), outputs, slopes=True)
     found = likelihood(QUIET, outputs, slopes=True)
     assert 60 < np.flatnonzero(found.status)[0] < 120
-    np.testing.assert_allclose(found.told, own.told, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found.identified, own.identified, rtol=1e-10, atol=1e-10)
     kept = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # all but the share, and the walk that is none
     scale = np.sqrt(np.sum(own.score[:, kept] ** 2, axis=0))
     np.testing.assert_allclose(found.score[:, kept] / scale, own.score[:, kept] / scale, atol=1e-9)
@@ -264,7 +272,7 @@ def test_samples_that_are_given_are_not_told(limit: float) -> None:
     np.testing.assert_allclose(rest.score.sum(axis=0), score, rtol=1e-9, atol=1e-9)
     information = every.information - first.information
     np.testing.assert_allclose(rest.information, information, rtol=1e-9, atol=1e-6)
-    assert not rest.told[:40].any()
+    assert not rest.identified[:40].any()
     np.testing.assert_array_equal(rest.filtered, every.filtered)
 
 

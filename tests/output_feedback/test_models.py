@@ -8,7 +8,7 @@ import pytest
 from impc.inverse.methods import fit
 from impc.model.structure import Structure
 from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.models import person_report, prediction_errors
 from impc.output_feedback.observer import Observer
 from tests.inverse.test_regulator_span import late_body, late_problem
@@ -18,18 +18,18 @@ pytestmark = pytest.mark.full
 
 
 @pytest.fixture(scope="module")
-def fitted() -> PersonFit:
+def fitted() -> OutputFeedbackFit:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    return fit_person(fit(posed(person, 0.01, 3.0)), person)
+    return fit_output_feedback(fit(posed(person, 0.01, 3.0)), person)
 
 
-def test_errors_ahead_are_those_that_the_filter_expects(fitted: PersonFit) -> None:
+def test_errors_ahead_are_those_that_the_filter_expects(fitted: OutputFeedbackFit) -> None:
     """One sample ahead they are the innovations; far ahead they grow to the noise in the loop."""
     ahead = (1, 5, 20)
     errors = prediction_errors(fitted, ahead)
-    told = np.concatenate([trial.innovations for trial in fitted.told.trials])
+    identified = np.concatenate([trial.innovations for trial in fitted.identified.trials])
     # A hundred starts in each of two trials: 5 % of a deviation, twice.
-    np.testing.assert_allclose(errors[0], np.sqrt(np.mean(told**2, axis=0)), rtol=0.12)
+    np.testing.assert_allclose(errors[0], np.sqrt(np.mean(identified**2, axis=0)), rtol=0.12)
     assert errors[0] < errors[1] < errors[2]
 
 

@@ -38,7 +38,7 @@ def test_the_rest_works_without_it(tmp_path: Path) -> None:
     code = TRIED.replace("impc.read_settings", "fit_settings") + (
         "from impc.studies.fit.settings import fit_settings\n"
         "print(np.abs(fit().fitted.K - law.K).max() < 1e-6)\n"
-        "for ask in (lambda: fit(observer={}), lambda: impc.fit_person):\n"
+        "for ask in (lambda: fit(observer={}), lambda: impc.fit_output_feedback):\n"
         "    try:\n"
         "        ask()\n"
         "    except (impc.ImpcError, ImportError) as error:\n"
@@ -53,5 +53,6 @@ def test_the_rest_works_without_it(tmp_path: Path) -> None:
         "True",
         "[fit.observer]: needs impc.output_feedback, which is not there; install all of impc, or "
         "leave the table out",
-        "impc.fit_person: needs impc.output_feedback, which is not there; install all of impc",
+        "impc.fit_output_feedback: needs impc.output_feedback, which is not there; install all of "
+        "impc",
     ]

@@ -91,14 +91,16 @@ def test_it_is_said_how_much_of_the_gain_is_told() -> None:
         (line,) = [
             line
             for line in replace(result, person=other).person_sentences
-            if "told from zero" in line
+            if "distinguishable from zero" in line
         ]
         return line
 
     both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
-    assert said(both).startswith("2 of the 2 entries of this person's gain are told from zero")
+    assert said(both).startswith(
+        "2 of the 2 entries of this person's gain are distinguishable from zero"
+    )
     assert said(one).startswith("1 of the 2 entries")
-    # By profile an entry that is not told by itself has no interval.
+    # By profile an entry that is not individually identified has no interval.
     nothing = said([[np.nan, np.nan], [-1.0, np.inf]])
     assert nothing.startswith("None of the 2 entries")
     assert nothing.endswith("several times as large or as small.")
@@ -146,9 +148,12 @@ def test_the_page_says_what_intervals_held_where_a_limit_was_met() -> None:
     fit = result.person.fit
     assert fit is not None
     limited = [
-        replace(one, status=np.full_like(one.status, Status.ACTIVE)) for one in fit.told.trials
+        replace(one, status=np.full_like(one.status, Status.ACTIVE))
+        for one in fit.identified.trials
     ]
-    met = replace(result.person, fit=replace(fit, told=replace(fit.told, trials=limited)))
+    met = replace(
+        result.person, fit=replace(fit, identified=replace(fit.identified, trials=limited))
+    )
     assert any("90 to 95 %" in line for line in replace(result, person=met).person_sentences)
     assert met.data()["at_limit"] is True
 
@@ -173,7 +178,7 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     assert covariance is not None
     about = np.asarray(fit.K)[..., None] + 1.959964 * covariance.entries[..., None] * [-1, 1]
     np.testing.assert_allclose(rough["K_intervals"], about, rtol=1e-6)
-    # The gain is well told: ends are half a width at most from those of deviations.
+    # The gain is well identified: ends are half a width at most from those of deviations.
     width = np.ptp(about, axis=-1, keepdims=True)
     assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
     assert "follows the likelihood" in str(quick.person.section())

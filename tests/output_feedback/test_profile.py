@@ -13,7 +13,7 @@ from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import blind
 from impc.arrays import Array
 from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.profile import (
     entry_intervals,
@@ -29,13 +29,15 @@ pytestmark = pytest.mark.full
 
 
 @pytest.fixture(scope="module")
-def fitted() -> PersonFit:
-    """Motor noise is well told; the sense of a state that is recorded too is not."""
+def fitted() -> OutputFeedbackFit:
+    """Motor noise is well identified; the sense of a state that is recorded too is not."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.01)
-    return fit_person(impc.fit(posed(person, 0.01, 3.0)), person)
+    return fit_output_feedback(impc.fit(posed(person, 0.01, 3.0)), person)
 
 
-def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(fitted: PersonFit) -> None:
+def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(
+    fitted: OutputFeedbackFit,
+) -> None:
     index = fitted.space.names.index("recorder x")
     expected = person_covariance(fitted, "expected")
     assert expected.levels[index] < 0.1
@@ -49,20 +51,24 @@ def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(fitted: Per
 @pytest.mark.parametrize(
     ("name", "end"), [("motor u", 0), ("motor u", 1), ("sensory x", 1), ("gain", 0), ("gain", 1)]
 )
-def test_at_its_end_the_likelihood_has_fallen(fitted: PersonFit, name: str, end: int) -> None:
+def test_at_its_end_the_likelihood_has_fallen(
+    fitted: OutputFeedbackFit, name: str, end: int
+) -> None:
     """By half of 1.96^2, all else being at its best by another search."""
     names, own = fitted.space.names, fitted.space.own
     index = own + names.index(name) if name in names else 0  # or the first coordinate of the gain
     value = profile(fitted, np.eye(len(fitted.theta))[index])[end]
     free = np.delete(np.arange(len(fitted.theta)), index)
-    information = np.array(fitted.told.information)[np.ix_(free, free)] + 0.1 * np.eye(len(free))
+    information = np.array(fitted.identified.information)[np.ix_(free, free)] + 0.1 * np.eye(
+        len(free)
+    )
     root = np.linalg.inv(np.linalg.cholesky(information)).T  # steps of one are deviations
     prior = fitted.prior
     unseen = unseen_slope(prior, prior.at(np.insert(np.array(fitted.theta)[free], index, value)))
 
     def climbed(steps: Array) -> tuple[float, Array]:
         here = prior.at(np.insert(fitted.theta[free] + root @ steps, index, value))
-        gradient = here.told.gradient + prior.slopes(here.theta)[0] + unseen
+        gradient = here.identified.gradient + prior.slopes(here.theta)[0] + unseen
         return -here.value, -root.T @ gradient[free]
 
     found = scipy.optimize.minimize(
@@ -79,8 +85,8 @@ def test_at_its_end_the_likelihood_has_fallen(fitted: PersonFit, name: str, end:
     )
 
 
-def test_entries_of_the_gain_that_are_told_have_intervals(fitted: PersonFit) -> None:
-    """Near a parabola they are those of the deviation; what is not told has none."""
+def test_entries_of_the_gain_that_are_told_have_intervals(fitted: OutputFeedbackFit) -> None:
+    """Near a parabola they are those of the deviation; what is not identified has none."""
     expected = person_covariance(fitted, "expected")
     ends = entry_intervals(fitted, expected)
     about = np.ravel(fitted.K)[:, None] + 1.96 * np.ravel(expected.entries)[:, None] * [-1, 1]
@@ -89,7 +95,7 @@ def test_entries_of_the_gain_that_are_told_have_intervals(fitted: PersonFit) -> 
     assert np.all(np.isnan(entry_intervals(fitted, vague)))
 
 
-def test_a_level_that_is_hardly_told_has_its_interval_by_profile(fitted: PersonFit) -> None:
+def test_a_level_that_is_hardly_told_has_its_interval_by_profile(fitted: OutputFeedbackFit) -> None:
     index = fitted.space.names.index("sensory x")
     low, high = level_interval(fitted, index)
     assert 0 <= low < 0.01 < high < 1.0
@@ -103,7 +109,7 @@ def test_a_level_that_is_hardly_told_has_its_interval_by_profile(fitted: PersonF
 def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
     """Someone who sees all but exactly."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[1e-4, 1e-4])
-    fit = fit_person(impc.fit(posed(person, 0.01, 3.0)), person)
+    fit = fit_output_feedback(impc.fit(posed(person, 0.01, 3.0)), person)
     low, high = level_interval(fit, fit.space.names.index("sensory x"))
     assert low == 0.0
     assert 1e-4 < high < 10.0  # metres: closed above, whatever is not expected of it
@@ -114,10 +120,10 @@ def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -
     """Without a prior of levels a sense slides to none here, and the motor noise takes its part."""
     who = subject("cart", seed, "both", 90.0, 0.7)
     first, motor = impc.fit(recorded(who, seed).problem), float(who.person.levels[0])
-    fit = fit_person(first, blind(who))
+    fit = fit_output_feedback(first, blind(who))
     low, high = person_covariance(fit, "expected").level_intervals(fit.levels)[0]
     assert low < motor < high
-    free = fit_person(first, blind(who), spread=np.inf)
+    free = fit_output_feedback(first, blind(who), spread=np.inf)
     deviations = person_covariance(free, "expected").levels
     assert np.max(deviations) > 10
     assert free.observer.motor[0] > fit.observer.motor[0]
@@ -127,7 +133,7 @@ def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -
 def test_all_levels_are_in_their_intervals() -> None:
     """A person with noise in motor and senses, at the limit, as the page prints it."""
     who = subject("cart", 1, "both", 90.0, 0.7)
-    fit = fit_person(impc.fit(recorded(who, 1).problem), blind(who))
+    fit = fit_output_feedback(impc.fit(recorded(who, 1).problem), blind(who))
     true = [*who.person.levels[who.person.levels > 0], *who.recorder]
     intervals = level_intervals(fit, person_covariance(fit, "expected"))
     assert all(low < level < high for level, (low, high) in zip(true, intervals, strict=True))

@@ -11,7 +11,7 @@ import impc
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.model.weights import Weights
-from impc.output_feedback.fit import PersonFit, fit_person
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.prior import Prior
 from impc.output_feedback.search import boxed_step, climb, learned_slope, unseen_slope
@@ -20,16 +20,16 @@ from tests.output_feedback.test_fit import cart, posed
 pytestmark = pytest.mark.full
 
 
-def sliding_person() -> PersonFit:
-    """Someone whose senses err so little that these levels are not told."""
+def sliding_person() -> OutputFeedbackFit:
+    """Someone whose senses err so little that these levels are not identified."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.002, 0.004])
-    return fit_person(
+    return fit_output_feedback(
         impc.fit(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
     )
 
 
 @pytest.fixture(scope="module")
-def sliding() -> PersonFit:
+def sliding() -> OutputFeedbackFit:
     return sliding_person()
 
 
@@ -48,7 +48,7 @@ def test_a_step_is_the_best_of_its_box(seed: int) -> None:
     assert promised == pytest.approx(gradient @ found - found @ curvature @ found / 2, abs=1e-9)
 
 
-def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None:
+def test_levels_that_slide_do_not_hold_back_the_rest(sliding: OutputFeedbackFit) -> None:
     """A step that was scaled as a whole took more than 30 likelihoods here, and 100 on the seat."""
     space, theta = sliding.space, np.array(sliding.space.start)
     _, _, spent, settled = climb(sliding.prior, sliding.prior.at(space.start), 100)
@@ -65,15 +65,15 @@ def test_levels_that_slide_do_not_hold_back_the_rest(sliding: PersonFit) -> None
     assert sliding.log_likelihood > space.value(theta)
 
 
-def test_a_search_that_may_not_go_on_says_so(sliding: PersonFit) -> None:
+def test_a_search_that_may_not_go_on_says_so(sliding: OutputFeedbackFit) -> None:
     space = sliding.space
     prior = Prior(space, 1.0, space.start[space.own :])
-    (theta, told, _, _), _, spent, settled = climb(prior, prior.at(space.start), 2)
+    (theta, identified, _, _), _, spent, settled = climb(prior, prior.at(space.start), 2)
     assert (spent, settled) == (2, False)
-    assert told.value == space.told(theta).value < sliding.log_likelihood
+    assert identified.value == space.identified(theta).value < sliding.log_likelihood
 
 
-def test_the_prior_bends_as_it_says(sliding: PersonFit) -> None:
+def test_the_prior_bends_as_it_says(sliding: OutputFeedbackFit) -> None:
     """The gradient against differences; without a spread it says nothing."""
     space, theta = sliding.space, np.array(sliding.theta)
     rng, scales = np.random.default_rng(0), space.start[space.own :]
@@ -81,12 +81,12 @@ def test_the_prior_bends_as_it_says(sliding: PersonFit) -> None:
     change = (prior.value(theta + h * step) - prior.value(theta - h * step)) / (2 * h)
     assert prior.slopes(theta)[0] @ step == pytest.approx(change, rel=1e-6)
     nothing = Prior(space, np.inf, scales)
-    assert nothing.value(theta) == nothing.lost(theta, sliding.told) == 0.0
+    assert nothing.value(theta) == nothing.lost(theta, sliding.identified) == 0.0
     assert not np.any(nothing.slopes(theta)[1])
     assert not np.any(unseen_slope(nothing, nothing.at(theta)))
 
 
-def test_initial_states_are_as_any_other_state(sliding: PersonFit) -> None:
+def test_initial_states_are_as_any_other_state(sliding: OutputFeedbackFit) -> None:
     """About zero, with second moments of the states and what noise in the loop adds."""
     space = sliding.space
     scales, driven = space.start[space.own :], np.diag([0.3, 0.2])
@@ -104,7 +104,7 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     """Against a grid over the gain, at the levels that were found and at twice the motor noise."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
     problem = replace(posed(person, 0.01, 3.0, trials=1), unknown_start=False)
-    fit = fit_person(impc.fit(problem), person)
+    fit = fit_output_feedback(impc.fit(problem), person)
     space, prior, steps = fit.space, fit.prior, np.linspace(-5, 5, 11)
     assert space.own == 2
     change = []
@@ -112,8 +112,8 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
         theta = np.array(fit.theta)
         theta[2] += np.log(factor)
         here, _, _, _ = climb(prior, prior.at(theta), 30, np.eye(len(theta))[:, :2])
-        root = np.linalg.cholesky(np.linalg.inv(here.told.information[:2, :2]))
-        top, total = here.told.value + prior.value(here.theta), 0.0
+        root = np.linalg.cholesky(np.linalg.inv(here.identified.information[:2, :2]))
+        top, total = here.identified.value + prior.value(here.theta), 0.0
         for first, second in itertools.product(steps, steps):
             there = here.theta.copy()
             there[:2] += root @ [first, second]
@@ -125,12 +125,12 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     assert change[0] == pytest.approx(change[1], abs=0.02)
 
 
-def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> None:
+def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: OutputFeedbackFit) -> None:
     """Against searches of all else with a level a little lower and higher."""
     prior, theta = sliding.prior, np.array(sliding.theta)
     own = sliding.space.own
     found, others, step = unseen_slope(prior, prior.at(theta)), np.eye(len(theta))[:, :own], 0.05
-    for index in (own, own + 3):  # those that are told: motor, recorder
+    for index in (own, own + 3):  # those that are identified: motor, recorder
         lost = []
         for sign in (-1, 1):
             start = theta + sign * step * np.eye(len(theta))[index]
@@ -142,7 +142,7 @@ def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: PersonFit) -> 
         assert found[index] == pytest.approx((lost[0] - lost[1]) / (2 * step), abs=0.1)
 
 
-def test_what_levels_lose_is_learned(sliding: PersonFit) -> None:
+def test_what_levels_lose_is_learned(sliding: OutputFeedbackFit) -> None:
     """After a long step along one level the slope along it is what was lost over the length."""
     prior, theta, own = sliding.prior, np.array(sliding.theta), sliding.space.own
     here, slope = prior.at(theta.copy()), np.array(sliding.unseen)

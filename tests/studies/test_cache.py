@@ -56,8 +56,8 @@ def counted(seed: int, made: list[int]) -> Callable[[], Found]:
     [("nothing", []), ("other digest", [1, 2]), ("cut", [1]), ("flipped", [1]), ("copied", [1])],
 )
 def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list[int]) -> None:
-    kept, told, made = Cache(tmp_path / "kept"), list[str](), list[int]()
-    first = Steps(kept, "digest", told.append)
+    kept, stated, made = Cache(tmp_path / "kept"), list[str](), list[int]()
+    first = Steps(kept, "digest", stated.append)
     assert first.kept() == "nothing was done yet"
     for seed in (1, 2):
         same(found(seed), first.get(f"step {seed}", counted(seed, made), decode))
@@ -71,12 +71,12 @@ def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list
         path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
     elif damage == "copied":
         path.write_bytes(kept.path("step 2").read_bytes())
-    other = Steps(kept, "another" if damage == "other digest" else "digest", told.append)
+    other = Steps(kept, "another" if damage == "other digest" else "digest", stated.append)
     made.clear()
     for seed in (1, 2):
         same(found(seed), other.get(f"step {seed}", counted(seed, made), decode))
     assert made == again
-    assert told == ["step 1", "step 2"] * 2
+    assert stated == ["step 1", "step 2"] * 2
     assert "step 1" in other.kept()
     kept.forget()
     assert not kept.folder.exists()

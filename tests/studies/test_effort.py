@@ -55,7 +55,7 @@ def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) 
     bounds = Bounds(plant, u_min=-1, u_max=1)
     trial = Recording(plant, np.ones((50, n)))
     problem = Problem(plant, bounds, horizon, (trial,), terminal_set=False)
-    told = fit_effort(problem, FitSettings(horizon=horizon)).gigabytes * 1e9
+    stated = fit_effort(problem, FitSettings(horizon=horizon)).gigabytes * 1e9
     K = solve_lqr(plant, Weights(np.eye(n), np.eye(m))).K
     controller = Controller.from_gain(plant, K, bounds, horizon, terminal_set=False)
     tracemalloc.start()
@@ -64,7 +64,7 @@ def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) 
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert 0.5 < told / peak < 2
+    assert 0.5 < stated / peak < 2
 
 
 def test_time_grows_with_what_is_asked() -> None:
@@ -148,8 +148,8 @@ def test_evaluations_of_a_selection_are_told_to_their_order_of_magnitude(which: 
     calls = 0
     cells = {("1", "1"): trials, ("1", "2"): trials}
     found = key_parameters(watched, cells, settings, in_turn(watched), bound=0.5)
-    told = key_evaluations(settings, len(found.candidates))
-    assert 1 / 10 < told / (calls / 2) < 10
+    stated = key_evaluations(settings, len(found.candidates))
+    assert 1 / 10 < stated / (calls / 2) < 10
 
 
 def drug() -> tuple[ParametricModel, tuple[Trial, ...]]:

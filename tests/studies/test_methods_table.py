@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.coverage import cart, noisy_trial
-from impc.assess.assessments import ASSESSMENTS, Assessment, MethodFit, judge
+from impc.assess.assessments import ASSESSMENTS, Assessment, MethodFit, evaluate_method
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -30,11 +30,11 @@ from impc.studies.methods_table import column_terms, methods_data, methods_findi
 def fits() -> list[MethodFit]:
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(21, 0.0)], settings)
-    gain = judge(fit(problem, "feedback_gain"), problem.bounds)
+    gain = evaluate_method(fit(problem, "feedback_gain"), problem.bounds)
     none = replace(
         gain.estimate, method="inverse_lqr_lmi", K=None, S=None, reason="it was not tried"
     )
-    return [gain, judge(none, problem.bounds)]
+    return [gain, evaluate_method(none, problem.bounds)]
 
 
 def test_the_three_say_the_same(fits: list[MethodFit]) -> None:

@@ -1,4 +1,4 @@
-"""A scheduler with certificates: who has them works on it, who has not is told so in one line."""
+"""A scheduler with certificates: who has them works on it, who has not is said so in one line."""
 
 from __future__ import annotations
 

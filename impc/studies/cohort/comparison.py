@@ -3,10 +3,10 @@
     two groups     Welch's t on the subjects' means over their visits, Hedges' g
     two visits     paired t on subjects who have both, d_z = mean / SD of the differences
     both           Welch's t on the subjects' changes per visit: whether groups change differently
-    all visits     a mixed model of prices within a structure: group, visit, a mean for each subject
-    reliability    ICC(A,1) between visits
+    all visits     a mixed model of cost weights within a structure: group, visit, a mean for each
+    subject reliability    ICC(A,1) between visits
 
-A gain that the recordings of a unit do not tell is no datum (`impc.studies.cohort.told`).
+A gain that the recordings of a unit do not say is no datum (`impc.studies.cohort.identified`).
 Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
 """
 
@@ -24,7 +24,7 @@ from statsmodels.regression.mixed_linear_model import MixedLM
 from impc.assess.several_tests import holm
 from impc.checking import replace
 from impc.errors import DataError, one_line
-from impc.studies.cohort.told import only_told
+from impc.studies.cohort.identified import only_identified
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
 
 _FEWEST = 3
-_PRICE = "log_price."
+_COST_WEIGHT = "log_cost_weight."
 
 
 @dataclass(frozen=True)
@@ -60,43 +60,43 @@ class Comparison:
 def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
     """Columns of the table `units` that are compared: few, chosen before the data are seen.
 
-    Logarithms of prices within a structure, or without one prices of recorded outputs in the
-    analytic centre; gains on recorded outputs and their rates; and VAF. Gains on states of a delay
-    or a muscle, one by one, say little, and every measure makes Holm's correction harder on the
-    others. All gains where no state has an output's name.
+    Logarithms of cost weights within a structure, or without one cost weights of recorded outputs
+    in the analytic centre; gains on recorded outputs and their rates; and VAF. Gains on states of a
+    delay or a muscle, one by one, say little, and every measure makes Holm's correction harder on
+    the others. All gains where no state has an output's name.
     """
     outputs = [name.removeprefix("vaf.") for name in units.columns if name.startswith("vaf.")]
     shown = {*outputs, *(f"{name}_rate" for name in outputs)}
     gains = [name for name in units.columns if name.startswith("K.")]
     named = [name for name in gains if name.split(".", 2)[2] in shown]
-    priced = [name for name in units.columns if name.startswith(_PRICE)]
-    centre = [name for name in units.columns if name in {f"centre_price.{o}" for o in outputs}]
+    penalised = [name for name in units.columns if name.startswith(_COST_WEIGHT)]
+    centre = [name for name in units.columns if name in {f"centre_weight.{o}" for o in outputs}]
     shares = [name for name in units.columns if name.startswith("vaf.")]
-    return (*priced, *(named or gains), *(() if priced else centre), *shares)
+    return (*penalised, *(named or gains), *(() if penalised else centre), *shares)
 
 
 def compare_cohort(
     units: pd.DataFrame, measures: Sequence[str] | None = None
 ) -> tuple[Comparison, ...]:
-    """Answer every question that the units allow; gains that a unit does not tell are left out."""
+    """Answer every question that the units allow; gains that a unit does not say are left out."""
     if len(units) == 0:
         raise DataError("cohort", "has no unit with a result", "see the reasons in the report")
     chosen = measures_of(units) if measures is None else tuple(measures)
     found: list[Comparison] = []
-    for condition, part in only_told(units).groupby("condition", sort=True, dropna=False):
-        told = str(condition)
+    for condition, part in only_identified(units).groupby("condition", sort=True, dropna=False):
+        stated = str(condition)
         groups = sorted(set(part["group"]) - {""})
         visits = list(dict.fromkeys(part["visit"]))
         for one, other in itertools.combinations(groups, 2):
-            found += _holm([_groups(part, name, told, one, other) for name in chosen])
+            found += _holm([_groups(part, name, stated, one, other) for name in chosen])
             if len(visits) > 1:
-                found += _holm([_interaction(part, name, told, one, other) for name in chosen])
-                priced = [name for name in chosen if name.startswith(_PRICE)]
-                found += _holm([_mixed(part, name, told, one, other) for name in priced])
+                found += _holm([_interaction(part, name, stated, one, other) for name in chosen])
+                penalised = [name for name in chosen if name.startswith(_COST_WEIGHT)]
+                found += _holm([_mixed(part, name, stated, one, other) for name in penalised])
         for one, other in itertools.combinations(visits, 2):
-            found += _holm([_visits(part, name, told, one, other) for name in chosen])
+            found += _holm([_visits(part, name, stated, one, other) for name in chosen])
         if len(visits) > 1:
-            found += [_reliability(part, name, told) for name in chosen]
+            found += [_reliability(part, name, stated) for name in chosen]
     return tuple(found)
 
 

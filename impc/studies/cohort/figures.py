@@ -9,7 +9,7 @@ import numpy as np
 
 from impc.model.plant import UNKNOWN
 from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
-from impc.studies.cohort.told import measure_words
+from impc.studies.cohort.identified import measure_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -99,6 +99,6 @@ def subject_figure(fit: dict[str, Any]) -> Figure:
 def _unit(name: str, names: Mapping[str, str]) -> str:
     if name.startswith(("vaf.", "held_out_vaf.")):
         return "%"
-    if name.startswith("log_price."):
+    if name.startswith("log_cost_weight."):
         return "-"
     return names.get(name, UNKNOWN)

@@ -17,10 +17,15 @@ from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
 from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.figures import group_figure
+from impc.studies.cohort.identified import (
+    measure_words,
+    not_identified,
+    only_identified,
+    unidentified_sentences,
+)
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.subject_page import kept_words, subject_files
 from impc.studies.cohort.tables import cohort_tables
-from impc.studies.cohort.told import measure_words, not_told, not_told_sentences, only_told
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +38,7 @@ _QUESTIONS = {
     "group": "between groups",
     "visit": "between visits",
     "change": "change from visit to visit",
-    "mixed": "between groups, over all visits (mixed model of the prices)",
+    "mixed": "between groups, over all visits (mixed model of the cost weights)",
     "reliability": "reliability between visits",
 }
 _WITHIN = "those of the structure, compared in their logarithms"
@@ -63,12 +68,12 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
     for subject, own in subjects.items():
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, subject_files(subject, own, store, failures))
-    figures = _figures(only_told(units), compared, _measure_units(study.units, store))
-    left_out = {name: n for name, n in not_told(units).items() if name in measures_of(units)}
+    figures = _figures(only_identified(units), compared, _measure_units(study.units, store))
+    left_out = {name: n for name, n in not_identified(units).items() if name in measures_of(units)}
     said = [
         *_findings(compared),
         *_structure_lines(units),
-        *not_told_sentences(left_out, len(units)),
+        *unidentified_sentences(left_out, len(units)),
         *_limits(units),
         *_falls(study.units, store, failures),
     ]
@@ -95,7 +100,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
             "failed": failures.units,
             "failed_replicates": failures.replicates,
             "digests": store.digests,
-            "not_told": left_out,
+            "not_identified": left_out,
         },
         beside=[Finding(name, table) for name, table in tables.items()],
     )
@@ -107,7 +112,8 @@ def _comparisons(
 ) -> list[Block]:
     structured = "structure_refused" in units.columns
     blocks: list[Block] = [
-        f"Gains are what the recordings give. Prices are {_WITHIN if structured else _CENTRE}. "
+        "Gains are what the recordings give. Cost weights are "
+        f"{_WITHIN if structured else _CENTRE}. "
         "Holm's correction is over the measures of one question."
     ]
     if "groups.png" in figures:
@@ -124,7 +130,7 @@ def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Bloc
 
 
 def _unit_findings(units: pd.DataFrame) -> list[Finding]:
-    """How much of every unit is explained; its prices within the structure, where one is asked."""
+    """How much of every unit is explained; its weights within the structure, where one is asked."""
     if not len(units):
         return []
     shown = [name for name in units.columns if name.startswith(("vaf.", "held_out_vaf."))]
@@ -132,20 +138,23 @@ def _unit_findings(units: pd.DataFrame) -> list[Finding]:
         at_the_bound_percent=100 * units["saturated"]
     )
     found = [Finding("agreement", explained, "Every unit. units.csv has all numbers.")]
-    priced = [name for name in units.columns if name.startswith("log_price.")]
-    if priced:
+    penalised = [name for name in units.columns if name.startswith("log_cost_weight.")]
+    if penalised:
         word = np.where(units["structure_refused"], "refused", "holds")
-        prices = units[["unit", "group"]].assign(structure=word)
-        for name in priced:
-            label = name.removeprefix("log_price.")
+        cost_weights = units[["unit", "group"]].assign(structure=word)
+        for name in penalised:
+            label = name.removeprefix("log_cost_weight.")
             for end in ("", "_low", "_high"):
-                logarithm = units[name.replace("log_price", f"log_price{end}")].astype(float)
-                prices[f"{label}{end}"] = np.exp(logarithm.fillna(-np.inf))
+                logarithm = units[name.replace("log_cost_weight", f"log_cost_weight{end}")].astype(
+                    float
+                )
+                cost_weights[f"{label}{end}"] = np.exp(logarithm.fillna(-np.inf))
         caption = (
-            "Prices within the structure, with one for the first command, and their intervals of "
+            "Cost weights within the structure, with one for the first command, and their "
+            "intervals of "
             "95 %; it holds where the recordings do not refuse it."
         )
-        found.append(Finding("prices", prices, caption, digits=3))
+        found.append(Finding("cost_weights", cost_weights, caption, digits=3))
     return found
 
 
@@ -166,7 +175,7 @@ def _figures(
 
 
 def _measure_units(units: Sequence[Unit], store: Store) -> dict[str, str]:
-    """Units of the columns of units.csv, as the first unit that was fitted tells."""
+    """Units of the columns of units.csv, as the first unit that was fitted says."""
     fits = (store.fit(unit.name) for unit in units)
     first = next((fit for fit in fits if fit is not None), {})
     return dict(first.get("units", {}))
@@ -194,8 +203,10 @@ def _findings(compared: tuple[Comparison, ...]) -> list[str]:
             what = f"{item.first} and {item.second}" if item.first else "groups over visits"
             effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
             where = f"{item.condition}: " if item.condition else ""
-            told = f"p = {item.p_holm:.2g} after Holm{effect}"
-            line = where + (_times(item, told) or f"{_differs(item, what)} ({told}).")
+            significance = f"p = {item.p_holm:.2g} after Holm{effect}"
+            line = where + (
+                _times(item, significance) or f"{_differs(item, what)} ({significance})."
+            )
             lines.append(line[0].upper() + line[1:])
     return lines or ["No difference between groups or visits stands after Holm's correction."]
 
@@ -204,9 +215,9 @@ def _differs(item: Comparison, what: str) -> str:
     return f"{measure_words(item.measure)} differs between {what}"
 
 
-def _times(item: Comparison, told: str) -> str:
+def _times(item: Comparison, significance: str) -> str:
     """A difference of logarithms as a factor; empty for other measures and questions."""
-    if not item.measure.startswith("log_price.") or item.question not in (
+    if not item.measure.startswith("log_cost_weight.") or item.question not in (
         "group",
         "visit",
         "mixed",
@@ -215,8 +226,9 @@ def _times(item: Comparison, told: str) -> str:
     factor, low, high = (f"{np.exp(x):.2g}" for x in (item.estimate, item.low, item.high))
     over = " over all visits" if item.question == "mixed" else ""
     return (
-        f"the price of {item.measure.removeprefix('log_price.')} is {factor} times as high in "
-        f"{item.second} as in {item.first}{over} (95 %: {low} to {high}; {told})."
+        f"the cost weight of {item.measure.removeprefix('log_cost_weight.')} is {factor} times as "
+        "high in "
+        f"{item.second} as in {item.first}{over} (95 %: {low} to {high}; {significance})."
     )
 
 
@@ -225,8 +237,8 @@ def _structure_lines(units: pd.DataFrame) -> list[str]:
     if "structure_refused" not in units.columns:
         return []
     refused = int(np.sum(units["structure_refused"]))
-    priced = [name for name in units.columns if name.startswith("log_price.")]
-    absent = np.isnan(units[priced].to_numpy()) & np.isfinite(units[["structure_p"]].to_numpy())
+    penalised = [name for name in units.columns if name.startswith("log_cost_weight.")]
+    absent = np.isnan(units[penalised].to_numpy()) & np.isfinite(units[["structure_p"]].to_numpy())
     zero = int(np.sum(np.any(absent, axis=1)))
     lines = [
         f"The structure of the weights is refused by the recordings of {refused} of {len(units)} "
@@ -234,21 +246,22 @@ def _structure_lines(units: pd.DataFrame) -> list[str]:
     ]
     if zero:
         lines.append(
-            f"{zero} units want a price of zero somewhere: it has no logarithm, and they are not "
-            "in the comparison of that price."
+            f"{zero} units want a cost weight of zero somewhere: it has no logarithm, and they "
+            "are not "
+            "in the comparison of that cost weight."
         )
     return lines
 
 
 def _limits(units: pd.DataFrame) -> list[str]:
-    """What those units tell of the limit that never reach it."""
+    """What those units say of the limit that never reach it."""
     if not len(units):
         return []
     never = int(np.sum(units["saturated"] == 0))
     if not never:
         return []
     return [
-        f"{never} of {len(units)} units never reach the limit of their command: they cannot tell "
+        f"{never} of {len(units)} units never reach the limit of their command: they cannot say "
         "inverse MPC from inverse LQR, nor where the limit is."
     ]
 

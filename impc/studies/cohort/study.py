@@ -10,7 +10,7 @@
 `recordings` is a pattern relative to the file; instead of it, `table` names a table with the
 columns file, subject, visit, condition, trial, and `bids` a folder whose file names say sub-,
 ses-, task- and run- as BIDS has them. `participants` is a table with a column subject (or
-participant_id, as in BIDS); a column group tells the groups; other columns that are arguments of
+participant_id, as in BIDS); a column group says the groups; other columns that are arguments of
 the plant (mass, height) replace those of [plant] for that subject. All trials with the same
 subject, visit and condition make a unit: one fit.
 

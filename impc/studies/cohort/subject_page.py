@@ -1,4 +1,4 @@
-"""The page of a subject of a cohort: a figure, agreement, gain and prices of each unit."""
+"""The page of a subject of a cohort: a figure, agreement, gain and cost weights of each unit."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
     return (
         Verdict(
             f"Inverse MPC accounts for {min(shares):.2f} to {max(shares):.2f} % of the outputs; "
-            f"the command stands at its bound for {at_bound:.1f} % of the time."
+            f"the command is at its bound for {at_bound:.1f} % of the time."
         ),
     )
 
 
 def kept_words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
-    """What the signals are, as the first unit that was fitted tells."""
+    """What the signals are, as the first unit that was fitted says."""
     fits = (store.fit(unit.name) for unit in units)
     first = next((fit for fit in fits if fit is not None), {})
     return [(name, meaning) for name, meaning in first.get("words", ())]
@@ -117,15 +117,18 @@ def _gain(unit: Unit, fit: dict[str, Any]) -> Finding:
             "entry": lambda at: f"{fit['controls'][at[0]]} from {fit['states'][at[1]]}",
             "gain": lambda at: float(fit["K"][at[0]][at[1]]),
             "standard_error": lambda at: (
-                or_nan(fit["K_deviation"][at[0]][at[1]]) if fit["K_told"][at[0]][at[1]] else np.nan
+                or_nan(fit["K_deviation"][at[0]][at[1]])
+                if fit["K_identified"][at[0]][at[1]]
+                else np.nan
             ),
             "gain_of_the_weights": lambda at: float(fit["K_of_weights"][at[0]][at[1]]),
-            "price_of_the_state": lambda at: float(reported["Q"][at[1]][at[1]]),
+            "weight_of_the_state": lambda at: float(reported["Q"][at[1]][at[1]]),
         },
     )
     caption = (
         "Gain with standard errors (none: the recordings identify this entry only together with "
-        "others), beside the gain of the reported weights; and prices of the weights of least "
+        "others), beside the gain of the reported weights; and cost weights of the weights of "
+        "least "
         "condition number: a choice among all weights with the latter gain."
     )
     return Finding(f"{unit.name}-gain", table, caption)

@@ -1,10 +1,10 @@
 """Tables of a cohort, made from the folder: what pandas, R and MATLAB read.
 
     units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters,
-                    logarithms of the prices within a structure
+                    logarithms of the cost weights within a structure
     replicates.csv  a row a replicate: labels, number, gain, parameters
     intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
-                    where the recordings do not tell the entry by itself
+                    where the recordings do not identify the entry by itself
 
 Rows are in the order of the study and columns in that of the plant: the same results give the same
 bytes, whatever ran them. Times and memory are in the log, not here.
@@ -71,13 +71,13 @@ def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
         given = fit[name] if isinstance(fit[name], dict) else {"": fit[name]}
         row |= {f"{name}.{signal}".rstrip("."): value for signal, value in given.items()}
     row["saturated"] = fit["saturated"]
-    for name in ("K", "K_deviation", "K_told", "K_of_weights"):
+    for name in ("K", "K_deviation", "K_identified", "K_of_weights"):
         row |= _gain(fit, name, fit[name])
     reported = next(iter(fit["readings"].values()))
     row |= _states(fit, "dominant", reported["dominant"])
-    row |= _states(fit, "price", np.diag(reported["Q"]))
+    row |= _states(fit, "cost_weight", np.diag(reported["Q"]))
     if _CENTRE in fit["readings"]:
-        row |= _states(fit, "centre_price", np.diag(fit["readings"][_CENTRE]["Q"]))
+        row |= _states(fit, "centre_weight", np.diag(fit["readings"][_CENTRE]["Q"]))
     row |= fit["parameters"]
     return row | structure_row(fit)
 
@@ -98,11 +98,12 @@ def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
 
 def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dict[str, Any]]:
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
-    told = _gain(fit, "K", fit["K_told"])
+    identified = _gain(fit, "K", fit["K_identified"])
     rows = []
     for name in drawn.columns:
-        # Replicates stay where the search began along what is not told: their spread says nothing.
-        known = told.get(name, True)
+        # Replicates stay where the search began along what is not identified: their spread says
+        # nothing.
+        known = identified.get(name, True)
         low, high = percentiles(drawn[name], _LEVEL) if known else (np.nan, np.nan)
         rows.append(
             _labels(unit)

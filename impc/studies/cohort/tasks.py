@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 
 from impc.arrays import frozen
-from impc.assess.assessments import assessed, judge
+from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent_statements import intent
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, bootstrap_model, replicate
@@ -28,7 +28,7 @@ from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
-from impc.model.plant import price_unit
+from impc.model.plant import weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_words
 from impc.studies.cohort.unit_structure import unit_structure
@@ -183,7 +183,7 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
     for name, task in tasks.items():
         try:
             problem, settings = unit_problem(task)
-        except ImpcError:  # told as the unit's own when its turn comes
+        except ImpcError:  # identified as the unit's own when its turn comes
             continue
         alone = replace(settings, profiles=[], horizons=[], unknown_limit=False)
         return fit_effort(problem, alone), sum(sizes.values()) / max(sizes[name], 1)
@@ -192,7 +192,7 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
 
 def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
     plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
-    fit = judge(fitted, problem.bounds)
+    fit = evaluate_method(fitted, problem.bounds)
     fit = replace(fit, held_out=_held_out(problem, fitted, settings))
     estimate = gain_estimate(fitted)
     sizes = state_sizes(fit.runs)
@@ -212,7 +212,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "K": estimate.K,
         "S": estimate.S,
         "K_deviation": estimate.covariance.entries,
-        "K_told": estimate.covariance.told_entries,
+        "K_identified": estimate.covariance.individually_identified,
         "K_of_weights": K,
         "Q": weights.Q,
         "R": weights.R,
@@ -237,9 +237,12 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
 
 def _units(plant: Plant) -> dict[str, str]:
     """Units of the measures that a cohort compares, by their columns of units.csv."""
-    prices = {f"centre_price.{name}": price_unit(plant, name, name) for name in plant.states}
+    cost_weights = {
+        f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
+    }
     return {
-        name: "-" if unit == "1" else unit for name, unit in (number_units(plant) | prices).items()
+        name: "-" if unit == "1" else unit
+        for name, unit in (number_units(plant) | cost_weights).items()
     }
 
 

@@ -1,6 +1,6 @@
-"""Prices of a unit within the structure of [fit.structure], and whether the unit refuses it.
+"""Cost weights of a unit within the structure of [fit.structure], and whether the unit refuses it.
 
-Groups are compared in these prices: unlike those of any weights they need no convention
+Groups are compared in these cost weights: unlike those of any weights they need no convention
 (docs/structures.md, docs/cohorts.md).
 """
 
@@ -26,22 +26,22 @@ def unit_structure(
 ) -> dict[str, Any] | None:
     """What a unit says within the structure, for its result; None where none is asked for.
 
-    Logarithms of prices with ends of 95 %; minus infinity, for a price that is or may be zero,
-    becomes null when it is written.
+    Logarithms of cost weights with ends of 95 %; minus infinity, for a cost weight that is or may
+    be zero, becomes null when it is written.
     """
     if settings.structure is None:
         return None
     structure = fit_structures(problem.plant, settings)[0]
-    told: dict[str, Any] = {"name": structure.name, "unknowns": structure.unknowns}
+    record: dict[str, Any] = {"name": structure.name, "unknowns": structure.unknowns}
     try:
         found = fit_structured(problem, structure, fitted)
         fit = assess_structure(problem, structure, found, fitted, settings.settle, held_out=False)
     except (SolverError, WeightsError) as error:
         nothing = [np.nan] * structure.count
-        ends = dict.fromkeys(("log_price", "low", "high"), nothing)
-        return told | ends | {"refused": True, "p": np.nan, "reason": str(error)}
-    return told | {
-        "log_price": [item.value for item in fit.intervals],
+        ends = dict.fromkeys(("log_cost_weight", "low", "high"), nothing)
+        return record | ends | {"refused": True, "p": np.nan, "reason": str(error)}
+    return record | {
+        "log_cost_weight": [item.value for item in fit.intervals],
         "low": [item.low for item in fit.intervals],
         "high": [item.high for item in fit.intervals],
         "refused": fit.refused,
@@ -56,8 +56,8 @@ def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
     if found is None:
         return {}
     row: dict[str, Any] = {}
-    for name in ("log_price", "low", "high"):
-        head = name if name == "log_price" else f"log_price_{name}"
+    for name in ("log_cost_weight", "low", "high"):
+        head = name if name == "log_cost_weight" else f"log_cost_weight_{name}"
         for unknown, value in zip(found["unknowns"], found[name], strict=True):
             row[f"{head}.{unknown}"] = np.nan if value is None else float(value)
     p = found["p"]

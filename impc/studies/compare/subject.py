@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.assess.assessments import judge
+from impc.assess.assessments import evaluate_method
 from impc.assess.variance_accounted_for import left_out_vaf
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -62,7 +62,7 @@ def compare_recordings(
             parts.append({})
     return tuple(
         replace(
-            judge(whole[name], problem.bounds),
+            evaluate_method(whole[name], problem.bounds),
             held_out=_held_out(problem, [part.get(name) for part in parts], settle),
         )
         for name in names

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.assessments import judge
+from impc.assess.assessments import evaluate_method
 from impc.assess.weights_test import Identifiability, identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -132,7 +132,7 @@ def run_case(
         solver=solver,
     )
     table = table_3_1(problem, absolute=True, progress=progress)
-    results = [_result(judge(table[name], bounds), truth_weights) for name in EXAMPLE]
+    results = [_result(evaluate_method(table[name], bounds), truth_weights) for name in EXAMPLE]
     branch = "gradient" if table["inverse_lqr_lmi"].weights is None else "LMI"
     direct = next(item for item in results if item.name == "inverse_mpc")
     assert direct.weights is not None  # it raises where there are none

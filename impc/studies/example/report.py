@@ -53,7 +53,8 @@ _ABOUT = (
 _ONE_THING = (
     "With the terminal weight used here (that of the Riccati equation), the controller stays as "
     "near to the fixed law u = -Kx as its bounds allow. It depends on Q and R through the gain K "
-    "alone, so no recording, saturated or not, can tell two pairs of weights with the same gain "
+    "alone, so no recording, saturated or not, can determine two pairs of weights with the same "
+    "gain "
     "apart. Which pair is reported is a choice: that of the least condition number. Read the gain "
     "and the bounds as a finding about the recording; read Q as one of many descriptions of it. "
     "Here the choice happens to fall on the true weights, because Q = I, R = 1 has the least "

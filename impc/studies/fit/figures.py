@@ -25,7 +25,7 @@ from impc.studies.fit.interval_figures import (
     statements_figure,
 )
 from impc.studies.fit.result import MOST_TRIALS, shown_trials, trial_name
-from impc.studies.fit.structures import price_figure
+from impc.studies.fit.structures import cost_weight_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,7 +58,7 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
         figures["intent"] = _intent(result)
         figures["methods"] = _methods(result)
         if result.structures and result.structures[0].ratios:
-            figures["structured-weights"] = price_figure(result)
+            figures["structured-weights"] = cost_weight_figure(result)
         return drawn(figures)
 
 
@@ -210,7 +210,7 @@ def _intent(result: FitResult) -> Figure:
         )
     left.set_yscale("log")
     left.set_xlabel("eigenvalue of Q, largest first (-)")
-    left.set_ylabel("price at R = 1 (SI units)")
+    left.set_ylabel("cost weight at R = 1 (SI units)")
     right.set_xticks(np.arange(plant.n), plant.states, rotation=35, ha="right")
     right.set_ylabel("share in dominant cost (%)")
     right.legend(fontsize=5.5, loc="upper right")

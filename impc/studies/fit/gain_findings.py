@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from impc.assess.covariance import TOLD
+from impc.assess.covariance import IDENTIFIED
 from impc.assess.printed_gain import entry_names
 from impc.assess.variance_accounted_for import verdict
 from impc.files.disk import LARGEST
@@ -42,9 +42,9 @@ _OTHER = {"cramer-rao": "white", "block": "block", "model": "model", "profile": 
 
 def gain_finding(result: FitResult) -> Finding:
     """Every number with its intervals, beside the gain of the weights."""
-    certainty, plant = result.certainty, result.fitted.problem.plant
+    uncertainty, plant = result.uncertainty, result.fitted.problem.plant
     of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
-    found = {(item.name, item.method): item for item in certainty.intervals}
+    found = {(item.name, item.method): item for item in uncertainty.intervals}
     units, rows = number_units(plant), []
     for name, item in result.preferred.items():
         row = {
@@ -53,7 +53,7 @@ def gain_finding(result: FitResult) -> Finding:
             "value": np.nan if item.value is None else float(item.value),
             "low": float(item.low),
             "high": float(item.high),
-            "identified": item.told,
+            "identified": item.identified,
             "excludes_zero": item.excludes_zero,
         }
         for method, column in _OTHER.items():
@@ -62,7 +62,7 @@ def gain_finding(result: FitResult) -> Finding:
                 row[f"{column}_low"] = np.nan if other is None else float(other.low)
                 row[f"{column}_high"] = np.nan if other is None else float(other.high)
         rows.append(row | {"gain_of_the_weights": float(of_weights.get(name, np.nan))})
-    level = 100 * certainty.intervals[0].level if rows else 95
+    level = 100 * uncertainty.intervals[0].level if rows else 95
     return Finding(
         "gain",
         pd.DataFrame(rows),
@@ -94,7 +94,7 @@ def direction_finding(result: FitResult) -> Finding:
             "direction": lambda k: direction_name(moved[k] / np.linalg.norm(moved[k]), names),
             "relative_singular_value": lambda k: float(values[k] / values[0]),
             "standard_error": lambda k: float(deviations[k]),
-            "identified": lambda k: bool(deviations[k] < TOLD),
+            "identified": lambda k: bool(deviations[k] < IDENTIFIED),
         },
     )
     return Finding(
@@ -102,7 +102,8 @@ def direction_finding(result: FitResult) -> Finding:
         table,
         "Directions of the gain, best determined first, as commands at typical states. The "
         "standard error is relative to the natural size of a gain: 1 means practically unknown. "
-        f"Above {TOLD:g} a direction is not identified, and the estimate stays near that of the "
+        f"Above {IDENTIFIED:g} a direction is not identified, and the estimate stays near that of "
+        "the "
         "weights.",
         folded="Combinations of entries: directions of the gain",
         digits=2,
@@ -133,8 +134,8 @@ def parameter_findings(result: FitResult) -> list[Finding]:
 def limit_findings(result: FitResult) -> list[Finding]:
     """What the recordings say of the limit of the command and of the horizon, where asked."""
     found = []
-    if result.certainty.limits:
-        limits = result.certainty.limits
+    if result.uncertainty.limits:
+        limits = result.uncertainty.limits
         table = table_of(
             zip(result.given.plant.controls, limits, strict=True),
             {
@@ -153,10 +154,10 @@ def limit_findings(result: FitResult) -> list[Finding]:
         level = Severity.RED if contradicted else Severity.NOTE
         said = [other_limit_sentence(result)]
         found.append(Finding("other_limit", sentences=said, severity=level))
-    if result.certainty.alternatives:
-        first = result.certainty.alternatives[0]
+    if result.uncertainty.alternatives:
+        first = result.uncertainty.alternatives[0]
         table = table_of(
-            result.certainty.alternatives,
+            result.uncertainty.alternatives,
             {
                 "fit": lambda item: item.name,
                 "horizon": lambda item: int(item.horizon),
@@ -201,8 +202,8 @@ def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
     if path is None or not path.is_file() or path.stat().st_size > LARGEST:
         return None
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        states, gain = tuple(told["states"]), np.array(told["K"], dtype=np.float64)
+        identified = json.loads(path.read_text(encoding="utf-8"))
+        states, gain = tuple(identified["states"]), np.array(identified["K"], dtype=np.float64)
     except (OSError, ValueError, KeyError, TypeError):  # a file of somebody else's
         return None
     return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
@@ -235,11 +236,12 @@ def _of_person(result: FitResult, truth: Array) -> str:
     """The same of the person who senses with noise, where one was found."""
     if result.person is None or result.person.fit is None:
         return ""
-    ends = np.array(result.person.entries)  # NaN of what is not told by itself
-    told = ~np.isnan(ends[:, 0])
+    ends = np.array(result.person.entries)  # NaN of what is not individually identified
+    identified = ~np.isnan(ends[:, 0])
     inside = np.count_nonzero((ends[:, 0] <= truth.ravel()) & (truth.ravel() <= ends[:, 1]))
     return (
-        f" Of the gain of the person who senses with noise {inside} of {np.count_nonzero(told)} "
+        f" Of the gain of the person who senses with noise {inside} of "
+        f"{np.count_nonzero(identified)} "
         "lie inside theirs."
     )
 

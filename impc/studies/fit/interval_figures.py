@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 4.2  # inches: 8 points are 9 pixels at the width of a phone
 _SOFT = "#8C8C8C"
-# Beside what the recordings tell; intervals of what they do not tell have no size.
+# Beside what the recordings identify; intervals of what they do not say have no size.
 _MARGIN = 0.15
 _LETTERS = 62  # of a line of the figure's width
 _MOST = 12
@@ -41,12 +41,12 @@ def gain_figure(result: FitResult) -> Figure:
     ends = np.array(
         [[scale[name] * end for end in (first[name].low, first[name].high)] for name in names]
     )
-    told = np.array([first[name].told for name in names])
-    low, high = _view(ends[told] if np.any(told) else ends)
+    identified = np.array([first[name].identified for name in names])
+    low, high = _view(ends[identified] if np.any(identified) else ends)
     figure = new_figure(_WIDTH, 0.9 + 0.28 * len(names))
     ax = figure.subplots()
     for row, name in enumerate(names):
-        colour = BLUE if told[row] else _SOFT
+        colour = BLUE if identified[row] else _SOFT
         _bar(ax, row, ends[row], (low, high), colour)
         value = first[name].value
         if value is not None and low <= scale[name] * value <= high:
@@ -55,8 +55,8 @@ def gain_figure(result: FitResult) -> Figure:
                 row,
                 "o",
                 markersize=3.5,
-                color=VERMILLION if told[row] else _SOFT,
-                markerfacecolor=VERMILLION if told[row] else "white",
+                color=VERMILLION if identified[row] else _SOFT,
+                markerfacecolor=VERMILLION if identified[row] else "white",
             )
     ax.axvline(0, color=INK, linewidth=0.7)
     ax.set_yticks(
@@ -72,7 +72,7 @@ def gain_figure(result: FitResult) -> Figure:
 
 def shown_statements(result: FitResult) -> list[Statement]:
     """Statements that have a bar: those that may be made first, then those of the fitted gain."""
-    summary = result.certainty.weights
+    summary = result.uncertainty.weights
     if summary is None:
         return []
     order = sorted(summary.statements, key=lambda item: (not item.made, item.holds is None))
@@ -80,7 +80,7 @@ def shown_statements(result: FitResult) -> list[Statement]:
 
 
 def statements_figure(result: FitResult) -> Figure:
-    """The range of each statement's difference of prices over all weights; its sign decides."""
+    """The range of each statement's difference of weights over all weights; its sign decides."""
     shown = shown_statements(result)
     figure = new_figure(_WIDTH, 0.8 + 0.46 * len(shown))
     ax = figure.subplots()
@@ -108,7 +108,7 @@ def statements_figure(result: FitResult) -> Figure:
     ax.spines["left"].set_visible(False)
     ax.set_yticks([])
     ax.set_ylim(len(shown) - 0.5, -0.9)
-    ax.set_xlabel("difference over the price of the state named first (-)")
+    ax.set_xlabel("difference over the cost weight of the state named first (-)")
     return figure
 
 

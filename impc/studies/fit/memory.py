@@ -69,4 +69,8 @@ def _seen(problem: Problem, stage: str, method: Method) -> Problem:
     """The problem of a stage as its method sees it."""
     left_out = _LEFT_OUT.match(stage)
     posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
-    return posed if method.name in ("inverse_mpc", "structured") else method.sees(posed.known())
+    return (
+        posed
+        if method.name in ("inverse_mpc", "structured")
+        else method.restrict(posed.with_nuisance_fixed())
+    )

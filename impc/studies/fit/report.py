@@ -323,11 +323,11 @@ def _estimate(result: FitResult) -> dict[str, Any]:
         "S": estimate.S,
         "misfit": estimate.misfit,
         "standard_errors": covariance.entries,
-        "identified": covariance.told_entries,
+        "identified": covariance.individually_identified,
         "singular_values": covariance.singular_values,
         "directions": covariance.directions,
         "direction_standard_errors": covariance.deviations,
-        "identified_directions": covariance.told,
+        "identified_directions": covariance.identified,
         "natural_coordinates": covariance.T,
         "natural_inputs": covariance.G,
     }

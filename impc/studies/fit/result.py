@@ -15,7 +15,7 @@ from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.assess.all_intervals import Certainty
+    from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
     from impc.assess.diagnostics import ResidualDiagnostics
     from impc.assess.input_limits import OtherLimit
@@ -63,14 +63,14 @@ class FitResult:
     given: Problem  # The problem as it was posed: nominal plant, trials at rest
     # Weights and their gain; `fitted.problem` holds the initial states and the plant found
     fitted: Estimate
-    # The gain that the recordings tell, and how far: what is printed with intervals
+    # The gain that the recordings identify, and how far: what is printed with intervals
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent
     # Directions of the weights that the recordings determine, and how many they leave
     identifiability: Identifiability
     # Intervals, the set of weights with this gain, and what else was asked for
-    certainty: Certainty
+    uncertainty: Uncertainty
     trials: tuple[TrialAgreement, ...]  # Of inverse MPC, one a trial
     held_out: tuple[HeldOut, ...]  # One a trial; empty for a single trial or when not asked for
     # Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC
@@ -110,7 +110,7 @@ class FitResult:
         names = entry_names(self.given.plant)
         return tuple(
             item
-            for item in self.certainty.intervals
+            for item in self.uncertainty.intervals
             if item.method == "sandwich" and item.name in names
         )
 
@@ -118,7 +118,7 @@ class FitResult:
     def preferred(self) -> dict[str, Interval]:
         """The first interval of every number by its name: the sandwich's, where it has one."""
         first: dict[str, Interval] = {}
-        for item in self.certainty.intervals:
+        for item in self.uncertainty.intervals:
             first.setdefault(item.name, item)
         return first
 
@@ -130,7 +130,7 @@ class FitResult:
     @property
     def widest_angle(self) -> float:
         """How far other weights with this gain turn the dominant direction, degrees."""
-        found = self.certainty.weights
+        found = self.uncertainty.weights
         over_set = 0.0 if found is None else found.widest_angle
         return max(self.intent.widest_angle, over_set)
 
@@ -154,6 +154,6 @@ def trial_name(result: FitResult, index: int) -> str:
 
 def shown_trials(result: FitResult) -> list[int]:
     """Trials of a `result` that have a figure: all, or of many those that are explained least."""
-    explained = [float(np.mean(told.vaf)) for told in result.trials]
+    explained = [float(np.mean(item.vaf)) for item in result.trials]
     least = sorted(range(len(explained)), key=lambda index: explained[index])
     return sorted(least[:MOST_TRIALS])

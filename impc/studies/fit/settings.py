@@ -44,7 +44,7 @@ T = TypeVar("T")
 class StructureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What may be costed, by name (`impc.model.structure`)."""
 
-    # "diagonal", "full", for Q "outputs", or features with a price each
+    # "diagonal", "full", for Q "outputs", or features with a cost weight each
     Q: str | list[str] = "diagonal"
     R: str | list[str] = "diagonal"
     # Features that "diagonal" or "full" is over; all states by default
@@ -61,8 +61,8 @@ class ObserverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     share: bool = False
     process: bool = False
     known: bool = True  # Whether the person knows the perturbation
-    # Whether intervals of the gain and of levels that are weakly told follow the likelihood: ten
-    # minutes and more on the seat
+    # Whether intervals of the gain and of levels that are weakly identified follow the likelihood:
+    # ten minutes and more on the seat
     profiles: bool = False
 
 

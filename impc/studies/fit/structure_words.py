@@ -7,20 +7,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.structured_weights import TOLD_FACTOR
+from impc.assess.structured_weights import IDENTIFIED_FACTOR
 from impc.reporting.rendering import number
 
 if TYPE_CHECKING:
-    from impc.assess.price_profiles import PriceInterval
     from impc.assess.structures import Ratio, StructureFit
+    from impc.assess.weight_profiles import WeightInterval
     from impc.studies.fit.result import FitResult
 
 # A test that refuses a departure less often than this has not looked.
 _BLIND = 0.1
 # docs/structures.md, What was measured.
 _AT_ZERO = (
-    "Where the best price is zero, intervals of 95 % held the truth of simulated seats in 78 to "
-    "96 %: take those of all prices for somewhat wider."
+    "Where the best cost weight is zero, intervals of 95 % held the truth of simulated seats in "
+    "78 to "
+    "96 %: take those of all cost weights for somewhat wider."
 )
 # The test holds its level where noise is in the recorder and the plant is the body.
 _OF_THE_MODEL = (
@@ -43,9 +44,11 @@ def structure_sentences(result: FitResult) -> tuple[str, ...]:
         lines.append(_OF_THE_MODEL)
     lines.append(_explains(result, found))
     if not found.refused:
-        lines += [*_prices(found), _told(found)]
-        prices = found.estimate.prices
-        lines += [_AT_ZERO] if prices is not None and np.any(np.isneginf(prices)) else []
+        lines += [*_cost_weights(found), _identified(found)]
+        cost_weights = found.estimate.cost_weights
+        lines += (
+            [_AT_ZERO] if cost_weights is not None and np.any(np.isneginf(cost_weights)) else []
+        )
     power = _power(found)
     return (*lines, *([power] if power else []))
 
@@ -58,17 +61,18 @@ def _verdict(found: StructureFit) -> str:
         return (
             f"The recordings refuse the structure “{name}”: other gains explain what its weights "
             f"leave ({probability(test.probability)}, {test.freedom} directions of the gain). "
-            "What it says of prices is not the subject's."
+            "What it says of cost weights is not the subject's."
         )
     if test.freedom == 0:
         return (
-            f"Within the structure “{name}” statements on prices need no convention. Whether it "
-            "holds was not tested: the recordings tell nothing of the gain beyond it."
+            f"Within the structure “{name}” statements on cost weights need no convention. "
+            "Whether it "
+            "holds was not tested: the recordings identify nothing of the gain beyond it."
         )
     return (
         f"Within the structure “{name}”, which the recordings do not refuse "
         f"({probability(test.probability)}, {test.freedom} directions of the gain), statements on "
-        "prices need no convention."
+        "cost weights need no convention."
     )
 
 
@@ -85,7 +89,7 @@ def _explains(result: FitResult, found: StructureFit) -> str:
     return f"{text}; weights of any kind for {free}."
 
 
-def _prices(found: StructureFit) -> list[str]:
+def _cost_weights(found: StructureFit) -> list[str]:
     lines = []
     for ratio in _tree(found.ratios):
         lines.append(
@@ -95,7 +99,8 @@ def _prices(found: StructureFit) -> list[str]:
         )
     if found.ratios and not lines:
         lines.append(
-            f"No ratio of two of its prices is told to a factor of {TOLD_FACTOR:g} at 95 %."
+            "No ratio of two of its cost weights is known to within a factor of "
+            f"{IDENTIFIED_FACTOR:g} at 95 %."
         )
     for index, label in enumerate(found.structure.labels):
         item = found.intervals[index]
@@ -109,7 +114,7 @@ def _prices(found: StructureFit) -> list[str]:
 
 
 def _tree(ratios: tuple[Ratio, ...]) -> list[Ratio]:
-    """The best told ratios that do not follow from one another."""
+    """The best identified ratios that do not follow from one another."""
     group: dict[str, str] = {}
 
     def root(label: str) -> str:
@@ -123,39 +128,40 @@ def _tree(ratios: tuple[Ratio, ...]) -> list[Ratio]:
             ratio.interval.high - ratio.interval.value, ratio.interval.value - ratio.interval.low
         )
         one, other = root(ratio.first), root(ratio.second)
-        if one != other and reach < np.log(TOLD_FACTOR):
+        if one != other and reach < np.log(IDENTIFIED_FACTOR):
             group[one] = other
             kept.append(ratio)
     return kept
 
 
-def _told(found: StructureFit) -> str:
-    """Told and untold combinations, with their percentages."""
+def _identified(found: StructureFit) -> str:
+    """Told and unidentified combinations, with their percentages."""
     covariance = found.covariance
     assert covariance is not None
     structure = found.structure
     text = (
-        f"Of its {structure.count} unknowns the recordings tell {found.told} combinations to a "
-        f"factor of {TOLD_FACTOR:g} or better"
+        f"Of its {structure.count} unknowns the recordings identify {found.identified} "
+        "combinations to a "
+        f"factor of {IDENTIFIED_FACTOR:g} or better"
     )
     pair = _best_pair(found)
     text += f": {pair}." if pair else "."
     blind = [
         label
         for label, own in zip(structure.unknowns, covariance.each, strict=True)
-        if TWO_SIDED * own >= np.log(TOLD_FACTOR)
+        if TWO_SIDED * own >= np.log(IDENTIFIED_FACTOR)
     ]
     if blind:
-        text += f" By themselves they do not tell {', '.join(blind)}."
+        text += f" By themselves they do not say {', '.join(blind)}."
     return text
 
 
 def _best_pair(found: StructureFit) -> str:
-    """The pair of prices whose ratio and common size are told most unequally, in words."""
+    """The pair of weights whose ratio and common size are identified most unequally, in words."""
     covariance, structure = found.covariance, found.structure
     assert covariance is not None
     best, text = 0.0, ""
-    moving = np.flatnonzero(np.isfinite(covariance.values) & structure.is_price)
+    moving = np.flatnonzero(np.isfinite(covariance.values) & structure.is_cost_weight)
     for place, i in enumerate(moving):
         for j in moving[place + 1 :]:
             row = np.zeros(structure.count)
@@ -168,16 +174,17 @@ def _best_pair(found: StructureFit) -> str:
                 one, other = structure.unknowns[i], structure.unknowns[j]
                 best = unequal
                 text = (
-                    f"the ratio of the price of {one} to that of {other} {factor_of(ratio)}, their "
+                    f"the ratio of the cost weight of {one} to that of {other} "
+                    f"{factor_of(ratio)}, their "
                     f"common size {factor_of(size)}"
                 )
     return text
 
 
 def factor_of(deviation: float) -> str:
-    """How far a logarithm with a `deviation` is told, at 95 %, as a factor."""
+    """How far a logarithm with a `deviation` is identified, at 95 %, as a factor."""
     reach = TWO_SIDED * deviation
-    if not reach < np.log(TOLD_FACTOR):
+    if not reach < np.log(IDENTIFIED_FACTOR):
         return "not at all"
     factor = float(np.exp(reach))
     return f"to {number(100 * (factor - 1), 2)} %" if factor < 2 else f"to a factor of {factor:.2g}"
@@ -190,14 +197,17 @@ def _power(found: StructureFit) -> str:
     powers = sorted(found.test.powers, key=lambda item: -item.power)
     if powers[0].power < _BLIND:
         return (
-            "The test is blind to cross terms here: prices of its features one by one make nearly "
-            "every gain that prices of their products would make, so it cannot be said whether "
+            "The test is blind to cross terms here: cost weights of its features one by one make "
+            "nearly "
+            "every gain that cost weights of their products would make, so it cannot be said "
+            "whether "
             "there are any."
         )
     most, least = powers[0], powers[-1]
     text = (
         f"A cross term of {most.first} and {most.second}, as large as half the geometric mean of "
-        f"their prices, would have been refused with a probability of {100 * most.power:.0f} %"
+        "their cost weights, would have been refused with a probability of "
+        f"{100 * most.power:.0f} %"
     )
     if len(powers) == 1:
         return f"{text}."
@@ -209,11 +219,11 @@ def probability(value: float) -> str:
     return "p < 0.001" if value < 1e-3 else f"p = {value:.2g}"
 
 
-def ends(item: PriceInterval) -> str:
+def ends(item: WeightInterval) -> str:
     """Where an interval ends, as it is printed."""
     low, high = np.exp(item.low), np.exp(item.high)
     if item.low == -np.inf:
-        return "not told" if item.high == np.inf else f"at most {number(float(high), 3)}"
+        return "not identified" if item.high == np.inf else f"at most {number(float(high), 3)}"
     if item.high == np.inf:
         return f"at least {number(float(low), 3)}"
     return f"{number(float(low), 3)} to {number(float(high), 3)}"

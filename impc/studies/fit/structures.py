@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.long_run_covariance import residual_noise
-from impc.assess.structured_weights import TOLD_FACTOR
+from impc.assess.structured_weights import IDENTIFIED_FACTOR
 from impc.assess.structures import criterion_of
 from impc.assess.variance_accounted_for import residuals_of
 from impc.reporting.document import Block, Details, Heading, Section
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 _WIDTH = 4.2  # inches, so that its words can be read on a phone
 _PICTURE = Picture(
     "structured-weights",
-    "Prices of the features with their intervals, one row each, on a logarithmic axis",
-    "Prices within the structure, at a price of one for the first input, with intervals of 95 % "
-    "for the colour of the residuals. An arrow: no lower end, the price may be zero.",
+    "Cost weights of the features with their intervals, one row each, on a logarithmic axis",
+    "Cost weights within the structure, at a cost weight of one for the first input, with "
+    "intervals of 95 % "
+    "for the colour of the residuals. An arrow: no lower end, the cost weight may be zero.",
     narrow=True,
 )
 
@@ -39,7 +40,7 @@ def structure_section(result: FitResult) -> Section:
     blocks: list[Block] = []
     if found.estimate is not None:
         inside = [*_ratios(found), _combinations(found), *_powers(found)]
-        blocks += [_prices(found), Details("Ratios and combinations of prices", inside)]
+        blocks += [_cost_weights(found), Details("Ratios and combinations of cost weights", inside)]
     blocks += [Heading("Structures side by side"), _comparison(result)]
     return Section(f"Within the structure: {found.structure.name}", blocks, "Structure")
 
@@ -69,8 +70,8 @@ def structure_data(result: FitResult) -> list[dict[str, Any]]:
     ]
 
 
-def price_figure(result: FitResult) -> Figure:
-    """Prices of the first structure with their intervals."""
+def cost_weight_figure(result: FitResult) -> Figure:
+    """Cost weights of the first structure with their intervals."""
     found = result.structures[0]
     labels = found.structure.unknowns
     figure = new_figure(_WIDTH, 0.9 + 0.28 * len(labels))
@@ -92,27 +93,27 @@ def price_figure(result: FitResult) -> Figure:
     ax.set_yticks(range(len(labels)), labels)
     ax.set_ylim(len(labels) - 0.5, -0.5)
     ax.set_ylabel("feature (-)")
-    ax.set_xlabel("price over that of the first input (SI)")
+    ax.set_xlabel("cost weight over that of the first input (SI)")
     ax.grid(visible=True, axis="x", color=INK, alpha=0.15, linewidth=0.5)
     return figure
 
 
-def _prices(found: StructureFit) -> Finding:
+def _cost_weights(found: StructureFit) -> Finding:
     structure, rows = found.structure, []
     for index, label in enumerate(structure.unknowns):
-        item, price = found.intervals[index], bool(structure.is_price[index])
+        item, cost_weight = found.intervals[index], bool(structure.is_cost_weight[index])
         ends = np.array([item.value, item.low, item.high])
-        value, low, high = np.exp(ends) if price else ends
+        value, low, high = np.exp(ends) if cost_weight else ends
         cost = np.nan
-        if price and index < len(structure.labels):
+        if cost_weight and index < len(structure.labels):
             cost = float(value * found.sizes[index] ** 2 / found.effort)
-        kind = "price" if price else "correlation"
+        kind = "cost_weight" if cost_weight else "correlation"
         rows.append((label, kind, float(value), float(low), float(high), cost))
     heads = ["feature", "kind", "value", "low", "high", "cost_over_the_command"]
     return Finding(
-        "structure_prices",
+        "structure_cost_weights",
         pd.DataFrame(rows, columns=heads),
-        f"Unknowns of the structure “{structure.name}”: prices over that of "
+        f"Unknowns of the structure “{structure.name}”: cost weights over that of "
         f"{structure.input_labels[0]}, in SI units, with intervals of 95 % that allow for "
         "autocorrelated residuals. Last: what the feature costs at the size that it has in the "
         "recordings, over what the command costs.",
@@ -159,8 +160,9 @@ def _combinations(found: StructureFit) -> Finding:
         "structure_combinations",
         table,
         "Combinations of the unknowns (sums of logarithms), best determined first: "
-        f"{covariance.rank} of {found.structure.count} above rounding, {found.told} identified to "
-        f"a factor of {TOLD_FACTOR:g} at 95 %.",
+        f"{covariance.rank} of {found.structure.count} above rounding, {found.identified} "
+        "identified to "
+        f"a factor of {IDENTIFIED_FACTOR:g} at 95 %.",
         digits=2,
     )
 
@@ -177,7 +179,7 @@ def _powers(found: StructureFit) -> list[Finding]:
     )
     caption = (
         "What the test of the structure would see: how probably it refuses a cross term as large "
-        "as half the geometric mean of two prices, at a level of 5 %."
+        "as half the geometric mean of two cost weights, at a level of 5 %."
     )
     return [Finding("structure_power", table, caption, digits=2)]
 
@@ -185,18 +187,18 @@ def _powers(found: StructureFit) -> list[Finding]:
 def _comparison(result: FitResult) -> Finding:
     outputs = result.fitted.problem.plant.outputs
     roots = np.asarray(residual_noise(residuals_of(result.fitted, result.fitted.problem)).root)
-    told = int(np.count_nonzero(result.estimate.covariance.told))
-    free = criterion_of(result.fitted, roots, told)
+    identified = int(np.count_nonzero(result.estimate.covariance.identified))
+    free = criterion_of(result.fitted, roots, identified)
     least = min([free, *(item.aic for item in result.structures)])
     held = [item.vaf for item in result.held_out]
     left_out = np.mean(held, axis=0) if held else np.full(len(outputs), np.nan)
     vaf = result.inverse_mpc.vaf
-    rows = [("weights of any kind", result.identifiability.free, told,
+    rows = [("weights of any kind", result.identifiability.free, identified,
              *vaf, *left_out, free - least, np.nan, "")]  # fmt: skip
     for item in result.structures:
         test = item.test
         p = np.nan if test is None or not test.freedom else test.probability
-        rows.append((item.structure.name, item.structure.count, item.told, *item.vaf,
+        rows.append((item.structure.name, item.structure.count, item.identified, *item.vaf,
                      *item.held_out, item.aic - least, p, _outcome(item)))  # fmt: skip
     heads = [
         "structure",

@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
-from impc.assess.assessments import judge
+from impc.assess.assessments import evaluate_method
 from impc.assess.diagnostics import (
     ResidualDiagnostics,
     residual_diagnostics,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from concurrent.futures import Future, ThreadPoolExecutor
 
-    from impc.assess.all_intervals import Attempt, Certainty
+    from impc.assess.all_intervals import Attempt, Uncertainty
     from impc.assess.assessments import MethodFit
     from impc.assess.input_limits import OtherLimit
     from impc.assess.printed_gain import GainEstimate
@@ -72,7 +72,7 @@ _UNUSABLE = "the controller explains less than half of a recorded signal."
 class FitProgress:
     """What a caller wants to hear of a fit, and what it remembers of an earlier one."""
 
-    done: Callable[[str], None] = lambda _: None  # Told the name of each stage when it is done
+    done: Callable[[str], None] = lambda _: None  # Given the name of each stage when it is done
     # (name of stage, compute) -> the estimate, from memory when it is there
     # (`impc.studies.fit.memory`). By default every one is computed.
     estimate: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute()
@@ -169,11 +169,11 @@ def fit_recordings(
     if progress is True:
         with tqdm(total=stages(problem, settings), unit="stage") as bar:
 
-            def told(name: str) -> None:
+            def advance(name: str) -> None:
                 bar.set_postfix_str(name, refresh=False)
                 bar.update()
 
-            return fit_recordings(problem, settings, told)
+            return fit_recordings(problem, settings, advance)
     if settings.observer is not None:
         output_feedback()  # refused at once where it is not installed
     if not isinstance(progress, FitProgress):
@@ -197,9 +197,9 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     found = _estimates(problem, settings, progress)
     fitted = found["inverse_mpc"]
     estimate = gain_estimate(fitted)
-    known, weights = fitted.problem.known(), fitted.stage_weights
+    known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
     plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
-    own = judge(fitted, problem.bounds)
+    own = evaluate_method(fitted, problem.bounds)
     sizes = state_sizes(own.runs)
     usable = bool(np.all(own.vaf >= LITTLE))
     diagnostics = attempt(
@@ -224,10 +224,10 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     )
     structures = _structures(problem, settings, fitted, progress)
     after = progress.done, progress.replicate, attempt
-    certainty = assess(problem, fitted, estimate, weights_found, settings, *after)
+    uncertainty = assess(problem, fitted, estimate, weights_found, settings, *after)
     trials = _agreements(known, methods[-1].runs, problem.bounds)
     doubted = diagnostics.contradicted or not usable
-    free = _free_limit(fitted, trials, certainty, attempt, doubted=doubted)
+    free = _free_limit(fitted, trials, uncertainty, attempt, doubted=doubted)
     person = functools.partial(_person, problem, settings, fitted, progress)
     return FitResult(
         settings,
@@ -237,7 +237,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         _parameters(estimate),
         intent(plant, K, metrics, sizes, weights),
         identifiability(known, weights),
-        certainty if usable else replace(certainty, intervals=()),
+        uncertainty if usable else replace(uncertainty, intervals=()),
         trials,
         held_out,
         methods,
@@ -280,7 +280,7 @@ def _beside_it(
         pending = _left_out(pool, own.estimate, settings, progress)
         in_background = pool.submit(whole_set)
         for found in others[::-1]:
-            methods.insert(0, judge(found, problem.bounds))
+            methods.insert(0, evaluate_method(found, problem.bounds))
             progress.done(found.method)
         for index, other in enumerate(pending):
             predicted = functools.partial(
@@ -300,15 +300,15 @@ def _beside_it(
 def _free_limit(
     fitted: Estimate,
     trials: tuple[TrialAgreement, ...],
-    certainty: Certainty,
+    uncertainty: Uncertainty,
     attempt: Attempt,
     *,
     doubted: bool,
 ) -> OtherLimit | None:
     """The fit with the limit free, where the command meets it and something speaks against it."""
-    if not any(item.saturated for item in trials) or not (doubted or certainty.limits):
+    if not any(item.saturated for item in trials) or not (doubted or uncertainty.limits):
         return None
-    known = certainty.limits[0] if certainty.limits else None
+    known = uncertainty.limits[0] if uncertainty.limits else None
     found: OtherLimit | None = attempt(
         "free limit", functools.partial(at_another_limit, fitted, known), None
     )

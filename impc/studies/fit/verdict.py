@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.covariance import TOLD
+from impc.assess.covariance import IDENTIFIED
 from impc.assess.intent_statements import dominant_sentence
 from impc.reporting.rendering import number
 from impc.studies.fit.result import LITTLE, trial_name
@@ -158,9 +158,9 @@ def _agreement(result: FitResult) -> str:
 
 
 def _at_the_bound(result: FitResult) -> list[str]:
-    """How often the command stands at its bound, and what inverse LQR needs instead."""
+    """How often the command is at its bound, and what inverse LQR needs instead."""
     share = 100 * float(np.mean([item.saturated for item in result.trials]))
-    text = f"The command stands at its bound for {share:.1f} % of the time"
+    text = f"The command is at its bound for {share:.1f} % of the time"
     methods = {item.name: item for item in result.methods}
     other, own = methods.get("inverse_lqr_output"), result.inverse_mpc
     if other is None or other.estimate.K is None or np.any(np.isnan(other.vaf)):
@@ -177,7 +177,7 @@ def _at_the_bound(result: FitResult) -> list[str]:
 
 
 def _gain(result: FitResult) -> str:
-    identified = result.estimate.covariance.told_entries
+    identified = result.estimate.covariance.individually_identified
     count, total = int(np.count_nonzero(identified)), int(np.size(identified))
     zero = sum(item.excludes_zero for item in result.gain_intervals)
     apart = f"the 95 % intervals of {zero} exclude zero"
@@ -194,7 +194,7 @@ def _weights(result: FitResult) -> str:
         "Other weights with exactly the same behaviour turn the dominant cost by up to "
         f"{result.widest_angle:.0f} degrees"
     )
-    summary = result.certainty.weights
+    summary = result.uncertainty.weights
     if result.weights_test.rejected:
         return "No cost weights explain this gain: nothing may be said of the subject's intent."
     if summary is None or not summary.drawn:
@@ -283,7 +283,7 @@ def _failed(result: FitResult) -> tuple[str, ...]:
 
 
 def _how_sure(result: FitResult) -> str:
-    summary = result.certainty.weights
+    summary = result.uncertainty.weights
     drawn = (
         ""
         if summary is None or not summary.drawn
@@ -301,11 +301,12 @@ def _determined(result: FitResult) -> str:
     found, covariance = result.identifiability, result.estimate.covariance
     values = covariance.singular_values
     count = int(np.count_nonzero(np.isfinite(covariance.deviations)))
-    told = int(np.count_nonzero(covariance.told))
-    entries = int(np.count_nonzero(covariance.told_entries))
+    identified = int(np.count_nonzero(covariance.identified))
+    entries = int(np.count_nonzero(covariance.individually_identified))
     return (
         f"Of the {len(values)} directions of the gain the recordings determine {count} above "
-        f"rounding and identify {told}: their standard error is below {TOLD:g} of a natural gain. "
+        f"rounding and identify {identified}: their standard error is below {IDENTIFIED:g} of a "
+        "natural gain. "
         f"{entries} of its entries are individually identified. Of the {found.free} directions of "
         f"the weights the recordings determine {found.rank}; the other {found.chosen} are a "
         "convention."

@@ -1,4 +1,4 @@
-"""What a fit says of the weights: statements, prices, readings by rules, entries with ranges."""
+"""What a fit says of the weights: statements, weights, readings by rules, entries with ranges."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ _READINGS = Picture(
 
 
 def statement_findings(result: FitResult) -> list[Finding]:
-    """Statements that hold for every weight with the gain, and the prices of the states."""
-    summary = result.certainty.weights
+    """Statements that hold for every weight with the gain, and the cost weights of the states."""
+    summary = result.uncertainty.weights
     if summary is None:
-        said = [f"Not available: {result.certainty.weights_reason}"]
+        said = [f"Not available: {result.uncertainty.weights_reason}"]
         return [Finding("statements", sentences=said)]
     figure = _STATEMENTS if shown_statements(result) else None
-    return [replace(statement_finding(summary), figure=figure), *price_findings(summary)]
+    return [replace(statement_finding(summary), figure=figure), *weight_interval_findings(summary)]
 
 
 def statement_finding(summary: WeightsSummary) -> Finding:
@@ -62,12 +62,12 @@ def statement_finding(summary: WeightsSummary) -> Finding:
     return Finding("statements", table, _tried(summary), folded=folded)
 
 
-def price_findings(summary: WeightsSummary) -> list[Finding]:
-    """Prices of the named states; without drawn gains there are none."""
-    if not summary.prices:
+def weight_interval_findings(summary: WeightsSummary) -> list[Finding]:
+    """Cost weights of the named states; without drawn gains there are none."""
+    if not summary.cost_weights:
         return []
     table = table_of(
-        summary.prices,
+        summary.cost_weights,
         {
             "state": lambda item: item.state,
             "low_fitted_gain": lambda item: float(item.low),
@@ -80,7 +80,7 @@ def price_findings(summary: WeightsSummary) -> list[Finding]:
         "What a typical excursion costs, d^2 Q at trace R = m, over all weights: with the fitted "
         f"gain, and (95 %) with it or any of {summary.drawn} others that the recordings allow."
     )
-    return [Finding("prices", table, caption, folded="Every price with its range")]
+    return [Finding("cost_weights", table, caption, folded="Every cost weight with its range")]
 
 
 def _tried(summary: WeightsSummary) -> str:
@@ -94,8 +94,9 @@ def _tried(summary: WeightsSummary) -> str:
     )
     return (
         "Statements on the states that are recorded or cost most, at the size that they have in "
-        f"the recordings. {tried} Low and high are those of the difference, or of the mixed price, "
-        "over the price of the state named first, at the fitted gain."
+        f"the recordings. {tried} Low and high are those of the difference, or of the mixed cost "
+        "weight, "
+        "over the cost weight of the state named first, at the fitted gain."
     )
 
 
@@ -110,7 +111,7 @@ def _verdict(item: Statement) -> str:
 def reading_finding(result: FitResult) -> Finding:
     """Weights with the fitted gain by several rules."""
     problem, found = result.fitted.problem, result.intent
-    summary = result.certainty.weights
+    summary = result.uncertainty.weights
     table = table_of(
         found.readings,
         {
@@ -157,7 +158,7 @@ def set_sentences(summary: WeightsSummary) -> list[str]:
 def weight_finding(result: FitResult) -> Finding:
     """Entries of the reported weights, with their ranges where they were computed."""
     plant, weights = result.given.plant, result.intent.reported.weights
-    summary = result.certainty.weights
+    summary = result.uncertainty.weights
     # At trace R = m: with one command the scale of the entries.
     ranged = summary.entries if summary is not None and plant.m == 1 else ()
     ranges = {frozenset((item.first, item.second)): (item.low, item.high) for item in ranged}

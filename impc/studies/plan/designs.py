@@ -45,7 +45,7 @@ class Person(Frozen):
 
     controller: Controller
     structure: Structure  # Of the weights
-    prices: Array  # Its unknowns (count,), logarithms
+    cost_weights: Array  # Its unknowns (count,), logarithms
     deviation: Array  # Of the noise in the recorder (p,), in the outputs' units
     root: float  # Its correlation from one sample to the next
     stops: Array  # Largest magnitude of each output (p,), infinite where there is no stop
@@ -83,7 +83,7 @@ class Outcome(Frozen):
     # The recordings, without noise, of so many trials as a person does; None where too few trials
     # end without a fall
     problem: Problem | None
-    expected: Expectation | None  # What they would tell
+    expected: Expectation | None  # What they would say
 
 
 def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Design, ...]:
@@ -94,7 +94,7 @@ def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Desig
 def try_design(
     person: Person, design: Design, perturbation: Perturbation, *, trials: int, draws: int
 ) -> Outcome:
-    """Simulate one experiment, and tell what its recordings would; `perturbation` (samples, d)."""
+    """Simulate one experiment, and say what its recordings would; `perturbation` (samples, d)."""
     plant, limits = person.controller.plant, person.controller.bounds
     numbers = range(max(draws, trials))
     tried = [_held(person, perturbation(design.amplitude, design.dwell, k)) for k in numbers]
@@ -154,7 +154,7 @@ def _problem_of(person: Person, trials: Sequence[_Trial]) -> Problem:
 
 def _expected(person: Person, problem: Problem) -> Expectation:
     return expected_intervals(
-        problem, np.array(person.prices), np.array(person.deviation), root=person.root
+        problem, np.array(person.cost_weights), np.array(person.deviation), root=person.root
     )
 
 
@@ -169,8 +169,8 @@ def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome
             "perturbation",
             "lower amplitude, or raise u_max or falls",
         )
-    told = [(item, item.expected) for item in held if item.expected is not None]
+    usable = [(item, item.expected) for item in held if item.expected is not None]
     return (
-        min(told, key=lambda pair: pair[1].mean_variance)[0],
-        min(told, key=lambda pair: pair[1].log_determinant)[0],
+        min(usable, key=lambda pair: pair[1].mean_variance)[0],
+        min(usable, key=lambda pair: pair[1].log_determinant)[0],
     )

@@ -1,4 +1,4 @@
-"""Figures of a plan: how far each price would be told, and what the perturbation does.
+"""Figures of a plan: how far each cost weight would be identified, and what the perturbation does.
 
 See docs/planning.md.
 """
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from impc.studies.plan.study import Plan
 
 _LINES = ((BLUE, "o", "-"), (VERMILLION, "s", "--"), (GREEN, "^", ":"), (INK, "D", "-."))
-# Beyond this factor a price is not told, whatever its interval.
+# Beyond this factor a cost weight is not identified, whatever its interval.
 _LARGEST = 100.0
 _COLUMNS = 3
 
 
-def prices_figure(plan: Plan) -> Figure:
-    """Half an interval of 95 % of each price, as a factor, over the amplitude."""
+def cost_weights_figure(plan: Plan) -> Figure:
+    """Half an interval of 95 % of each cost weight, as a factor, over the amplitude."""
     names = plan.person.structure.unknowns
     rows = math.ceil(len(names) / _COLUMNS)
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 2.0 * rows)
@@ -38,7 +38,7 @@ def prices_figure(plan: Plan) -> Figure:
     for index, (ax, name) in enumerate(zip(axes, names, strict=False)):
         _lines(ax, plan, functools.partial(_factor, index))
         ax.set_yscale("log")
-        ax.set_ylabel(f"price of {name} (-)")
+        ax.set_ylabel(f"cost weight of {name} (-)")
         ax.grid(visible=True, which="both", axis="y", linewidth=0.4, alpha=0.5)
         ax.yaxis.set_major_formatter("{x:g}")
         ax.yaxis.set_minor_formatter("{x:g}")

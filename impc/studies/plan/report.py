@@ -19,7 +19,7 @@ from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit, signal_words
 from impc.reporting.style import drawn, journal_style
 from impc.studies.fit.gain_findings import number_name
-from impc.studies.plan.figures import experiments_figure, prices_figure
+from impc.studies.plan.figures import cost_weights_figure, experiments_figure
 from impc.studies.plan.sentences import plan_sentences
 from impc.studies.plan.study import spread
 
@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 
 _PICTURES = (
     Picture(
-        "prices",
-        "How far each price would be told, over the amplitude of the perturbation",
-        "Half an interval of 95 %, as a factor of the price: farther down is better, 1 is exact. "
+        "cost_weights",
+        "How far each cost weight would be identified, over the amplitude of the perturbation",
+        "Half an interval of 95 %, as a factor of the cost weight: farther down is better, 1 is "
+        "exact. "
         "Each line is a dwell; the large ring marks the experiment above.",
     ),
     Picture(
@@ -45,11 +46,13 @@ _PICTURES = (
 def plan_report(plan: Plan, provenance: Provenance) -> Report:
     """Page, result.json, experiments.csv and figures."""
     with journal_style():
-        figures = drawn({"prices": prices_figure(plan), "experiments": experiments_figure(plan)})
+        figures = drawn(
+            {"cost_weights": cost_weights_figure(plan), "experiments": experiments_figure(plan)}
+        )
     first, *rest = plan_sentences(plan)
     sections = [
         Section("1. The experiments", (*_PICTURES, _experiments(plan)), "Experiments"),
-        Section("2. What the best one would tell", _best(plan), "Best"),
+        Section("2. What the best one would say", _best(plan), "Best"),
         Section("3. Groups", (_groups(plan),), "Groups"),
         Section("4. The presumed person", _presumed(plan), "Person"),
         Section(
@@ -59,7 +62,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
     ]
     return Report(
         "impc plan",
-        "What an experiment would tell",
+        "What an experiment would say",
         (Verdict(first), Lines(rest)),
         sections,
         figures=figures,
@@ -70,7 +73,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
 
 
 def _experiments(plan: Plan) -> Finding:
-    """Every experiment and what it would tell, as factors of the presumed prices (95 %)."""
+    """Every experiment and what it would say, as factors of the presumed cost weights (95 %)."""
     rows: list[dict[str, Any]] = []
     for item in plan.outcomes:
         best = [word for word, one in (("A-optimal", plan.best), ("D-optimal", plan.sharpest))
@@ -91,7 +94,8 @@ def _experiments(plan: Plan) -> Finding:
             row[f"{name}_standard_error"] = error
         rows.append({**row, "best": ", ".join(best)})
     caption = (
-        "Expected intervals of 95 %, as factors of the presumed price, and standard errors of its "
+        "Expected intervals of 95 %, as factors of the presumed cost weight, and standard errors "
+        "of its "
         "logarithm; dwell in s."
     )
     return Finding("experiments", pd.DataFrame(rows), caption, digits=3)
@@ -102,12 +106,12 @@ def _best(plan: Plan) -> list[Finding]:
     if expected is None:
         return []
     plant, truth, fits = person.controller.plant, np.array(person.controller.K), plan.simulated
-    scatter = None if fits is None or len(fits.prices) == 0 else spread(fits.prices)
-    prices = table_of(
+    scatter = None if fits is None or len(fits.cost_weights) == 0 else spread(fits.cost_weights)
+    cost_weights = table_of(
         range(len(person.structure.unknowns)),
         {
-            "price_of": lambda k: person.structure.unknowns[k],
-            "presumed": lambda k: math.exp(float(person.prices[k])),
+            "cost_weight_of": lambda k: person.structure.unknowns[k],
+            "presumed": lambda k: math.exp(float(person.cost_weights[k])),
             "low": lambda k: math.exp(expected.intervals[k].low),
             "high": lambda k: math.exp(expected.intervals[k].high),
             "standard_error_of_the_logarithm": lambda k: float(expected.deviations[k]),
@@ -123,16 +127,21 @@ def _best(plan: Plan) -> list[Finding]:
             "unit": lambda at: gain_unit(plant, plant.controls[at[0]], plant.states[at[1]]),
             "presumed": lambda at: float(truth[at]),
             "half_an_interval": lambda at: 1.96 * float(expected.gain.entries[at]),
-            "identified": lambda at: bool(expected.gain.told_entries[at]),
+            "identified": lambda at: bool(expected.gain.individually_identified[at]),
         },
     )
-    along = int(np.count_nonzero(expected.gain.told))
+    along = int(np.count_nonzero(expected.gain.identified))
     caption = (
         f"Gains fitted without a structure: {along} of {truth.size} directions would be identified "
         "to a fifth of their natural size. Half an interval is that of 95 %."
     )
     return [
-        Finding("prices", prices, "Prices, with one for the first command, 95 %.", digits=3),
+        Finding(
+            "cost_weights",
+            cost_weights,
+            "Cost weights, with one for the first command, 95 %.",
+            digits=3,
+        ),
         Finding("gain", gains, caption, digits=3),
     ]
 
@@ -146,14 +155,15 @@ def _groups(plan: Plan) -> Finding:
     table = table_of(
         plan.groups,
         {
-            "price_of": lambda item: item.feature,
+            "cost_weight_of": lambda item: item.feature,
             "standard_deviation_within_a_group": lambda item: float(item.deviation),
             **powers,
             "persons_a_group_for_80_percent": lambda item: float(item.needed),
         },
     )
     caption = (
-        f"Two groups whose price differs by {settings.difference:g} %, t-test of the logarithms at "
+        f"Two groups whose cost weight differs by {settings.difference:g} %, t-test of the "
+        "logarithms at "
         f"5 %; persons within a group differ by {settings.between:g} %."
     )
     return Finding("groups", table, caption, digits=3)
@@ -165,9 +175,9 @@ def _presumed(plan: Plan) -> tuple[Terms, ...]:
     for name, value in zip(plant.outputs, person.deviation, strict=True):
         factor, unit = shown_unit(plant, name)
         noise.append(f"{name}: {number(factor * float(value))} {unit}")
-    prices = [
+    cost_weights = [
         f"{name}: {number(math.exp(float(value)))}"
-        for name, value in zip(person.structure.unknowns, person.prices, strict=True)
+        for name, value in zip(person.structure.unknowns, person.cost_weights, strict=True)
     ]
     tau = plan.settings.correlation
     kind = f"correlated over {tau:g} s" if tau > 0 else "white"
@@ -178,7 +188,7 @@ def _presumed(plan: Plan) -> tuple[Terms, ...]:
     return (
         Terms(
             [
-                ("Prices", prices),
+                ("Cost weights", cost_weights),
                 (f"Noise in the recorder, {kind}", noise),
                 ("Limit", limits),
                 ("Horizon", (f"{person.controller.horizon} samples of {plant.dt:g} s",)),
@@ -197,7 +207,7 @@ def _data(plan: Plan) -> dict[str, Any]:
             "dwell": plan.sharpest.design.dwell,
         },
         "structure": person.structure.name,
-        "presumed": dict(zip(names, np.exp(person.prices), strict=True)),
+        "presumed": dict(zip(names, np.exp(person.cost_weights), strict=True)),
         "gain": {"presumed": person.controller.K},
         "sentences": plan_sentences(plan),
         "simulated": None,
@@ -207,9 +217,9 @@ def _data(plan: Plan) -> dict[str, Any]:
         found["limit_deviation"] = expected.limits
     if fits is not None and expected is not None:
         found["simulated"] = {
-            "fits": len(fits.prices),
+            "fits": len(fits.cost_weights),
             "failed": fits.failed,
             "inside": dict(zip(names, fits.inside(expected), strict=True)),
-            "scatter": dict(zip(names, spread(fits.prices), strict=True)),
+            "scatter": dict(zip(names, spread(fits.cost_weights), strict=True)),
         }
     return found

@@ -15,13 +15,13 @@ from impc.reporting.shown_units import shown_unit
 from impc.studies.plan.study import spread
 
 if TYPE_CHECKING:
-    from impc.assess.price_profiles import PriceInterval
+    from impc.assess.weight_profiles import WeightInterval
     from impc.studies.plan.designs import Design, Outcome
     from impc.studies.plan.study import Plan
 
-# Wider than this, from end to end of an interval, a price is not called told.
+# Wider than this, from end to end of an interval, a cost weight is not called identified.
 _WIDE = math.log(100)
-# Nearer to one on both sides, an interval is told in percent.
+# Nearer to one on both sides, an interval is identified in percent.
 _NARROW = 1.5
 
 
@@ -34,7 +34,7 @@ def design_name(plan: Plan, design: Design) -> str:
     return f"{design.amplitude:g} {unit}, each value held for {design.dwell:g} s"
 
 
-def told_as(item: PriceInterval) -> str:
+def stated_as(item: WeightInterval) -> str:
     """An interval about the presumed value: "-7 to +8 %", "0.4 to 2.1 times", "0 to 3 times"."""
     if math.isinf(item.high):
         least = math.exp(item.low - item.value)
@@ -54,7 +54,7 @@ def plan_sentences(plan: Plan) -> tuple[str, ...]:
     return (
         f"{which}, {settings.trials} {trials} of {_length(plan)}: "
         f"{design_name(plan, best.design)}.",
-        _prices(plan),
+        _cost_weights(plan),
         _limits(plan),
         _how_it_goes(plan, best),
         *_groups(plan),
@@ -68,12 +68,12 @@ def _length(plan: Plan) -> str:
     return "their recorded length" if plan.settings.files else f"{plan.settings.duration:g} s"
 
 
-def _prices(plan: Plan) -> str:
+def _cost_weights(plan: Plan) -> str:
     expected = plan.best.expected
     if expected is None:
-        return "Nothing is told."
+        return "Nothing is identified."
     parts = [
-        f"{name} {told_as(item)}"
+        f"{name} {stated_as(item)}"
         for name, item in zip(plan.person.structure.unknowns, expected.intervals, strict=True)
     ]
     wide = [
@@ -81,7 +81,9 @@ def _prices(plan: Plan) -> str:
         for name, item in zip(plan.person.structure.unknowns, expected.intervals, strict=True)
         if item.high - item.low > _WIDE
     ]
-    text = f"Beside the presumed price, an interval of 95 % would be for {'; for '.join(parts)}."
+    text = (
+        f"Beside the presumed cost weight, an interval of 95 % would be for {'; for '.join(parts)}."
+    )
     if wide:
         text += f" That says next to nothing of {', '.join(wide)}."
     return text
@@ -97,7 +99,7 @@ def _limits(plan: Plan) -> str:
             lines.append(f"the limit of {name} to ±{number(196 * float(deviation), 2)} %")
         else:
             lines.append(f"nothing on the limit of {name}, which is never met")
-    return f"It would tell {'; '.join(lines)}."
+    return f"It would say {'; '.join(lines)}."
 
 
 def _how_it_goes(plan: Plan, best: Outcome) -> str:
@@ -126,26 +128,27 @@ def _groups(plan: Plan) -> tuple[str, ...]:
         f"{least.needed:.0f} persons a group on"
     )
     if most.needed == least.needed:
-        return (f"{text} in any of these prices.",)
+        return (f"{text} in any of these cost weights.",)
     other = f"from {most.needed:.0f} on in that of {most.feature}"
-    return (f"{text} in the price of {least.feature}, {other}.",)
+    return (f"{text} in the cost weight of {least.feature}, {other}.",)
 
 
 def _seen(plan: Plan) -> tuple[str, ...]:
     fits, expected = plan.simulated, plan.best.expected
-    if fits is None or expected is None or len(fits.prices) == 0:
+    if fits is None or expected is None or len(fits.cost_weights) == 0:
         return ()
     held = fits.inside(expected)
     names = plan.person.structure.unknowns
     worst = int(np.argmin(held))
     ratios = [
         float(one / two)
-        for one, two in zip(spread(fits.prices), expected.deviations, strict=True)
+        for one, two in zip(spread(fits.cost_weights), expected.deviations, strict=True)
         if np.isfinite(one) and np.isfinite(two)
     ]
     text = (
-        f"Of {len(fits.prices)} fits of simulated recordings {100 * np.mean(held):.0f} % of the "
-        f"prices lay in these intervals ({100 * held[worst]:.0f} % of {names[worst]})"
+        f"Of {len(fits.cost_weights)} fits of simulated recordings {100 * np.mean(held):.0f} % of "
+        "the "
+        f"cost weights lay in these intervals ({100 * held[worst]:.0f} % of {names[worst]})"
     )
     if ratios:
         text += f", and they scattered {min(ratios):.2f} to {max(ratios):.2f} times as foreseen"

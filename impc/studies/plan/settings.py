@@ -36,9 +36,9 @@ _NUMBER = re.compile(r"\s*([0-9.eE+-]+)\s*(.*\S)\s*")
 class PlanSettings:
     """The presumed person, the experiments to choose from, and what is asked of them."""
 
-    # Presumed price of each feature of the structure, with the first input's at one; without
+    # Presumed cost weight of each feature of the structure, with the first input's at one; without
     # [fit.structure] its keys are the features
-    prices: dict[str, float]
+    cost_weights: dict[str, float]
     # Standard deviation of the noise in the recorder, for each output: in the plant's unit, or with
     # one, as in "0.1 deg"
     noise: dict[str, float | str]
@@ -62,13 +62,13 @@ class PlanSettings:
     falls: Annotated[float, Meta(ge=0, le=100)] = (
         5.0  # Largest share of them that may end in a fall, %
     )
-    # Persons in each of two groups that are to be told apart
+    # Persons in each of two groups that are to be distinguished
     groups: Annotated[list[Persons], Some] = field(default_factory=lambda: [10, 20])
     difference: Annotated[float, Meta(ge=0.1, le=1e4)] = (
-        50.0  # By which a price differs between the groups, %
+        50.0  # By which a cost weight differs between the groups, %
     )
     between: Annotated[float, Meta(ge=0, le=1000)] = (
-        30.0  # Standard deviation of the logarithm of a price within a group, %
+        30.0  # Standard deviation of the logarithm of a cost weight within a group, %
     )
     # Fits of simulated recordings of the best experiment, to compare with; 0 for none
     fits: Annotated[int, Meta(ge=0, le=10_000)] = 0
@@ -83,27 +83,33 @@ def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
     return settings
 
 
-def presumed_prices(
+def assumed_cost_weights(
     plant: Plant, settings: PlanSettings, fit: FitSettings
 ) -> tuple[Structure, Array]:
     """The structure of the presumed person, and its unknowns (count,)."""
-    given = settings.prices
+    given = settings.cost_weights
     item = fit.structure
     if item is None:
         structure = Structure(plant, list(given))
     else:
         structure = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
     if structure.coupled or structure.input_coupled:
-        raise InputError("[fit.structure]", "prices products too", "plan with a diagonal structure")
+        raise InputError(
+            "[fit.structure]", "cost weights products too", "plan with a diagonal structure"
+        )
     for name in structure.unknowns:
         if name not in given:
-            raise InputError("[plan] prices", f"lacks {name!r}", "presume a price for each feature")
-    for name, price in given.items():
+            raise InputError(
+                "[plan] cost_weights", f"lacks {name!r}", "presume a cost weight for each feature"
+            )
+    for name, cost_weight in given.items():
         if name not in structure.unknowns:
             known = ", ".join(structure.unknowns)
-            raise InputError(f"[plan] prices {name}", "is not a feature", f"known: {known}")
-        if not 1e-100 < price < 1e100:
-            raise InputError(f"[plan] prices {name}", f"got {price:g}", "give a positive number")
+            raise InputError(f"[plan] cost_weights {name}", "is not a feature", f"known: {known}")
+        if not 1e-100 < cost_weight < 1e100:
+            raise InputError(
+                f"[plan] cost_weights {name}", f"got {cost_weight:g}", "give a positive number"
+            )
     return structure, np.log([given[name] for name in structure.unknowns])
 
 
@@ -120,13 +126,13 @@ def mechanical_stops(
     plant: Plant, settings: PlanSettings, signals: Mapping[str, SignalTable]
 ) -> Array:
     """Largest magnitude of each output (p,), in the plant's units; infinite without a stop."""
-    told = {
+    stops = {
         name: entry.limit * si_unit(entry.unit).factor
         for name, entry in signals.items()
         if entry.limit is not None
     }
-    told |= _of_outputs(plant, "stops", settings.stops)
-    return np.array([told.get(name, np.inf) for name in plant.outputs])
+    stops |= _of_outputs(plant, "stops", settings.stops)
+    return np.array([stops.get(name, np.inf) for name in plant.outputs])
 
 
 def _of_outputs(plant: Plant, key: str, given: Mapping[str, float | str]) -> dict[str, float]:

@@ -18,7 +18,7 @@ import scipy.optimize
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.printed_gain import told_gain
+from impc.assess.printed_gain import identified_gain
 from impc.checking import replace
 from impc.errors import ImpcError
 from impc.inverse.structured_fit import structured_estimate
@@ -51,9 +51,9 @@ _A_FIT = 40
 
 @dataclass(frozen=True)
 class GroupPower(Frozen):
-    """Whether two groups can be told apart by one price."""
+    """Whether two groups can be distinguished by one cost weight."""
 
-    feature: str  # Whose price
+    feature: str  # Whose cost weight
     # Of the logarithm of an estimate within a group: of persons and of the estimate
     deviation: float
     powers: Array  # How often a t-test at 5 % sees the difference, for each size of group (g,)
@@ -62,14 +62,14 @@ class GroupPower(Frozen):
 
 @dataclass(frozen=True)
 class Plan(Frozen):
-    """What experiments would tell of a presumed person."""
+    """What experiments would say of a presumed person."""
 
     person: Person
     settings: PlanSettings
     outcomes: tuple[Outcome, ...]  # One an experiment, in the order of `designs`
-    best: Outcome  # With the least mean variance of the logarithms of prices (A-optimal)
+    best: Outcome  # With the least mean variance of the logarithms of cost weights (A-optimal)
     sharpest: Outcome  # With the least determinant of their covariance (D-optimal)
-    groups: tuple[GroupPower, ...]  # For the best one, one a price
+    groups: tuple[GroupPower, ...]  # For the best one, one a cost weight
     simulated: SimulatedFits | None  # Of the best one
 
 
@@ -78,7 +78,7 @@ def _grid(settings: PlanSettings) -> tuple[Design, ...]:
 
 
 def steps_of(settings: PlanSettings) -> int:
-    """Count of the steps that `make_plan` tells of."""
+    """Count of the steps that `make_plan` says of."""
     return len(_grid(settings)) + settings.fits
 
 
@@ -107,7 +107,7 @@ def make_plan(
 def group_powers(
     person: Person, outcome: Outcome, settings: PlanSettings
 ) -> tuple[GroupPower, ...]:
-    """Two groups whose prices differ by `settings.difference`, each estimated once a person."""
+    """Two groups whose weights differ by `settings.difference`, each estimated once a person."""
     if outcome.expected is None:
         return ()
     from statsmodels.stats.power import TTestIndPower  # noqa: PLC0415  # a second to load
@@ -164,14 +164,16 @@ _MIDDLE = (15.866, 84.134)
 class SimulatedFits(Frozen):
     """What so many fits found."""
 
-    prices: Array  # Unknowns of the structure (fits, count); minus infinity for a price of zero
+    cost_weights: (
+        Array  # Unknowns of the structure (fits, count); minus infinity for a cost weight of zero
+    )
     gains: Array  # Gain without a structure, as it is printed with intervals (fits, m, n)
     failed: int  # Fits that ended without an answer
 
     def inside(self, expected: Expectation) -> Array:
         """Share of the fits whose unknowns lie in the expected intervals (count,)."""
         ends = np.array([[item.low, item.high] for item in expected.intervals])
-        held = (self.prices >= ends[:, 0]) & (self.prices <= ends[:, 1])
+        held = (self.cost_weights >= ends[:, 0]) & (self.cost_weights <= ends[:, 1])
         return np.asarray(np.mean(held, axis=0))
 
 
@@ -185,7 +187,7 @@ def spread(values: Array) -> Array:
 class OneFit(Frozen):
     """What one of them found; both empty where it ended without an answer."""
 
-    prices: Array
+    cost_weights: Array
     gain: Array
 
 
@@ -202,25 +204,25 @@ def simulated_fits(
     remember: RememberFit = lambda _, compute: compute(),
 ) -> SimulatedFits:
     """Fit recordings of one experiment with fresh noise, again and again."""
-    truth = np.array(person.prices)
+    truth = np.array(person.cost_weights)
 
     def fit(number: int) -> OneFit:
         noisy = _measured(person, problem, np.random.default_rng([seed, number]))
         try:
             end = search_from(noisy, person.structure, truth)
             fitted = structured_estimate(noisy, person.structure, end)
-            gain = told_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
-        except ImpcError:  # counted, and told
+            gain = identified_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
+        except ImpcError:  # counted, and identified
             return OneFit(frozen([]), frozen([]))
-        return OneFit(frozen(end.prices), frozen(gain))
+        return OneFit(frozen(end.cost_weights), frozen(gain))
 
     found = []
     for number in range(count):
         found.append(remember(f"fit {number + 1}", functools.partial(fit, number)))
         done(f"fit {number + 1}")
-    ended = [one for one in found if len(one.prices)]
+    ended = [one for one in found if len(one.cost_weights)]
     return SimulatedFits(
-        frozen(np.reshape([one.prices for one in ended], (-1, len(truth)))),
+        frozen(np.reshape([one.cost_weights for one in ended], (-1, len(truth)))),
         frozen(np.reshape([one.gain for one in ended], (-1, *person.controller.K.shape))),
         count - len(ended),
     )

@@ -106,7 +106,7 @@ class TransferFunction:
 
     frequency: Array  # Hz (f,)
     response: ComplexArray  # Output over input (f, p)
-    coherence: Array  # (f, p); 1 for a single trial, which cannot tell
+    coherence: Array  # (f, p); 1 for a single trial, which cannot say
 
 
 def transfer_function(

@@ -1,7 +1,7 @@
 """The answer that a test's users ask for: is it reliable, in which measure, and what change shows.
 
 A word for an ICC (Cicchetti 1994) is that of its whole 95 % interval: where its ends have different
-words the study does not tell, however high the estimate (docs/reliability.md).
+words the study does not say, however high the estimate (docs/reliability.md).
 
 The dissertation's findings of chapter 2, each looked for in a study; and its own p-values.
 
@@ -36,7 +36,7 @@ def band_of(value: float) -> str:
 def interval_band(low: float, high: float) -> str:
     """The word for an interval from `low` to `high`; of both ends where they differ."""
     ends = band_of(low), band_of(high)
-    return ends[0] if ends[0] == ends[1] else f"not told: {ends[0]} to {ends[1]}"
+    return ends[0] if ends[0] == ends[1] else f"not identified: {ends[0]} to {ends[1]}"
 
 
 def shown_score(item: MeasureResult) -> tuple[float, str]:
@@ -63,11 +63,11 @@ def answer(result: Reliability) -> tuple[str, ...]:
         found = [item for item in known if words[id(item)] == word]
         if found:
             lines.append(f"Reliability between visits is {word} for {_named(found)}.")
-    open_ = [item for item in known if words[id(item)].startswith("not told")]
+    open_ = [item for item in known if words[id(item)].startswith("not identified")]
     if open_:
         lines.append(
             f"For {_named(open_)} {len(result.subjects)} subjects and {len(result.visits)} visits "
-            "do not tell: the interval reaches from one word to another. More subjects or visits "
+            "do not say: the interval reaches from one word to another. More subjects or visits "
             "narrow it."
         )
     return (*lines, *_changes(known))
@@ -124,10 +124,10 @@ def findings(result: Reliability) -> tuple[Finding, ...]:
         for item in result.measures
         if item.icc is not None
     }
-    told = []
+    verdicts = []
     if values:
         least = min(values.values())
-        told.append(
+        verdicts.append(
             Finding(
                 "Between-visit reliability is excellent (ICC of 0.75 or more) for every measure.",
                 least >= 0.75,
@@ -139,7 +139,7 @@ def findings(result: Reliability) -> tuple[Finding, ...]:
             [value for key, value in values.items() if key[1] == result.outputs[place]]
             for place in (0, 1)
         )
-        told.append(
+        verdicts.append(
             Finding(
                 "The lower body is more reliable than the upper body.",
                 float(np.mean(lower)) > float(np.mean(upper)),
@@ -153,7 +153,7 @@ def findings(result: Reliability) -> tuple[Finding, ...]:
         if np.any(np.isfinite(item.within)) and np.any(np.isfinite(item.between))
     ]
     if pairs:
-        told.append(
+        verdicts.append(
             Finding(
                 "Transfer functions agree better within a visit than between visits (CMC).",
                 all(one > other for one, other in pairs),
@@ -161,4 +161,4 @@ def findings(result: Reliability) -> tuple[Finding, ...]:
                 f"{np.mean([b for _, b in pairs]):.3f} between",
             )
         )
-    return tuple(told)
+    return tuple(verdicts)

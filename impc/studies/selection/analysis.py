@@ -1,6 +1,6 @@
 """Sensitive parameters of a study (chapter 4): per subject, in common, and for all at once.
 
-Work on one subject: what its recordings tell of all parameters, then of the chosen ones.
+Work on one subject: what its recordings identify of all parameters, then of the chosen ones.
 
 The steps of chapter 4, as docs/selection.md lists them.
 
@@ -134,7 +134,7 @@ def _intersection(
 
 @dataclass(frozen=True)
 class Nominal:
-    """All parameters of one subject, and what the recordings tell of them."""
+    """All parameters of one subject, and what the recordings identify of them."""
 
     fit: Estimate  # All parameters fitted
     information: Information  # At that estimate

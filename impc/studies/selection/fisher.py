@@ -120,13 +120,13 @@ def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[s
 def null_directions(model: ParametricModel, found: Information) -> tuple[NullDirection, ...]:
     """Directions beyond the rank, least seen first, in relative changes of the parameters."""
     values, vectors = found.relative[:, 0], found.relative[:, 1:]
-    told = []
+    nulls = []
     for index in range(model.size - 1, found.rank - 1, -1):
         v = vectors[index] * np.sign(vectors[index][np.argmax(np.abs(vectors[index]))])
         order = np.argsort(-np.abs(v), kind="stable")
         shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= _NAMED}
         parts = ", ".join(f"{name} {share:+.2f}" for name, share in shares.items())
-        told.append(
+        nulls.append(
             NullDirection(
                 float(values[index] / values[0]),
                 shares,
@@ -134,7 +134,7 @@ def null_directions(model: ParametricModel, found: Information) -> tuple[NullDir
                 f"{values[index] / values[0]:.0e} of what the best seen direction does",
             )
         )
-    return tuple(told)
+    return tuple(nulls)
 
 
 _EPS = float(np.finfo(np.float64).eps)

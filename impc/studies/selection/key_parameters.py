@@ -138,8 +138,8 @@ def _by_visit(
 
 def _reliability(values: Array) -> float:
     """(5.6): the least ICC(A,k) of a subset's parameters; NaN without several of both."""
-    told = [between_visits(table) for table in values]
-    return float(np.min([item.value if item else np.nan for item in told]))
+    coefficients = [between_visits(table) for table in values]
+    return float(np.min([item.value if item else np.nan for item in coefficients]))
 
 
 def between_visits(values: Array) -> Icc | None:

@@ -97,8 +97,8 @@ def _data(model: ParametricModel, found: KeyParameters) -> dict[str, Any]:
 
 def _icc(values: Array) -> dict[str, float]:
     """With its 95 % interval; NaN where there is none."""
-    told = between_visits(values)
-    return {key: float(getattr(told, key, np.nan)) for key in ("value", "low", "high")}
+    coefficient = between_visits(values)
+    return {key: float(getattr(coefficient, key, np.nan)) for key in ("value", "low", "high")}
 
 
 def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:

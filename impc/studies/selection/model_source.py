@@ -63,30 +63,30 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
     make = import_function(name)
     try:
         with users_code(f"model {name}", TypeError, ValueError):
-            told = make(**arguments)
+            returned = make(**arguments)
     except (TypeError, ValueError) as error:
         raise InputError(f"model {name}", str(error), "correct the [model] table") from None
-    lacking = [key for key in _NEEDED if not isinstance(told, dict) or key not in told]
-    if lacking or not ("matrices" in told or "simulate" in told):
+    lacking = [key for key in _NEEDED if not isinstance(returned, dict) or key not in returned]
+    if lacking or not ("matrices" in returned or "simulate" in returned):
         missing = lacking[0] if lacking else "simulate or matrices"
         raise InputError(f"model {name}", f"lacks {missing}", "see docs/selection.md")
-    rate = float(told["rate"])
-    simulate, jacobian = told.get("simulate"), told.get("jacobian")
-    if "matrices" in told:
-        simulate, jacobian = linear_functions(told["matrices"], 1 / rate)
+    rate = float(returned["rate"])
+    simulate, jacobian = returned.get("simulate"), returned.get("jacobian")
+    if "matrices" in returned:
+        simulate, jacobian = linear_functions(returned["matrices"], 1 / rate)
     model = parametric_model(
-        told["names"],
-        told["low"],
-        told["high"],
-        told["typical"],
+        returned["names"],
+        returned["low"],
+        returned["high"],
+        returned["typical"],
         simulate,
-        pathways=told.get("pathways"),
-        units=told.get("units"),
-        meanings=told.get("meanings"),
+        pathways=returned.get("pathways"),
+        units=returned.get("units"),
+        meanings=returned.get("meanings"),
         jacobian=jacobian,
     )
     return ModelSource(
-        name, dict(arguments), model, tuple(told["inputs"]), tuple(told["outputs"]), rate
+        name, dict(arguments), model, tuple(returned["inputs"]), tuple(returned["outputs"]), rate
     )
 
 

@@ -72,7 +72,7 @@ def command_section(command: str) -> Section:
 
 def _verdict(model: ParametricModel, found: StudySelection) -> str:
     return (
-        f"The recordings tell {len(found.free)} of the {model.size} parameters well enough at "
+        f"The recordings identify {len(found.free)} of the {model.size} parameters well enough at "
         f"once: {names_of(model, found.free)}."
     )
 

@@ -28,11 +28,11 @@ def cart_plant(drag: float = 0.3) -> Any:
     return control.c2d(control.ss(A, B, [[1.0, 0.0]], 0, **names), _DT)
 
 
-def subject_trial(seed: int, price: float = 4.0) -> Recording:
-    """A trial of a subject with Q = diag(price, 1), with white noise of a fifth."""
+def subject_trial(seed: int, cost_weight: float = 4.0) -> Recording:
+    """A trial of a subject with Q = diag(cost weight, 1), with white noise of a fifth."""
     plant, rng = cart(), np.random.default_rng(seed)
     bounds = Bounds(plant, u_min=-1, u_max=1)
-    weights = Weights(np.diag([price, 1.0]), 1)
+    weights = Weights(np.diag([cost_weight, 1.0]), 1)
     controller = Controller(plant, weights, bounds, 10, terminal_set=False)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], _SAMPLES // 10), 10)
     run = require_complete(
@@ -52,9 +52,9 @@ def write_study(
     for number in range(1, subjects + 1):
         group = "a" if number <= subjects / 2 else "b"
         people.append(f"{number:02d},{group},0.3")
-        price = (4.0 if group == "a" else 8.0) * float(np.exp(0.1 * rng.standard_normal()))
+        cost_weight = (4.0 if group == "a" else 8.0) * float(np.exp(0.1 * rng.standard_normal()))
         for visit in range(1, visits + 1):
-            trial = subject_trial(int(rng.integers(2**31)), price)
+            trial = subject_trial(int(rng.integers(2**31)), cost_weight)
             rows = np.column_stack([np.arange(_SAMPLES) * _DT, trial.outputs, trial.disturbance])
             path = folder / f"sub-{number:02d}" / f"cart_{visit}.csv"
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ def fit_of(seed: int) -> dict[str, Any]:
         "shown_units": [[1.0, "m"]], "words": [["position", "Of the hand, in m."]],
         "units": {"K.force.position": "N/m", "K.force.position_rate": "N s/m"},
         "trials": 2, "samples": 100, "K": gain, "K_deviation": [[0.1, None]],
-        "K_told": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
+        "K_identified": [[True, False]], "K_of_weights": gain, "S": [[1.0]],
         "Q": weights["Q"], "R": [[1.0]], "misfit": 0.1, "exact": True, "converged": True,
         **{item.name: made_up(item, rng) for item in ASSESSMENTS.values()},
         "held_out_vaf": {"position": None}, "largest_input": {"force": 1.0}, "beyond_bound": 0.0,

@@ -1,4 +1,4 @@
-"""Groups and visits compared: against scipy's tests, without what a unit does not tell."""
+"""Groups and visits compared: against scipy's tests, without what a unit does not say."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import scipy.stats
 from experiments.coverage import cart
 from impc.inverse.noisy_fit import fit_controller
 from impc.studies.cohort.comparison import compare_cohort
-from impc.studies.cohort.told import not_told, not_told_sentences
+from impc.studies.cohort.identified import not_identified, unidentified_sentences
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 from tests.studies.cohort.carts import subject_trial
@@ -73,8 +73,10 @@ def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:
     rows = []
     for number in range(subjects):
         group = "a" if number < subjects // 2 else "b"
-        price = 4.0 * (difference if group == "b" else 1.0) * np.exp(0.2 * rng.standard_normal())
-        trial = subject_trial(int(rng.integers(2**31)), float(price))
+        cost_weight = (
+            4.0 * (difference if group == "b" else 1.0) * np.exp(0.2 * rng.standard_normal())
+        )
+        trial = subject_trial(int(rng.integers(2**31)), float(cost_weight))
         fitted = fit_controller(fit_problem(cart(), [trial], SETTINGS))
         rows.append((str(number), "1", "", group, fitted.gain[0, 0]))
     units = pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.force.x"])
@@ -121,15 +123,15 @@ def test_a_gain_of_629_with_a_deviation_of_1700_is_not_tested() -> None:
     a, b = (rest.loc[rest["group"] == group, "K.u.x"] for group in "ab")
     assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
     assert found.n == 9
-    assert not_told(units) == {"K.u.x": 1}
+    assert not_identified(units) == {"K.u.x": 1}
 
 
 def test_a_gain_without_a_deviation_is_not_tested() -> None:
     units = gains({0: np.nan, 5: np.inf})
     (found,) = compare_cohort(units)
     assert found.n == 8
-    assert not_told(units) == {"K.u.x": 2}
-    (said,) = not_told_sentences(not_told(units), len(units))
+    assert not_identified(units) == {"K.u.x": 2}
+    (said,) = unidentified_sentences(not_identified(units), len(units))
     assert said.endswith("of 10 units the gain of x to u of 2.")
 
 
@@ -146,4 +148,4 @@ def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
     """A deviation above the size of every entry is no reason: twenty draws about zero, seed 3."""
     units = gains({})
     units["K.u.x"] = 20 * np.random.default_rng(3).standard_normal(10)
-    assert not_told(units) == {}
+    assert not_identified(units) == {}

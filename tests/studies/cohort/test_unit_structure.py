@@ -1,4 +1,4 @@
-"""A cohort in structured weights: prices of every unit, groups compared in their logarithms."""
+"""A cohort in structured weights: weights of every unit, groups compared in their logarithms."""
 
 from __future__ import annotations
 
@@ -43,20 +43,22 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Store]:
 
 def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]) -> None:
     units = cohort_tables(*fitted)["units"]
-    price = units["log_price.x[0]"]
+    cost_weight = units["log_cost_weight.x[0]"]
     truth = np.where(units["group"] == "a", np.log(4.0), np.log(8.0))
-    low, high = units["log_price_low.x[0]"], units["log_price_high.x[0]"]
+    low, high = units["log_cost_weight_low.x[0]"], units["log_cost_weight_high.x[0]"]
     # Subjects differ by 10 % and one interval in twenty misses: six of them, seed 0.
     assert np.sum((low - 0.2 < truth) & (truth < high + 0.2)) == len(units) == 6
     assert np.sum(units["structure_refused"]) <= 1
-    assert measures_of(units)[:2] == ("log_price.x[0]", "log_price.x[1]")
+    assert measures_of(units)[:2] == ("log_cost_weight.x[0]", "log_cost_weight.x[1]")
     found = {
-        item.question: item for item in compare_cohort(units) if item.measure == "log_price.x[0]"
+        item.question: item
+        for item in compare_cohort(units)
+        if item.measure == "log_cost_weight.x[0]"
     }
     assert set(found) == {"group"}
     assert found["group"].low < np.log(2.0) < found["group"].high
     assert found["group"].p < 0.05
-    assert price.notna().all()
+    assert cost_weight.notna().all()
 
 
 def made_up(subjects: int, visits: int) -> pd.DataFrame:
@@ -67,13 +69,15 @@ def made_up(subjects: int, visits: int) -> pd.DataFrame:
         for visit in range(visits):
             score = own + 0.4 * visit + 0.7 * (number % 2) + 0.5 * rng.standard_normal()
             rows.append((str(number), str(visit), "", "ab"[number % 2], score))
-    return pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "log_price.x"])
+    return pd.DataFrame(
+        rows, columns=["subject", "visit", "condition", "group", "log_cost_weight.x"]
+    )
 
 
 def test_the_mixed_model_of_whole_tables_is_students_t_on_subject_means() -> None:
     units = made_up(14, 3)
     (found,) = (item for item in compare_cohort(units) if item.question == "mixed")
-    means = units.groupby(["group", "subject"])["log_price.x"].mean()
+    means = units.groupby(["group", "subject"])["log_cost_weight.x"].mean()
     test: Any = scipy.stats.ttest_ind(means["b"], means["a"], equal_var=True)
     assert found.estimate == pytest.approx(means["b"].mean() - means["a"].mean(), abs=1e-6)
     assert found.p == pytest.approx(test.pvalue, rel=1e-3)
@@ -83,13 +87,13 @@ def test_the_mixed_model_of_whole_tables_is_students_t_on_subject_means() -> Non
 
 def test_a_unit_without_a_structure_has_no_columns_for_it() -> None:
     assert structure_row({"structure": None}) == {}
-    told = {
-        "name": "x", "unknowns": ["a"], "log_price": [None], "low": [None], "high": [1.0],
+    identified = {
+        "name": "x", "unknowns": ["a"], "log_cost_weight": [None], "low": [None], "high": [1.0],
         "refused": False, "p": 0.4, "reason": "",
     }  # fmt: skip
-    row = structure_row({"structure": told})
-    assert np.isnan(row["log_price.a"])
-    assert row["log_price_high.a"] == 1.0
+    row = structure_row({"structure": identified})
+    assert np.isnan(row["log_cost_weight.a"])
+    assert row["log_cost_weight_high.a"] == 1.0
 
 
 def test_a_structure_that_loses_its_plant_names_why(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from experiments.coverage import cart, noisy_trial, true_controller
 from impc.arrays import Array
-from impc.assess.assessments import MethodFit, judge
+from impc.assess.assessments import MethodFit, evaluate_method
 from impc.checking import replace
 from impc.cli.main import main
 from impc.control.controller import Controller
@@ -98,12 +98,12 @@ def test_only_samples_that_were_reached_count() -> None:
     problem = Problem(plant, wide, 3, [Recording(plant, run.x)], terminal_set=False)
     found = methods.fit(problem)
     tight = Bounds(plant, u_min=-0.1, u_max=0.1)
-    fit = judge(replace(found, problem=replace(found.problem, bounds=tight)), wide)
+    fit = evaluate_method(replace(found, problem=replace(found.problem, bounds=tight)), wide)
     assert fit.fell[0] is not None
     assert 5 < len(fit.commands) < 200
     np.testing.assert_allclose(fit.commands, -0.1)
     small = Bounds(plant, u_min=-0.05, u_max=0.05)
-    assert judge(fit.estimate, small).exceeded == 1.0
+    assert evaluate_method(fit.estimate, small).exceeded == 1.0
 
 
 def test_what_the_gain_leaves_too_is_no_fault_of_the_weights(
@@ -187,8 +187,8 @@ def test_the_command(tmp_path: Path) -> None:
     with (out / "methods.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     for row in rows:
-        told = found[row["name"]]["vaf"]["theta1"]
-        assert row["vaf_theta1"] == ("" if told is None else repr(told))
+        identified = found[row["name"]]["vaf"]["theta1"]
+        assert row["vaf_theta1"] == ("" if identified is None else repr(identified))
     gain, weights, sway = (pd.read_csv(out / f"{name}.csv")
                            for name in ("gain", "weights", "trajectories"))  # fmt: skip
     entry = gain.query("number == 'K.command.theta1'").set_index("method")

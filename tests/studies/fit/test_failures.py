@@ -49,7 +49,7 @@ def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
     found = data(result)
     assert np.max(result.inverse_mpc.vaf) < 50
     assert found["usable"] is False
-    assert not {"gain", "directions", "prices"} & set(found["findings"])
+    assert not {"gain", "directions", "cost_weights"} & set(found["findings"])
     assert verdict(result).startswith("The fitted controller explains less than half of angle")
     assert not any("cost is" in sentence for sentence in (*abstract(result), *remarks(result)))
     assert data(fitted())["usable"] is True
@@ -60,7 +60,7 @@ def test_no_weights_is_said_before_any_weights() -> None:
     result = fitted(-60.0, -4.0)
     assert result.weights_test.rejected
     assert verdict(result).startswith("No cost weights explain this gain")
-    assert "prices" not in data(result)["findings"]
+    assert "cost_weights" not in data(result)["findings"]
     assert not any("dominant cost" in sentence for sentence in abstract(result))
     assert not fitted().weights_test.rejected
 

@@ -1,11 +1,11 @@
-"""How far prices are told, in words; sentences of whole fits are in `test_structures`."""
+"""How far weights are identified, in words; sentences of whole fits are in `test_structures`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from impc.assess.price_profiles import PriceInterval
+from impc.assess.weight_profiles import WeightInterval
 from impc.studies.fit.structure_words import ends, factor_of, probability
 
 
@@ -15,11 +15,11 @@ from impc.studies.fit.structure_words import ends, factor_of, probability
         (np.log(2.0), np.log(8.0), "2 to 8"),
         (-np.inf, np.log(8.0), "at most 8"),
         (np.log(2.0), np.inf, "at least 2"),
-        (-np.inf, np.inf, "not told"),
+        (-np.inf, np.inf, "not identified"),
     ],
 )
 def test_an_interval_says_which_ends_it_has(low: float, high: float, said: str) -> None:
-    assert ends(PriceInterval(np.log(4.0), low, high, 0.95)) == said
+    assert ends(WeightInterval(np.log(4.0), low, high, 0.95)) == said
 
 
 def test_a_deviation_is_a_factor_at_95_percent() -> None:

@@ -39,7 +39,7 @@ TABLE: dict[str, Any] = {
 
 @functools.cache
 def fitted(cross: float) -> FitResult:
-    """Two carts, two trials of 40 s at a VAF of 98 %, positions priced together by `cross`."""
+    """Two carts, two trials of 40 s at a VAF of 98 %, positions penalised together by `cross`."""
     plant = carts(2)
     Q = np.diag([4.0, 5.0, 1.0, 1.0])
     Q[0, 1] = Q[1, 0] = cross * np.sqrt(20.0)
@@ -61,7 +61,7 @@ def test_statements_within_a_structure_that_holds() -> None:
     sentence = next(line for line in lines if "costs" in line and "times as much as" in line)
     assert sentence.startswith("Within it ")
     assert ratio.interval.low < ratio.interval.value < ratio.interval.high
-    assert any(line.startswith("Of its 5 unknowns the recordings tell 5") for line in lines)
+    assert any(line.startswith("Of its 5 unknowns the recordings identify 5") for line in lines)
     assert any("would have been refused with a probability of" in line for line in lines)
     truth = {"x[0]": 4.0, "x[1]": 5.0, "x[2]": 1.0, "x[3]": 1.0, "force2": 1.0}
     held = [
@@ -76,12 +76,12 @@ def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
     result = fitted(0.0)
     found = result.structures[0]
     assert found.estimate is not None
-    assert not any("best price is zero" in line for line in structure_sentences(result))
-    prices = np.array(found.estimate.prices)
-    prices[3] = -np.inf
-    zero = replace(found, estimate=replace(found.estimate, prices=prices))
+    assert not any("best cost weight is zero" in line for line in structure_sentences(result))
+    cost_weights = np.array(found.estimate.cost_weights)
+    cost_weights[3] = -np.inf
+    zero = replace(found, estimate=replace(found.estimate, cost_weights=cost_weights))
     lines = structure_sentences(replace(result, structures=(zero, *result.structures[1:])))
-    assert any(line.startswith("Where the best price is zero") for line in lines)
+    assert any(line.startswith("Where the best cost weight is zero") for line in lines)
 
 
 @pytest.mark.full
@@ -114,10 +114,10 @@ def test_the_section_has_every_structure() -> None:
     found = {item.name: item for item in Report("", "", (), [section]).findings()}
     side_by_side = found["structures"].rows
     assert [row[0] for row in side_by_side] == ["weights of any kind", "one by one", "positions"]
-    assert side_by_side[2][-1] == "refuse it"  # no price on speeds
+    assert side_by_side[2][-1] == "refuse it"  # no cost weight on speeds
     kept = structure_data(result)
     assert [item["name"] for item in kept] == ["one by one", "positions"]
-    assert len(found["structure_prices"].rows) == 5
+    assert len(found["structure_cost_weights"].rows) == 5
     json.dumps([item["refused"] for item in kept])
 
 

@@ -47,7 +47,7 @@ def cart(dt: float = 0.05) -> Plant:
 
 
 def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]:
-    """Trials of a cart whose force stands at its limit of 1 for a part of the time."""
+    """Trials of a cart whose force is at its limit of 1 for a part of the time."""
     plant, rng = cart(), np.random.default_rng(SEED)
     weights = Weights(np.diag([4.0, 1.0]), 1)
     controller = Controller(
@@ -196,7 +196,7 @@ def test_an_interrupted_fit_goes_on(
         computed.append(len(problem.recordings))
         return fit_controller(problem, start)
 
-    for module in ("impc.studies.fit.subject", "impc.inverse.groundwork"):
+    for module in ("impc.studies.fit.subject", "impc.inverse.methods"):
         monkeypatch.setattr(f"{module}.fit_controller", counting)
     result = fit_recordings(*small, FitProgress(lambda _: None, again.estimate))
     fits = {"inverse_mpc", *(f"without trial {number}" for number in (1, 2, 3))}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def ends() -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """Low and high of each entry, (2, 2)."""
-    found = {item.name: item for item in reversed(fitted(1.0).certainty.intervals)}
+    found = {item.name: item for item in reversed(fitted(1.0).uncertainty.intervals)}
     names = ("K.pull.place", "K.pull.speed")
     return np.array([[found[name].low, found[name].high] for name in names])
 
@@ -30,9 +30,9 @@ def test_inside_and_outside_are_counted_and_the_farthest_is_named() -> None:
         "2 of the 2 entries of their true gain lie inside their 95 % intervals."
     )
     beyond = np.array([[place[1] + 0.1, speed[1] + 10 * (speed[1] - speed[0])]])
-    told = truth_sentence(result, beyond)
-    assert "0 of the 2 entries" in told
-    assert told.endswith(
+    identified = truth_sentence(result, beyond)
+    assert "0 of the 2 entries" in identified
+    assert identified.endswith(
         f"farthest off is the gain of speed, {speed[0]:.4g} to {speed[1]:.4g} where the truth is "
         f"{beyond[0, 1]:.4g}."
     )

@@ -152,13 +152,16 @@ def test_curves_of_the_page_are_those_of_the_fit() -> None:
 def test_weights_of_the_slider_move_prices_and_nothing_else() -> None:
     result = fitted(1.0)
     data = weights_chart(result.fitted.problem, result.intent)
-    # Of this cart, a double integrator, only the mixed price is free: from 0 to 0.93, measured.
-    prices = np.array([one["prices"] for one in data["positions"]])
-    np.testing.assert_allclose(prices, np.tile(prices[0], (len(prices), 1)), rtol=1e-9)
+    # Of this cart, a double integrator, only the mixed cost weight is free: from 0 to 0.93,
+    # measured.
+    cost_weights = np.array([one["cost_weights"] for one in data["positions"]])
+    np.testing.assert_allclose(
+        cost_weights, np.tile(cost_weights[0], (len(cost_weights), 1)), rtol=1e-9
+    )
     assert data["mixed"] == ["place with speed"]
     mixed = np.array([one["mixed"] for one in data["positions"]])
     assert np.ptp(mixed) > 0.9
-    assert len(prices) == 4 * len(result.intent.readings) - 3
+    assert len(cost_weights) == 4 * len(result.intent.readings) - 3
     for one in data["positions"]:
         for panel, values in zip(data["panels"], one["panels"], strict=True):
             np.testing.assert_allclose(values, panel["curves"][0], rtol=1e-4, atol=1e-9)
@@ -168,7 +171,7 @@ def test_bars_are_the_intervals() -> None:
     result = fitted(1.0)
     (ax,) = gain_figure(result).axes
     sizes = dict(zip(result.given.plant.states, result.intent.sizes, strict=True))
-    first = {item.name: item for item in reversed(result.certainty.intervals)}
+    first = {item.name: item for item in reversed(result.uncertainty.intervals)}
     for bar, (name, size) in zip(bars(ax), sizes.items(), strict=False):
         item = first[f"K.pull.{name}"]
         np.testing.assert_allclose(bar, [size * item.low, size * item.high])

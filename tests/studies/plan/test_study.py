@@ -19,16 +19,16 @@ from impc.studies.fit.settings import FitSettings, StructureSettings
 from impc.studies.plan.designs import Design, Person, try_design
 from impc.studies.plan.settings import (
     PlanSettings,
+    assumed_cost_weights,
     mechanical_stops,
     noise_deviations,
     plan_settings,
-    presumed_prices,
 )
 from impc.studies.plan.study import make_plan, recorded_noise, simulated_fits, spread, steps_of
 
-PRICES = {"x[0]": 4.0, "x[1]": 1.0}
+COST_WEIGHTS = {"x[0]": 4.0, "x[1]": 1.0}
 SETTINGS = PlanSettings(
-    prices=PRICES,
+    cost_weights=COST_WEIGHTS,
     noise={"position1": 0.03},
     amplitude=[0.4, 0.8, 3.0],
     dwell=[1.0, 2.0],
@@ -42,10 +42,10 @@ def person() -> Person:
     """A cart with a limit of one."""
     plant = carts(1)
     structure = Structure(plant, list(plant.states))
-    prices = np.log(list(PRICES.values()))
+    cost_weights = np.log(list(COST_WEIGHTS.values()))
     bounds = Bounds(plant, u_min=-1, u_max=1)
-    law = Controller(plant, structure.weights(prices), bounds, 8, terminal_set=False)
-    return Person(law, structure, prices, np.array([0.03]), 0.0, np.array([np.inf]))
+    law = Controller(plant, structure.weights(cost_weights), bounds, 8, terminal_set=False)
+    return Person(law, structure, cost_weights, np.array([0.03]), 0.0, np.array([np.inf]))
 
 
 def perturbation(amplitude: float, dwell: float, number: int) -> Array:
@@ -54,9 +54,9 @@ def perturbation(amplitude: float, dwell: float, number: int) -> Array:
 
 
 def test_the_best_experiment_is_the_one_that_tells_most_without_a_fall() -> None:
-    told = list[str]()
-    plan = make_plan(person(), SETTINGS, perturbation, told.append)
-    assert len(told) == steps_of(SETTINGS) == 6
+    identified = list[str]()
+    plan = make_plan(person(), SETTINGS, perturbation, identified.append)
+    assert len(identified) == steps_of(SETTINGS) == 6
     falls = {(item.design.amplitude, item.design.dwell): item.falls for item in plan.outcomes}
     # A push of 3 against a force of 1: nobody holds that for two seconds.
     assert falls[3.0, 2.0] > 0
@@ -100,16 +100,16 @@ def test_power_is_that_of_the_noncentral_t() -> None:
 def test_fits_scatter_as_foreseen() -> None:
     """Twenty fits: a deviation of 16 % of their own; the noise is that of the recordings."""
     someone = replace(person(), root=0.5, deviation=np.array([0.02]))
-    told = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
-    assert told.expected is not None
-    assert told.problem is not None
-    fits = simulated_fits(someone, told.problem, 20, 1)
+    identified = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
+    assert identified.expected is not None
+    assert identified.problem is not None
+    fits = simulated_fits(someone, identified.problem, 20, 1)
     assert fits.failed == 0
-    ratios = np.std(fits.prices, axis=0) / told.expected.deviations
+    ratios = np.std(fits.cost_weights, axis=0) / identified.expected.deviations
     assert np.all((ratios > 0.65) & (ratios < 1.35)), ratios
-    gains = np.std(fits.gains, axis=0) / told.expected.gain.entries
+    gains = np.std(fits.gains, axis=0) / identified.expected.gain.entries
     assert np.all((gains > 0.65) & (gains < 1.35)), gains
-    assert np.all(fits.inside(told.expected) > 0.8)
+    assert np.all(fits.inside(identified.expected) > 0.8)
 
 
 def test_noise_has_the_deviation_and_the_colour_that_were_asked_for() -> None:
@@ -127,12 +127,12 @@ def test_spread_is_the_deviation_of_normal_numbers() -> None:
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"prices": PRICES, "noise": {}, "amplitude": []}, "amplitude: is empty"),
-        ({"prices": PRICES, "noise": {}, "amplitude": [-1.0]}, "amplitude[0]: got -1"),
-        ({"prices": PRICES, "noise": {}, "trials": 0}, "trials: got 0"),
-        ({"prices": PRICES, "noise": {}, "fits": 3}, "fits: got 3"),
-        ({"prices": PRICES, "noise": {}, "trails": 3}, "trails: is not a setting"),
-        ({"noise": {}}, "prices"),
+        ({"cost_weights": COST_WEIGHTS, "noise": {}, "amplitude": []}, "amplitude: is empty"),
+        ({"cost_weights": COST_WEIGHTS, "noise": {}, "amplitude": [-1.0]}, "amplitude[0]: got -1"),
+        ({"cost_weights": COST_WEIGHTS, "noise": {}, "trials": 0}, "trials: got 0"),
+        ({"cost_weights": COST_WEIGHTS, "noise": {}, "fits": 3}, "fits: got 3"),
+        ({"cost_weights": COST_WEIGHTS, "noise": {}, "trails": 3}, "trails: is not a setting"),
+        ({"noise": {}}, "cost_weights"),
     ],
 )
 def test_settings_are_checked(table: dict[str, object], message: str) -> None:
@@ -142,14 +142,16 @@ def test_settings_are_checked(table: dict[str, object], message: str) -> None:
 
 def test_prices_and_noise_go_by_their_names() -> None:
     plant = carts(1)
-    given = replace(SETTINGS, prices={"x[1]": 1.0, "x[0]": 4.0})
-    structure, prices = presumed_prices(plant, given, FitSettings())
-    assert dict(zip(structure.unknowns, np.exp(prices), strict=True)) == pytest.approx(PRICES)
+    given = replace(SETTINGS, cost_weights={"x[1]": 1.0, "x[0]": 4.0})
+    structure, cost_weights = assumed_cost_weights(plant, given, FitSettings())
+    assert dict(zip(structure.unknowns, np.exp(cost_weights), strict=True)) == pytest.approx(
+        COST_WEIGHTS
+    )
     shape = FitSettings(structure=StructureSettings(["x[0]", "x[1]", "x[0] - x[1]"]))
     with pytest.raises(InputError, match="lacks 'x\\[0\\] - x\\[1\\]'"):
-        presumed_prices(plant, given, shape)
+        assumed_cost_weights(plant, given, shape)
     with pytest.raises(InputError, match="products"):
-        presumed_prices(plant, given, FitSettings(structure=StructureSettings("full")))
+        assumed_cost_weights(plant, given, FitSettings(structure=StructureSettings("full")))
     with pytest.raises(InputError, match="lacks position1"):
         noise_deviations(plant, replace(SETTINGS, noise={}))
     with pytest.raises(InputError, match="is not an output"):

@@ -37,8 +37,9 @@ def scores(subjects: int, visits: int, spread: float) -> Array:
 
 @pytest.mark.parametrize(
     ("low", "high", "word"),
-    [(0.8, 0.9, "excellent"), (0.61, 0.7, "good"), (-3.22, 0.95, "not told: poor to excellent"),
-     (0.7, 0.8, "not told: good to excellent"), (-1, 0.3, "poor")],
+    [(0.8, 0.9, "excellent"), (0.61, 0.7, "good"),
+     (-3.22, 0.95, "not identified: poor to excellent"),
+     (0.7, 0.8, "not identified: good to excellent"), (-1, 0.3, "poor")],
 )  # fmt: skip
 def test_a_word_is_that_of_the_interval(low: float, high: float, word: str) -> None:
     assert interval_band(low, high) == word
@@ -60,5 +61,5 @@ def test_few_subjects_tell_nothing_however_high_the_estimate() -> None:
     found = icc(made, "A,k", method="generalised")
     assert found.value > 0.6
     lines = answer(study(made))
-    assert "4 subjects and 2 visits do not tell" in lines[0]
+    assert "4 subjects and 2 visits do not say" in lines[0]
     assert not any("is excellent" in line or "is good" in line for line in lines)

@@ -80,9 +80,9 @@ def test_rank_and_what_is_not_seen() -> None:
     before, after = (MODEL.simulate(theta, TRIALS[0].input) for theta in (NOMINAL, moved))
     assert 1 - np.sum((after - before) ** 2) / np.sum(before**2) > 0.9999999
     assert common_scaling(MODEL, FOUND, ("Kvis",)) > 100
-    told = null_directions(MODEL, FOUND)
-    assert len(told) == 4
-    assert any({"Kvis", "Kvcr", "Kccr"} <= set(item.shares) for item in told)
+    identified = null_directions(MODEL, FOUND)
+    assert len(identified) == 4
+    assert any({"Kvis", "Kvcr", "Kccr"} <= set(item.shares) for item in identified)
 
 
 @pytest.mark.parametrize("bound", [0.05, 0.25, 0.95])
@@ -160,7 +160,7 @@ def test_models_are_checked() -> None:
 
 
 def test_subsets_beyond_number_are_refused_and_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of forty parameters that are all told: a million subsets of five, and more of six."""
+    """Of forty parameters that are all identified: a million subsets of five, and more of six."""
     monkeypatch.setattr(impc.studies.selection.fisher, "_MOST", 2000)
     tracemalloc.start()
     try:

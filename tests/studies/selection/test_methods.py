@@ -149,14 +149,14 @@ MINE = ("--model", "tests.studies.selection.dosing:blood_model")
 
 def blood_study(folder: Path, subjects: int, visits: int) -> Path:
     """Subjects with doses every eight hours for two days."""
-    told, rng = blood_model(), np.random.default_rng(SEED)
+    identified, rng = blood_model(), np.random.default_rng(SEED)
     dose = np.zeros((192, 1))
     dose[::32] = 400.0
     for subject in range(subjects):
         own = np.array([1.0, 0.1, 30.0]) * np.exp(0.3 * rng.standard_normal(3))
         for visit in range(visits):
             theta = own * np.exp(0.02 * rng.standard_normal(3))
-            level = told["simulate"](theta, dose)
+            level = identified["simulate"](theta, dose)
             noisy = level + 0.03 * np.std(level) * rng.standard_normal(level.shape)
             rows = np.column_stack([np.arange(192) * 0.25, dose, noisy])
             np.savetxt(

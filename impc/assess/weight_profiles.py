@@ -1,16 +1,16 @@
-"""Intervals of prices, and of ratios of two, by profile likelihood.
+"""Intervals of cost weights, and of ratios of two, by profile likelihood.
 
-With a combination a'z of the unknowns held at v, all other prices are fitted again: in the
+With a combination a'z of the unknowns held at v, all other cost weights are fitted again: in the
 quadratic form of the gain near the fit, then in that near the end. With m(v) the least misfit,
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),
 
 s^2 the variance of a residual and f the factor by which their colour widens the variance of a'z.
-The interval is {v : D(v) <= q}, q chi-squared's quantile. It has no lower end where the price may
-be zero: the answer is "at most" (docs/structures.md).
+The interval is {v : D(v) <= q}, q chi-squared's quantile. It has no lower end where the cost weight
+may be zero: the answer is "at most" (docs/structures.md).
 
-The recordings tell a gain; what is far from linear is the way from prices to gains. So near a fit
-the misfit is taken as a quadratic form of gain and metric, known from one simulation,
+The recordings identify a gain; what is far from linear is the way from cost weights to gains. So
+near a fit the misfit is taken as a quadratic form of gain and metric, known from one simulation,
 
     m^2(z) = |q + R (k(z) - k)|^2 + rest,       k = (G^-1 K T, S),
 
@@ -39,10 +39,10 @@ from impc.inverse.structured_search import regulator_slopes
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
-    from impc.assess.structured_weights import PriceCovariance, Tangent
+    from impc.assess.structured_weights import Tangent, WeightCovariance
     from impc.model.riccati import LqrSolution
 
-# A price about its value in the fit: far wider than any interval that has an end.
+# A cost weight about its value in the fit: far wider than any interval that has an end.
 _SPREAD = 20.0
 _TRIES = 30
 
@@ -120,7 +120,7 @@ class NearFit:
 
     def _form(self, z: Array, moving: Array) -> tuple[Array, Array]:
         """R (k(z) - k) and its derivative with respect to the unknowns that move."""
-        problem, structure = self.at.problem.known(), self.at.structure
+        problem, structure = self.at.problem.with_nuisance_fixed(), self.at.structure
         solution = solve_lqr(problem.plant, structure.weights(z))
         dK, dS = regulator_slopes(problem, structure, z, solution)
         slopes = self._natural(dK[moving]).reshape(int(np.sum(moving)), -1)
@@ -136,7 +136,7 @@ def _moved(z: Array, moving: Array, step: Array) -> Array:
     return there
 
 
-# Logarithms: beyond a factor of e^12 in price there is no end.
+# Logarithms: beyond a factor of e^12 in cost weight there is no end.
 _FARTHEST = 12.0
 # Of a step: how near to its end an interval ends.
 _END = 1e-2
@@ -147,11 +147,12 @@ _HUGE = 1e12
 
 
 @dataclass(frozen=True)
-class PriceInterval:
-    """An interval of a price or of a ratio of two."""
+class WeightInterval:
+    """An interval of a cost weight or of a ratio of two."""
 
-    value: float  # Its logarithm in the fit; minus infinity for a price of zero
-    low: float  # Ends of the logarithm: minus infinity where the price may be zero, or sets no end
+    value: float  # Its logarithm in the fit; minus infinity for a cost weight of zero
+    # Ends of the logarithm: minus infinity where the cost weight may be zero, or sets no end
+    low: float
     high: float
     level: float  # Between 0 and 1
 
@@ -160,41 +161,41 @@ class PriceInterval:
         return self.low <= value <= self.high
 
 
-class PriceProfiles:
+class WeightProfiles:
     """Intervals from the misfit near a fit, and near each end."""
 
-    def __init__(self, at: Tangent, covariance: PriceCovariance) -> None:
+    def __init__(self, at: Tangent, covariance: WeightCovariance) -> None:
         self.at, self.covariance, self.near = at, covariance, NearFit(at)
         samples = len(at.residual)
         self.variance = at.noise**2 * samples / max(samples - covariance.rank, 1)
-        self.base = self.near.least(np.array(at.prices), np.eye(int(np.sum(at.moving))))[0]
+        self.base = self.near.least(np.array(at.cost_weights), np.eye(int(np.sum(at.moving))))[0]
 
-    def interval(self, combination: Array, level: float = LEVEL) -> PriceInterval:
+    def interval(self, combination: Array, level: float = LEVEL) -> WeightInterval:
         """Interval of a'z; `combination` (count,)."""
         deviation, wider = self.covariance.spread(combination)
         quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
-        moving, prices = self.at.moving, np.array(self.at.prices)
-        value = float(combination[moving] @ prices[moving])
+        moving, cost_weights = self.at.moving, np.array(self.at.cost_weights)
+        value = float(combination[moving] @ cost_weights[moving])
         if not np.isfinite(deviation):
-            return PriceInterval(value, -np.inf, np.inf, level)
+            return WeightInterval(value, -np.inf, np.inf, level)
         step = min(max(deviation, 1e-9), 1.0)
         low, high = (
-            self._end(_Line(combination, prices, value, sign * step), quantile)
+            self._end(_Line(combination, cost_weights, value, sign * step), quantile)
             for sign in (-1.0, 1.0)
         )
-        return PriceInterval(value, low, high, level)
+        return WeightInterval(value, low, high, level)
 
-    def zero(self, index: int, level: float = LEVEL) -> PriceInterval:
-        """Interval of the price `index` that is zero in the fit: at most its upper end."""
-        near = np.array(self.at.prices)
+    def zero(self, index: int, level: float = LEVEL) -> WeightInterval:
+        """Interval of the cost weight `index` that is zero in the fit: at most its upper end."""
+        near = np.array(self.at.cost_weights)
         near[index] = self._smallest_seen(index)
         line = _Line(np.eye(len(near))[index], near, float(near[index]), 0.5)
         high = self._end(line, float(scipy.stats.chi2.ppf(level, 1)))
-        return PriceInterval(-np.inf, -np.inf, high, level)
+        return WeightInterval(-np.inf, -np.inf, high, level)
 
     def _smallest_seen(self, index: int) -> float:
-        """Logarithm of the price that moves the outputs by a tenth of a deviation."""
-        column = self.at.without_nuisance(np.array(self.at.on_prices[:, index])[:, None])
+        """Logarithm of the cost weight that moves the outputs by a tenth of a deviation."""
+        column = self.at.without_nuisance(np.array(self.at.on_cost_weights[:, index])[:, None])
         size = max(float(np.linalg.norm(column)), 1e-300)
         return float(np.log(0.1 * self.at.noise / size))
 
@@ -205,8 +206,8 @@ class PriceProfiles:
         are simulated again where the end is found, until it stays, between places with less and
         with more. Where the body falls, or there is no regulator, is more.
         """
-        inside, outside = line.prices, None
-        end, there = self._passing(self.near, line, line.prices, quantile)
+        inside, outside = line.cost_weights, None
+        end, there = self._passing(self.near, line, line.cost_weights, quantile)
         for _ in range(_ROUNDS):
             before, form = end, self._form(there)
             more, further = True, None
@@ -224,10 +225,10 @@ class PriceProfiles:
                 break
         return end
 
-    def _form(self, prices: Array) -> NearFit | None:
+    def _form(self, cost_weights: Array) -> NearFit | None:
         """The quadratic form elsewhere, in the noise of the fit; None where there is none."""
         try:
-            there = tangent(self.at.structure, self.at.problem, prices)
+            there = tangent(self.at.structure, self.at.problem, cost_weights)
         except WeightsError:
             return None
         if there.found.reason:
@@ -242,7 +243,7 @@ class PriceProfiles:
         Away from the fit where D is less there, towards it where it is more. The root of D is all
         but linear; each place is looked for from the nearest one that is known.
         """
-        known = {line.value: line.prices, line.at(here): here}
+        known = {line.value: line.cost_weights, line.at(here): here}
 
         def excess(value: float) -> float:
             if value == line.value:
@@ -274,7 +275,7 @@ class PriceProfiles:
         z[moving] += (value - float(own @ near[moving])) / float(own @ own) * own
         best, there = form.least(z, scipy.linalg.null_space(own[None]))
         for index in np.flatnonzero(~moving[: len(self.at.structure.labels)]):
-            # A price of zero may be worth having once another is held elsewhere.
+            # A cost weight of zero may be worth having once another is held elsewhere.
             other = z.copy()
             other[index] = self._smallest_seen(int(index))
             free = row[np.isfinite(other)]
@@ -288,14 +289,14 @@ class _Line(NamedTuple):
     """A combination of unknowns (count,), these and its value in the fit, a step to an end."""
 
     row: Array
-    prices: Array
+    cost_weights: Array
     value: float
     step: float
 
-    def at(self, prices: Array) -> float:
+    def at(self, cost_weights: Array) -> float:
         """Value of the combination elsewhere."""
-        finite = np.isfinite(prices)
-        return float(self.row[finite] @ prices[finite])
+        finite = np.isfinite(cost_weights)
+        return float(self.row[finite] @ cost_weights[finite])
 
     def between(self, inside: Array, value: float, outside: Array | None) -> bool:
         """Whether a value lies between those of two places; with one, beyond that."""

@@ -1,4 +1,4 @@
-"""Gains that the recordings of a unit do not tell: no data of a comparison, and left out of it.
+"""Gains that the recordings of a unit do not say: no data of a comparison, and left out of it.
 
 What the columns of units.csv are, in words: for the pages of a cohort (docs/cohorts.md).
 """
@@ -14,21 +14,22 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-# A deviation may be so many times the usual size of an entry. Small entries that are well told
-# stay: those of a gain whose truth is zero have a median size of 0.67 of their deviation. It is
-# not compared with the unit's own value, for what stayed would then be too large on average.
+# A deviation may be so many times the usual size of an entry. Small entries that are well
+# identified stay: those of a gain whose truth is zero have a median size of 0.67 of their
+# deviation. It is not compared with the unit's own value, for what stayed would then be too large
+# on average.
 _LARGEST = 2.0
 
 
-def not_told(units: pd.DataFrame) -> dict[str, int]:
-    """How many units do not tell a gain, by its column; gains that all of them tell are in none.
+def not_identified(units: pd.DataFrame) -> dict[str, int]:
+    """How many units do not say a gain, by its column; gains that all of them say are in none.
 
-    A unit tells an entry whose standard deviation is at most twice the median size of the entry
+    A unit says an entry whose standard deviation is at most twice the median size of the entry
     over the units that give a deviation. The deviation counts what the entry may owe to directions
-    that are not told (`GainCovariance.entries`), so that one told only with others is data too
-    where it is told well enough.
+    that are not identified (`GainCovariance.entries`), so that one identified only with others is
+    data too where it is identified well enough.
     """
-    kept = only_told(units)
+    kept = only_identified(units)
     return {
         name: count
         for name in units.columns
@@ -36,8 +37,8 @@ def not_told(units: pd.DataFrame) -> dict[str, int]:
     }
 
 
-def only_told(units: pd.DataFrame) -> pd.DataFrame:
-    """The table `units` with NaN for each gain that its unit does not tell, as `not_told` has it.
+def only_identified(units: pd.DataFrame) -> pd.DataFrame:
+    """The table `units` with NaN for each gain that `not_identified` has of its unit.
 
     A gain without a column `K_deviation` stays as it is.
     """
@@ -54,13 +55,14 @@ def only_told(units: pd.DataFrame) -> pd.DataFrame:
     return kept
 
 
-def not_told_sentences(counts: Mapping[str, int], of: int) -> list[str]:
+def unidentified_sentences(counts: Mapping[str, int], of: int) -> list[str]:
     """What is left out for it, in one sentence; none where nothing is."""
     if not counts:
         return []
     each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())
     return [
-        "A gain whose standard deviation is more than twice its usual size is not told, and not "
+        "A gain whose standard deviation is more than twice its usual size is not identified, and "
+        "not "
         f"compared: of {of} units {each}."
     ]
 
@@ -70,10 +72,10 @@ _WORDS = {
     "K_of_weights": "gain of the weights, {1} to {0}",
     "vaf": "VAF of {0}",
     "held_out_vaf": "VAF of {0}, left out",
-    "price": "price of {0}",
-    "centre_price": "price of {0}, analytic centre",
+    "cost_weight": "cost weight of {0}",
+    "centre_weight": "cost weight of {0}, analytic centre",
     "largest_input": "largest {0}",
-    "log_price": "logarithm of the price of {0}",
+    "log_cost_weight": "logarithm of the cost weight of {0}",
 }
 
 
