@@ -33,6 +33,8 @@ ROOMS = {
     "cli": "commands: parse, call, print",
     "door": "import impc, python -m impc",
 }
+#: The one module with arrows up: methods of an estimate call functions of higher rooms when used.
+RESULT = "inverse.estimates"
 
 
 def imports(typing: bool = True, package: Path = ROOT / "impc") -> dict[str, set[str]]:
@@ -53,6 +55,9 @@ def imports(typing: bool = True, package: Path = ROOT / "impc") -> dict[str, set
             item for node in _imports(tree.body, typing) for item in _named(node, package.name)
         ]
         found[name] = {_known(item, files) for item in named} - {name}
+    if typing and RESULT in found:
+        highest = list(ROOMS).index(room(RESULT))
+        found[RESULT] = {one for one in found[RESULT] if list(ROOMS).index(room(one)) <= highest}
     return found
 
 

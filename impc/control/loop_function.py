@@ -180,53 +180,44 @@ class _Matrices(ca.Callback):
 
 def _loop_of_gain(controller: Controller, given: Array, fixed: bool) -> ca.Function:
     """(K, S, x0) -> (x, u) under a disturbance, or (K, S, x0, disturbance) -> (x, u)."""
-    plant, near = controller.plant, controller.terminal
-    n, m, (steps, d) = plant.n, plant.m, given.shape
+    n, m, (steps, d) = controller.plant.n, controller.plant.m, given.shape
     inputs: Shapes = {"K": (m, n), "S": (m, m), "x0": (n, 1)}
     if not fixed:
         inputs["disturbance"] = (steps, d)
+    loop = _GainLoop(controller, given, fixed)
+    outputs: Shapes = {"x": (steps + 1, n), "u": (steps, m)}
+    return _Matrices("closed_loop", inputs, outputs, loop.value, loop.slopes)
 
-    def made(K: Array, S: Array, *others: Array) -> Controller | None:
-        nonlocal near
-        if not all(np.all(np.isfinite(part)) for part in (K, S, *others)):
-            return None
-        try:
-            law = Controller.from_gain(
-                plant,
-                K,
-                controller.bounds,
-                controller.horizon,
-                metric=(S + S.T) / 2,
-                terminal_set=controller.terminal is not None,
-                softening=controller.softening,
-                near=near,
-                solver=controller.solver,
-            )
-        except ImpcError:  # there is no such controller, which NaN says
-            return None
-        near = law.terminal
-        return law
 
-    def drive(x0: Array, disturbance: Array = given) -> Scenario:
-        return Scenario(frozen(x0.ravel()), frozen(disturbance))
+class _GainLoop:
+    """Values and derivatives of the loop at a point: K, S, x0 and, if not fixed, a disturbance."""
 
-    def value(point: list[Array]) -> list[Array]:
-        law = made(*point)
+    def __init__(self, controller: Controller, given: Array, fixed: bool) -> None:
+        self.controller, self.given, self.fixed = controller, given, fixed
+        self.near = controller.terminal
+
+    def value(self, point: list[Array]) -> list[Array]:
+        """x (steps + 1, n) and u (steps, m)."""
+        plant, steps = self.controller.plant, len(self.given)
+        law = self._law(*point)
         if law is None:
-            return [np.full((steps + 1, n), np.nan), np.full((steps, m), np.nan)]
-        run, _ = run_loop(prepare_loop(law, directions(law, 0)), drive(*point[2:]))
+            return [np.full((steps + 1, plant.n), np.nan), np.full((steps, plant.m), np.nan)]
+        run, _ = run_loop(prepare_loop(law, directions(law, 0)), self._drive(*point[2:]))
         x, u = np.array(run.x), np.array(run.u)
         if not run.complete:
             x[run.reached + 1 :], u[run.reached :] = np.nan, np.nan
         return [x, u]
 
-    def slopes(point: list[Array]) -> list[list[Array]]:
+    def slopes(self, point: list[Array]) -> list[list[Array]]:
+        """Of both by each part of the point."""
+        plant, (steps, d) = self.controller.plant, self.given.shape
+        n, m = plant.n, plant.m
         K, S = slice(n, n + m * n), slice(n + m * n, n + m * n + m * m)
         local: Array = np.full((steps, m, S.stop), np.nan)
         x: Array = np.zeros((steps, n))
         u: Array = np.zeros((steps, m))
-        driven = drive(*point[2:])
-        law = made(*point)
+        driven = self._drive(*point[2:])
+        law = self._law(*point)
         if law is not None:
             dS = np.zeros((m, m, S.stop))
             dS[..., S] = _scaled(point[1])
@@ -246,14 +237,37 @@ def _loop_of_gain(controller: Controller, given: Array, fixed: bool) -> ca.Funct
             ]
             for part in (dx, L @ dx[:-1] + G)
         ]
-        if not fixed:
+        if not self.fixed:
             unit = np.eye(steps * d).reshape(steps, d, steps * d)
             dx = _passed(closed, np.zeros((n, steps * d)), lambda t: E[t] @ unit[t])
             found[0].append(dx.reshape(steps + 1, n, steps, d))
             found[1].append((L @ dx[:-1]).reshape(steps, m, steps, d))
         return found
 
-    return _Matrices("closed_loop", inputs, {"x": (steps + 1, n), "u": (steps, m)}, value, slopes)
+    def _law(self, K: Array, S: Array, *others: Array) -> Controller | None:
+        if not all(np.all(np.isfinite(part)) for part in (K, S, *others)):
+            return None
+        given = self.controller
+        try:
+            law = Controller.from_gain(
+                given.plant,
+                K,
+                given.bounds,
+                given.horizon,
+                metric=(S + S.T) / 2,
+                terminal_set=given.terminal is not None,
+                softening=given.softening,
+                near=self.near,
+                solver=given.solver,
+            )
+        except ImpcError:  # there is no such controller, which NaN says
+            return None
+        self.near = law.terminal
+        return law
+
+    def _drive(self, x0: Array, disturbance: Array | None = None) -> Scenario:
+        driven = self.given if disturbance is None else disturbance
+        return Scenario(frozen(x0.ravel()), frozen(driven))
 
 
 def _passed(closed: Array, start: Array, push: Callable[[int], Array]) -> Array:

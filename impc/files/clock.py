@@ -134,7 +134,7 @@ def _stated_rate(table: Table, recording: RecordingTable) -> float:
     if given is None and stated is None:
         raise DataError(
             table.source,
-            "says no clock and no rate",
+            "gives no clock and no rate",
             "name the column with recording.time, or give recording.rate",
         )
     if given is not None and stated is not None and abs(given - stated) > _RATE * stated:

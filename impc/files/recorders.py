@@ -138,14 +138,16 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
 
 def _require_together(source: str, timed: dict[str, Any]) -> None:
     """Refuse channels with a clock that begin at different times."""
-    begins = {
-        name: (item.get("wf_start_time"), float(item.get("wf_start_offset", 0) or 0))
-        for name, item in timed.items()
-    }
+    moments = {name: item.get("wf_start_time") for name, item in timed.items()}
+    earliest = min((moment for moment in moments.values() if moment is not None), default=None)
+    begins = {name: float(item.get("wf_start_offset", 0) or 0) for name, item in timed.items()}
+    for name, moment in moments.items():
+        if moment is not None:
+            begins[name] += float((moment - earliest) / np.timedelta64(1, "s"))
+    first = next(iter(begins), "")
     for name, begin in begins.items():
-        first, earliest = next(iter(begins.items()))
-        if begin != earliest:
-            problem = f"channel {name} begins at another time than {first}"
+        if begin != begins[first]:
+            problem = f"channel {first} begins at {begins[first]:g} s and {name} at {begin:g} s"
             remedy = "export channels that are recorded together into a file of their own"
             raise DataError(source, problem, remedy)
 
