@@ -273,7 +273,7 @@ DAMAGED: dict[str, tuple[str, Make]] = {
     ),
     "uneven clock": ("is uneven", seat(time=UNEVEN)),
     "absent clock": ("column 'clock': is not in the file", seat(('"time"', '"clock"'))),
-    "unknown rate": ("says no clock and no rate", seat(OWN_RATE)),
+    "unknown rate": ("gives no clock and no rate", seat(OWN_RATE)),
     "clock in degrees": ("is no time", seat(('"time"', '"time"\ntime_unit = "deg"'))),
     "cut behind the end": (
         "does not reach recording.stop = 60 s", seat(('"time"', '"time"\nstop = 60.0'))
