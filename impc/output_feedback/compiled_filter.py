@@ -1,8 +1,13 @@
 """Compiled code: the filter of plant and estimate of one trial, with its derivatives.
 
-The filter is that of `likelihood` (docs/noisy-people.md), a sample of it that of
-`compiled_sample`. While no bound is near the covariance, which is most of what a filter costs,
-soon stands still.
+The equations are those of `likelihood`. With the gain g = P C'S^-1 and P|t what is left of P,
+
+    P|t = P - g C P,    P+ = F P|t F' + Q,     L = F g,    G = F - L C,    dG = dF - L dC
+    dP+ = G dP G' + dG P|t F' + F P|t dG' + dQ + L dR L'
+
+as in `kalman`: g makes P|t least, so that dP+ leaves dg alone. F has the command's slope in it.
+Of q directions the first k move covariances; k is the first axis of their derivatives, so that each
+product is one of matrices. While no bound is near the covariance soon stands still.
 """
 
 from __future__ import annotations
@@ -12,32 +17,33 @@ from typing import NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_kernel import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law
+from impc.control.compiled_dual import substitute_all
+from impc.control.compiled_kernel import (
+    DIVERGED,
+    LARGEST,
+    SOFTENED,
+    LoopMatrices,
+    Workspace,
+    law,
+    workspace,
+)
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
-from impc.output_feedback.compiled_clip import Clip
-from impc.output_feedback.compiled_covariance import advance, weigh
-from impc.output_feedback.compiled_room import Covariance, Room
-from impc.output_feedback.compiled_sample import (
-    FilterResult,
-    ahead,
-    clip_command,
-    expected_command,
-    share_noise,
-    update,
-)
-from impc.output_feedback.compiled_slope import slope_of_law
+from impc.output_feedback.compiled_clip import Clip, Clipped, clipped
 from impc.output_feedback.joint_loop import JointLoop
 
 # The covariance is taken for the stationary one when no entry differs by more than this, of the
 # deviations of its row and column; nor its derivative by more than the second.
 _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
+# A first state is forgotten when none of its directions moves an innovation by more than this, of
+# its deviation.
+_FORGOTTEN = 1e-9
 
 
 class Steady(NamedTuple):
     """The stationary filter where no bound is active, and its derivatives along k directions."""
 
-    P: Buffer  # Covariance of z given all earlier outputs (z, z), and (z, z, k)
+    P: Buffer  # Covariance of z given all earlier outputs (z, z), and (k, z, z)
     dP: Buffer
     known: bool  # Whether there is one
 
@@ -54,9 +60,44 @@ class FilterParts(NamedTuple):
     clip: Clip  # What is done to the law's command
     joint: JointLoop  # The system, and its derivatives along the first k directions
     djoint: JointLoop
-    steady: Steady  # The stationary filter
+    moving: bool  # Whether any direction moves B, C, E or G
+    turning: Buffer  # Which direction moves F or Q (k,)
+    steady: Steady
     at: int  # Where the estimate stands in z
     lasting: int  # How many directions, the first ones, move more than the first state
+
+
+class Likelihood(NamedTuple):
+    """What one trial says, sample by sample; the filter writes it."""
+
+    identified: Buffer  # Log-likelihood of each sample given the earlier ones (samples,), nats
+    score: Buffer  # Its derivatives along q directions (samples, q)
+    information: Buffer  # Fisher's, expected (q, q)
+    innovations: Buffer  # Recorded outputs minus what the filter expects (samples, p)
+    spreads: Buffer  # Their covariances (samples, p, p)
+    filtered: Buffer  # Expected z given all outputs so far (samples, z)
+    u: Buffer  # Command expected there (samples, m)
+    status: Buffer  # `Status` of each sample (samples,)
+    counted: int  # The first sample whose likelihood counts: earlier ones are given
+
+    @property
+    def value(self) -> float:
+        """Log-likelihood, nats."""
+        return float(np.sum(self.identified))
+
+
+class _Weighed(NamedTuple):
+    """What follows from the covariance of z before a sample of the outputs."""
+
+    S: Buffer  # Covariance of the innovation, its inverse (p, p) and log det
+    inverse: Buffer
+    volume: float
+    gain: Buffer  # g (z, p)
+    left: Buffer  # P|t (z, z)
+    dPC: Buffer  # Derivatives of P C' (k, z, p) and of S (k, p, p), and dS S^-1
+    dS: Buffer
+    weighed: Buffer
+    half: Buffer  # tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k)
 
 
 @njit(cache=True, nogil=True)
@@ -66,85 +107,280 @@ def run_filter(
     disturbance: Buffer,
     z: Buffer,
     dz: Buffer,
-    room: Room,
-    result: FilterResult,
+    P: Buffer,
+    dP: Buffer,
+    result: Likelihood,
     first: int,
 ) -> int:
     """Filter one trial from the first sample on; returns the sample at which it ends.
 
     It ends after the last sample; at one whose status has been written, at which the law has no
     answer or the state leaves every range; and at the first one that remembers nothing of the first
-    state, from where `lasting` directions are enough. Until there the room has the covariance.
+    state, from where `lasting` directions are enough. z, dz, P and dP are those before that sample.
 
-    `outputs` (samples, p); `disturbance` (samples, d); `z` (z,); `dz` (z, q).
+    `outputs` (samples, p); `disturbance` (samples, d); `z` (z,); `dz` (z, q); `P` (z, z);
+    `dP` (k, z, z).
     """
-    u, joint, djoint, at = room.u, parts.joint, parts.djoint, parts.at
-    n = parts.loop.K.shape[1]
+    joint, djoint, steady, at = parts.joint, parts.djoint, parts.steady, parts.at
+    (m, n), q, k, rows = parts.loop.K.shape, dz.shape[1], len(dP), parts.rows
+    work, lam, u, du = workspace(rows, m, q), np.zeros(len(rows.b)), np.empty(m), np.empty((m, q))
+    plain = np.ascontiguousarray(parts.dloop.K[:, :, :k].transpose((2, 0, 1)))
     settled, quiet = False, 0
-    weigh(joint, djoint, room)
+    known = _weigh(parts, P, dP)
     for t in range(first, len(outputs)):
-        if quiet > 2 * len(z) and dz.shape[1] > parts.lasting:
+        if quiet > 2 * len(z) and q > parts.lasting:
             return t
-        forgotten = update(joint, djoint, room, outputs[t], z, dz, result, t, parts.lasting)
-        quiet = quiet + 1 if forgotten else 0
-        status, near = _command(parts, room, z[at : at + n], dz[at : at + n])
-        result.u[t], result.status[t] = u, status
+        quiet = quiet + 1 if _update(parts, known, outputs[t], z, dz, result, t) else 0
+        x, dx = z[at : at + n], dz[at : at + n]
+        status, _, _ = law(
+            parts.loop, parts.dloop, rows, parts.drows, parts.unit, work, x, dx, lam, False, u, du
+        )
+        near = status > 0
+        result.status[t] = status
         if status > SOFTENED:
             return t
-        ahead(joint, djoint, room, u, disturbance[t], z, dz)
+        slope, dslope = _slope_of_law(parts, work, plain)
+        noise, dnoise = np.zeros(m), np.zeros((k, m))
+        if parts.clip.used:
+            found = _clip_command(parts, known, dP, u, du, slope, dslope, dnoise)
+            noise[0] = found.variance
+            near = near or found.near
+            result.status[t] = max(status, found.beyond)
+        result.u[t] = u
+        moved = joint.F @ z + joint.B @ u + joint.E @ disturbance[t]
+        dmoved = joint.F @ dz + joint.B @ du
+        dmoved[:, :k] += _times(djoint.F[:k], z)
+        if parts.moving:
+            dmoved[:, :k] += _times(djoint.B[:k], u) + _times(djoint.E[:k], disturbance[t])
+        z[:], dz[:] = moved, dmoved
         if not np.max(np.abs(z)) < LARGEST:
             result.status[t] = DIVERGED
             return t
         if not settled or near:
-            settled = _advanced(parts, room, near)
+            _advance(parts, known, P, dP, u, du, slope, dslope, noise, dnoise)
+            settled = steady.known and not near and _is_near(P, dP, steady)
+            if settled:
+                P[:], dP[:] = steady.P, steady.dP[:k]
+            known = _weigh(parts, P, dP)
     return len(outputs)
 
 
-@njit(cache=True, inline="always")
-def _command(parts: FilterParts, room: Room, x: Buffer, dx: Buffer) -> tuple[int, bool]:
-    """The room has what is expected of a command.
-
-    The estimate x (n,) and its derivatives (n, q) are those that are expected. Returns the status,
-    and whether a bound is near.
-    """
-    loop, dloop, rows, drows, unit = parts.loop, parts.dloop, parts.rows, parts.drows, parts.unit
-    work, lam, u, du = room.work, room.lam, room.u, room.du
-    status, _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u, du)
-    near = status > 0
-    if status > SOFTENED:
-        return status, near
-    slope_of_law(loop, dloop, rows, drows, work, room.slope, room.dslope)
-    if parts.clip.used:
-        found, s = expected_command(parts.clip, room, parts.at, u)
-        near = near or found.near
-        clip_command(found, s, parts.joint, parts.djoint, room, parts.at, u)
-        status = max(status, found.beyond)
-    return status, near
-
-
-@njit(cache=True, inline="always")
-def _advanced(parts: FilterParts, room: Room, met: bool) -> bool:
-    """The covariance becomes that of the next sample; whether it is the stationary one."""
-    here, noise, dnoise = room.here, room.noise[1], room.dnoise[1]
-    joint, djoint, steady = parts.joint, parts.djoint, parts.steady
-    share_noise(joint.share, djoint.share, room.u, room.du, noise, dnoise)
-    advance(joint, djoint, room, parts.at)
-    settled = steady.known and not met and _near(here, steady)
-    if settled:
-        here.P[:], here.dP[:] = steady.P, steady.dP[:, :, : here.dP.shape[2]]
-    weigh(joint, djoint, room)
-    return settled
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _times(changes: Buffer, vector: Buffer) -> Buffer:
+    """Changes (k, i, j) times a vector (j,), as columns (i, k)."""
+    k, i, j = changes.shape
+    return (changes.reshape(k * i, j) @ vector).reshape(k, i).T
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _near(here: Covariance, steady: Steady) -> bool:
-    """Whether covariance and derivative are the stationary ones, but for what is left out."""
-    for i in range(len(here.P)):
-        for j in range(len(here.P)):
-            unit = np.sqrt(steady.P[i, i] * steady.P[j, j])
-            if not abs(here.P[i, j] - steady.P[i, j]) <= _STEADY * unit:
-                return False
-            for c in range(here.dP.shape[2]):
-                if not abs(here.dP[i, j, c] - steady.dP[i, j, c]) <= _STEADY_SLOPE * unit:
-                    return False
+def _weigh(parts: FilterParts, P: Buffer, dP: Buffer) -> _Weighed:
+    """What follows from P (z, z) and dP (k, z, z)."""
+    joint, djoint, C = parts.joint, parts.djoint, parts.joint.C
+    (p, size), k = C.shape, len(dP)
+    CP = C @ P
+    S = CP @ C.T + joint.R
+    inverse = np.linalg.inv(S)
+    gain = CP.T @ inverse
+    dPC = (dP.reshape(k * size, size) @ C.T).reshape(k, size, p)
+    if parts.moving:
+        for c in range(k):
+            dPC[c] += P @ djoint.C[c].T
+    dCP = np.ascontiguousarray(dPC.transpose((0, 2, 1)))
+    dS = (dCP.reshape(k * p, size) @ C.T).reshape(k, p, p) + djoint.R[:k]
+    if parts.moving:
+        for c in range(k):
+            dS[c] += CP @ djoint.C[c].T
+    weighed = (dS.reshape(k * p, p) @ inverse).reshape(k, p, p)
+    turned = np.ascontiguousarray(weighed.transpose((0, 2, 1)))
+    half = weighed.reshape(k, p * p) @ turned.reshape(k, p * p).T / 2
+    volume = np.linalg.slogdet(S)[1]
+    return _Weighed(S, inverse, volume, gain, P - gain @ CP, dPC, dS, weighed, half)
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _update(
+    parts: FilterParts,
+    known: _Weighed,
+    output: Buffer,
+    z: Buffer,
+    dz: Buffer,
+    result: Likelihood,
+    t: int,
+) -> bool:
+    """Likelihood and score of one sample; z and dz become those given the sample.
+
+    Returns whether directions from `lasting` on move neither the innovation nor its covariance.
+    """
+    C, S, inverse, dS, k = parts.joint.C, known.S, known.inverse, known.dS, len(known.dS)
+    p, lasting = len(C), parts.lasting
+    e, de = output - C @ z, -(C @ dz)
+    if parts.moving:
+        de[:, :k] -= _times(parts.djoint.C[:k], z)
+    we, wde = inverse @ e, inverse @ de
+    moved = _times(dS, we)
+    if t >= result.counted:
+        result.identified[t] = -(np.dot(e, we) + known.volume + p * np.log(2 * np.pi)) / 2
+        score = result.score[t, : dz.shape[1]]
+        score -= we @ de
+        score[:k] += we @ moved / 2
+        for a in range(p):
+            score[:k] -= known.weighed[:, a, a] / 2
+        result.information[: len(score), : len(score)] += de.T @ wde
+        result.information[:k, :k] += known.half
+    # The gain is P C'S^-1: with w = S^-1 e it moves by (d(P C') - gain dS) w where it is applied.
+    z += known.gain @ e
+    dz += known.gain @ de
+    dz[:, :k] += _times(known.dPC, we) - known.gain @ moved
+    result.innovations[t], result.spreads[t], result.filtered[t] = e, S, z
+    for a in range(p):
+        if not np.all(np.abs(de[a, lasting:]) <= _FORGOTTEN * np.sqrt(S[a, a])):
+            return False
+        if not np.all(np.abs(dS[lasting:, a, a]) <= _FORGOTTEN * S[a, a]):
+            return False
     return True
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _slope_of_law(parts: FilterParts, work: Workspace, plain: Buffer) -> tuple[Buffer, Buffer]:
+    """Slope of the command with the state (m, n) at the active rows, its derivatives (k, m, n).
+
+    With the active rows a it is -K - (Gram_aa^-1 N_a0)' T_a, N_a0 the columns of the first stage.
+
+    `plain` (k, m, n): derivatives of the gain.
+    """
+    loop, dloop, rows, drows = parts.loop, parts.dloop, parts.rows, parts.drows
+    m, active = len(loop.K), work.active[0]
+    slope, dslope = -loop.K, -plain
+    if active == 0:
+        return slope, dslope
+    free = work.free[:active]
+    N, T, dM, dT = rows.N[free], rows.T[free], drows.M[free], drows.T[free]
+    first = N[:, :m].copy()
+    substitute_all(work.factor, active, first)
+    pulled = N.T @ first
+    slope -= first.T @ T
+    flat, width, k = dM.reshape(active, -1), N.shape[1], len(plain)
+    for i in range(m):
+        # Gram^-1 (dN_0 - dGram first), with dN = (dM - N dS) S^-1, dGram = dN M' + N dM'.
+        own, across = first[:, i].copy(), pulled[:, i].copy()
+        change = (own @ flat).reshape(width, -1)
+        for j in range(width):
+            for h in range(m):
+                change[j] -= dloop.S[j % m, h] * across[j - j % m + h]
+        right = -(N @ change)
+        for a in range(active):
+            right[a] -= across @ dM[a]
+            for h in range(m):
+                right[a] += dM[a, h] * loop.S[h, i]
+                for g in range(m):
+                    right[a] -= N[a, g] * dloop.S[g, h] * loop.S[h, i]
+        substitute_all(work.factor, active, right)
+        turned = (own @ dT.reshape(active, -1)).reshape(T.shape[1], -1)
+        dslope[:, i] -= (T.T @ right + turned).T[:k]
+    return slope, dslope
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _clip_command(
+    parts: FilterParts,
+    known: _Weighed,
+    dP: Buffer,
+    u: Buffer,
+    du: Buffer,
+    slope: Buffer,
+    dslope: Buffer,
+    dnoise: Buffer,
+) -> Clipped:
+    """Command and slope become those that are expected of a clipped command; see `Clip`."""
+    C, at, n, k = parts.joint.C, parts.at, slope.shape[1], len(dslope)
+    seen = np.zeros(len(known.left))
+    seen[at : at + n] = slope[0]
+    weighed = known.left @ seen
+    s = np.sqrt(max(np.dot(seen, weighed), 0.0))
+    found = clipped(parts.clip, u[0], s)
+    if not found.near:
+        return found
+    ds, along = np.zeros(k), du[0, :k].copy()
+    if found.inside_g != 0.0 or found.inside_s != 0.0:
+        # Of seen' P|t seen: d(P|t) = (I - g C) dP (I - g C)' + g dR g' less what dC moves.
+        answer = seen @ known.gain
+        before = seen - C.T @ answer
+        ds += before @ _times(dP, before)
+        for c in range(k):
+            ds[c] += np.dot(answer, parts.djoint.R[c] @ answer)
+            if parts.moving:
+                ds[c] -= 2 * np.dot(answer, parts.djoint.C[c] @ weighed)
+            ds[c] = ds[c] / (2 * s) + np.dot(dslope[c, 0], weighed[at : at + n]) / s
+    dnoise[:, 0] = found.variance_g * along + found.variance_s * ds
+    turned = found.inside_g * along + found.inside_s * ds
+    for c in range(k):
+        dslope[c, 0] = found.inside * dslope[c, 0] + turned[c] * slope[0]
+    du *= found.inside
+    du[0, :k] += found.value_s * ds
+    u[0] = found.value
+    slope *= found.inside
+    return found
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _advance(
+    parts: FilterParts,
+    known: _Weighed,
+    P: Buffer,
+    dP: Buffer,
+    u: Buffer,
+    du: Buffer,
+    slope: Buffer,
+    dslope: Buffer,
+    noise: Buffer,
+    dnoise: Buffer,
+) -> None:
+    """P and dP become those before the next sample.
+
+    `noise` (m,) and `dnoise` (k, m): variance that enters with each command, beside motor noise.
+    """
+    joint, djoint, at, B, Gm = parts.joint, parts.djoint, parts.at, parts.joint.B, parts.joint.G
+    (m, n), size, k, p, C = slope.shape, len(P), len(dP), len(joint.C), joint.C
+    F = joint.F.copy()
+    F[:, at : at + n] += B @ slope
+    ahead, L = F @ known.left, F @ known.gain
+    G = F - L @ C
+    share = (joint.share * u) ** 2
+    following = ahead @ F.T + joint.Q + (B * noise) @ B.T + (Gm * share) @ Gm.T
+    P[:] = (following + following.T) / 2
+    product = (dP.reshape(k * size, size) @ G.T).reshape(k, size, size)
+    turned = np.ascontiguousarray(product.transpose((0, 2, 1)))
+    product = (turned.reshape(k * size, size) @ G.T).reshape(k, size, size)
+    # Of the rest a half is written, as what enters by a few columns: to dP go it and its mirror.
+    columns = np.concatenate((B, Gm, L), axis=1)
+    changes, estimate = np.empty((k, size, 2 * m + p)), np.ascontiguousarray(ahead[:, at : at + n])
+    for c in range(k):
+        changes[c, :, :m] = estimate @ dslope[c].T + B * dnoise[c] / 2
+        shared = joint.share * u * (joint.share * du[:, c] + djoint.share[c] * u)
+        changes[c, :, m : 2 * m] = Gm * shared
+        changes[c, :, 2 * m :] = L * np.diag(djoint.R[c]) / 2
+    rest = (changes.reshape(k * size, 2 * m + p) @ columns.T).reshape(k, size, size)
+    for c in range(k):
+        if parts.turning[c]:
+            rest[c] += ahead @ djoint.F[c].T + djoint.Q[c] / 2
+        if parts.moving:
+            rest[c] -= ahead @ (L @ djoint.C[c]).T
+            rest[c] += (
+                estimate @ (djoint.B[c] @ slope).T
+                + (B * noise) @ djoint.B[c].T
+                + (Gm * share) @ djoint.G[c].T
+            )
+        for i in range(size):
+            for j in range(i + 1):
+                dP[c, i, j] = product[c, i, j] + rest[c, i, j] + rest[c, j, i]
+                dP[c, j, i] = dP[c, i, j]
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _is_near(P: Buffer, dP: Buffer, steady: Steady) -> bool:
+    """Whether covariance and derivative are the stationary ones, but for what is left out."""
+    deviations = np.sqrt(np.diag(steady.P))
+    unit = np.outer(deviations, deviations)
+    if not np.all(np.abs(P - steady.P) <= _STEADY * unit):
+        return False
+    return bool(np.all(np.abs(dP - steady.dP[: len(dP)]) <= _STEADY_SLOPE * unit))

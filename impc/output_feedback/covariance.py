@@ -1,13 +1,9 @@
 """How sure a person at the largest likelihood is: gain, levels of noise, and which are confused.
 
-With I the information of all recordings about all that was searched, initial states too,
+    expected   I^-1                    I: Fisher's information about all unknowns
+    sandwich   I^-1 cov(sum s_t) I^-1  s_t: the score of a sample; its sum by Newey and West
 
-    expected   I^-1                    Fisher's information, which the search has
-    sandwich   I^-1 cov(sum s_t) I^-1  s_t the score of a sample; its sum by Newey and West
-
-agree where the model is true. Where it is not, the last still says how estimates scatter. The
-prior of the search is left out but for a trace: what is not identified has a deviation of hundreds
-(docs/noisy-people.md).
+agree where the model is true; where it is not, the last still says how estimates scatter.
 """
 
 from __future__ import annotations
@@ -44,18 +40,12 @@ class PersonCovariance(Frozen):
     deviations: Array  # Standard deviation along each (g,)
 
     def level_intervals(self, values: Array) -> Array:
-        """Intervals of 95 % of the levels (l, 2), in their units.
-
-        `values` (l,).
-        """
+        """Intervals of 95 % of the levels (l, 2), in their units; `values` (l,)."""
         factors = np.exp(np.minimum(TWO_SIDED * self.levels, 700.0))  # still numbers
         return frozen(np.stack([values / factors, values * factors], axis=-1))
 
     def entry_intervals(self, K: Array) -> Array:
-        """Intervals of 95 % of the entries of a gain (entries, 2), in their units.
-
-        `K` (m, n).
-        """
+        """Intervals of 95 % of the entries of a gain (entries, 2), in their units; `K` (m, n)."""
         about = TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
         return frozen(np.ravel(K)[:, None] + about)
 

@@ -1,11 +1,4 @@
-"""A person who senses with noise, by maximum likelihood.
-
-The search starts from a fit that takes all that it does not explain for noise in the recorder, or
-from a regulator by Bryson's rule where that is likelier once levels of both have been found, and
-climbs from there. Beside where it ended it looks with all senses as noisy as any could be. One that
-does not settle is begun from the other too, and one for cost weights of somebody who estimates
-always, from larger cost weights (`start`, `search`; docs/noisy-people.md).
-"""
+"""Fit a person who senses with noise by maximum likelihood (docs/noisy-people.md, "The fit")."""
 
 from __future__ import annotations
 
@@ -216,13 +209,7 @@ def _levelled(prior: Prior, theta: Array, budget: int) -> _End:
 
 
 def _looked_beside(end: _End, asked: Asked, budget: int) -> _End:
-    """The higher end, of a search and of one from where it ended with every sense anew.
-
-    While the gain is far off, senses that are not used explain more than noisy ones: a search may
-    end at somebody who knows the rates exactly and hardly looks at the angles. With all senses at
-    the sizes that are expected a few likelihoods are higher than such an end, if not at the
-    person's.
-    """
+    """The higher end, of a search and of one from where it ended with every sense anew."""
     prior, theta = end.prior, end.place.theta.copy()
     senses = prior.space.senses
     theta[senses] = prior.scales[senses - prior.space.own]
@@ -260,10 +247,7 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
 def person_at(
     prior: Prior, place: Place, unseen: Array, settled: bool, spent: int
 ) -> OutputFeedbackFit:
-    """What is said of a person where a search has come to.
-
-    `unseen` (q,).
-    """
+    """What is said of a person where a search has come to; `unseen` (q,)."""
     space = prior.space
     person, cost_weights = space.unpack(place.theta), cost_weights_at(space, place.theta)
     return OutputFeedbackFit(

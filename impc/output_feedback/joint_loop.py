@@ -20,7 +20,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from impc.arrays import Array, Buffer
 from impc.model.riccati import lyapunov_series
@@ -32,8 +31,12 @@ if TYPE_CHECKING:
     from impc.output_feedback.observer import Observer
 
 
+# Of a derivative: its square is nothing beside one.
+_STEP = 1e-30j
+
+
 class JointLoop(NamedTuple):
-    """The system, or its derivatives along k directions, which are then a last axis.
+    """The system, or its derivatives along k directions, which are then a first axis.
 
     A named tuple because compiled code takes it as it is.
     """
@@ -59,33 +62,15 @@ class PlantMoves(NamedTuple):
     C: Array  # (k, p, n)
 
 
-def joint_loop(
-    plant: Plant, person: Observer, recorder: Array, believes: Observer | None = None
-) -> JointLoop:
-    """The system of a `page` at a `plant`.
-
-    `recorder` (p,).
-    """
-    R = np.diag(np.asarray(recorder) ** 2)
-    share = np.array(person.share)
-    moved = plant.B @ np.diag(person.motor**2) @ plant.B.T + np.diag(person.process**2)
-    if not person.estimates:
-        parts = plant.A, plant.B, plant.E, plant.B, plant.C, moved, R, np.zeros_like(moved)
-        return _contiguous(*parts, share)
-    L = believed_filter(plant, person if believes is None else believes).L
-    rows = _Rows(plant.n, len(L) - plant.n)
-    F, E = _transition(plant, person, L)
-    B, G, C = rows.zeros(plant.m), rows.zeros(plant.m), rows.zeros(len(plant.C)).T
-    B[rows.estimate], G[rows.error] = plant.B, plant.B
-    C[:, rows.error], C[:, rows.estimate] = plant.C, plant.C
-    V = np.diag(person.sensory**2)
-    entry = _entry(rows, L)
-    Q = entry @ V @ entry.T
-    Q[rows.error, rows.error] += moved
-    apart = np.ix_(rows.wandering, rows.wandering)
-    P0 = np.zeros_like(F)
-    P0[apart] = lyapunov_series(F[apart], Q[apart][None])[0]
-    return _contiguous(F, B, E, G, C, Q, R, P0, share)
+def joint_loop(plant: Plant, person: Observer, recorder: Array) -> JointLoop:
+    """The system of a `person` at a `plant`, with the `recorder`'s noise (p,)."""
+    L = believed_filter(plant, person).L if person.estimates else None
+    body = PlantMoves(plant.A, plant.B, plant.E, plant.C)
+    found = _assembled(body, person, [*_levels(person), np.asarray(recorder)], L)
+    P0, own = np.zeros_like(found.F), _apart(plant, person)
+    if person.estimates:
+        P0[own] = lyapunov_series(found.F[own], found.Q[own][None])[0]
+    return found._replace(P0=P0)
 
 
 def joint_directions(
@@ -93,123 +78,96 @@ def joint_directions(
 ) -> JointLoop:
     """Derivatives of `joint_loop` along k directions, for a person who believes what is true.
 
+    All but two equations are products, of which a complex step is exact (Squire and Trapp 1998).
+
     `recorder` (p,); `levels` (k, levels + p).
     """
-    count, sizes = len(levels), [len(person.level(name)) for name in LEVELS]
-    motor, share, process, sensory, walk, white = np.split(levels, np.cumsum(sizes), axis=1)
-    dR = _diagonals(2 * np.asarray(recorder) * white)
-    turned = moves.B @ np.diag(person.motor**2) @ plant.B.T
-    moved = turned + turned.transpose(0, 2, 1) + _diagonals(2 * person.process * process)
-    moved += plant.B @ _diagonals(2 * person.motor * motor) @ plant.B.T
-    if not person.estimates:
-        still = np.zeros_like(moved)
-        return _last(moves.A, moves.B, moves.E, moves.B, moves.C, moved, dR, still, share)
-    dV = _diagonals(2 * person.sensory * sensory)
-    F, C, _, V = believed_matrices(plant, person)
-    n, h = plant.n, len(F)
-    dF, dQ = np.zeros((count, h, h)), np.zeros((count, h, h))
-    dF[:, :n, :n], dF[:, :n, n:] = moves.A, moves.E[:, :, : h - n]
-    dQ[:, :n, :n] = moved
-    if person.walk is not None:
-        dQ[:, n:, n:] = _diagonals(2 * person.walk * walk)
-    believed = believed_filter(plant, person)
-    dL = filter_changes(believed, (F, C), dF, np.zeros((count, *C.shape)), dQ, dV).L
-    return _estimated(plant, person, (believed.L, V), moves, (dL, moved, dV, dR, share))
+    count, n, own = len(levels), plant.n, _apart(plant, person)
+    each = [*_levels(person), np.asarray(recorder)]
+    moved = np.split(levels, np.cumsum([len(level) for level in each])[:-1], axis=1)
+    body = PlantMoves(
+        *(part + _STEP * change for part, change in
+          zip((plant.A, plant.B, plant.E, plant.C), moves, strict=True))
+    )  # fmt: skip
+    changed = [level + _STEP * change for level, change in zip(each, moved, strict=True)]
+    L: Array | None = None
+    if person.estimates:
+        F, C, _, _ = believed_matrices(plant, person)
+        dF, dQ = np.zeros((2, count, *F.shape))
+        dF[:, :n, :n], dF[:, :n, n:] = moves.A, moves.E[:, :, : len(F) - n]
+        dQ[:, :n, :n] = _moving(body.B, changed[0], changed[2]).imag / _STEP.imag
+        if person.walk is not None:
+            dQ[:, n:, n:] = _diagonal(2 * person.walk * moved[4])
+        dV, believed = _diagonal(2 * person.sensory * moved[3]), believed_filter(plant, person)
+        dC = np.zeros((count, *C.shape))
+        L = believed.L + _STEP * filter_changes(believed, (F, C), dF, dC, dQ, dV).L
+    found = _assembled(body, person, changed, L)
+    change = JointLoop(*(np.ascontiguousarray(part.imag / _STEP.imag) for part in found))
+    if person.estimates:
+        here, rows = (
+            joint_loop(plant, person, recorder),
+            (np.arange(count)[:, None, None], own[0][None], own[1][None]),
+        )
+        turned = change.F[rows] @ here.P0[own] @ here.F[own].T
+        right = turned + turned.transpose(0, 2, 1) + change.Q[rows]
+        change.P0[rows] = lyapunov_series(here.F[own], right)
+    return change
 
 
-def _estimated(
-    plant: Plant,
-    person: Observer,
-    given: tuple[Array, Array],
-    moves: PlantMoves,
-    changes: tuple[Array, Array, Array, Array, Array],
+def _levels(person: Observer) -> list[Array]:
+    return [person.level(name) for name in LEVELS]
+
+
+def _apart(plant: Plant, person: Observer) -> tuple[Array, ...]:
+    """What no command moves, rows and columns of z: error and believed perturbation."""
+    n, d = plant.n, 0 if person.walk is None else plant.E.shape[1]
+    return np.ix_(*[np.r_[:n, 2 * n : 2 * n + d]] * 2)
+
+
+def _moving(B: Array, motor: Array, process: Array) -> Array:
+    """Covariance of what moves the body."""
+    return np.asarray(B @ _diagonal(motor**2) @ np.swapaxes(B, -1, -2) + _diagonal(process**2))
+
+
+def _assembled(
+    body: PlantMoves, person: Observer, levels: list[Array], L: Array | None
 ) -> JointLoop:
-    """Derivatives for a person who estimates, by the product rule."""
-    (L, V), (dL, moved, dV, dR, share) = given, changes
-    rows, count = _Rows(plant.n, len(L) - plant.n), len(dL)
-    dF, dE = rows.zeros(rows.size, count), rows.zeros(plant.E.shape[1], count)
-    dB, dG = rows.zeros(plant.m, count), rows.zeros(plant.m, count)
-    dC = rows.zeros(len(plant.C), count).transpose(0, 2, 1)
-    entry, dentry = _entry(rows, L), _entry(rows, dL)
-    dF[:, :, rows.error] = dentry @ person.C
-    dF[:, rows.error, rows.error] += moves.A
-    dF[:, rows.estimate, rows.estimate] = moves.A
+    """The system without P0, of arrays that may be complex and have k directions before all."""
+    (A, B, E, C), (motor, share, process, sensory, _, white) = body, levels
+    moved, R = _moving(B, motor, process), _diagonal(white**2)
+    if L is None:
+        return _contiguous(A, B, E, B, C, moved, R, np.zeros_like(moved), share)
+    n, d = A.shape[-1], 0 if person.walk is None else E.shape[-1]
+    error, estimate, walk = slice(0, n), slice(n, 2 * n), slice(2 * n, 2 * n + d)
+
+    def zeros(rows: int, columns: int) -> Array:
+        return np.zeros((*A.shape[:-2], rows, columns), dtype=A.dtype)
+
+    size, m = 2 * n + d, B.shape[-1]
+    entry, F, into = zeros(size, len(person.C)), zeros(size, size), zeros(size, E.shape[-1])
+    entry[..., error, :], entry[..., estimate, :] = -L[..., :n, :], L[..., :n, :]
+    entry[..., walk, :] = L[..., n:, :]
+    F[..., error] = entry @ person.C
+    F[..., error, error] += A
+    F[..., estimate, estimate] = A
     if person.walk is None:
-        dE[:, rows.estimate] = moves.E
+        into[..., estimate, :] = E
     else:
-        dE[:, rows.error] = moves.E
-        dF[:, rows.error, rows.walk] = -moves.E
-        dF[:, rows.estimate, rows.walk] = moves.E
-    dB[:, rows.estimate], dG[:, rows.error] = moves.B, moves.B
-    dC[:, :, rows.error], dC[:, :, rows.estimate] = moves.C, moves.C
-    turned = dentry @ V @ entry.T
-    dQ = turned + turned.transpose(0, 2, 1) + entry @ dV @ entry.T
-    dQ[:, rows.error, rows.error] += moved
-    F, _ = _transition(plant, person, L)
-    apart, own = np.ix_(rows.wandering, rows.wandering), rows.wandering
-    P0 = lyapunov_series(F[apart], (entry @ V @ entry.T)[apart][None] + _moved(plant, person, rows))
-    turned = dF[:, own[:, None], own] @ P0 @ F[apart].T
-    dP0 = np.zeros_like(dF)
-    dP0[:, own[:, None], own] = lyapunov_series(
-        F[apart], turned + turned.transpose(0, 2, 1) + dQ[:, own[:, None], own]
-    )
-    return _last(dF, dB, dE, dG, dC, dQ, dR, dP0, share)
+        into[..., error, :] = E
+        F[..., error, walk], F[..., estimate, walk] = -E, E
+        F[..., walk, walk] = np.diag(person.persistence)
+    commanded, noisy, seen = zeros(size, m), zeros(size, m), zeros(C.shape[-2], size)
+    commanded[..., estimate, :], noisy[..., error, :] = B, B
+    seen[..., error], seen[..., estimate] = C, C
+    Q = entry @ _diagonal(sensory**2) @ np.swapaxes(entry, -1, -2)
+    Q[..., error, error] += moved
+    return _contiguous(F, commanded, into, noisy, seen, Q, R, np.zeros_like(Q), share)
 
 
-class _Rows:
-    """Where error, estimate and believed perturbation stand in z."""
-
-    def __init__(self, n: int, d: int) -> None:
-        self.size = 2 * n + d
-        self.error, self.estimate = slice(0, n), slice(n, 2 * n)
-        self.walk = slice(2 * n, self.size)
-        self.wandering = np.r_[0:n, 2 * n : self.size]  # what no command moves
-
-    def zeros(self, columns: int, *count: int) -> Array:
-        return np.zeros((*count, self.size, columns))
-
-
-def _entry(rows: _Rows, L: Array) -> Array:
-    """How sensory noise enters z, of a gain (h, s) or of changes of one (k, h, s)."""
-    entry = np.zeros((*L.shape[:-2], rows.size, L.shape[-1]))
-    n = rows.error.stop
-    entry[..., rows.error, :] = -L[..., :n, :]
-    entry[..., rows.estimate, :] = L[..., :n, :]
-    entry[..., rows.walk, :] = L[..., n:, :]
-    return entry
-
-
-def _transition(plant: Plant, person: Observer, L: Array) -> tuple[Array, Array]:
-    """F and E of a person who estimates."""
-    rows = _Rows(plant.n, len(L) - plant.n)
-    F, E = rows.zeros(rows.size), rows.zeros(plant.E.shape[1])
-    F[:, rows.error] = _entry(rows, L) @ person.C
-    F[rows.error, rows.error] += plant.A
-    F[rows.estimate, rows.estimate] = plant.A
-    if person.walk is None:
-        E[rows.estimate] = plant.E
-    else:
-        E[rows.error] = plant.E
-        F[rows.error, rows.walk], F[rows.estimate, rows.walk] = -plant.E, plant.E
-        F[rows.walk, rows.walk] = np.diag(person.persistence)
-    return F, E
-
-
-def _moved(plant: Plant, person: Observer, rows: _Rows) -> Array:
-    """Covariance of what moves the body, among what no command moves."""
-    found = plant.B @ np.diag(person.motor**2) @ plant.B.T + np.diag(person.process**2)
-    return scipy.linalg.block_diag(found, np.zeros((rows.size - rows.walk.start,) * 2))
-
-
-def _diagonals(values: Array) -> Array:
-    """Diagonal matrices (k, a, a) of rows (k, a)."""
-    return np.asarray(values[:, :, None] * np.eye(values.shape[1]))
+def _diagonal(values: Array) -> Array:
+    """Diagonal matrices (..., a, a) of rows (..., a)."""
+    return np.asarray(values[..., None] * np.eye(values.shape[-1]))
 
 
 def _contiguous(*parts: Array) -> JointLoop:
     return JointLoop(*(np.array(part, order="C") for part in parts))
-
-
-def _last(*parts: Array) -> JointLoop:
-    """Directions from the first axis to the last."""
-    return _contiguous(*(np.moveaxis(part, 0, -1) for part in parts))

@@ -1,7 +1,6 @@
-"""A subject that was fitted, as values that JSON keeps: an interrupted command goes on from there.
+"""A fitted subject as values that JSON keeps, so that an interrupted command goes on from there.
 
-What the recordings say at its unknowns is not kept: one likelihood says it again, to the last
-digit.
+One likelihood says again, to the last digit, what the recordings say at its unknowns.
 """
 
 from __future__ import annotations

@@ -6,16 +6,9 @@ With z of `joint_loop` (plant and estimate) and the innovation e_t = y_t - C z_t
     z_t|t = z_t + P_t C'S_t^-1 e_t,            P_t|t = P_t - P_t C'S_t^-1 C P_t
     z_t+1 = F z_t|t + B u_t + E d_t,           P_t+1 = F_t P_t|t F_t' + Q,     F_t = F + B D_t H
 
-with u_t = MPC(H z_t|t) and D_t its slope there: H picks the estimate out of z. The law is piecewise
-affine, and its slope that of the active set. While no bound is near D_t = -K, all is linear and the
-likelihood is exact. Elsewhere the filter is an approximation: for one input, whose bounds clip a
-command that is only expected, u_t, D_t and some variance beside follow from the distribution of
-that command (`Clip`); for several inputs it is the extended filter. Derivatives follow the active
-sets, as those of a simulation do, and hold wherever none is about to change.
-
-P_t does not depend on what is recorded while D_t stays. Once it has come as near to its stationary
-value as rounding lets a derivative see it is taken for that value, until a bound is met
-(docs/noisy-people.md).
+with u_t = MPC(H z_t|t) and D_t its slope there: H picks the estimate out of z. While no bound is
+near all is linear and the likelihood is exact; elsewhere a command of one input is clipped as its
+distribution says (`Clip`), and several inputs take an extended filter (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -28,22 +21,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import RowDirections, Rows
 from impc.control.simulation import Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.output_feedback.compiled_clip import Clip
-from impc.output_feedback.compiled_filter import FilterParts, Steady, run_filter
-from impc.output_feedback.compiled_room import filter_room
-from impc.output_feedback.compiled_sample import FilterResult
+from impc.output_feedback.compiled_filter import FilterParts, Likelihood, Steady, run_filter
 from impc.output_feedback.joint_loop import PlantMoves, joint_directions, joint_loop
 from impc.output_feedback.kalman import filter_changes, stationary_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from impc.arrays import Array
     from impc.control.closed_loop import PreparedLoop
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
@@ -72,26 +63,6 @@ class PreparedFilter:
     parts: FilterParts  # With it, and with the system
 
 
-@dataclass(frozen=True)
-class Likelihood(Frozen):
-    """What a recording says, sample by sample."""
-
-    identified: Array  # Log-likelihood of each sample given those before (samples,), nats
-    score: Array  # Its derivatives along q directions (samples, q)
-    information: Array  # Fisher's, expected (q, q)
-    # Recorded outputs minus what the filter expects (samples, p), in the outputs' units
-    innovations: Array
-    spreads: Array  # Their covariances (samples, p, p)
-    filtered: Array  # Expected z given the outputs so far (samples, z)
-    u: Array  # Commands there (samples, m)
-    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # `Status` of each sample (samples,)
-
-    @property
-    def value(self) -> float:
-        """Log-likelihood, nats."""
-        return float(np.sum(self.identified))
-
-
 def prepare_filter(
     controller: Controller,
     person: Observer,
@@ -99,10 +70,7 @@ def prepare_filter(
     along: Directions,
     noise: NoiseDirections,
 ) -> PreparedFilter:
-    """Build all that does not depend on a recording.
-
-    `recorder` (p,).
-    """
+    """Build all that does not depend on a recording; `recorder` (p,)."""
     plant = controller.plant
     law, clip = _unclipped(prepare_loop(controller, along))
     count = along.count if np.any(person.share) or clip.used else noise.covariances
@@ -121,6 +89,8 @@ def prepare_filter(
         clip,
         joint,
         moves,
+        any(bool(np.any(part)) for part in (moves.B, moves.C, moves.E, moves.G)),
+        np.any(moves.F, axis=(1, 2)) | np.any(moves.Q, axis=(1, 2)),
         steady,
         at,
         noise.covariances,
@@ -147,7 +117,7 @@ def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likel
     z, dz = np.zeros(size), np.zeros((size, q))
     z[parts.at : parts.at + plant.n] = trial.x0
     dz[parts.at : parts.at + plant.n] = law.along.x0
-    result = FilterResult(
+    result = Likelihood(
         np.zeros(count),
         np.zeros((count, q)),
         np.zeros((q, q)),
@@ -159,34 +129,17 @@ def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likel
         counted,
     )
     outputs, disturbance = np.array(trial.outputs), np.array(trial.disturbance)
-    P, dP, first = joint.P0, parts.djoint.P0, 0
+    P, dP, first = joint.P0.copy(), parts.djoint.P0.copy(), 0
     while first < count and result.status[first] not in _FAILED:
-        room = filter_room(parts.rows, joint, parts.djoint, P, dP, plant.n, dz.shape[1])
-        first = run_filter(parts, outputs, disturbance, z, dz, room, result, first)
-        dz = np.ascontiguousarray(dz[:, : parts.lasting])
-        P, dP = room.here.P, np.ascontiguousarray(room.here.dP[:, :, : parts.lasting])
-    return _checked(result)
-
-
-def _checked(result: FilterResult) -> Likelihood:
-    """What the filter has written; an error where it ended early."""
+        first = run_filter(parts, outputs, disturbance, z, dz, P, dP, result, first)
+        dz, dP = np.ascontiguousarray(dz[:, : parts.lasting]), dP[: parts.lasting]
     failed = np.flatnonzero(np.isin(result.status, _FAILED))
     if len(failed):
         status = Status(int(result.status[failed[0]]))
         raise SolverError(
             f"sample {failed[0]}", f"{status.sentence}, as the filter expects it", "start elsewhere"
         )
-    information = result.information
-    return Likelihood(
-        frozen(result.identified),
-        frozen(result.score),
-        frozen(np.tril(information) + np.tril(information, -1).T),
-        frozen(result.innovation),
-        frozen(result.spread),
-        frozen(result.filtered),
-        frozen(result.u),
-        result.status,
-    )
+    return result
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
@@ -224,14 +177,11 @@ def _steady(
         return Steady(joint.P0, moves.P0, known=False)
     F = np.array(joint.F)
     F[:, estimate] -= joint.B @ K
-    parts = (np.moveaxis(part, -1, 0) for part in (moves.F, moves.B, moves.C, moves.Q, moves.R, dK))
-    dF, dB, dC, dQ, dR, dgain = parts
-    dF = np.array(dF)
-    dF[:, :, estimate] -= dB @ K + joint.B @ dgain
+    dF = np.array(moves.F)
+    dF[:, :, estimate] -= moves.B @ K + joint.B @ np.moveaxis(dK, -1, 0)
     try:
         found = stationary_filter(F, joint.C, joint.Q, joint.R)
     except SolverError:  # a gain that does not stabilise: the covariance has no end
         return Steady(joint.P0, moves.P0, known=False)
-    changes = filter_changes(found, (F, joint.C), dF, dC, dQ, dR)
-    dP = np.ascontiguousarray(np.moveaxis(changes.P, 0, -1))
-    return Steady(np.ascontiguousarray(found.P), dP, known=True)
+    changes = filter_changes(found, (F, joint.C), dF, moves.C, moves.Q, moves.R)
+    return Steady(np.ascontiguousarray(found.P), np.ascontiguousarray(changes.P), known=True)

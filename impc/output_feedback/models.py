@@ -1,11 +1,4 @@
-"""Models of how a person senses, side by side, and what the one that was asked for leaves.
-
-Each is fitted by maximum likelihood to the same recordings, from the same first fit, so that
-Akaike's criterion compares them: noise in the recorder alone, which is least squares; a person who
-sees every state and has noise in the loop; who estimates, the perturbation known, and not known;
-the one that was asked for with any gain, where a structure says which there are; and the same
-without its limits (docs/noisy-people.md).
-"""
+"""Models of how a person senses, fitted to the same recordings; Akaike's criterion of each."""
 
 from __future__ import annotations
 

@@ -60,6 +60,20 @@ class PersonModel:
     fit: OutputFeedbackFit | None  # None where it has no likelihood
     reason: str  # Why it has none
 
+    @property
+    def criterion(self) -> float:
+        """Akaike's; infinite where there is no likelihood."""
+        return np.inf if self.fit is None else self.fit.criterion
+
+    def data(self) -> dict[str, Any]:
+        """For result.json."""
+        fit = self.fit
+        numbers: tuple[float | None, ...] = (None,) * 4
+        if fit is not None:
+            numbers = fit.log_likelihood, fit.criterion, fit.count, fit.converged
+        heads = "log_likelihood", "aic", "count", "converged"
+        return {"name": self.name, **dict(zip(heads, numbers, strict=True)), "reason": self.reason}
+
 
 @dataclass(frozen=True)
 class PersonReport(Frozen):
@@ -97,7 +111,8 @@ class PersonReport(Frozen):
         asked = self.models[0]
         if asked.fit is None or not asked.fit.converged:
             return False
-        return _criterion(asked) < min(map(_criterion, self.models)) + _UNDECIDED
+        least = min(item.criterion for item in self.models)
+        return asked.criterion < least + _UNDECIDED
 
     def sentences(self, sizes: Array) -> tuple[str, ...]:
         """What may be said of the subject; `sizes` (n,) are those of the states."""
@@ -129,21 +144,9 @@ class PersonReport(Frozen):
 
     def data(self) -> dict[str, Any]:
         """For result.json."""
-        fit, covariance = self.fit, self.covariance
-        found: dict[str, Any] = {
-            "models": [
-                {
-                    "name": item.name,
-                    "log_likelihood": None if item.fit is None else item.fit.log_likelihood,
-                    "aic": None if item.fit is None else item.fit.criterion,
-                    "count": None if item.fit is None else item.fit.count,
-                    "converged": None if item.fit is None else item.fit.converged,
-                    "reason": item.reason,
-                }
-                for item in self.models
-            ]
-        }
-        if fit is None or covariance is None or self.confusion is None:
+        fit = self.fit
+        found: dict[str, Any] = {"models": [item.data() for item in self.models]}
+        if fit is None or self.confusion is None:
             return found
         return found | {
             "K": fit.K,
@@ -167,13 +170,13 @@ class PersonReport(Frozen):
 
 def _compared(report: PersonReport) -> str:
     asked = report.models[0]
-    others = sorted((item for item in report.models[1:] if item.fit is not None), key=_criterion)
-    if not others:
+    others = sorted(report.models[1:], key=lambda item: item.criterion)
+    if not others or others[0].fit is None:
         return (
             f"As one who {asked.name} the recordings can be identified; nothing stands beside it."
         )
     best = others[0]
-    apart = _criterion(best) - _criterion(asked)
+    apart = best.criterion - asked.criterion
     if abs(apart) < _UNDECIDED:
         return (
             f"Whether the person {asked.name}, or {best.name}, the recordings do not identify "
@@ -245,33 +248,28 @@ def _left(report: PersonReport) -> list[str]:
     ]
 
 
-def _criterion(model: PersonModel) -> float:
-    return np.inf if model.fit is None else model.fit.criterion
-
-
 def _model_finding(report: PersonReport) -> Finding:
-    least = min((_criterion(item) for item in report.models), default=np.inf)
-    table = table_of(
-        report.models,
-        {
-            "the_person": lambda item: item.name,
-            "searched": lambda item: None if item.fit is None else item.fit.count,
-            "log_likelihood": lambda item: (
-                np.nan if item.fit is None else float(item.fit.log_likelihood)
-            ),
-            "criterion": lambda item: (
-                np.nan if item.fit is None else float(_criterion(item) - least)
-            ),
-            "settled": lambda item: None if item.fit is None else item.fit.converged,
-            "reason": lambda item: item.reason,
-        },
-    )
+    least = min(item.criterion for item in report.models)
+    rows = [
+        (item.name, None, np.nan, np.nan, None, item.reason)
+        if item.fit is None
+        else (
+            item.name,
+            item.fit.count,
+            float(item.fit.log_likelihood),
+            float(item.criterion - least),
+            item.fit.converged,
+            item.reason,
+        )
+        for item in report.models
+    ]
+    heads = ["the_person", "searched", "log_likelihood", "criterion", "settled", "reason"]
     caption = (
         "Models of sensing on the same recordings, the one that was asked for first. The criterion "
         "is Akaike's, over the least; searched: gain or cost weights, initial states, levels of "
         "noise."
     )
-    return Finding("person_models", table, caption, digits=6)
+    return Finding("person_models", pd.DataFrame(rows, columns=heads), caption, digits=6)
 
 
 def _level_finding(report: PersonReport) -> Finding:

@@ -1,11 +1,6 @@
-"""What a search for a person makes largest: likelihood times prior, less what levels lose.
+"""What a search for a person makes largest: log-likelihood + log-prior - REML term for the levels.
 
-Noisy recordings leave some directions of the gain all but free. A weak normal prior in natural
-coordinates keeps those where the first fit was, as in `gain_search`, and a barrier keeps gains that
-stabilise from the border of those that do not. Levels are those of the largest restricted
-likelihood, and are expected to have a size: without either the likelihood of several levels is
-often largest where one of them is zero, and others are too large in its place (Chung et al. 2013;
-docs/noisy-people.md).
+docs/noisy-people.md, "The fit", says why there is each (Chung et al. 2013).
 """
 
 from __future__ import annotations

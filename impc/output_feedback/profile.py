@@ -1,16 +1,8 @@
-"""Profiles of a person's levels of noise and of the gain: intervals that need no parabola.
+"""Intervals by profile likelihood: they need no parabola (docs/noisy-people.md).
 
-The logarithm of a level that is weakly identified is not normal, for its likelihood falls on one
-side and stays on the other; and where half of a gain is hardly identified the other half bends with
-it, by many of its deviations. The interval of 95 % of v'theta is where, with v'theta held,
-
-    2 (max F - max_held F) <= 1.96^2
-
-F is what the search makes largest, but that of a level that is held nothing is expected: it is
-open to zero where F never falls, and the level is then at most its upper end
-(docs/noisy-people.md).
-
-The likeliest person of whom one number is held: of such are profiles, and ends of intervals.
+The interval of 95 % of v'theta is where, with v'theta held, 2 (max F - max_held F) <= 1.96^2. F is
+what the search makes largest, but that of a level that is held nothing is expected: its interval
+is open to zero where F never falls.
 """
 
 from __future__ import annotations
@@ -77,10 +69,7 @@ def level_interval(fit: OutputFeedbackFit, index: int) -> tuple[float, float]:
 
 
 def profile(fit: OutputFeedbackFit, along: Array) -> tuple[float, float]:
-    """Interval of 95 % of along'theta by profile.
-
-    `along` (q,).
-    """
+    """Interval of 95 % of along'theta by profile; `along` (q,)."""
     low, high = (_end(fit, along, side) for side in (-1, 1))
     return low, high
 
@@ -97,12 +86,7 @@ def fallen(fit: OutputFeedbackFit, along: Array, value: float) -> float:
 
 
 def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
-    """Where the profile has fallen by enough on one side.
-
-    With all else at its best the slope along the value is that of the profile, and the information
-    its curvature: the next value is where a parabola with both has fallen by enough, and the next
-    search begins on its ridge.
-    """
+    """Where the profile has fallen by enough on one side, found by parabolas."""
     prior, begin = fit.prior.freed(along), float(along @ fit.theta)
     here, unseen = prior.placed(np.array(fit.theta), fit.identified), np.array(fit.unseen)
     top, inside, outside, value = here.value, begin, side * np.inf, begin
@@ -136,14 +120,9 @@ def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
 def held_person(
     prior: Prior, here: Place, along: Array, off: float, unseen: Array, budget: int
 ) -> tuple[Place, Array] | None:
-    """The best of all else with along'theta so far off (docs/noisy-people.md).
-
-    The search begins on the ridge of the parabola about `here`, or beside it, where it is the
-    higher: a straight ridge may leave the gains that stabilise, and moves a level that is all but
-    none by many powers of e.
-
-    `along` (q,); `unseen` (q,); returns (q,).
-    """
+    """The best of all else with along'theta so far off."""
+    # On the ridge of the parabola, or beside it where that is higher: a straight ridge may leave
+    # the gains that stabilise, and moves a level that is all but none by many powers of e.
     _, curvature = prior.parabola(here, unseen)
     ridge = np.asarray(np.linalg.solve(curvature, along), dtype=np.float64)
     ways = ridge / float(along @ ridge), along

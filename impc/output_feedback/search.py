@@ -1,13 +1,10 @@
 """The largest likelihood, by Fisher's scoring in a box.
 
-With g the gradient of the log-likelihood and I the expected information, a step is that of
-
     maximise  g's - s'I s / 2    over  |s_i| <= radius
 
-and the radius follows from what the step brings. A box, because a level that is all but none may
-slide as far as it likes while all else takes its step: a step that is scaled as a whole is held
-back by what slides, and crept for hundreds of rounds on the seat (docs/noisy-people.md). What is
-made largest is that of `prior`.
+with g the gradient and I the expected information; the radius follows from what the step brings. A
+step that is scaled as a whole, instead of a box, is held back by a level that slides to zero: it
+crept for hundreds of rounds on the seat (docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -52,10 +49,7 @@ def climb(
     along: Array | None = None,
     unseen: Array | None = None,
 ) -> tuple[Place, Array, int, bool]:
-    """The largest likelihood near a place, times the prior and less what levels lose.
-
-    `along` (q, r); `unseen` (q,); returns (q,).
-    """
+    """The best place near one, its `unseen` slope (q,), likelihoods spent, and whether settled."""
     way = np.eye(len(begin.theta)) if along is None else along
     others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
     reach = _reach(prior, way)
@@ -104,11 +98,8 @@ def _reach(prior: Prior, way: Array) -> Array:
 
 
 def _followed(prior: Prior, here: Place, others: Array, unseen: Array) -> tuple[Place, int]:
-    """All but the levels (q, r) where the slope puts it, and likelihoods spent.
-
-    The ridge that all else makes bends with the levels, on the seat by many deviations. What levels
-    lose changes by nats beside it, so that places are compared on it.
-    """
+    """All but the levels (q, r) where the slope puts it, and likelihoods spent."""
+    # The ridge that all else makes bends with the levels, on the seat by many deviations.
     slope, bend = prior.parabola(here, unseen)
     radius = _STEP * _reach(prior, others)
     step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
@@ -134,10 +125,7 @@ def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tupl
 
 
 def unseen_slope(prior: Prior, here: Place) -> Array:
-    """Slope of what levels lose (q,), nats, by differences about a place; none without a prior.
-
-    Levels lose with all else fitted to the same noise (`prior`), and scores do not have it.
-    """
+    """Slope of what levels lose (q,), nats, which scores do not have: by differences."""
     slope = np.zeros(len(here.theta))
     if prior.used:
         slope[prior.space.own :] = _lost(prior, here)
@@ -159,11 +147,7 @@ def learned_slope(prior: Prior, slope: Array, here: Place, there: Place) -> Arra
 
 
 def _lost(prior: Prior, here: Place) -> Array:
-    """What levels lose, along each (levels,).
-
-    All else follows a level along its ridge, for `Place.lost` changes along that too. Where neither
-    way has a likelihood the slope is taken for zero.
-    """
+    """What levels lose along each (levels,), all else on its ridge; zero without a likelihood."""
     own, slopes = prior.space.own, np.zeros(len(prior.scales))
     information = here.identified.information + prior.slopes(here.theta)[1]
     ridges = -np.linalg.solve(information[:own, :own], information[:own, own:])

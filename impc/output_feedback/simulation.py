@@ -54,18 +54,14 @@ def simulate_person(
     steps: int | None = None,
     recorder: ArrayLike = 0.0,
     x0: ArrayLike | None = None,
-    believes: Observer | None = None,
     seed: Any = 0,
 ) -> PersonTrial:
-    """Simulate one trial.
-
-    `recorder` (p,); `x0` (n,).
-    """
+    """Simulate one trial; `recorder` (p,); `x0` (n,)."""
     plant = controller.plant
     given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance)
     rng, p = np.random.default_rng(seed), len(plant.outputs)
     white = finite_array("recorder", np.full(p, recorder, dtype=np.float64), (p,))
-    joint = joint_loop(plant, person, white, believes)
+    joint = joint_loop(plant, person, white)
     at = plant.n if person.estimates else 0
     size, (m, n) = len(joint.F), controller.K.shape
     start = _root(joint.P0) @ rng.standard_normal(size)
@@ -88,10 +84,7 @@ def run_joint(
     disturbance: Array,
     noise: tuple[Array, Array],
 ) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
-    """States of plant and estimate, and commands, with noise that has been drawn.
-
-    `start` (z,); `disturbance` (steps, d).
-    """
+    """States of plant and estimate, and commands, with noise that has been drawn."""
     steps, (m, n) = len(disturbance), law.controller.K.shape
     z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
     z[0] = start
@@ -115,10 +108,7 @@ def run_joint(
 
 
 def _root(covariance: Array) -> Array:
-    """The symmetric A with A A' the covariance, which need not be definite.
-
-    There is one, so that what is drawn is the same everywhere; eigenvectors are not.
-    """
+    """The one symmetric A with A A' the covariance, so that the same is drawn everywhere."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
@@ -139,12 +129,7 @@ def run_person(
     u: Buffer,
     status: Buffer,
 ) -> int:
-    """Simulate from z[0] with noise that has been drawn, without derivatives.
-
-    `loop, dloop, rows, drows, unit, joint, at` (m,); `disturbance` (samples, d); `noise`
-    (samples, z); `shared` (samples, m); `z` (samples + 1, z); `u` (samples, m); `status`
-    (samples,).
-    """
+    """Simulate from z[0] with noise that has been drawn, without derivatives."""
     n = loop.K.shape[1]
     work = workspace(rows, u.shape[1], 0)
     lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))

@@ -80,10 +80,7 @@ def _prior(space: PersonCoordinates, asked: Asked, size: _Sizes) -> Prior:
 def likeliest_start(
     points: Sequence[Point], cost_weights: Array | None, asked: Asked
 ) -> tuple[Prior, Array]:
-    """Where a search begins, of several points.
-
-    `cost_weights` (count,); returns (q,).
-    """
+    """Where a search begins, of several points; `cost_weights` (count,); returns (q,)."""
     found, highest, reason = None, -np.inf, "no number"
     for point in points:
         try:

@@ -1,9 +1,6 @@
 """The unknowns of a likelihood: those of a search for a gain or for weights, then levels of noise.
 
-    theta = (coordinates of `Coordinates` or `WeightCoordinates` | logarithms of the levels)
-
-A level of zero stays zero and one that is held stays as it is, all others are searched: of the
-person's noise, and of the recorder's (docs/noisy-people.md).
+theta = (coordinates of `Coordinates` or `WeightCoordinates` | logarithms of the levels searched)
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.inverse.coordinates import Coordinates, Point
-    from impc.output_feedback.likelihood import Likelihood
+    from impc.output_feedback.compiled_filter import Likelihood
     from impc.output_feedback.observer import Observer
 
 # Largest logarithm, either way, of a level whose square double precision can still multiply.
@@ -59,10 +56,7 @@ class LikelihoodTerms:
 
 
 class PersonCoordinates:
-    """The unknowns of one search.
-
-    `recorder` (p,).
-    """
+    """The unknowns of one search; `recorder` (p,)."""
 
     def __init__(
         self,

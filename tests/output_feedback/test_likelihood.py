@@ -18,9 +18,9 @@ from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
+from impc.output_feedback.compiled_filter import Likelihood
 from impc.output_feedback.joint_loop import joint_loop
 from impc.output_feedback.likelihood import (
-    Likelihood,
     NoiseDirections,
     PreparedFilter,
     joint_likelihoods,

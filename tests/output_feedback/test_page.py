@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
-from dataclasses import asdict
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -148,7 +148,7 @@ def test_the_page_says_what_intervals_held_where_a_limit_was_met() -> None:
     fit = result.person.fit
     assert fit is not None
     limited = [
-        replace(one, status=np.full_like(one.status, Status.ACTIVE))
+        one._replace(status=np.full_like(one.status, Status.ACTIVE))
         for one in fit.identified.trials
     ]
     met = replace(
@@ -225,7 +225,7 @@ def test_settings_of_a_person() -> None:
     table = {"observer": {"sensed": ["x"], "known": False, "share": True, "motor": False}}
     asked = fit_settings(table).observer
     assert asked is not None
-    given = asdict(asked)
+    given = msgspec.structs.asdict(asked)
     del given["profiles"]
     person, walk = asked_observer(cart(), trials(), **given)
     assert person.walk is not None
