@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
 
 _WIDTH = 78
+# Rows of a matrix that is printed whole.
+_SMALL = 4
 
 
 def summary(estimate: Estimate) -> str:
@@ -34,7 +36,10 @@ def summary(estimate: Estimate) -> str:
         parts = (("Q", estimate.weights.Q), ("R", estimate.weights.R))
         for name, matrix in parts:
             text = np.array2string(matrix, precision=4, suppress_small=True)
-            lines.append(f"{name} = " + text.replace("\n", "\n    "))
+            small = len(matrix) <= _SMALL
+            text = text.replace("\n", "\n    ") if small else f"{matrix.shape}, see .weights"
+            lines.append(f"{name} = {text}")
+        lines.append("The intervals are of the gain by itself; .K is the gain of these weights.")
     said = [estimate.status.sentence, estimate.reason, *estimate.doubts]
     return "\n".join([*lines, *(text for text in said if text)])
 
@@ -98,12 +103,12 @@ def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any
         raise InputError("axes", f"got {len(shown)}", f"give {count}: outputs, then inputs")
     for k, name in enumerate(plant.outputs):
         factor, _ = shown_unit(plant, name)
-        shown[k].plot(run.time, factor * recorded[:, k], color="0.6", label="recorded")
+        shown[k].plot(run.time, factor * recorded[:, k], color="0.7", linewidth=3, label="recorded")
         shown[k].plot(run.time, factor * run.outputs[:, k], label="simulated")
         shown[k].set_ylabel(axis_label(plant, name))
     for k, name in enumerate(plant.controls):
         _input(shown[len(plant.outputs) + k], estimate, trial, k, name)
-    shown[0].legend()
+    shown[0].legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
     shown[-1].set_xlabel("time (s)")
     return shown
 
