@@ -31,7 +31,7 @@ Q = "diagonal"
 over = ["theta1", "theta2"]
 
 [plan]
-cost weights = { theta1 = 6e3, theta2 = 9e3 }
+cost_weights = { theta1 = 6e3, theta2 = 9e3 }
 noise = { theta1 = "0.05 deg", theta2 = "0.05 deg" }
 correlation = 0.02
 stops = { theta1 = "12 deg" }

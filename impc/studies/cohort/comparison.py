@@ -28,8 +28,6 @@ from impc.studies.cohort.identified import only_identified
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import pandas as pd
 
     from impc.arrays import Array
@@ -52,8 +50,8 @@ class Comparison:
     high: float
     effect: float  # Hedges' g or d_z; NaN for the others
     p: float  # NaN for the reliability
-    p_holm: float
     n: int  # Subjects
+    p_holm: float = np.nan
     note: str = ""  # Why there is no number; empty otherwise
 
 
@@ -75,13 +73,11 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
     return (*penalised, *(named or gains), *(() if penalised else centre), *shares)
 
 
-def compare_cohort(
-    units: pd.DataFrame, measures: Sequence[str] | None = None
-) -> tuple[Comparison, ...]:
+def compare_cohort(units: pd.DataFrame) -> tuple[Comparison, ...]:
     """Answer every question that the units allow; gains that a unit does not say are left out."""
     if len(units) == 0:
-        raise DataError("cohort", "has no unit with a result", "see the reasons in the report")
-    chosen = measures_of(units) if measures is None else tuple(measures)
+        return ()
+    chosen = measures_of(units)
     found: list[Comparison] = []
     for condition, part in only_identified(units).groupby("condition", sort=True, dropna=False):
         stated = str(condition)
@@ -116,7 +112,7 @@ def _welch(
     interval = test.confidence_interval(0.95)
     return Comparison(
         question, measure, condition, one, other, float(b.mean() - a.mean()),
-        float(interval.low), float(interval.high), _hedges(a, b), float(test.pvalue), np.nan, n,
+        float(interval.low), float(interval.high), _hedges(a, b), float(test.pvalue), n,
     )  # fmt: skip
 
 
@@ -132,7 +128,7 @@ def _visits(part: pd.DataFrame, measure: str, condition: str, one: str, other: s
     return Comparison(
         "visit", measure, condition, one, other, float(difference.mean()), float(interval.low),
         float(interval.high), float(difference.mean() / spread) if spread else np.nan,
-        float(test.pvalue), np.nan, len(both),
+        float(test.pvalue), len(both),
     )  # fmt: skip
 
 
@@ -162,8 +158,8 @@ def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: st
     if min(each.get(one, 0), each.get(other, 0)) < _FEWEST:
         return _nothing("mixed", measure, condition, one, other, n)
     visits = list(dict.fromkeys(rows["visit"]))[1:]
-    second = np.asarray(rows["group"] == other, dtype=np.float64)
-    design = [np.ones(len(rows)), second, *(np.asarray(rows["visit"] == v, float) for v in visits)]
+    second = [rows["group"] == other, *(rows["visit"] == visit for visit in visits)]
+    design = [np.ones(len(rows)), *(one.to_numpy(float) for one in second)]
     with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")
         model = MixedLM(np.asarray(rows[measure], float), np.transpose(design), rows["subject"])
@@ -175,10 +171,8 @@ def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: st
         return replace(found, note=f"the mixed model did not converge ({one_line(why)[:60]})")
     reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
     p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
-    return Comparison(
-        "mixed", measure, condition, one, other, effect, effect - reach, effect + reach, np.nan, p,
-        np.nan, n,
-    )  # fmt: skip
+    ends = effect - reach, effect + reach
+    return Comparison("mixed", measure, condition, one, other, effect, *ends, np.nan, p, n)
 
 
 def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison:
@@ -187,10 +181,8 @@ def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison
         found = icc(wide.to_numpy(), "A,1")
     except DataError:
         return _nothing("reliability", measure, condition, "", "", len(wide.dropna()))
-    return Comparison(
-        "reliability", measure, condition, "", "", found.value, found.low, found.high, np.nan,
-        np.nan, np.nan, found.subjects,
-    )  # fmt: skip
+    nan, ends = float("nan"), (found.value, found.low, found.high)
+    return Comparison("reliability", measure, condition, "", "", *ends, nan, nan, found.subjects)
 
 
 def _hedges(a: Array, b: Array) -> float:
@@ -205,10 +197,9 @@ def _hedges(a: Array, b: Array) -> float:
 def _nothing(
     question: str, measure: str, condition: str, one: str, other: str, n: int
 ) -> Comparison:
-    nan = float("nan")
-    note = f"too few subjects ({n})"
+    nan, note = float("nan"), f"too few subjects ({n})"
     return Comparison(
-        question, measure, condition, one, other, nan, nan, nan, nan, nan, nan, n, note
+        question, measure, condition, one, other, nan, nan, nan, nan, nan, n, note=note
     )
 
 

@@ -29,12 +29,9 @@ def not_identified(units: pd.DataFrame) -> dict[str, int]:
     that are not identified (`GainCovariance.entries`), so that one identified only with others is
     data too where it is identified well enough.
     """
-    kept = only_identified(units)
-    return {
-        name: count
-        for name in units.columns
-        if name.startswith("K.") and (count := int((kept[name].isna() & units[name].notna()).sum()))
-    }
+    gains = units.filter(regex=r"^K\.")
+    lost = (only_identified(units)[gains.columns].isna() & gains.notna()).sum()
+    return {str(name): int(count) for name, count in lost.items() if count}
 
 
 def only_identified(units: pd.DataFrame) -> pd.DataFrame:
@@ -45,13 +42,10 @@ def only_identified(units: pd.DataFrame) -> pd.DataFrame:
     kept = units.copy()
     for name in units.columns:
         beside = f"K_deviation{name[1:]}"
-        if not name.startswith("K.") or beside not in units.columns:
-            continue
-        deviation = units[beside].to_numpy(dtype=np.float64)
-        given = np.isfinite(deviation)
-        sizes = np.abs(units[name].to_numpy(dtype=np.float64)[given])
-        usual = float(np.median(sizes)) if len(sizes) else 0.0
-        kept[name] = units[name].where(given & (deviation <= _LARGEST * usual))
+        if name.startswith("K.") and beside in units.columns:
+            deviation = units[beside].astype(float)
+            usual = units[name].astype(float).abs()[np.isfinite(deviation)].median()
+            kept[name] = units[name].where(deviation <= _LARGEST * usual)
     return kept
 
 
@@ -62,8 +56,7 @@ def unidentified_sentences(counts: Mapping[str, int], of: int) -> list[str]:
     each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())
     return [
         "A gain whose standard deviation is more than twice its usual size is not identified, and "
-        "not "
-        f"compared: of {of} units {each}."
+        f"not compared: of {of} units {each}."
     ]
 
 

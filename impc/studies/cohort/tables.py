@@ -22,11 +22,12 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.studies.cohort.unit_structure import structure_row
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from impc.studies.cohort.engine import Store
-    from impc.studies.cohort.study import Study, Unit
+    from impc.studies.cohort.study import Study
 
 _CENTRE = "analytic centre (no units)"
-_LEVEL = 0.95
 
 
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
@@ -37,31 +38,24 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
         fit = store.fit(unit.name)
         if fit is None:
             continue
-        units.append(_labels(unit) | _unit_row(fit))
-        drawn = []
+        labels = {"unit": unit.name} | {
+            name: getattr(unit, name) for name in ("subject", "visit", "condition", "group")
+        }
+        units.append(labels | _unit_row(fit))
+        drawn = {}
         for index in range(count):
             found = store.replicate(unit.name, index)
             if found is not None:
-                row = _gain(fit, "K", found["K"])
-                row |= dict(zip(fit["parameters"], found["parameters"], strict=True))
-                drawn.append(row)
-                replicates.append(_labels(unit) | {"replicate": index + 1} | row)
+                drawn[index + 1] = _gain(fit, "K", found["K"]) | dict(
+                    zip(fit["parameters"], found["parameters"], strict=True)
+                )
+        replicates += [labels | {"replicate": number} | row for number, row in drawn.items()]
         if len(drawn) > 1:
-            intervals += _intervals(unit, fit, pd.DataFrame(drawn))
+            intervals += [labels | row for row in _intervals(fit, pd.DataFrame(drawn.values()))]
     return {
         "units": pd.DataFrame(units),
         "replicates": pd.DataFrame(replicates),
         "intervals": pd.DataFrame(intervals),
-    }
-
-
-def _labels(unit: Unit) -> dict[str, Any]:
-    return {
-        "unit": unit.name,
-        "subject": unit.subject,
-        "visit": unit.visit,
-        "condition": unit.condition,
-        "group": unit.group,
     }
 
 
@@ -96,24 +90,19 @@ def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
     }
 
 
-def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dict[str, Any]]:
+def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, Any]]:
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
     identified = _gain(fit, "K", fit["K_identified"])
-    rows = []
-    for name in drawn.columns:
+    for name, values in drawn.items():
         # Replicates stay where the search began along what is not identified: their spread says
         # nothing.
-        known = identified.get(name, True)
-        low, high = percentiles(drawn[name], _LEVEL) if known else (np.nan, np.nan)
-        rows.append(
-            _labels(unit)
-            | {
-                "name": name,
-                "value": estimate[name],
-                "low": float(low),
-                "high": float(high),
-                "level": _LEVEL,
-                "replicates": len(drawn),
-            }
-        )
-    return rows
+        known = identified.get(str(name), True)
+        low, high = percentiles(values, 0.95) if known else (np.nan, np.nan)
+        yield {
+            "name": name,
+            "value": estimate[name],
+            "low": float(low),
+            "high": float(high),
+            "level": 0.95,
+            "replicates": len(drawn),
+        }
