@@ -22,6 +22,7 @@ from impc.files.digests import versions
 from impc.files.disk import IN_ITS_PLACE, require_ordinary, unwritable
 from impc.reporting.writer import write_files
 from impc.studies.cache import Cache
+from impc.studies.cohort.study import LABELS
 from impc.studies.cohort.tasks import fit_unit, replicate_unit
 from impc.studies.pool import Task, run
 
@@ -143,10 +144,24 @@ def run_study(
 ) -> Failures:
     """Do what is left of a study."""
     require_same(store)
-    manifest = json.dumps(_manifest(study, tasks), indent=1, sort_keys=True) + "\n"
-    write_files(store.folder, {"manifest.json": manifest.encode()})
-    store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     count = int(study.configuration.fit.get("replicates", 0))
+    manifest = {
+        "plant": study.plant,
+        "replicates": count,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
+        "units": {
+            unit.name: {
+                **{name: getattr(unit, name) for name in LABELS},
+                "files": [file.name for file in unit.files],
+                "digest": tasks[unit.name].digest if unit.name in tasks else None,
+            }
+            for unit in study.units
+        },
+    }
+    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
+    write_files(store.folder, {"manifest.json": text.encode()})
+    store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     failures, cache = Failures(), store.cache
     queue = deque(Task(_fit(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
     for result in run(pool, queue, cache):
@@ -186,23 +201,3 @@ def keep_failure(store: Store, unit: str, reason: str) -> None:
 def _failed(name: str) -> str:
     """Where the reason is kept why there is no such result."""
     return f"{name}-failed".replace("/fit-", "/")
-
-
-def _manifest(study: Study, tasks: Mapping[str, FitTask]) -> dict[str, Any]:
-    return {
-        "plant": study.plant,
-        "replicates": int(study.configuration.fit.get("replicates", 0)),
-        "made": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions(),
-        "units": {
-            unit.name: {
-                "subject": unit.subject,
-                "visit": unit.visit,
-                "condition": unit.condition,
-                "group": unit.group,
-                "files": [file.name for file in unit.files],
-                "digest": tasks[unit.name].digest if unit.name in tasks else None,
-            }
-            for unit in study.units
-        },
-    }

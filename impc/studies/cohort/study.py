@@ -41,7 +41,6 @@ from impc.studies.cohort.sheet import column_values, read_sheet
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from pathlib import Path
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
@@ -55,6 +54,10 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     table: str | None = None
     bids: str | None = None
     participants: str | None = None  # Table of the subjects
+
+
+#: What a unit is called by.
+LABELS = ("subject", "visit", "condition", "group")
 
 
 @dataclass(frozen=True)
@@ -107,14 +110,11 @@ def read_study(path: Path) -> Study:
     for key in sorted(together, key=lambda item: tuple(map(_natural, item))):
         trials = sorted(together[key], key=lambda item: (_natural(item[0]), str(item[1])))
         files = tuple(file for _, file in trials)
-        if people is None:
-            units.append(Unit(*key, files))
-        elif key[0] in people:
-            units.append(Unit(*key, files, *people[key[0]]))
-        else:
+        if people is not None and key[0] not in people:
             raise InputError(
                 f"{path}: subject {key[0]}", f"is not in {table.participants}", "add a row"
             )
+        units.append(Unit(*key, files, *(people[key[0]] if people else ())))
     _require_distinct(path, units)
     return Study(table.plant or "", configuration, tuple(units), table.model or "")
 
@@ -157,8 +157,6 @@ def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
     """Subject -> group and the other columns."""
     sheet = read_sheet(path)
     named = [name for name in ("subject", "participant_id") if name in sheet.heads]
-    if not named:
-        raise InputError(sheet.where, "lacks a subject", "name the column subject, fill every row")
     others = [name for name in sheet.heads if name not in (*named, "group")]
     values = {name: column_values(sheet, name) for name in others}
     found: dict[str, tuple[str, dict[str, float | str]]] = {}

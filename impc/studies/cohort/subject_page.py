@@ -13,6 +13,7 @@ from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.style import drawn, journal_style
 from impc.studies.cohort.figures import subject_figure
 from impc.studies.cohort.study import safe_name
+from impc.studies.cohort.unit_structure import or_nan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -115,8 +116,3 @@ def _gain(unit: str, fit: dict[str, Any]) -> Finding:
         "least condition number: a choice among all weights with the latter gain."
     )
     return Finding(f"{unit}-gain", pd.DataFrame(rows, columns=heads), caption)
-
-
-def or_nan(value: float | None) -> float:
-    """A `value` that may be missing, as JSON and pandas have it."""
-    return float("nan") if value is None else float(value)

@@ -19,6 +19,7 @@ import pandas as pd
 
 from impc.arrays import percentiles
 from impc.assess.assessments import ASSESSMENTS
+from impc.studies.cohort.study import LABELS
 from impc.studies.cohort.unit_structure import structure_row
 
 if TYPE_CHECKING:
@@ -38,9 +39,7 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
         fit = store.fit(unit.name)
         if fit is None:
             continue
-        labels = {"unit": unit.name} | {
-            name: getattr(unit, name) for name in ("subject", "visit", "condition", "group")
-        }
+        labels = {"unit": unit.name} | {name: getattr(unit, name) for name in LABELS}
         units.append(labels | _unit_row(fit))
         drawn = {}
         for index in range(count):

@@ -46,12 +46,9 @@ if TYPE_CHECKING:
     from impc.files.plant_sources import PlantSource
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
 
-# They say how many replicates there are, not what any of them is.
-_COUNTS = ("replicates",)
 # Points of a trajectory that are kept for pictures.
 _SHOWN = 600
 
@@ -94,16 +91,12 @@ def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
     They stay out of the fit: age and sex of a subject are no fault of the table.
     """
     names = {name: None for unit in study.units for name in unit.person}
-    return tuple(name for name in names if not _takes(source, name))
-
-
-def _takes(source: PlantSource, name: str) -> bool:
     if ":" not in source.name:  # matrices in a file have no arguments of a person
-        return False
-    parameters = inspect.signature(source.make).parameters
-    return name in parameters or any(
-        one.kind is inspect.Parameter.VAR_KEYWORD for one in parameters.values()
-    )
+        return tuple(names)
+    taken = inspect.signature(source.make).parameters
+    if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in taken.values()):
+        return ()
+    return tuple(name for name in names if name not in taken)
 
 
 def unit_digest(
@@ -116,7 +109,8 @@ def unit_digest(
         dict(arguments),
         configuration.recording,
         configuration.signals,
-        {key: value for key, value in configuration.fit.items() if key not in _COUNTS},
+        # How many replicates there are says not what any of them is.
+        {key: value for key, value in configuration.fit.items() if key != "replicates"},
         versions(),
     )
 
@@ -199,6 +193,9 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
     family = estimate.problem.family
     names = () if family is None else family.names
+    units = number_units(plant) | {
+        f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
+    }
     limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     return {
         "states": plant.states,
@@ -206,7 +203,8 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "outputs": plant.outputs,
         "shown_units": [shown_unit(plant, name) for name in plant.outputs],
         "words": signal_words(plant),
-        "units": _units(plant),
+        # Of the measures that a cohort compares, by their columns of units.csv.
+        "units": {name: "-" if unit == "1" else unit for name, unit in units.items()},
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
@@ -232,17 +230,6 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "findings": [trial.findings for trial in problem.recordings],
         "trajectory": _trajectory(fit),
         "structure": unit_structure(problem, fitted, settings),
-    }
-
-
-def _units(plant: Plant) -> dict[str, str]:
-    """Units of the measures that a cohort compares, by their columns of units.csv."""
-    cost_weights = {
-        f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
-    }
-    return {
-        name: "-" if unit == "1" else unit
-        for name, unit in (number_units(plant) | cost_weights).items()
     }
 
 

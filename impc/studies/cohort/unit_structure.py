@@ -55,13 +55,15 @@ def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
     found = fit.get("structure")
     if found is None:
         return {}
-    row: dict[str, Any] = {}
-    for name in ("log_cost_weight", "low", "high"):
-        head = name if name == "log_cost_weight" else f"log_cost_weight_{name}"
-        for unknown, value in zip(found["unknowns"], found[name], strict=True):
-            row[f"{head}.{unknown}"] = np.nan if value is None else float(value)
-    p = found["p"]
-    return row | {
-        "structure_refused": bool(found["refused"]),
-        "structure_p": np.nan if p is None else float(p),
+    heads = {"log_cost_weight": "", "low": "_low", "high": "_high"}
+    row: dict[str, Any] = {
+        f"log_cost_weight{end}.{unknown}": or_nan(value)
+        for name, end in heads.items()
+        for unknown, value in zip(found["unknowns"], found[name], strict=True)
     }
+    return row | {"structure_refused": bool(found["refused"]), "structure_p": or_nan(found["p"])}
+
+
+def or_nan(value: float | None) -> float:
+    """A `value` that may be missing, as JSON and pandas have it."""
+    return float("nan") if value is None else float(value)

@@ -50,8 +50,6 @@ def estimate(
     trials: Sequence[Trial],
     free: Sequence[int],
     start: Array,
-    *,
-    max_evaluations: int = 200,
 ) -> Estimate:
     """Fit the free parameters to all trials at once; `start` (k,)."""
     if not trials:
@@ -70,7 +68,7 @@ def estimate(
         ftol=_TOLERANCE,
         xtol=_TOLERANCE,
         gtol=1e-12,
-        max_nfev=max_evaluations,
+        max_nfev=200,
     )
     full = base.copy()
     full[chosen] = found.x
@@ -92,8 +90,6 @@ def multi_start(
     free: Sequence[int],
     starts: int,
     seed: int,
-    *,
-    spread: float = 0.5,
 ) -> tuple[Estimate, ...]:
     """Fits from the typical values and from points drawn about them, the best first.
 
@@ -111,7 +107,7 @@ def multi_start(
                 raise
         moved = typical.copy()
         chosen = np.asarray(free, dtype=int)
-        moved[chosen] += spread * rng.standard_normal(len(chosen))
+        moved[chosen] += 0.5 * rng.standard_normal(len(chosen))
         begin = np.clip(moved, -0.98, 0.98)
     return tuple(sorted(found, key=lambda item: item.misfit))
 
@@ -139,21 +135,12 @@ def _evaluation(
         if last is None or last[0] != t.tobytes():
             full = base.copy()
             full[chosen] = t
-            parts = [_part(model, full, trial, chosen) for trial in trials]
-            residual, jacobian = (np.concatenate(item) for item in zip(*parts, strict=True))
-            last = (t.tobytes(), residual, jacobian)
+            theta, residuals, slopes = physical(model, full), [], []
+            for trial in trials:
+                outputs, derivative = sensitivity(model, theta, trial.input, chosen)
+                residuals.append((outputs - trial.outputs).ravel())
+                slopes.append(derivative.reshape(-1, len(chosen)))
+            last = (t.tobytes(), np.concatenate(residuals), np.concatenate(slopes))
         return last[1], last[2]
 
-    def residual(t: Array) -> Array:
-        return evaluated(t)[0]
-
-    def derivative(t: Array) -> Array:
-        return evaluated(t)[1]
-
-    return residual, derivative
-
-
-def _part(model: ParametricModel, t: Array, trial: Trial, chosen: IntArray) -> tuple[Array, Array]:
-    outputs, derivative = sensitivity(model, physical(model, t), trial.input, chosen)
-    residual = (outputs - trial.outputs).ravel()
-    return residual, derivative.reshape(residual.size, len(chosen))
+    return lambda t: evaluated(t)[0], lambda t: evaluated(t)[1]

@@ -32,7 +32,6 @@ from impc.studies.selection.model import sensitivity
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from impc.arrays import Array
     from impc.studies.selection.model import ParametricModel, Trial
 
 # Singular values of the sensitivity below this, of the largest, are rounding or as good as that.
@@ -199,9 +198,11 @@ def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2)
                 "lower bound and bounds in [select]",
             )  # fmt: skip
         kept = _feasible(informations, grown, bound) if grown else []
-    if not best or len(best[0][0]) < least:
-        return Selection(bound, (), ())
-    ordered = sorted(best, key=lambda item: item[1])
+    return _selected(bound, best if best and len(best[0][0]) >= least else [])
+
+
+def _selected(bound: float, feasible: list[tuple[tuple[int, ...], float]]) -> Selection:
+    ordered = sorted(feasible, key=lambda item: item[1])
     return Selection(bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered))
 
 
@@ -227,11 +228,8 @@ def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> S
         subsets = list(itertools.combinations(range(count), size))
         found = _feasible(informations, subsets, bound)
         if found:
-            ordered = sorted(found, key=lambda item: item[1])
-            return Selection(
-                bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered)
-            )
-    return Selection(bound, (), ())
+            return _selected(bound, found)
+    return _selected(bound, [])
 
 
 def sweep(
