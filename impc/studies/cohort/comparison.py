@@ -147,11 +147,7 @@ def _interaction(
 
 
 def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
-    """Group effect with a mean for each visit and each subject, by restricted likelihood.
-
-    The effect lies between subjects: its t has so many degrees of freedom as there are subjects
-    less the two groups, which is exact where every subject has all visits.
-    """
+    """Group effect with a mean for each visit and each subject, by restricted likelihood."""
     rows = part[part["group"].isin([one, other])].dropna(subset=[measure])
     each = rows.groupby("group")["subject"].nunique()
     n = int(each.sum())
@@ -169,6 +165,7 @@ def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: st
         why = "; ".join(str(item.message) for item in raised[:1]) or "no deviation"
         found = _nothing("mixed", measure, condition, one, other, n)
         return replace(found, note=f"the mixed model did not converge ({one_line(why)[:60]})")
+    # The effect lies between subjects: exact where every subject has all visits.
     reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
     p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
     ends = effect - reach, effect + reach

@@ -23,10 +23,7 @@ _SOFT = "#8C8C8C"
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str], names: Mapping[str, str]) -> Figure:
-    """Measures of every unit by group and visit; bars are means.
-
-    A line joins the visits of one subject in one condition.
-    """
+    """Every unit by group and visit; a line joins the visits of one subject; bars are means."""
     groups = sorted(set(units["group"])) or [""]
     visits = list(dict.fromkeys(units["visit"]))
     rows = -(-len(measures) // _COLUMNS)

@@ -35,10 +35,7 @@ def not_identified(units: pd.DataFrame) -> dict[str, int]:
 
 
 def only_identified(units: pd.DataFrame) -> pd.DataFrame:
-    """The table `units` with NaN for each gain that `not_identified` has of its unit.
-
-    A gain without a column `K_deviation` stays as it is.
-    """
+    """The table `units` with NaN for each gain that `not_identified` has of its unit."""
     kept = units.copy()
     for name in units.columns:
         beside = f"K_deviation{name[1:]}"

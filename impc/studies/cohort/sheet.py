@@ -82,10 +82,7 @@ def _cells(where: str, path: Path) -> list[list[str]]:
 
 
 def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
-    """The cells of a column `name`: numbers where all are, else text; None where a cell is empty.
-
-    Decimal commas are read where the column has them throughout.
-    """
+    """The cells of a column `name`: numbers where all are, else text; None for an empty cell."""
     cells = [row[name] for row in sheet.rows]
     given = [cell for cell in cells if cell not in ("", "n/a")]
     where = f"{sheet.where}: column {name}"

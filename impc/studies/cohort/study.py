@@ -138,14 +138,13 @@ def _found(path: Path, table: StudyTable) -> list[Found]:
             f"{path}: study", f"has {', '.join(given) or 'none'} of recordings, table and bids",
             "give exactly one",
         )  # fmt: skip
-    where = f"{path}: study.{given[0]}"
+    where, written = f"{path}: study.{given[0]}", str(getattr(table, given[0]))
     try:
-        if table.recordings is not None:
-            found = find_by_pattern(where, path.parent, table.recordings)
-        elif table.bids is not None:
-            found = find_by_entities(path.parent / table.bids)
+        if given[0] == "recordings":
+            found = find_by_pattern(where, path.parent, written)
         else:
-            found = find_by_table(path.parent / str(table.table))
+            find = find_by_entities if given[0] == "bids" else find_by_table
+            found = find(path.parent / written)
     except OSError as error:
         raise InputError(where, f"cannot be looked for ({error.strerror})", "check it") from None
     if not found:
@@ -254,16 +253,13 @@ def _expression(where: str, pattern: str) -> str:
         raise InputError(
             where, f"has nothing between {together[0]}", "write a character between, or use `table`"
         )
-    expression, seen = "", set()
+    expression = ""
     for part in re.split(r"(\{\w+\})", Path(pattern).as_posix()):
-        name = part[1:-1]
-        if part.startswith("{") and name in seen:
-            expression += f"(?P={name})"
-        elif part.startswith("{"):
-            expression += f"(?P<{name}>{_NAME})"
-            seen.add(name)
-        else:
+        group = f"(?P<{part[1:-1]}>"
+        if not part.startswith("{"):
             expression += re.escape(part)
+        else:
+            expression += f"(?P={part[1:-1]})" if group in expression else f"{group}{_NAME})"
     return expression
 
 
@@ -286,12 +282,9 @@ def find_by_table(path: Path) -> list[Found]:
     sheet = read_sheet(path)
     if not {"file", "subject"} <= set(sheet.heads):
         raise InputError(sheet.where, "lacks a column", "name the columns file, subject")
-    found = []
-    for row in sheet.rows:
-        if not row["file"] or not row["subject"]:
-            raise InputError(sheet.where, "has a row without file or subject", "fill every row")
-        found.append((_labels(sheet.where, row), path.parent / row["file"]))
-    return found
+    if not all(row["file"] and row["subject"] for row in sheet.rows):
+        raise InputError(sheet.where, "has a row without file or subject", "fill every row")
+    return [(_labels(sheet.where, row), path.parent / row["file"]) for row in sheet.rows]
 
 
 def _labels(where: str, given: dict[str, str]) -> dict[str, str]:

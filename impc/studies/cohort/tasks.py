@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.assess.assessments import MethodFit
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
     from impc.inverse.estimates import Estimate
@@ -65,10 +64,7 @@ class FitTask:
 
 
 def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
-    """Tasks of all units by name, and the reason for each unit that has none.
-
-    All recordings are read from their first byte to their last, for the digests.
-    """
+    """Tasks of all units by name, and why a unit has none; every recording is read for a digest."""
     unused = set(unused_columns(study, source))
     tasks: dict[str, FitTask] = {}
     failed: dict[str, str] = {}
@@ -86,10 +82,7 @@ def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], 
 
 
 def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
-    """Columns of the participants that are no arguments of the plant of this `study`.
-
-    They stay out of the fit: age and sex of a subject are no fault of the table.
-    """
+    """Columns of the participants that are no arguments of the plant, and stay out of the fit."""
     names = {name: None for unit in study.units for name in unit.person}
     if ":" not in source.name:  # matrices in a file have no arguments of a person
         return tuple(names)
@@ -197,6 +190,8 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
     }
     limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
+    first = fitted.problem.recordings[0]
+    step = max(1, first.samples // _SHOWN)
     return {
         "states": plant.states,
         "controls": plant.controls,
@@ -228,7 +223,12 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
         "findings": [trial.findings for trial in problem.recordings],
-        "trajectory": _trajectory(fit),
+        # Of the first trial, a few hundred points.
+        "trajectory": {
+            "dt": plant.dt * step,
+            "recorded": first.outputs[::step],
+            "simulated": (fit.runs[0].x @ plant.C.T)[::step],
+        },
         "structure": unit_structure(problem, fitted, settings),
     }
 
@@ -241,15 +241,3 @@ def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Arra
         other = fit_controller(fitted.problem.leaving_out(index), fitted.stage_weights)
         rows[index] = left_out_vaf(other, problem.recordings[index], settings.settle).vaf
     return frozen(rows)
-
-
-def _trajectory(fit: MethodFit) -> dict[str, Any]:
-    """Recorded and simulated outputs of the first trial, a few hundred points."""
-    problem = fit.estimate.problem
-    trial, run = problem.recordings[0], fit.runs[0]
-    step = max(1, trial.samples // _SHOWN)
-    return {
-        "dt": problem.plant.dt * step,
-        "recorded": trial.outputs[::step],
-        "simulated": (run.x @ problem.plant.C.T)[::step],
-    }

@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 def unit_structure(
     problem: Problem, fitted: Estimate, settings: FitSettings
 ) -> dict[str, Any] | None:
-    """What a unit says within the structure, for its result; None where none is asked for.
-
-    Logarithms of cost weights with ends of 95 %; minus infinity, for a cost weight that is or may
-    be zero, becomes null when it is written.
-    """
+    """Logarithms of cost weights with ends of 95 %; None where no structure is asked for."""
     if settings.structure is None:
         return None
     structure = fit_structures(problem.plant, settings)[0]

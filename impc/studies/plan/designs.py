@@ -112,10 +112,7 @@ def try_design(
 
 
 def _held(person: Person, push: Array) -> tuple[Recording, Array] | None:
-    """The recording without noise and its inputs (samples, m), or None for a fall.
-
-    The trial is the perturbation `push` (samples, d), and a rest as long.
-    """
+    """The recording of a `push` (samples, d) and its inputs (samples, m), or None for a fall."""
     plant, samples = person.controller.plant, len(push)
     alone = np.vstack([push, np.zeros_like(push)])
     run = simulate(person.controller, scenario(plant, np.zeros(plant.n), disturbance=alone))

@@ -88,10 +88,7 @@ def visit_anova(scores: Array) -> Anova:
 
 
 def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
-    """Every pair of visits; subjects who lack one of the two are left out of that pair.
-
-    `scores` (subjects, visits).
-    """
+    """Every pair of visits, of subjects who have both; `scores` (subjects, visits)."""
     rows = []
     for i, j in itertools.combinations(range(len(visits)), 2):
         both = scores[np.all(np.isfinite(scores[:, [i, j]]), axis=1)]

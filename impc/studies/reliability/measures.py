@@ -58,10 +58,7 @@ def rms(outputs: Array) -> Array:
 
 
 def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
-    """Largest contiguous range of excited frequencies with power above a share of the peak.
-
-    `signal` (samples,); `rate` in second.
-    """
+    """Largest contiguous range of excited frequencies of a `signal` (samples,) at `rate` per s."""
     frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
     power[0] = 0.0
     peak = float(power.max(initial=0.0))
@@ -80,10 +77,7 @@ def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
 
 
 def band_energy(outputs: Array, rate: float, low: float, high: float) -> Array:
-    """Mean bandpass signal energy (2.1) of each output (p,), in its unit squared.
-
-    `outputs` (samples, p); `rate` in second.
-    """
+    """(2.1) of outputs (samples, p) at `rate` per s: (p,), in their unit squared."""
     frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=0)
     step = float(frequency[1] - frequency[0])
     rounding = 1e-6 * step
@@ -112,10 +106,7 @@ class TransferFunction:
 def transfer_function(
     inputs: Sequence[Array], outputs: Sequence[Array], rate: float, band: Passband
 ) -> TransferFunction:
-    """Estimate from one or several trials of the same length.
-
-    `inputs` (samples,); `outputs` (samples, p); `rate` in second.
-    """
+    """From trials of one length: inputs (samples,), outputs (samples, p), at `rate` per s."""
     if not inputs:
         raise DataError("transfer function", "has no trial", "give one or more")
     lengths = {len(item) for item in (*inputs, *outputs)}

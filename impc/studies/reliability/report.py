@@ -120,16 +120,11 @@ def _icc(own: Sequence[MeasureResult], measure: str) -> Finding:
         factor, unit = shown_score(item)
         row: dict[str, Any] = {"condition": item.condition, "output": item.output}
         if item.icc is not None and item.error is not None:
-            row |= {
-                "icc": item.icc.value,
-                "low": item.icc.low,
-                "high": item.icc.high,
-                "reliability": interval_band(item.icc.low, item.icc.high),
-                "sem": factor * item.error.sem,
-                "mdc": factor * item.error.mdc,
-                "unit": unit,
-                "subjects": item.icc.subjects,
-            }
+            value, low, high, subjects, _ = item.icc
+            row |= {"icc": value, "low": low, "high": high}
+            row |= {"reliability": interval_band(low, high)}
+            row |= {"sem": factor * item.error.sem, "mdc": factor * item.error.mdc}
+            row |= {"unit": unit, "subjects": subjects}
         rows.append(row | {"notes": "; ".join(item.notes)})
     caption = (
         f"Counterpart of table {'2.2' if measure == 'rms' else '2.3'}: between-visit reliability "

@@ -150,9 +150,8 @@ def fit_nominal(
     found = fisher_information(model, np.array(nominal.theta), trials)
     swept = sweep([found.F], settings.bounds, settings.least)
     seconds = time.perf_counter() - started
-    return Nominal(
-        nominal, found, null_directions(model, found), unseen_scalings(model, found), swept, seconds
-    )
+    unseen, scalings = null_directions(model, found), unseen_scalings(model, found)
+    return Nominal(nominal, found, unseen, scalings, swept, seconds)
 
 
 def fit_chosen(
@@ -190,10 +189,7 @@ class BootstrapIntervals(Frozen):
 
 
 def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """A `Draw` row by row: residuals `parts` (samples, p) of each trial to as many, (samples, p).
-
-    Rows come from all trials; `rng` is what is drawn from.
-    """
+    """A `Draw` row by row of all trials: residuals `parts` (samples, p) of each, drawn by `rng`."""
     pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
 

@@ -85,10 +85,7 @@ def key_parameters(
     least_reliability: float = 0.75,
     most: int = 20,
 ) -> KeyParameters:
-    """Choose key parameters of a study of several subjects and visits.
-
-    `recorded` (subject, visit).
-    """
+    """Choose key parameters of a study; `recorded` by (subject, visit)."""
     trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
     informations = [np.asarray(item.information.F) for item in nominal.values()]

@@ -81,14 +81,8 @@ def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
     exponential, change = _exponentials(joined, along)
     dA, dB = change[:, :n, :n].copy(), change[:, :n, n:].copy()
     dC = derivatives[2].T.reshape(k, n, C.shape[0]).transpose(0, 2, 1)
-    return Discrete(
-        np.ascontiguousarray(exponential[:n, :n]),
-        np.ascontiguousarray(exponential[:n, n:]),
-        np.asarray(C),
-        dA,
-        dB,
-        np.ascontiguousarray(dC),
-    )
+    A, B = map(np.ascontiguousarray, np.split(exponential[:n], [n], axis=1))
+    return Discrete(A, B, np.asarray(C), dA, dB, np.ascontiguousarray(dC))
 
 
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:

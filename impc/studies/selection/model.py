@@ -121,10 +121,7 @@ def physical(model: ParametricModel, t: Array) -> Array:
 def sensitivity(
     model: ParametricModel, theta: Array, given: Array, free: IntArray | None = None
 ) -> tuple[Array, Array]:
-    """Outputs of the model, and their derivative with respect to normalised parameters.
-
-    `theta` (k,); `given` (samples, d); `free` (f,).
-    """
+    """Outputs at theta (k,), input (samples, d); derivatives by normalised parameters (f,)."""
     along = np.arange(model.size) if free is None else free
     if model.jacobian is not None:
         outputs, derivative = model.jacobian(theta, given, along)
