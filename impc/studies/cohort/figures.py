@@ -9,7 +9,7 @@ import numpy as np
 
 from impc.model.plant import UNKNOWN
 from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
-from impc.studies.cohort.identified import measure_words
+from impc.studies.cohort.comparison import measure_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -15,20 +15,21 @@ from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
-from impc.studies.cohort.comparison import compare_cohort, measures_of
-from impc.studies.cohort.figures import group_figure
-from impc.studies.cohort.identified import (
+from impc.studies.cohort.comparison import (
+    compare_cohort,
     measure_words,
+    measures_of,
     not_identified,
     only_identified,
     unidentified_sentences,
 )
+from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.subject_page import described_signals, subject_files
 from impc.studies.cohort.tables import cohort_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.studies.cohort.comparison import Comparison
     from impc.studies.cohort.engine import Failures, Store
@@ -41,12 +42,20 @@ _QUESTIONS = {
     "mixed": "between groups, over all visits (mixed model of the cost weights)",
     "reliability": "reliability between visits",
 }
+_COMPARED = (
+    "Gains are what the recordings give. Cost weights are {}. Holm's correction is over the "
+    "measures of one question."
+)
 _WITHIN = "those of the structure, compared in their logarithms"
 _CENTRE = (
     "those of the analytic centre of all weights with the same gain: a choice, the same for every "
     "subject"
 )
 _NUMBERS = ("n", "estimate", "low", "high", "effect", "p", "p_holm", "note")
+_RUN = Markup(
+    "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
+    "numbers, cohort.log the times."
+)
 _GROUPS = Picture(
     "groups",
     "Measures of every unit by group",
@@ -67,12 +76,7 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, subject_files(subject, own, store, failures))
     signals = described_signals(study.units, store)
-    measures = _most_telling(compared, units) if len(units) else []
-    figures = {}
-    if measures:
-        with journal_style():
-            shown = group_figure(only_identified(units), measures, signals.get("units", {}))
-            figures = drawn({"groups": shown})
+    figures = _figures(units, compared, signals.get("units", {}))
     left_out = {name: n for name, n in not_identified(units).items() if name in measures_of(units)}
     said = [
         *_findings(compared),
@@ -87,19 +91,6 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         f"{len(tables['replicates'])} bootstrap replicates of {count * len(units)} done, "
         f"{sum(map(len, failures.replicates.values()))} failed."
     )
-    compared_in = (
-        "Gains are what the recordings give. Cost weights are "
-        f"{_WITHIN if 'structure_refused' in units.columns else _CENTRE}. "
-        "Holm's correction is over the measures of one question."
-    )
-    links = Markup(", ").join(
-        Markup('<a href="subjects/sub-{}.html">{}</a>').format(safe_name(name), name)
-        for name in subjects
-    )
-    run = Markup(
-        "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
-        "numbers, cohort.log the times."
-    ).format(command)
     report = Report(
         "impc cohort",
         f"Groups and visits of {len(subjects)} subjects",
@@ -109,13 +100,13 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
             Section(
                 "1. Groups and visits",
                 [
-                    compared_in,
+                    _COMPARED.format(_WITHIN if "structure_refused" in units.columns else _CENTRE),
                     *([_GROUPS] if figures else []),
                     *([_comparison(compared)] if compared else []),
                 ],
             ),
-            Section("2. Subjects", [links, *_unit_findings(units)]),
-            Section("3. The run", [run]),
+            Section("2. Subjects", [_links(subjects), *_unit_findings(units)]),
+            Section("3. The run", [_RUN.format(command)]),
         ],
         figures=figures,
         provenance=Provenance(command=command),
@@ -131,6 +122,13 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         beside=[Finding(name, table) for name, table in tables.items()],
     )
     write_files(store.folder, report.files())
+
+
+def _links(subjects: Iterable[str]) -> str:
+    return Markup(", ").join(
+        Markup('<a href="subjects/sub-{}.html">{}</a>').format(safe_name(name), name)
+        for name in subjects
+    )
 
 
 def _unit_findings(units: pd.DataFrame) -> list[Finding]:
@@ -230,6 +228,15 @@ def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> list[str]
         "often than another, what is left may understate how the groups differ: compare the "
         "numbers of falls as well."
     ]
+
+
+def _figures(
+    units: pd.DataFrame, compared: tuple[Comparison, ...], names: Mapping[str, str]
+) -> dict[str, bytes]:
+    measures = _most_telling(compared, units) if len(units) else []
+    with journal_style():
+        shown = only_identified(units)
+        return drawn({"groups": group_figure(shown, measures, names)} if measures else {})
 
 
 def _most_telling(compared: tuple[Comparison, ...], units: pd.DataFrame) -> list[str]:
