@@ -52,18 +52,11 @@ class Store:
         """Where they are kept."""
         return Cache(self.folder / "units")
 
-    def fit(self, unit: str) -> dict[str, Any] | None:
-        """The fit of a unit, or None."""
-        return self._find(unit, _fit(unit))
-
-    def replicate(self, unit: str, index: int) -> dict[str, Any] | None:
-        """The replicate `index` of a `unit`, or None."""
-        return self._find(unit, _replicate(unit, index))
-
-    def _find(self, unit: str, name: str) -> dict[str, Any] | None:
+    def fit(self, unit: str, index: int | None = None) -> dict[str, Any] | None:
+        """The fit of a unit, or its replicate `index`; None where there is none."""
         if unit not in self.digests:
             return None
-        found: dict[str, Any] | None = self.cache.find(name, self.digests[unit])
+        found: dict[str, Any] | None = self.cache.find(_name(unit, index), self.digests[unit])
         return found
 
     def log(self, line: str) -> None:
@@ -99,12 +92,9 @@ class Failures:
         return bool(self.units or self.replicates)
 
 
-def _fit(unit: str) -> str:
-    return f"{unit}/fit"
-
-
-def _replicate(unit: str, index: int) -> str:
-    return f"{unit}/replicate-{index:04d}"
+def _name(unit: str, index: int | None = None) -> str:
+    """Of the result of a fit, or of its replicate `index`."""
+    return f"{unit}/fit" if index is None else f"{unit}/replicate-{index:04d}"
 
 
 def work_kept(study: Study, store: Store) -> tuple[int, int]:
@@ -113,7 +103,7 @@ def work_kept(study: Study, store: Store) -> tuple[int, int]:
     names = [
         name
         for unit in study.units
-        for name in (_fit(unit.name), *(_replicate(unit.name, index) for index in range(count)))
+        for name in (_name(unit.name), *(_name(unit.name, index) for index in range(count)))
     ]
     return sum(store.cache.path(name).exists() for name in names), len(names)
 
@@ -126,7 +116,7 @@ def require_same(store: Store) -> None:
     except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: no result is used then
         return  # that has another digest
     for unit, digest in before.items():
-        path = store.cache.path(_fit(unit))
+        path = store.cache.path(_name(unit))
         if digest not in (None, store.digests[unit]) and path.exists():
             raise InputError(
                 f"file {path}",
@@ -163,7 +153,7 @@ def run_study(
     write_files(store.folder, {"manifest.json": text.encode()})
     store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     failures, cache = Failures(), store.cache
-    queue = deque(Task(_fit(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
+    queue = deque(Task(_name(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
     for result in run(pool, queue, cache):
         task, content = result.task, result.content
         unit, _, name = task.name.partition("/")
@@ -186,7 +176,7 @@ def run_study(
             # Before other fits: a unit is finished before the next is begun.
             needed = {key: content[key] for key in _NEEDED}
             queue.extendleft(
-                Task(_replicate(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
+                Task(_name(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
                 for k in reversed(range(count))
             )
         done(result)
@@ -195,7 +185,7 @@ def run_study(
 
 def keep_failure(store: Store, unit: str, reason: str) -> None:
     """Write down the `reason` why a `unit` cannot be fitted: none of its recordings can be read."""
-    store.cache.keep(_failed(_fit(unit)), "", {"reason": reason})
+    store.cache.keep(_failed(_name(unit)), "", {"reason": reason})
 
 
 def _failed(name: str) -> str:

@@ -13,7 +13,7 @@ from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.style import drawn, journal_style
 from impc.studies.cohort.figures import subject_figure
 from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.unit_structure import or_nan
+from impc.studies.cohort.tables import or_nan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

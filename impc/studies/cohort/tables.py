@@ -20,7 +20,6 @@ import pandas as pd
 from impc.arrays import percentiles
 from impc.assess.assessments import ASSESSMENTS
 from impc.studies.cohort.study import LABELS
-from impc.studies.cohort.unit_structure import structure_row
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -43,7 +42,7 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
         units.append(labels | _unit_row(fit))
         drawn = {}
         for index in range(count):
-            found = store.replicate(unit.name, index)
+            found = store.fit(unit.name, index)
             if found is not None:
                 drawn[index + 1] = _gain(fit, "K", found["K"]) | dict(
                     zip(fit["parameters"], found["parameters"], strict=True)
@@ -105,3 +104,22 @@ def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, A
             "level": 0.95,
             "replicates": len(drawn),
         }
+
+
+def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
+    """The columns of units.csv, from the content of a `fit`; none without a structure."""
+    found = fit.get("structure")
+    if found is None:
+        return {}
+    heads = {"log_cost_weight": "", "low": "_low", "high": "_high"}
+    row: dict[str, Any] = {
+        f"log_cost_weight{end}.{unknown}": or_nan(value)
+        for name, end in heads.items()
+        for unknown, value in zip(found["unknowns"], found[name], strict=True)
+    }
+    return row | {"structure_refused": bool(found["refused"]), "structure_p": or_nan(found["p"])}
+
+
+def or_nan(value: float | None) -> float:
+    """A `value` that may be missing, as JSON and pandas have it."""
+    return float("nan") if value is None else float(value)

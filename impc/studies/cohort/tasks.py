@@ -21,18 +21,20 @@ from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent_statements import intent
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, bootstrap_model, replicate
+from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
 from impc.checking import replace
-from impc.errors import DataError, ImpcError
+from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.structured_fit import fit_structured
 from impc.model.plant import weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_words
-from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.effort import Effort, fit_effort
+from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.gain_findings import number_units
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
@@ -47,9 +49,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
-
-# Points of a trajectory that are kept for pictures.
-_SHOWN = 600
 
 
 @dataclass(frozen=True)
@@ -191,7 +190,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     }
     limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     first = fitted.problem.recordings[0]
-    step = max(1, first.samples // _SHOWN)
+    step = max(1, first.samples // 600)
     return {
         "states": plant.states,
         "controls": plant.controls,
@@ -229,7 +228,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
             "recorded": first.outputs[::step],
             "simulated": (fit.runs[0].x @ plant.C.T)[::step],
         },
-        "structure": unit_structure(problem, fitted, settings),
+        "structure": _structure(problem, fitted, settings),
     }
 
 
@@ -241,3 +240,26 @@ def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Arra
         other = fit_controller(fitted.problem.leaving_out(index), fitted.stage_weights)
         rows[index] = left_out_vaf(other, problem.recordings[index], settings.settle).vaf
     return frozen(rows)
+
+
+def _structure(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any] | None:
+    """Logarithms of cost weights with ends of 95 %; None where no structure is asked for."""
+    if settings.structure is None:
+        return None
+    structure = fit_structures(problem.plant, settings)[0]
+    record: dict[str, Any] = {"name": structure.name, "unknowns": structure.unknowns}
+    try:
+        found = fit_structured(problem, structure, fitted)
+        fit = assess_structure(problem, structure, found, fitted, settings.settle, held_out=False)
+    except (SolverError, WeightsError) as error:
+        nothing = [np.nan] * structure.count
+        ends = dict.fromkeys(("log_cost_weight", "low", "high"), nothing)
+        return record | ends | {"refused": True, "p": np.nan, "reason": str(error)}
+    return record | {
+        "log_cost_weight": [item.value for item in fit.intervals],
+        "low": [item.low for item in fit.intervals],
+        "high": [item.high for item in fit.intervals],
+        "refused": fit.refused,
+        "p": np.nan if fit.test is None else fit.test.probability,
+        "reason": "",
+    }

@@ -146,8 +146,6 @@ def plan_effort(person: Person, settings: PlanSettings) -> Effort:
 
 # Correlation left of the noise before the first sample: 1e-6.
 _FORGOTTEN = 14.0
-# Of a normal distribution, one deviation to each side.
-_MIDDLE = (15.866, 84.134)
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ class SimulatedFits(Frozen):
 
 def spread(values: Array) -> Array:
     """Half of what the middle 68 % span (k,), of values (fits, k): a deviation without tails."""
-    low, high = np.percentile(values, _MIDDLE, axis=0, method="inverted_cdf")
+    low, high = np.percentile(values, (15.866, 84.134), axis=0, method="inverted_cdf")
     return np.asarray((high - low) / 2)
 
 

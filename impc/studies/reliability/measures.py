@@ -34,7 +34,6 @@ from impc.errors import DataError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_SHARE = 0.03
 # Power below this share of the peak is none: rounding, and what a window leaks.
 _NOTHING = 1e-6
 # A period's odd harmonics are half of all frequencies.
@@ -57,7 +56,7 @@ def rms(outputs: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(np.asarray(outputs) ** 2, axis=0)))
 
 
-def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
+def passband(signal: Array, rate: float) -> Passband:
     """Largest contiguous range of excited frequencies of a `signal` (samples,) at `rate` per s."""
     frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
     power[0] = 0.0
@@ -68,7 +67,7 @@ def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
     if len(excited) > _MOST_LINES * len(power):  # no line spectrum
         power = scipy.ndimage.uniform_filter1d(power, _NEIGHBOURS)
         peak = float(power.max())
-    above = power[excited] > share * peak
+    above = power[excited] > 0.03 * peak
     runs = np.split(np.arange(len(excited)), np.flatnonzero(np.diff(above.astype(int))) + 1)
     inside = [run for run in runs if above[run[0]]]
     best = max(inside, key=lambda run: int(excited[run[-1]] - excited[run[0]]))

@@ -52,8 +52,6 @@ _PICTURES = (
         "Counterpart of figure 2.6: one condition and visit, several subjects.",
     ),
 )
-
-
 _VISITS = Picture(
     "visits",
     "Root-mean-square of every person at every visit, one line a person",

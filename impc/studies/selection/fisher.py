@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 # Singular values of the sensitivity below this, of the largest, are rounding or as good as that.
 _RANK = 1e-6
-_NAMED = 0.1
-_UNSEEN = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[s
     return tuple(
         tuple(names)
         for kind, names in kinds.items()
-        if kind and len(names) > 1 and common_scaling(model, found, names) <= _UNSEEN
+        if kind and len(names) > 1 and common_scaling(model, found, names) <= 1
     )
 
 
@@ -114,7 +112,7 @@ def null_directions(model: ParametricModel, found: Information) -> tuple[NullDir
     for index in range(model.size - 1, found.rank - 1, -1):
         v = vectors[index] * np.sign(vectors[index][np.argmax(np.abs(vectors[index]))])
         order = np.argsort(-np.abs(v), kind="stable")
-        shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= _NAMED}
+        shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= 0.1}
         parts = ", ".join(f"{name} {share:+.2f}" for name, share in shares.items())
         seen = float(values[index] / values[0])
         sentence = (

@@ -79,20 +79,18 @@ def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -
     """The largest selection of at most `count` parameters along lambda, by bisection."""
     low, high, solves = 1e-8, 1e3, 0
     best: tuple[float, Array, float] | None = None
-    for _ in range(40):
+    while solves < 40 and high / low >= 1.01:
         middle = float(np.sqrt(low * high))
         t, objective = proximal_lasso(model, trials, middle)
         solves += 1
         chosen = _selected(model, t)
-        if len(chosen) <= count:
-            high = middle
-            if best is None or len(chosen) >= len(_selected(model, best[1])):
-                best = (middle, t, objective)
-            if len(chosen) == count:
-                break
-        else:
+        if len(chosen) > count:
             low = middle
-        if high / low < 1.01:
+            continue
+        high = middle
+        if best is None or len(chosen) >= len(_selected(model, best[1])):
+            best = (middle, t, objective)
+        if len(chosen) == count:
             break
     if best is None:
         best = (high, *proximal_lasso(model, trials, high))
