@@ -205,7 +205,10 @@ class Processes:
                 except (EOFError, OSError):
                     if self._closed:
                         return
-                    code = self._buried(worker)
+                    self._workers.remove(worker)
+                    worker.pipe.close()
+                    worker.process.join()
+                    code = worker.process.exitcode or 0
                     worker = self._started()
                 else:
                     break
@@ -236,13 +239,6 @@ class Processes:
         if self._closed:
             process.terminate()
         return worker
-
-    def _buried(self, worker: _Worker) -> int:
-        """The status with which a worker has ended."""
-        self._workers.remove(worker)
-        worker.pipe.close()
-        worker.process.join()
-        return worker.process.exitcode or 0
 
 
 @dataclass(frozen=True)

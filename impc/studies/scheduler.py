@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _PATIENCE = "10s"
 # Seconds for which the number of threads holds: to ask takes a millisecond.
 _HOLDS = 5.0
+_OPTIONS = ("--tls-ca", "--tls-cert", "--tls-key")
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,7 @@ def _silent() -> Iterator[None]:
 
 
 def _security(cluster: Cluster, address: str) -> Any:
-    files = {
-        "--tls-ca": cluster.tls_ca,
-        "--tls-cert": cluster.tls_cert,
-        "--tls-key": cluster.tls_key,
-    }
+    files = dict(zip(_OPTIONS, (cluster.tls_ca, cluster.tls_cert, cluster.tls_key), strict=True))
     missing = [name for name, path in files.items() if path is None]
     if not address.startswith("tls://"):
         if len(missing) < len(files):

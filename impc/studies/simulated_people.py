@@ -11,7 +11,7 @@ The controller is that of (3.1); docs/fitting.md has what a fit makes of such su
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -57,18 +57,18 @@ def simulate_subject(
     largest: float = 1e3,
     seed: int | np.random.SeedSequence = 0,
 ) -> SubjectTrial:
-    """Simulate one trial from rest.
-
-    `disturbance` (samples, d); `rate` in second; `motor` (m,); `sensor` (p,).
-    """
-    plant, within = controller.plant, _samples_within(rate, controller.plant.dt)
+    """A trial from rest; `disturbance` (samples, d), `rate` per s, `motor` (m,), `sensor` (p,)."""
+    plant, dt = controller.plant, controller.plant.dt
+    within = round(rate * dt)  # Samples of the recording in one of the controller's
+    if within < 1 or abs(within / (rate * dt) - 1) > 1e-9:
+        raise InputError("rate", f"got {rate:g} per s", f"give a multiple of {1 / dt:g} per s")
     columns = np.asarray(disturbance, dtype=np.float64)
     d = finite_array(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (None, plant.E.shape[1])
     )
     rng = np.random.default_rng(seed)
-    noise = _Noise(rng, np.asarray(motor), _Senses(plant, person))
-    x, u, end = _moved(controller, step.mapaccum(within), d, within, noise, largest)
+    senses = _Senses(plant, person, rng, np.asarray(motor))
+    x, u, end = _moved(controller, step.mapaccum(within), d, within, senses, largest)
     limits = controller.bounds
     sensed = np.asarray(sensor) * rng.standard_normal((len(d), len(plant.outputs)))
     return SubjectTrial(
@@ -82,26 +82,13 @@ def simulate_subject(
     )
 
 
-class _Noise(NamedTuple):
-    """Noise of the motor: numbers drawn, and their standard deviation, one or (m,); the senses."""
-
-    rng: np.random.Generator
-    deviation: Array
-    senses: _Senses
-
-    def on(self, command: Array) -> Array:
-        """Motor noise beside a command (m,)."""
-        person, deviation = self.senses.person, self.deviation
-        if person is not None:
-            deviation = np.hypot(person.motor, person.share * command)
-        return np.asarray(deviation * self.rng.standard_normal(len(command)))
-
-
 class _Senses:
-    """What a person takes for the state: the state itself, or an estimate."""
+    """What a person takes for the state, the state itself or an estimate; noise of the motor."""
 
-    def __init__(self, plant: Plant, person: Observer | None) -> None:
-        self.plant, self.person = plant, person
+    def __init__(
+        self, plant: Plant, person: Observer | None, rng: np.random.Generator, motor: Array
+    ) -> None:
+        self.plant, self.person, self.rng, self.motor = plant, person, rng, motor
         if person is not None and np.any(person.process):
             raise InputError("process", "cannot be simulated here", "leave it at 0")
         self.estimating = person is not None and person.estimates
@@ -119,11 +106,18 @@ class _Senses:
         """Estimate (n,) at a `state` (n,)."""
         return np.asarray(self.found[: self.plant.n]) if self.estimating else state
 
-    def look(self, rng: np.random.Generator, state: Array, command: Array, d: Array) -> None:
+    def noise(self, command: Array) -> Array:
+        """Motor noise beside a command (m,)."""
+        deviation, person = self.motor, self.person
+        if person is not None:
+            deviation = np.hypot(person.motor, person.share * command)
+        return np.asarray(deviation * self.rng.standard_normal(len(command)))
+
+    def look(self, state: Array, command: Array, d: Array) -> None:
         """Sense a state (n,); a command (m,), and a known perturbation d (d,), have acted."""
         if self.person is None or not self.estimating:
             return
-        noise = self.person.sensory * rng.standard_normal(len(self.C))
+        noise = self.person.sensory * self.rng.standard_normal(len(self.C))
         error = self.person.C @ state + noise - self.C @ self.found
         self.found = self.F @ self.found + self.L @ error
         self.found[: self.plant.n] += self.plant.B @ command
@@ -131,16 +125,8 @@ class _Senses:
             self.found[: self.plant.n] += self.plant.E @ d
 
 
-def _samples_within(rate: float, dt: float) -> int:
-    """How many samples of the recording one of the controller's takes."""
-    within = round(rate * dt)
-    if within < 1 or abs(within / (rate * dt) - 1) > 1e-9:
-        raise InputError("rate", f"got {rate:g} per s", f"give a multiple of {1 / dt:g} per s")
-    return within
-
-
 def _moved(
-    controller: Controller, several: Any, d: Array, within: int, noise: _Noise, largest: float
+    controller: Controller, several: Any, d: Array, within: int, senses: _Senses, largest: float
 ) -> tuple[Array, Array, int | None]:
     """States (samples, n), commands (samples, m), and the sample of a fall, from rest."""
     plant, samples = controller.plant, len(d)
@@ -149,14 +135,14 @@ def _moved(
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
     state = np.zeros(plant.n)
     for first in range(0, samples, within):
-        run, _ = run_loop(prepared, Scenario(noise.senses.of(state), still))
+        run, _ = run_loop(prepared, Scenario(senses.of(state), still))
         last = min(first + within, samples)
         if run.status[0] > Status.SOFTENED:
             x[first:], u[first:] = state, u[first - 1]
             return x, u, first
         command = run.u[0]
-        moved = command + noise.on(command)
-        noise.senses.look(noise.rng, state, command, np.mean(d[first:last], axis=0))
+        moved = command + senses.noise(command)
+        senses.look(state, command, np.mean(d[first:last], axis=0))
         inputs = np.hstack(
             [np.tile(moved, (within, 1)), np.resize(d[first:last], (within, d.shape[1]))]
         )

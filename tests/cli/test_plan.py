@@ -31,7 +31,7 @@ Q = "diagonal"
 over = ["theta1", "theta2"]
 
 [plan]
-cost weights = { theta1 = 6e3, theta2 = 9e3 }
+cost_weights = { theta1 = 6e3, theta2 = 9e3 }
 noise = { theta1 = "0.05 deg", theta2 = "0.05 deg" }
 correlation = 0.02
 stops = { theta1 = "12 deg" }
@@ -120,8 +120,8 @@ def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
         (('"0.05 deg", theta2', '"0.05 kg", theta2'), "noise theta1: is in kg"),
         (('"0.05 deg", theta2', '"deg", theta2'), "noise theta1: got deg"),
         (("theta1 = 6e3, ", ""), "[plan] cost_weights: lacks 'theta1'"),
-        (("theta1 = 6e3", "theta1 = 0"), "cost weights theta1: got 0"),
-        (("theta1 = 6e3", "angle = 1, theta1 = 6e3"), "cost weights angle: is not a feature"),
+        (("theta1 = 6e3", "theta1 = 0"), "cost_weights theta1: got 0"),
+        (("theta1 = 6e3", "angle = 1, theta1 = 6e3"), "cost_weights angle: is not a feature"),
         (("u_max = 6.0", 'bounded_states = { theta1 = "data" }'), 'bounded_states: is "data"'),
         (("[plan]", "[plann]"), "plann: is not known"),
     ],

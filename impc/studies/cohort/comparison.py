@@ -6,7 +6,7 @@
     all visits     a mixed model of cost weights within a structure: group, visit, a mean for each
     subject reliability    ICC(A,1) between visits
 
-A gain that the recordings of a unit do not say is no datum (`impc.studies.cohort.identified`).
+A gain that the recordings of a unit do not say is no datum (`not_identified`).
 Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
 """
 
@@ -24,11 +24,10 @@ from statsmodels.regression.mixed_linear_model import MixedLM
 from impc.assess.several_tests import holm
 from impc.checking import replace
 from impc.errors import DataError, one_line
-from impc.studies.cohort.identified import only_identified
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping
 
     import pandas as pd
 
@@ -36,6 +35,11 @@ if TYPE_CHECKING:
 
 _FEWEST = 3
 _COST_WEIGHT = "log_cost_weight."
+# A deviation may be so many times the usual size of an entry. Small entries that are well
+# identified stay: those of a gain whose truth is zero have a median size of 0.67 of their
+# deviation. It is not compared with the unit's own value, for what stayed would then be too large
+# on average.
+_LARGEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,8 @@ class Comparison:
     high: float
     effect: float  # Hedges' g or d_z; NaN for the others
     p: float  # NaN for the reliability
-    p_holm: float
     n: int  # Subjects
+    p_holm: float = np.nan
     note: str = ""  # Why there is no number; empty otherwise
 
 
@@ -75,13 +79,11 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
     return (*penalised, *(named or gains), *(() if penalised else centre), *shares)
 
 
-def compare_cohort(
-    units: pd.DataFrame, measures: Sequence[str] | None = None
-) -> tuple[Comparison, ...]:
+def compare_cohort(units: pd.DataFrame) -> tuple[Comparison, ...]:
     """Answer every question that the units allow; gains that a unit does not say are left out."""
     if len(units) == 0:
-        raise DataError("cohort", "has no unit with a result", "see the reasons in the report")
-    chosen = measures_of(units) if measures is None else tuple(measures)
+        return ()
+    chosen = measures_of(units)
     found: list[Comparison] = []
     for condition, part in only_identified(units).groupby("condition", sort=True, dropna=False):
         stated = str(condition)
@@ -116,7 +118,7 @@ def _welch(
     interval = test.confidence_interval(0.95)
     return Comparison(
         question, measure, condition, one, other, float(b.mean() - a.mean()),
-        float(interval.low), float(interval.high), _hedges(a, b), float(test.pvalue), np.nan, n,
+        float(interval.low), float(interval.high), _hedges(a, b), float(test.pvalue), n,
     )  # fmt: skip
 
 
@@ -132,7 +134,7 @@ def _visits(part: pd.DataFrame, measure: str, condition: str, one: str, other: s
     return Comparison(
         "visit", measure, condition, one, other, float(difference.mean()), float(interval.low),
         float(interval.high), float(difference.mean() / spread) if spread else np.nan,
-        float(test.pvalue), np.nan, len(both),
+        float(test.pvalue), len(both),
     )  # fmt: skip
 
 
@@ -151,19 +153,15 @@ def _interaction(
 
 
 def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
-    """Group effect with a mean for each visit and each subject, by restricted likelihood.
-
-    The effect lies between subjects: its t has so many degrees of freedom as there are subjects
-    less the two groups, which is exact where every subject has all visits.
-    """
+    """Group effect with a mean for each visit and each subject, by restricted likelihood."""
     rows = part[part["group"].isin([one, other])].dropna(subset=[measure])
     each = rows.groupby("group")["subject"].nunique()
     n = int(each.sum())
     if min(each.get(one, 0), each.get(other, 0)) < _FEWEST:
         return _nothing("mixed", measure, condition, one, other, n)
     visits = list(dict.fromkeys(rows["visit"]))[1:]
-    second = np.asarray(rows["group"] == other, dtype=np.float64)
-    design = [np.ones(len(rows)), second, *(np.asarray(rows["visit"] == v, float) for v in visits)]
+    second = [rows["group"] == other, *(rows["visit"] == visit for visit in visits)]
+    design = [np.ones(len(rows)), *(one.to_numpy(float) for one in second)]
     with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")
         model = MixedLM(np.asarray(rows[measure], float), np.transpose(design), rows["subject"])
@@ -173,12 +171,11 @@ def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: st
         why = "; ".join(str(item.message) for item in raised[:1]) or "no deviation"
         found = _nothing("mixed", measure, condition, one, other, n)
         return replace(found, note=f"the mixed model did not converge ({one_line(why)[:60]})")
+    # The effect lies between subjects: exact where every subject has all visits.
     reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
     p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
-    return Comparison(
-        "mixed", measure, condition, one, other, effect, effect - reach, effect + reach, np.nan, p,
-        np.nan, n,
-    )  # fmt: skip
+    ends = effect - reach, effect + reach
+    return Comparison("mixed", measure, condition, one, other, effect, *ends, np.nan, p, n)
 
 
 def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison:
@@ -187,10 +184,8 @@ def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison
         found = icc(wide.to_numpy(), "A,1")
     except DataError:
         return _nothing("reliability", measure, condition, "", "", len(wide.dropna()))
-    return Comparison(
-        "reliability", measure, condition, "", "", found.value, found.low, found.high, np.nan,
-        np.nan, np.nan, found.subjects,
-    )  # fmt: skip
+    nan, ends = float("nan"), (found.value, found.low, found.high)
+    return Comparison("reliability", measure, condition, "", "", *ends, nan, nan, found.subjects)
 
 
 def _hedges(a: Array, b: Array) -> float:
@@ -205,10 +200,9 @@ def _hedges(a: Array, b: Array) -> float:
 def _nothing(
     question: str, measure: str, condition: str, one: str, other: str, n: int
 ) -> Comparison:
-    nan = float("nan")
-    note = f"too few subjects ({n})"
+    nan, note = float("nan"), f"too few subjects ({n})"
     return Comparison(
-        question, measure, condition, one, other, nan, nan, nan, nan, nan, nan, n, note
+        question, measure, condition, one, other, nan, nan, nan, nan, nan, n, note=note
     )
 
 
@@ -218,3 +212,57 @@ def _holm(found: list[Comparison]) -> list[Comparison]:
         replace(item, p_holm=float(p)) if np.isfinite(p) else item
         for item, p in zip(found, corrected, strict=True)
     ]
+
+
+def not_identified(units: pd.DataFrame) -> dict[str, int]:
+    """How many units do not say a gain, by its column; gains that all of them say are in none.
+
+    A unit says an entry whose standard deviation is at most twice the median size of the entry
+    over the units that give a deviation. The deviation counts what the entry may owe to directions
+    that are not identified (`GainCovariance.entries`), so that one identified only with others is
+    data too where it is identified well enough.
+    """
+    gains = units.filter(regex=r"^K\.")
+    lost = (only_identified(units)[gains.columns].isna() & gains.notna()).sum()
+    return {str(name): int(count) for name, count in lost.items() if count}
+
+
+def only_identified(units: pd.DataFrame) -> pd.DataFrame:
+    """The table `units` with NaN for each gain that `not_identified` has of its unit."""
+    kept = units.copy()
+    for name in units.columns:
+        beside = f"K_deviation{name[1:]}"
+        if name.startswith("K.") and beside in units.columns:
+            deviation = units[beside].astype(float)
+            usual = units[name].astype(float).abs()[np.isfinite(deviation)].median()
+            kept[name] = units[name].where(deviation <= _LARGEST * usual)
+    return kept
+
+
+def unidentified_sentences(counts: Mapping[str, int], of: int) -> list[str]:
+    """What is left out for it, in one sentence; none where nothing is."""
+    if not counts:
+        return []
+    each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())
+    return [
+        "A gain whose standard deviation is more than twice its usual size is not identified, and "
+        f"not compared: of {of} units {each}."
+    ]
+
+
+_WORDS = {
+    "K": "gain of {1} to {0}",
+    "K_of_weights": "gain of the weights, {1} to {0}",
+    "vaf": "VAF of {0}",
+    "held_out_vaf": "VAF of {0}, left out",
+    "cost_weight": "cost weight of {0}",
+    "centre_weight": "cost weight of {0}, analytic centre",
+    "largest_input": "largest {0}",
+    "log_cost_weight": "logarithm of the cost weight of {0}",
+}
+
+
+def measure_words(name: str) -> str:
+    """A column by its `name` in words: "K.command.theta1" is "gain of theta1 to command"."""
+    kind, *rest = name.split(".", 2 if name.startswith("K") else 1)
+    return _WORDS[kind].format(*rest) if kind in _WORDS and rest else name.replace("_", " ")

@@ -22,6 +22,7 @@ from impc.files.digests import versions
 from impc.files.disk import IN_ITS_PLACE, require_ordinary, unwritable
 from impc.reporting.writer import write_files
 from impc.studies.cache import Cache
+from impc.studies.cohort.study import LABELS
 from impc.studies.cohort.tasks import fit_unit, replicate_unit
 from impc.studies.pool import Task, run
 
@@ -51,18 +52,11 @@ class Store:
         """Where they are kept."""
         return Cache(self.folder / "units")
 
-    def fit(self, unit: str) -> dict[str, Any] | None:
-        """The fit of a unit, or None."""
-        return self._find(unit, _fit(unit))
-
-    def replicate(self, unit: str, index: int) -> dict[str, Any] | None:
-        """The replicate `index` of a `unit`, or None."""
-        return self._find(unit, _replicate(unit, index))
-
-    def _find(self, unit: str, name: str) -> dict[str, Any] | None:
+    def fit(self, unit: str, index: int | None = None) -> dict[str, Any] | None:
+        """The fit of a unit, or its replicate `index`; None where there is none."""
         if unit not in self.digests:
             return None
-        found: dict[str, Any] | None = self.cache.find(name, self.digests[unit])
+        found: dict[str, Any] | None = self.cache.find(_name(unit, index), self.digests[unit])
         return found
 
     def log(self, line: str) -> None:
@@ -98,12 +92,9 @@ class Failures:
         return bool(self.units or self.replicates)
 
 
-def _fit(unit: str) -> str:
-    return f"{unit}/fit"
-
-
-def _replicate(unit: str, index: int) -> str:
-    return f"{unit}/replicate-{index:04d}"
+def _name(unit: str, index: int | None = None) -> str:
+    """Of the result of a fit, or of its replicate `index`."""
+    return f"{unit}/fit" if index is None else f"{unit}/replicate-{index:04d}"
 
 
 def work_kept(study: Study, store: Store) -> tuple[int, int]:
@@ -112,7 +103,7 @@ def work_kept(study: Study, store: Store) -> tuple[int, int]:
     names = [
         name
         for unit in study.units
-        for name in (_fit(unit.name), *(_replicate(unit.name, index) for index in range(count)))
+        for name in (_name(unit.name), *(_name(unit.name, index) for index in range(count)))
     ]
     return sum(store.cache.path(name).exists() for name in names), len(names)
 
@@ -125,7 +116,7 @@ def require_same(store: Store) -> None:
     except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: no result is used then
         return  # that has another digest
     for unit, digest in before.items():
-        path = store.cache.path(_fit(unit))
+        path = store.cache.path(_name(unit))
         if digest not in (None, store.digests[unit]) and path.exists():
             raise InputError(
                 f"file {path}",
@@ -143,12 +134,26 @@ def run_study(
 ) -> Failures:
     """Do what is left of a study."""
     require_same(store)
-    manifest = json.dumps(_manifest(study, tasks), indent=1, sort_keys=True) + "\n"
-    write_files(store.folder, {"manifest.json": manifest.encode()})
-    store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     count = int(study.configuration.fit.get("replicates", 0))
+    manifest = {
+        "plant": study.plant,
+        "replicates": count,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
+        "units": {
+            unit.name: {
+                **{name: getattr(unit, name) for name in LABELS},
+                "files": [file.name for file in unit.files],
+                "digest": tasks[unit.name].digest if unit.name in tasks else None,
+            }
+            for unit in study.units
+        },
+    }
+    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
+    write_files(store.folder, {"manifest.json": text.encode()})
+    store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     failures, cache = Failures(), store.cache
-    queue = deque(Task(_fit(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
+    queue = deque(Task(_name(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
     for result in run(pool, queue, cache):
         task, content = result.task, result.content
         unit, _, name = task.name.partition("/")
@@ -171,7 +176,7 @@ def run_study(
             # Before other fits: a unit is finished before the next is begun.
             needed = {key: content[key] for key in _NEEDED}
             queue.extendleft(
-                Task(_replicate(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
+                Task(_name(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
                 for k in reversed(range(count))
             )
         done(result)
@@ -180,29 +185,9 @@ def run_study(
 
 def keep_failure(store: Store, unit: str, reason: str) -> None:
     """Write down the `reason` why a `unit` cannot be fitted: none of its recordings can be read."""
-    store.cache.keep(_failed(_fit(unit)), "", {"reason": reason})
+    store.cache.keep(_failed(_name(unit)), "", {"reason": reason})
 
 
 def _failed(name: str) -> str:
     """Where the reason is kept why there is no such result."""
     return f"{name}-failed".replace("/fit-", "/")
-
-
-def _manifest(study: Study, tasks: Mapping[str, FitTask]) -> dict[str, Any]:
-    return {
-        "plant": study.plant,
-        "replicates": int(study.configuration.fit.get("replicates", 0)),
-        "made": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions(),
-        "units": {
-            unit.name: {
-                "subject": unit.subject,
-                "visit": unit.visit,
-                "condition": unit.condition,
-                "group": unit.group,
-                "files": [file.name for file in unit.files],
-                "digest": tasks[unit.name].digest if unit.name in tasks else None,
-            }
-            for unit in study.units
-        },
-    }

@@ -9,7 +9,7 @@ import numpy as np
 
 from impc.model.plant import UNKNOWN
 from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
-from impc.studies.cohort.identified import measure_words
+from impc.studies.cohort.comparison import measure_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,10 +23,7 @@ _SOFT = "#8C8C8C"
 
 
 def group_figure(units: pd.DataFrame, measures: Sequence[str], names: Mapping[str, str]) -> Figure:
-    """Measures of every unit by group and visit; bars are means.
-
-    A line joins the visits of one subject in one condition.
-    """
+    """Every unit by group and visit; a line joins the visits of one subject; bars are means."""
     groups = sorted(set(units["group"])) or [""]
     visits = list(dict.fromkeys(units["visit"]))
     rows = -(-len(measures) // _COLUMNS)
@@ -49,7 +46,9 @@ def group_figure(units: pd.DataFrame, measures: Sequence[str], names: Mapping[st
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
         ax.set_title(textwrap.fill(measure_words(name), 28), loc="left")
-        ax.set_ylabel(f"value ({_unit(name, names)})")
+        percent = name.startswith(("vaf.", "held_out_vaf."))
+        unit = "-" if name.startswith("log_cost_weight.") else names.get(name, UNKNOWN)
+        ax.set_ylabel(f"value ({'%' if percent else unit})")
     return figure
 
 
@@ -79,26 +78,12 @@ def subject_figure(fit: dict[str, Any]) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 1.3 * recorded.shape[1] + 0.5)
     axes = np.ravel(figure.subplots(recorded.shape[1], 1, sharex=True, squeeze=False))
     time = np.arange(len(recorded)) * shown["dt"]
+    dashed: Any = {"color": VERMILLION, "linestyle": "--", "linewidth": 1.0}
     for index, ax in enumerate(axes):
         factor, unit = fit["shown_units"][index]
         ax.plot(time, factor * recorded[:, index], color=_SOFT, linewidth=1.6, label="recorded")
-        ax.plot(
-            time,
-            factor * simulated[:, index],
-            color=VERMILLION,
-            linestyle="--",
-            linewidth=1.0,
-            label="simulated",
-        )
+        ax.plot(time, factor * simulated[:, index], label="simulated", **dashed)
         ax.set_ylabel(f"{fit['outputs'][index]} ({unit})")
     axes[-1].set_xlabel("time (s)")
     axes[0].legend(loc="upper right", ncols=2, bbox_to_anchor=(1.0, 1.3))
     return figure
-
-
-def _unit(name: str, names: Mapping[str, str]) -> str:
-    if name.startswith(("vaf.", "held_out_vaf.")):
-        return "%"
-    if name.startswith("log_cost_weight."):
-        return "-"
-    return names.get(name, UNKNOWN)

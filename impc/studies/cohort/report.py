@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from impc.errors import DataError
 from impc.files.checks import FELL
-from impc.reporting.document import Block, Lines, Report, Section, Verdict
+from impc.reporting.document import Lines, Report, Section, Verdict
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
 from impc.reporting.style import drawn, journal_style
 from impc.reporting.writer import write_files
-from impc.studies.cohort.comparison import compare_cohort, measures_of
-from impc.studies.cohort.figures import group_figure
-from impc.studies.cohort.identified import (
+from impc.studies.cohort.comparison import (
+    compare_cohort,
     measure_words,
+    measures_of,
     not_identified,
     only_identified,
     unidentified_sentences,
 )
+from impc.studies.cohort.figures import group_figure
 from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.subject_page import kept_words, subject_files
+from impc.studies.cohort.subject_page import described_signals, subject_files
 from impc.studies.cohort.tables import cohort_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.studies.cohort.comparison import Comparison
     from impc.studies.cohort.engine import Failures, Store
@@ -41,10 +42,19 @@ _QUESTIONS = {
     "mixed": "between groups, over all visits (mixed model of the cost weights)",
     "reliability": "reliability between visits",
 }
+_COMPARED = (
+    "Gains are what the recordings give. Cost weights are {}. Holm's correction is over the "
+    "measures of one question."
+)
 _WITHIN = "those of the structure, compared in their logarithms"
 _CENTRE = (
     "those of the analytic centre of all weights with the same gain: a choice, the same for every "
     "subject"
+)
+_NUMBERS = ("n", "estimate", "low", "high", "effect", "p", "p_holm", "note")
+_RUN = Markup(
+    "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
+    "numbers, cohort.log the times."
 )
 _GROUPS = Picture(
     "groups",
@@ -58,17 +68,15 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
     """Write the tables, result.json, pages and figures of a study."""
     tables = cohort_tables(study, store)
     units = tables["units"]
-    try:
-        compared = compare_cohort(units)
-    except DataError:
-        compared = ()
+    compared = compare_cohort(units)
     subjects: dict[str, list[Unit]] = {}
     for unit in study.units:
         subjects.setdefault(unit.subject, []).append(unit)
     for subject, own in subjects.items():
         # One after the other: the figures of a thousand subjects would fill the memory.
         write_files(store.folder, subject_files(subject, own, store, failures))
-    figures = _figures(only_identified(units), compared, _measure_units(study.units, store))
+    signals = described_signals(study.units, store)
+    figures = _figures(units, compared, signals.get("units", {}))
     left_out = {name: n for name, n in not_identified(units).items() if name in measures_of(units)}
     said = [
         *_findings(compared),
@@ -77,23 +85,32 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
         *_limits(units),
         *_falls(study.units, store, failures),
     ]
+    count = int(study.configuration.fit.get("replicates", 0))
+    summary = (
+        f"{len(units)} of {len(study.units)} units of {len(subjects)} subjects were fitted, "
+        f"{len(tables['replicates'])} bootstrap replicates of {count * len(units)} done, "
+        f"{sum(map(len, failures.replicates.values()))} failed."
+    )
     report = Report(
         "impc cohort",
         f"Groups and visits of {len(subjects)} subjects",
-        (
-            Verdict(said[0]),
-            *((Lines(said[1:]),) if said[1:] else ()),
-            _summary(study, tables, subjects, failures),
-        ),
+        (Verdict(said[0]), *((Lines(said[1:]),) if said[1:] else ()), summary),
         [
             *([Section("Not fitted", (Lines(failures.lines),))] if failures.lines else ()),
-            Section("1. Groups and visits", _comparisons(compared, figures, units)),
-            Section("2. Subjects", _subjects(subjects, units)),
-            Section("3. The run", _run(command)),
+            Section(
+                "1. Groups and visits",
+                [
+                    _COMPARED.format(_WITHIN if "structure_refused" in units.columns else _CENTRE),
+                    *([_GROUPS] if figures else []),
+                    *([_comparison(compared)] if compared else []),
+                ],
+            ),
+            Section("2. Subjects", [_links(subjects), *_unit_findings(units)]),
+            Section("3. The run", [_RUN.format(command)]),
         ],
         figures=figures,
         provenance=Provenance(command=command),
-        words=kept_words(study.units, store),
+        words=signals.get("words", ()),
         data={
             "units": len(study.units),
             "fitted": len(units),
@@ -107,26 +124,11 @@ def write_report(study: Study, store: Store, failures: Failures, command: str) -
     write_files(store.folder, report.files())
 
 
-def _comparisons(
-    compared: tuple[Comparison, ...], figures: dict[str, bytes], units: pd.DataFrame
-) -> list[Block]:
-    structured = "structure_refused" in units.columns
-    blocks: list[Block] = [
-        "Gains are what the recordings give. Cost weights are "
-        f"{_WITHIN if structured else _CENTRE}. "
-        "Holm's correction is over the measures of one question."
-    ]
-    if "groups.png" in figures:
-        blocks.append(_GROUPS)
-    return [*blocks, *([_comparison(compared)] if compared else [])]
-
-
-def _subjects(subjects: dict[str, list[Unit]], units: pd.DataFrame) -> list[Block]:
-    links = [
+def _links(subjects: Iterable[str]) -> str:
+    return Markup(", ").join(
         Markup('<a href="subjects/sub-{}.html">{}</a>').format(safe_name(name), name)
         for name in subjects
-    ]
-    return [Markup(", ").join(links), *_unit_findings(units)]
+    )
 
 
 def _unit_findings(units: pd.DataFrame) -> list[Finding]:
@@ -145,91 +147,38 @@ def _unit_findings(units: pd.DataFrame) -> list[Finding]:
         for name in penalised:
             label = name.removeprefix("log_cost_weight.")
             for end in ("", "_low", "_high"):
-                logarithm = units[name.replace("log_cost_weight", f"log_cost_weight{end}")].astype(
-                    float
-                )
+                logarithm = units[f"log_cost_weight{end}.{label}"].astype(float)
                 cost_weights[f"{label}{end}"] = np.exp(logarithm.fillna(-np.inf))
         caption = (
             "Cost weights within the structure, with one for the first command, and their "
-            "intervals of "
-            "95 %; it holds where the recordings do not refuse it."
+            "intervals of 95 %; it holds where the recordings do not refuse it."
         )
         found.append(Finding("cost_weights", cost_weights, caption, digits=3))
     return found
 
 
-def _run(command: str) -> list[Block]:
-    said = Markup(
-        "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
-        "numbers, cohort.log the times."
-    ).format(command)
-    return [said]
-
-
-def _figures(
-    units: pd.DataFrame, compared: tuple[Comparison, ...], names: dict[str, str]
-) -> dict[str, bytes]:
-    with journal_style():
-        measures = _most_telling(compared, units) if len(units) else []
-        return drawn({"groups": group_figure(units, measures, names)} if measures else {})
-
-
-def _measure_units(units: Sequence[Unit], store: Store) -> dict[str, str]:
-    """Units of the columns of units.csv, as the first unit that was fitted says."""
-    fits = (store.fit(unit.name) for unit in units)
-    first = next((fit for fit in fits if fit is not None), {})
-    return dict(first.get("units", {}))
-
-
-def _summary(
-    study: Study,
-    tables: dict[str, pd.DataFrame],
-    subjects: dict[str, list[Unit]],
-    failures: Failures,
-) -> str:
-    fitted, count = len(tables["units"]), int(study.configuration.fit.get("replicates", 0))
-    return (
-        f"{fitted} of {len(study.units)} units of {len(subjects)} subjects were fitted, "
-        f"{len(tables['replicates'])} bootstrap replicates of {count * fitted} done, "
-        f"{sum(map(len, failures.replicates.values()))} failed."
-    )
-
-
 def _findings(compared: tuple[Comparison, ...]) -> list[str]:
-    """Differences that stand after Holm's correction."""
+    """Differences that stand after Holm's correction; of logarithms as factors."""
     lines = []
     for item in compared:
-        if np.isfinite(item.p_holm) and item.p_holm <= 0.05:
-            what = f"{item.first} and {item.second}" if item.first else "groups over visits"
-            effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
-            where = f"{item.condition}: " if item.condition else ""
-            significance = f"p = {item.p_holm:.2g} after Holm{effect}"
-            line = where + (
-                _times(item, significance) or f"{_differs(item, what)} ({significance})."
+        if not item.p_holm <= 0.05:
+            continue
+        effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
+        significance = f"p = {item.p_holm:.2g} after Holm{effect}"
+        kind, _, feature = item.measure.partition(".")
+        if kind == "log_cost_weight" and item.question in ("group", "visit", "mixed"):
+            factor, low, high = (f"{np.exp(x):.2g}" for x in (item.estimate, item.low, item.high))
+            over = " over all visits" if item.question == "mixed" else ""
+            line = (
+                f"the cost weight of {feature} is {factor} times as high in {item.second} as in "
+                f"{item.first}{over} (95 %: {low} to {high}; {significance})."
             )
-            lines.append(line[0].upper() + line[1:])
+        else:
+            what = f"{item.first} and {item.second}" if item.first else "groups over visits"
+            line = f"{measure_words(item.measure)} differs between {what} ({significance})."
+        line = f"{item.condition}: {line}" if item.condition else line
+        lines.append(line[0].upper() + line[1:])
     return lines or ["No difference between groups or visits stands after Holm's correction."]
-
-
-def _differs(item: Comparison, what: str) -> str:
-    return f"{measure_words(item.measure)} differs between {what}"
-
-
-def _times(item: Comparison, significance: str) -> str:
-    """A difference of logarithms as a factor; empty for other measures and questions."""
-    if not item.measure.startswith("log_cost_weight.") or item.question not in (
-        "group",
-        "visit",
-        "mixed",
-    ):
-        return ""
-    factor, low, high = (f"{np.exp(x):.2g}" for x in (item.estimate, item.low, item.high))
-    over = " over all visits" if item.question == "mixed" else ""
-    return (
-        f"the cost weight of {item.measure.removeprefix('log_cost_weight.')} is {factor} times as "
-        "high in "
-        f"{item.second} as in {item.first}{over} (95 %: {low} to {high}; {significance})."
-    )
 
 
 def _structure_lines(units: pd.DataFrame) -> list[str]:
@@ -247,17 +196,14 @@ def _structure_lines(units: pd.DataFrame) -> list[str]:
     if zero:
         lines.append(
             f"{zero} units want a cost weight of zero somewhere: it has no logarithm, and they "
-            "are not "
-            "in the comparison of that cost weight."
+            "are not in the comparison of that cost weight."
         )
     return lines
 
 
 def _limits(units: pd.DataFrame) -> list[str]:
     """What those units say of the limit that never reach it."""
-    if not len(units):
-        return []
-    never = int(np.sum(units["saturated"] == 0))
+    never = int(np.sum(units["saturated"] == 0)) if len(units) else 0
     if not never:
         return []
     return [
@@ -284,6 +230,15 @@ def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> list[str]
     ]
 
 
+def _figures(
+    units: pd.DataFrame, compared: tuple[Comparison, ...], names: Mapping[str, str]
+) -> dict[str, bytes]:
+    measures = _most_telling(compared, units) if len(units) else []
+    with journal_style():
+        shown = only_identified(units)
+        return drawn({"groups": group_figure(shown, measures, names)} if measures else {})
+
+
 def _most_telling(compared: tuple[Comparison, ...], units: pd.DataFrame) -> list[str]:
     """Six measures for the picture: those that differ most, else the first ones."""
     ranked = sorted(
@@ -300,16 +255,9 @@ def _comparison(compared: tuple[Comparison, ...]) -> Finding:
         {
             "question": lambda item: _QUESTIONS[item.question],
             "measure": lambda item: measure_words(item.measure),
-            "condition": lambda item: item.condition,
+            "condition": attrgetter("condition"),
             "compared": lambda item: f"{item.second} - {item.first}" if item.first else "",
-            "n": lambda item: item.n,
-            "estimate": lambda item: item.estimate,
-            "low": lambda item: item.low,
-            "high": lambda item: item.high,
-            "effect": lambda item: item.effect,
-            "p": lambda item: item.p,
-            "p_holm": lambda item: item.p_holm,
-            "note": lambda item: item.note,
+            **{name: attrgetter(name) for name in _NUMBERS},
         },
     )
     caption = (

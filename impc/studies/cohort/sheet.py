@@ -12,7 +12,6 @@ from impc.errors import InputError
 from impc.files.apart import cells_apart
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
 # 100 000 participants of 100 characters are 10 MB.
@@ -39,8 +38,7 @@ class Sheet:
 def read_sheet(path: Path) -> Sheet:
     """Read the table at `path`."""
     where = f"table {path.name}"
-    workbook = path.suffix.lower() in (".xlsx", ".ods")
-    lines = _cells(where, path) if workbook else _divided(where, _text(where, path))
+    lines = _cells(where, path)
     if len(lines) < 2:
         raise InputError(where, "has no rows", "write a head and a row for each")
     heads = tuple(cell.strip() for cell in lines[0])
@@ -61,11 +59,20 @@ def read_sheet(path: Path) -> Sheet:
 
 
 def _cells(where: str, path: Path) -> list[list[str]]:
-    _require_file(where, path)
-    return [row for row in cells_apart(path, _LARGEST) if any(row)]
-
-
-def _divided(where: str, text: str) -> list[list[str]]:
+    """Every line that is not empty."""
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(where, "is no ordinary file", "check the path")
+        if path.stat().st_size > _LARGEST:
+            raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
+        if path.suffix.lower() in (".xlsx", ".ods"):
+            return [row for row in cells_apart(path, _LARGEST) if any(row)]
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise InputError(where, f"cannot be read ({reason})", "check it") from None
+    if "\0" in text:
+        raise InputError(where, "has a NUL in it", "save it again as UTF-8 text")
     first = text.partition("\n")[0]
     delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
     try:
@@ -74,55 +81,17 @@ def _divided(where: str, text: str) -> list[list[str]]:
         raise InputError(where, f"cannot be read ({error})", "save it again as CSV") from None
 
 
-def _text(where: str, path: Path) -> str:
-    _require_file(where, path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise InputError(where, f"cannot be read ({reason})", "check it") from None
-    if "\0" in text:
-        raise InputError(where, "has a NUL in it", "save it again as UTF-8 text")
-    return text
-
-
-def _require_file(where: str, path: Path) -> None:
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(where, "is no ordinary file", "check the path")
-        if path.stat().st_size > _LARGEST:
-            raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
-    except OSError as error:
-        raise InputError(where, f"cannot be read ({error.strerror})", "check it") from None
-
-
 def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
-    """The cells of a column `name`: numbers where all are, else text; None where a cell is empty.
-
-    Decimal commas are read where the column has them throughout.
-    """
+    """The cells of a column `name`: numbers where all are, else text; None for an empty cell."""
     cells = [row[name] for row in sheet.rows]
     given = [cell for cell in cells if cell not in ("", "n/a")]
     where = f"{sheet.where}: column {name}"
     commas = [cell for cell in given if _COMMA.fullmatch(cell)]
     if not all(_POINT.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in given):
-        _require_no_words_for_numbers(where, given)
+        for cell in given:
+            if cell.lower().lstrip("+-") in ("nan", "na", "inf", "infinity"):
+                raise InputError(where, f"has {cell!a}", "leave the cell empty, or write n/a")
         return [cell if cell in given else None for cell in cells]
-    _require_one_mark(where, given, commas)
-    numbers = {cell: float(cell.replace(",", ".")) for cell in given}
-    for cell, value in numbers.items():
-        if not math.isfinite(value):
-            raise InputError(where, f"has {cell}", "give a finite number, or n/a")
-    return [numbers.get(cell) for cell in cells]
-
-
-def _require_no_words_for_numbers(where: str, given: Sequence[str]) -> None:
-    for cell in given:
-        if cell.lower().lstrip("+-") in ("nan", "na", "inf", "infinity"):
-            raise InputError(where, f"has {cell!a}", "leave the cell empty, or write n/a")
-
-
-def _require_one_mark(where: str, given: Sequence[str], commas: Sequence[str]) -> None:
     points = [cell for cell in given if "." in cell]
     if commas and points:
         raise InputError(
@@ -132,3 +101,8 @@ def _require_one_mark(where: str, given: Sequence[str], commas: Sequence[str]) -
         raise InputError(
             where, f"has {commas[0]}, which may be thousands", "write it with a decimal point"
         )
+    numbers = {cell: float(cell.replace(",", ".")) for cell in given}
+    for cell, value in numbers.items():
+        if not math.isfinite(value):
+            raise InputError(where, f"has {cell}", "give a finite number, or n/a")
+    return [numbers.get(cell) for cell in cells]

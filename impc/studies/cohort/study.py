@@ -41,7 +41,6 @@ from impc.studies.cohort.sheet import column_values, read_sheet
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from pathlib import Path
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
@@ -55,6 +54,10 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     table: str | None = None
     bids: str | None = None
     participants: str | None = None  # Table of the subjects
+
+
+#: What a unit is called by.
+LABELS = ("subject", "visit", "condition", "group")
 
 
 @dataclass(frozen=True)
@@ -107,14 +110,11 @@ def read_study(path: Path) -> Study:
     for key in sorted(together, key=lambda item: tuple(map(_natural, item))):
         trials = sorted(together[key], key=lambda item: (_natural(item[0]), str(item[1])))
         files = tuple(file for _, file in trials)
-        if people is None:
-            units.append(Unit(*key, files))
-        elif key[0] in people:
-            units.append(Unit(*key, files, *people[key[0]]))
-        else:
+        if people is not None and key[0] not in people:
             raise InputError(
                 f"{path}: subject {key[0]}", f"is not in {table.participants}", "add a row"
             )
+        units.append(Unit(*key, files, *(people[key[0]] if people else ())))
     _require_distinct(path, units)
     return Study(table.plant or "", configuration, tuple(units), table.model or "")
 
@@ -138,14 +138,13 @@ def _found(path: Path, table: StudyTable) -> list[Found]:
             f"{path}: study", f"has {', '.join(given) or 'none'} of recordings, table and bids",
             "give exactly one",
         )  # fmt: skip
-    where = f"{path}: study.{given[0]}"
+    where, written = f"{path}: study.{given[0]}", str(getattr(table, given[0]))
     try:
-        if table.recordings is not None:
-            found = find_by_pattern(where, path.parent, table.recordings)
-        elif table.bids is not None:
-            found = find_by_entities(path.parent / table.bids)
+        if given[0] == "recordings":
+            found = find_by_pattern(where, path.parent, written)
         else:
-            found = find_by_table(path.parent / str(table.table))
+            find = find_by_entities if given[0] == "bids" else find_by_table
+            found = find(path.parent / written)
     except OSError as error:
         raise InputError(where, f"cannot be looked for ({error.strerror})", "check it") from None
     if not found:
@@ -157,8 +156,6 @@ def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
     """Subject -> group and the other columns."""
     sheet = read_sheet(path)
     named = [name for name in ("subject", "participant_id") if name in sheet.heads]
-    if not named:
-        raise InputError(sheet.where, "lacks a subject", "name the column subject, fill every row")
     others = [name for name in sheet.heads if name not in (*named, "group")]
     values = {name: column_values(sheet, name) for name in others}
     found: dict[str, tuple[str, dict[str, float | str]]] = {}
@@ -256,16 +253,13 @@ def _expression(where: str, pattern: str) -> str:
         raise InputError(
             where, f"has nothing between {together[0]}", "write a character between, or use `table`"
         )
-    expression, seen = "", set()
+    expression = ""
     for part in re.split(r"(\{\w+\})", Path(pattern).as_posix()):
-        name = part[1:-1]
-        if part.startswith("{") and name in seen:
-            expression += f"(?P={name})"
-        elif part.startswith("{"):
-            expression += f"(?P<{name}>{_NAME})"
-            seen.add(name)
-        else:
+        group = f"(?P<{part[1:-1]}>"
+        if not part.startswith("{"):
             expression += re.escape(part)
+        else:
+            expression += f"(?P={part[1:-1]})" if group in expression else f"{group}{_NAME})"
     return expression
 
 
@@ -288,12 +282,9 @@ def find_by_table(path: Path) -> list[Found]:
     sheet = read_sheet(path)
     if not {"file", "subject"} <= set(sheet.heads):
         raise InputError(sheet.where, "lacks a column", "name the columns file, subject")
-    found = []
-    for row in sheet.rows:
-        if not row["file"] or not row["subject"]:
-            raise InputError(sheet.where, "has a row without file or subject", "fill every row")
-        found.append((_labels(sheet.where, row), path.parent / row["file"]))
-    return found
+    if not all(row["file"] and row["subject"] for row in sheet.rows):
+        raise InputError(sheet.where, "has a row without file or subject", "fill every row")
+    return [(_labels(sheet.where, row), path.parent / row["file"]) for row in sheet.rows]
 
 
 def _labels(where: str, given: dict[str, str]) -> dict[str, str]:

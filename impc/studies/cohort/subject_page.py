@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from impc.reporting.document import Block, Report, Section, Verdict
@@ -12,6 +13,7 @@ from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.style import drawn, journal_style
 from impc.studies.cohort.figures import subject_figure
 from impc.studies.cohort.study import safe_name
+from impc.studies.cohort.tables import or_nan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,73 +28,63 @@ def subject_files(
     """The page of a subject and the figures on it, by path."""
     sections: list[Section] = []
     figures: dict[str, bytes] = {}
+    fits = []
     for unit in units:
         fit = store.fit(unit.name)
         if fit is None:
             reason = failures.units.get(unit.name, "not fitted yet")
             sections.append(Section(unit.name, (f"Not fitted: {reason}",)))
             continue
+        fits.append(fit)
         with journal_style():
             figures |= drawn({unit.name: subject_figure(fit)})
-        sections.append(Section(unit.name, _unit_blocks(unit, fit, failures)))
+        sections.append(Section(unit.name, _unit_blocks(unit.name, fit, failures)))
     group = f", group {units[0].group}" if units[0].group else ""
+    shares = [or_nan(value) for fit in fits for value in fit["vaf"].values()]
+    verdict = "Not every recording of this subject could be explained to its end."
+    if fits and not np.isnan(shares).any():
+        at_bound = 100 * float(np.mean([fit["saturated"] for fit in fits]))
+        verdict = (
+            f"Inverse MPC accounts for {min(shares):.2f} to {max(shares):.2f} % of the outputs; "
+            f"the command is at its bound for {at_bound:.1f} % of the time."
+        )
     report = Report(
         f"impc cohort: {subject}",
         f"Subject {subject}{group}",
-        (*_subject_verdict(units, store), Markup('<a href="../report.html">The cohort</a>')),
+        (Verdict(verdict), Markup('<a href="../report.html">The cohort</a>')),
         sections,
         figures=figures,
-        words=kept_words(units, store),
+        words=described_signals(units, store).get("words", ()),
     )
     files = {f"sub-{safe_name(subject)}.html": report.page().encode(), **figures}
     return {f"subjects/{name}": content for name, content in files.items()}
 
 
-def _subject_verdict(units: list[Unit], store: Store) -> tuple[Verdict, ...]:
-    """What the fits of a subject explain, in one sentence."""
-    fits = [fit for unit in units if (fit := store.fit(unit.name)) is not None]
-    shares = [or_nan(value) for fit in fits for value in fit["vaf"].values()]
-    if not fits or np.isnan(shares).any():
-        return (Verdict("Not every recording of this subject could be explained to its end."),)
-    at_bound = 100 * float(np.mean([fit["saturated"] for fit in fits]))
-    return (
-        Verdict(
-            f"Inverse MPC accounts for {min(shares):.2f} to {max(shares):.2f} % of the outputs; "
-            f"the command is at its bound for {at_bound:.1f} % of the time."
-        ),
+def described_signals(units: Sequence[Unit], store: Store) -> dict[str, Any]:
+    """The fit of the first unit that has one: what its signals are, and their units."""
+    return next((fit for unit in units if (fit := store.fit(unit.name)) is not None), {})
+
+
+def _unit_blocks(name: str, fit: dict[str, Any], failures: Failures) -> list[Block]:
+    failed = len(failures.replicates.get(name, {}))
+    lost = (
+        f"{failed} bootstrap replicates could not be fitted; the reasons are in "
+        "failed_replicates of result.json."
     )
-
-
-def kept_words(units: Sequence[Unit], store: Store) -> list[tuple[str, str]]:
-    """What the signals are, as the first unit that was fitted says."""
-    fits = (store.fit(unit.name) for unit in units)
-    first = next((fit for fit in fits if fit is not None), {})
-    return [(name, meaning) for name, meaning in first.get("words", ())]
-
-
-def _unit_blocks(unit: Unit, fit: dict[str, Any], failures: Failures) -> list[Block]:
-    blocks: list[Block] = [
+    return [
         Picture(
-            unit.name,
+            name,
             "Recorded and simulated outputs of the first trial",
             "First trial. Grey: recorded. Dashed: simulated from the disturbance alone.",
-        )
-    ]
-    failed = len(failures.replicates.get(unit.name, {}))
-    if failed:
-        blocks.append(
-            f"{failed} bootstrap replicates could not be fitted; the reasons are in "
-            "failed_replicates of result.json."
-        )
-    return [
-        *blocks,
-        _explained(unit, fit),
-        _gain(unit, fit),
+        ),
+        *([lost] if failed else []),
+        _explained(name, fit),
+        _gain(name, fit),
         *(line for trial in fit["findings"] for line in trial),
     ]
 
 
-def _explained(unit: Unit, fit: dict[str, Any]) -> Finding:
+def _explained(unit: str, fit: dict[str, Any]) -> Finding:
     table = table_of(
         fit["outputs"],
         {
@@ -105,35 +97,22 @@ def _explained(unit: Unit, fit: dict[str, Any]) -> Finding:
         f"Variance accounted for, {fit['trials']} trials; the command is at its bound for "
         f"{100 * fit['saturated']:.1f} % of the time."
     )
-    return Finding(f"{unit.name}-agreement", table, caption, digits=5)
+    return Finding(f"{unit}-agreement", table, caption, digits=5)
 
 
-def _gain(unit: Unit, fit: dict[str, Any]) -> Finding:
-    reported = next(iter(fit["readings"].values()))
-    entries = [(i, j) for i in range(len(fit["controls"])) for j in range(len(fit["states"]))]
-    table = table_of(
-        entries,
-        {
-            "entry": lambda at: f"{fit['controls'][at[0]]} from {fit['states'][at[1]]}",
-            "gain": lambda at: float(fit["K"][at[0]][at[1]]),
-            "standard_error": lambda at: (
-                or_nan(fit["K_deviation"][at[0]][at[1]])
-                if fit["K_identified"][at[0]][at[1]]
-                else np.nan
-            ),
-            "gain_of_the_weights": lambda at: float(fit["K_of_weights"][at[0]][at[1]]),
-            "weight_of_the_state": lambda at: float(reported["Q"][at[1]][at[1]]),
-        },
-    )
+def _gain(unit: str, fit: dict[str, Any]) -> Finding:
+    Q = next(iter(fit["readings"].values()))["Q"]
+    rows = []
+    for i, control in enumerate(fit["controls"]):
+        for j, state in enumerate(fit["states"]):
+            known = fit["K_identified"][i][j]
+            error = or_nan(fit["K_deviation"][i][j]) if known else np.nan
+            rows.append((f"{control} from {state}", fit["K"][i][j], error,
+                         fit["K_of_weights"][i][j], Q[j][j]))  # fmt: skip
+    heads = ["entry", "gain", "standard_error", "gain_of_the_weights", "weight_of_the_state"]
     caption = (
         "Gain with standard errors (none: the recordings identify this entry only together with "
         "others), beside the gain of the reported weights; and cost weights of the weights of "
-        "least "
-        "condition number: a choice among all weights with the latter gain."
+        "least condition number: a choice among all weights with the latter gain."
     )
-    return Finding(f"{unit.name}-gain", table, caption)
-
-
-def or_nan(value: float | None) -> float:
-    """A `value` that may be missing, as JSON and pandas have it."""
-    return float("nan") if value is None else float(value)
+    return Finding(f"{unit}-gain", pd.DataFrame(rows, columns=heads), caption)

@@ -19,14 +19,15 @@ import pandas as pd
 
 from impc.arrays import percentiles
 from impc.assess.assessments import ASSESSMENTS
-from impc.studies.cohort.unit_structure import structure_row
+from impc.studies.cohort.study import LABELS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from impc.studies.cohort.engine import Store
-    from impc.studies.cohort.study import Study, Unit
+    from impc.studies.cohort.study import Study
 
 _CENTRE = "analytic centre (no units)"
-_LEVEL = 0.95
 
 
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
@@ -37,31 +38,22 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
         fit = store.fit(unit.name)
         if fit is None:
             continue
-        units.append(_labels(unit) | _unit_row(fit))
-        drawn = []
+        labels = {"unit": unit.name} | {name: getattr(unit, name) for name in LABELS}
+        units.append(labels | _unit_row(fit))
+        drawn = {}
         for index in range(count):
-            found = store.replicate(unit.name, index)
+            found = store.fit(unit.name, index)
             if found is not None:
-                row = _gain(fit, "K", found["K"])
-                row |= dict(zip(fit["parameters"], found["parameters"], strict=True))
-                drawn.append(row)
-                replicates.append(_labels(unit) | {"replicate": index + 1} | row)
+                drawn[index + 1] = _gain(fit, "K", found["K"]) | dict(
+                    zip(fit["parameters"], found["parameters"], strict=True)
+                )
+        replicates += [labels | {"replicate": number} | row for number, row in drawn.items()]
         if len(drawn) > 1:
-            intervals += _intervals(unit, fit, pd.DataFrame(drawn))
+            intervals += [labels | row for row in _intervals(fit, pd.DataFrame(drawn.values()))]
     return {
         "units": pd.DataFrame(units),
         "replicates": pd.DataFrame(replicates),
         "intervals": pd.DataFrame(intervals),
-    }
-
-
-def _labels(unit: Unit) -> dict[str, Any]:
-    return {
-        "unit": unit.name,
-        "subject": unit.subject,
-        "visit": unit.visit,
-        "condition": unit.condition,
-        "group": unit.group,
     }
 
 
@@ -96,24 +88,38 @@ def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
     }
 
 
-def _intervals(unit: Unit, fit: dict[str, Any], drawn: pd.DataFrame) -> list[dict[str, Any]]:
+def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, Any]]:
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
     identified = _gain(fit, "K", fit["K_identified"])
-    rows = []
-    for name in drawn.columns:
+    for name, values in drawn.items():
         # Replicates stay where the search began along what is not identified: their spread says
         # nothing.
-        known = identified.get(name, True)
-        low, high = percentiles(drawn[name], _LEVEL) if known else (np.nan, np.nan)
-        rows.append(
-            _labels(unit)
-            | {
-                "name": name,
-                "value": estimate[name],
-                "low": float(low),
-                "high": float(high),
-                "level": _LEVEL,
-                "replicates": len(drawn),
-            }
-        )
-    return rows
+        known = identified.get(str(name), True)
+        low, high = percentiles(values, 0.95) if known else (np.nan, np.nan)
+        yield {
+            "name": name,
+            "value": estimate[name],
+            "low": float(low),
+            "high": float(high),
+            "level": 0.95,
+            "replicates": len(drawn),
+        }
+
+
+def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
+    """The columns of units.csv, from the content of a `fit`; none without a structure."""
+    found = fit.get("structure")
+    if found is None:
+        return {}
+    heads = {"log_cost_weight": "", "low": "_low", "high": "_high"}
+    row: dict[str, Any] = {
+        f"log_cost_weight{end}.{unknown}": or_nan(value)
+        for name, end in heads.items()
+        for unknown, value in zip(found["unknowns"], found[name], strict=True)
+    }
+    return row | {"structure_refused": bool(found["refused"]), "structure_p": or_nan(found["p"])}
+
+
+def or_nan(value: float | None) -> float:
+    """A `value` that may be missing, as JSON and pandas have it."""
+    return float("nan") if value is None else float(value)

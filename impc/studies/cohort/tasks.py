@@ -21,18 +21,20 @@ from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent_statements import intent
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import DRAWS, bootstrap_model, replicate
+from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
 from impc.checking import replace
-from impc.errors import DataError, ImpcError
+from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import make_plant, plant_family_of, plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.structured_fit import fit_structured
 from impc.model.plant import weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_words
-from impc.studies.cohort.unit_structure import unit_structure
 from impc.studies.effort import Effort, fit_effort
+from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.gain_findings import number_units
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
@@ -41,19 +43,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.assess.assessments import MethodFit
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
-
-# They say how many replicates there are, not what any of them is.
-_COUNTS = ("replicates",)
-# Points of a trajectory that are kept for pictures.
-_SHOWN = 600
 
 
 @dataclass(frozen=True)
@@ -68,10 +63,7 @@ class FitTask:
 
 
 def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
-    """Tasks of all units by name, and the reason for each unit that has none.
-
-    All recordings are read from their first byte to their last, for the digests.
-    """
+    """Tasks of all units by name, and why a unit has none; every recording is read for a digest."""
     unused = set(unused_columns(study, source))
     tasks: dict[str, FitTask] = {}
     failed: dict[str, str] = {}
@@ -89,21 +81,14 @@ def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], 
 
 
 def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
-    """Columns of the participants that are no arguments of the plant of this `study`.
-
-    They stay out of the fit: age and sex of a subject are no fault of the table.
-    """
+    """Columns of the participants that are no arguments of the plant, and stay out of the fit."""
     names = {name: None for unit in study.units for name in unit.person}
-    return tuple(name for name in names if not _takes(source, name))
-
-
-def _takes(source: PlantSource, name: str) -> bool:
     if ":" not in source.name:  # matrices in a file have no arguments of a person
-        return False
-    parameters = inspect.signature(source.make).parameters
-    return name in parameters or any(
-        one.kind is inspect.Parameter.VAR_KEYWORD for one in parameters.values()
-    )
+        return tuple(names)
+    taken = inspect.signature(source.make).parameters
+    if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in taken.values()):
+        return ()
+    return tuple(name for name in names if name not in taken)
 
 
 def unit_digest(
@@ -116,7 +101,8 @@ def unit_digest(
         dict(arguments),
         configuration.recording,
         configuration.signals,
-        {key: value for key, value in configuration.fit.items() if key not in _COUNTS},
+        # How many replicates there are says not what any of them is.
+        {key: value for key, value in configuration.fit.items() if key != "replicates"},
         versions(),
     )
 
@@ -199,14 +185,20 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
     family = estimate.problem.family
     names = () if family is None else family.names
+    units = number_units(plant) | {
+        f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
+    }
     limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
+    first = fitted.problem.recordings[0]
+    step = max(1, first.samples // 600)
     return {
         "states": plant.states,
         "controls": plant.controls,
         "outputs": plant.outputs,
         "shown_units": [shown_unit(plant, name) for name in plant.outputs],
         "words": signal_words(plant),
-        "units": _units(plant),
+        # Of the measures that a cohort compares, by their columns of units.csv.
+        "units": {name: "-" if unit == "1" else unit for name, unit in units.items()},
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
@@ -230,19 +222,13 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
         "findings": [trial.findings for trial in problem.recordings],
-        "trajectory": _trajectory(fit),
-        "structure": unit_structure(problem, fitted, settings),
-    }
-
-
-def _units(plant: Plant) -> dict[str, str]:
-    """Units of the measures that a cohort compares, by their columns of units.csv."""
-    cost_weights = {
-        f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
-    }
-    return {
-        name: "-" if unit == "1" else unit
-        for name, unit in (number_units(plant) | cost_weights).items()
+        # Of the first trial, a few hundred points.
+        "trajectory": {
+            "dt": plant.dt * step,
+            "recorded": first.outputs[::step],
+            "simulated": (fit.runs[0].x @ plant.C.T)[::step],
+        },
+        "structure": _structure(problem, fitted, settings),
     }
 
 
@@ -256,13 +242,24 @@ def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Arra
     return frozen(rows)
 
 
-def _trajectory(fit: MethodFit) -> dict[str, Any]:
-    """Recorded and simulated outputs of the first trial, a few hundred points."""
-    problem = fit.estimate.problem
-    trial, run = problem.recordings[0], fit.runs[0]
-    step = max(1, trial.samples // _SHOWN)
-    return {
-        "dt": problem.plant.dt * step,
-        "recorded": trial.outputs[::step],
-        "simulated": (run.x @ problem.plant.C.T)[::step],
+def _structure(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any] | None:
+    """Logarithms of cost weights with ends of 95 %; None where no structure is asked for."""
+    if settings.structure is None:
+        return None
+    structure = fit_structures(problem.plant, settings)[0]
+    record: dict[str, Any] = {"name": structure.name, "unknowns": structure.unknowns}
+    try:
+        found = fit_structured(problem, structure, fitted)
+        fit = assess_structure(problem, structure, found, fitted, settings.settle, held_out=False)
+    except (SolverError, WeightsError) as error:
+        nothing = [np.nan] * structure.count
+        ends = dict.fromkeys(("log_cost_weight", "low", "high"), nothing)
+        return record | ends | {"refused": True, "p": np.nan, "reason": str(error)}
+    return record | {
+        "log_cost_weight": [item.value for item in fit.intervals],
+        "low": [item.low for item in fit.intervals],
+        "high": [item.high for item in fit.intervals],
+        "refused": fit.refused,
+        "p": np.nan if fit.test is None else fit.test.probability,
+        "reason": "",
     }

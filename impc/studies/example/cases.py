@@ -8,7 +8,7 @@ method is in tests/.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from impc.assess.assessments import MethodFit
     from impc.model.plant import Plant
-
-_T = TypeVar("_T")
 
 #: Initial states by name.
 CASES: dict[str, tuple[float, float]] = {"A": (1.0, 3.0), "B": (2.0, 3.0), "C": (2.0, 1.0)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from impc.reporting.style import (
 from impc.studies.example.cases import BOUND
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -52,11 +54,9 @@ def example_figures(case: CaseResult) -> dict[str, bytes]:
 def _fit(case: CaseResult, method: str) -> Figure:
     """One method against the recording: (A) states above (B) control."""
     figure = new_figure(SINGLE_COLUMN, 4.0)
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1.25, 1])
-    _draw_states(above, case, method)
-    _draw_control(below, case, method)
-    _finish(above, below, case)
-    for axes, letter in ((above, "A"), (below, "B")):
+    pair = figure.subplots(2, 1, sharex=True, height_ratios=[1.25, 1])
+    _draw(pair, case, method)
+    for axes, letter in zip(pair, "AB", strict=True):
         axes.set_title(f"({letter})", loc="left", fontweight="bold")
         axes.legend(loc="upper right", ncols=2, columnspacing=1.2)
     return figure
@@ -66,13 +66,10 @@ def _comparison(case: CaseResult) -> Figure:
     """The three methods of figures 3.2 to 3.4 side by side, for a first page."""
     figure = new_figure(DOUBLE_COLUMN, 3.5)
     grid = figure.subplots(2, len(FIGURES), sharex=True, sharey="row", height_ratios=[1.25, 1])
-    for column, (_, method, label) in enumerate(FIGURES):
-        above, below = grid[:, column]
-        _draw_states(above, case, method)
-        _draw_control(below, case, method)
-        _finish(above, below, case)
-        above.set_title(label[0].upper() + label[1:])
-        for axes in (above, below):
+    for pair, (_, method, label) in zip(grid.T, FIGURES, strict=True):
+        _draw(pair, case, method)
+        pair[0].set_title(label[0].upper() + label[1:])
+        for axes in pair:
             axes.label_outer()
     grid[0, -1].legend(loc="upper right", handlelength=2.0)
     grid[1, -1].legend(loc="center", bbox_to_anchor=(0.5, 0.31), ncols=2, handlelength=2.0)
@@ -100,42 +97,21 @@ def _terminal_set(case: CaseResult) -> Figure:
     return figure
 
 
-def _draw_states(axes: Axes, case: CaseResult, method: str) -> None:
-    fitted = _run(case, method).x
-    samples = np.arange(len(fitted))
+def _draw(pair: Iterable[Axes], case: CaseResult, method: str) -> None:
+    """States above the control: lines of the `method`, open markers of the recording."""
+    above, below = pair
+    run, truth = _run(case, method), case.truth
     for i, mark in enumerate(STATE_MARKS):
-        axes.plot(
-            samples,
-            case.truth.x[:, i],
-            mark.marker,
-            color=mark.color,
-            mfc="white",
-            label=f"$x_{i + 1}$ recorded",
-        )
-        axes.plot(samples, fitted[:, i], mark.line, color=mark.color, label=f"$x_{i + 1}$ fitted")
-
-
-def _draw_control(axes: Axes, case: CaseResult, method: str) -> None:
-    fitted = _run(case, method).u[:, 0]
+        shown: Any = {"color": mark.color, "mfc": "white", "label": f"$x_{i + 1}$ recorded"}
+        above.plot(truth.x[:, i], mark.marker, **shown)
+        above.plot(run.x[:, i], mark.line, color=mark.color, label=f"$x_{i + 1}$ fitted")
     # An input holds from its sample to the next: the last value is drawn once more, at the end.
-    axes.step(
-        np.arange(len(fitted) + 1),
-        np.append(fitted, fitted[-1]),
-        where="post",
-        color=_CONTROL.color,
-        label="$u$ fitted",
-        zorder=3,
-    )
-    axes.plot(
-        np.arange(len(fitted)),
-        case.truth.u[:, 0],
-        _CONTROL.marker,
-        color=INK,
-        mfc="white",
-        ms=3.2,
-        label="$u$ recorded",
-        zorder=4,
-    )
+    held = np.append(run.u[:, 0], run.u[-1, 0])
+    fitted: Any = {"color": _CONTROL.color, "label": "$u$ fitted", "zorder": 3}
+    below.step(np.arange(len(held)), held, where="post", **fitted)
+    recorded: Any = {"color": INK, "mfc": "white", "ms": 3.2, "label": "$u$ recorded", "zorder": 4}
+    below.plot(truth.u[:, 0], _CONTROL.marker, **recorded)
+    _finish(above, below, case)
 
 
 def _finish(above: Axes, below: Axes, case: CaseResult) -> None:

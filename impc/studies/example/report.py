@@ -31,10 +31,9 @@ from impc.studies.example.cases import EXAMPLE, LOST, SETTINGS, true_weights
 from impc.studies.example.figures import FIGURES, example_figures
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.assess.weights_test import Identifiability
     from impc.model.weights import Weights
     from impc.reporting.provenance import Provenance
     from impc.studies.example.cases import CaseResult, MethodResult
@@ -54,10 +53,9 @@ _ONE_THING = (
     "With the terminal weight used here (that of the Riccati equation), the controller stays as "
     "near to the fixed law u = -Kx as its bounds allow. It depends on Q and R through the gain K "
     "alone, so no recording, saturated or not, can determine two pairs of weights with the same "
-    "gain "
-    "apart. Which pair is reported is a choice: that of the least condition number. Read the gain "
-    "and the bounds as a finding about the recording; read Q as one of many descriptions of it. "
-    "Here the choice happens to fall on the true weights, because Q = I, R = 1 has the least "
+    "gain apart. Which pair is reported is a choice: that of the least condition number. Read the "
+    "gain and the bounds as a finding about the recording; read Q as one of many descriptions of "
+    "it. Here the choice happens to fall on the true weights, because Q = I, R = 1 has the least "
     "condition number of all."
 )
 _COLUMNS = {
@@ -89,26 +87,33 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     figures: dict[str, bytes] = {}
     for case in cases:
         figures |= example_figures(case)
-    methods = [(_label(name), (METHODS[name].sentence,)) for name in EXAMPLE]
-    read = Section(
-        "How to read this page",
-        [
-            _ONE_THING,
-            Heading("The columns"),
-            Terms([(term, (meaning,)) for term, meaning in _COLUMNS.items()]),
-            Heading("The methods"),
-            Terms(methods),
-            Heading("What was determined"),
-            _DETERMINED,
-            _WORDS,
-        ],
-        "How to read this page",
-    )
+    read: list[Block] = [
+        _ONE_THING,
+        Heading("The columns"),
+        Terms([(term, (meaning,)) for term, meaning in _COLUMNS.items()]),
+        Heading("The methods"),
+        Terms([(_label(name), (METHODS[name].sentence,)) for name in EXAMPLE]),
+        Heading("What was determined"),
+        _DETERMINED,
+        _WORDS,
+    ]
+    plant = cases[0].controller.plant
+    made = [
+        ("Made", (provenance.made,)),
+        ("Plant", (f"{provenance.plant_name}: A = {plant.A.tolist()}, B = {plant.B.tolist()}",)),
+        *((name.replace("_", " "), (f"{value}",)) for name, value in SETTINGS.items()),
+        ("Quadratic programs", (f"Solved by {described(cases[0].controller.solver)}.",)),
+        ("Versions", (provenance.all_versions,)),
+    ]
     return Report(
         "impc example: the weights behind a recorded closed loop",
         "The weights behind a recorded closed loop",
         (Verdict(_verdict(cases)), _ABOUT, Note("A stand-in.", LOST)),
-        [*map(_case_section, cases), read, _made(cases, provenance)],
+        [
+            *map(_case_section, cases),
+            Section("How to read this page", read, "How to read this page"),
+            Section("Versions and settings", (Terms(made),), "Versions and settings"),
+        ],
         figures=figures,
         data=example_data(cases, provenance, SETTINGS),
         provenance=provenance,
@@ -126,19 +131,6 @@ def _case_section(case: CaseResult) -> Section:
         others_finding(case),
     ]
     return Section(f"Case {case.name}: start at ({start})", blocks, f"Case {case.name}")
-
-
-def _made(cases: Sequence[CaseResult], provenance: Provenance) -> Section:
-    plant = cases[0].controller.plant
-    settings = ((name.replace("_", " "), (f"{value}",)) for name, value in SETTINGS.items())
-    terms = [
-        ("Made", (provenance.made,)),
-        ("Plant", (f"{provenance.plant_name}: A = {plant.A.tolist()}, B = {plant.B.tolist()}",)),
-        *settings,
-        ("Quadratic programs", (f"Solved by {described(cases[0].controller.solver)}.",)),
-        ("Versions", (provenance.all_versions,)),
-    ]
-    return Section("Versions and settings", (Terms(terms),), "Versions and settings")
 
 
 def methods_finding(case: CaseResult) -> Finding:
@@ -187,11 +179,7 @@ def others_finding(case: CaseResult) -> Finding:
     found = case.identifiability
     values = ", ".join(f"{value:.3g}" for value in found.singular_values)
     rows = [
-        {
-            **_entries(item.weights, None),
-            "condition_number": item.condition,
-            "misfit": item.misfit,
-        }
+        _entries(item.weights, None) | {"condition_number": item.condition, "misfit": item.misfit}
         for item in found.others
     ]
     return Finding(
@@ -248,31 +236,27 @@ def _label(name: str) -> str:
     return label[0].upper() + label[1:]
 
 
-def _pictures(case: CaseResult) -> tuple[Picture, ...]:
-    pictures = [
-        Picture(
+def _pictures(case: CaseResult) -> Iterator[Picture]:
+    for number, name, label in FIGURES:
+        method = case.method(name)
+        control = (
+            "The control stays inside its bound (white)."
+            if method.bound_kept
+            else f"The control reaches {method.max_abs_u:.3f}, beyond its bound (grey)."
+        )
+        yield Picture(
             f"figure-{number}-case-{case.name}",
             f"States and control over time: recorded, and as the {label} explains them",
             f"Counterpart of figure {number}, {label}. (A) The two states and (B) the control. "
-            "Open markers: recorded. Lines: as this method explains them. "
-            f"{_control_sentence(case.method(method))}",
+            f"Open markers: recorded. Lines: as this method explains them. {control}",
         )
-        for number, method, label in FIGURES
-    ]
-    terminal = Picture(
+    yield Picture(
         f"terminal-set-case-{case.name}",
         "The terminal set in the plane of the two states, with the trajectories",
         "The terminal set: from any state inside it the true gain alone never exceeds the "
         "bound. At every sample the controller plans so that it arrives there within its "
         "horizon. Lines: the trajectory of each method from the same start.",
     )
-    return (*pictures, terminal)
-
-
-def _control_sentence(method: MethodResult) -> str:
-    if method.bound_kept:
-        return "The control stays inside its bound (white)."
-    return f"The control reaches {method.max_abs_u:.3f}, beyond its bound (grey)."
 
 
 def example_data(
@@ -289,55 +273,38 @@ def example_data(
 
 
 def _case(case: CaseResult) -> dict[str, Any]:
-    truth = _truth(case)
-    return {
-        "x0": case.x0,
-        "branch": case.branch,
-        "truth": truth,
-        # The truth stands among the methods too, so that a reader can compare them in one loop.
-        "methods": {"truth": truth} | {item.name: _method(item) for item in case.methods},
-        "identifiability": _identifiability(case.identifiability),
-    }
-
-
-def _truth(case: CaseResult) -> dict[str, Any]:
-    return {
+    truth = {
         **_weights(true_weights(case.controller.plant)),
         "K": case.controller.K,
         "max_abs_u": float(np.max(np.abs(case.truth.u))),
         "x": case.truth.x,
         "u": case.truth.u,
     }
+    found = case.identifiability
+    named = ("free", "rank", "chosen", "singular_values", "tolerance")
+    others = [{**_weights(item.weights), "state_misfit": item.misfit} for item in found.others]
+    return {
+        "x0": case.x0,
+        "branch": case.branch,
+        "truth": truth,
+        # The truth stands among the methods too, so that a reader can compare them in one loop.
+        "methods": {"truth": truth} | {item.name: _method(item) for item in case.methods},
+        "identifiability": {name: getattr(found, name) for name in named} | {"others": others},
+    }
 
 
 def _method(method: MethodResult) -> dict[str, Any]:
-    found: dict[str, Any] = {} if method.weights is None else _weights(method.weights)
-    optional = {
-        "K": method.K,
-        "state_misfit": method.state_misfit,
-        "max_abs_u": method.max_abs_u,
-        "bound_kept": method.bound_kept,
-        "residual": method.residual,
-        "feasible": method.feasible,
-        "x": None if method.simulation is None else method.simulation.x,
-        "u": None if method.simulation is None else method.simulation.u,
+    run = method.simulation
+    named = ("K", "state_misfit", "max_abs_u", "bound_kept", "residual", "feasible")
+    found = {name: getattr(method, name) for name in named}
+    found |= {} if run is None else {"x": run.x, "u": run.u}
+    return {
+        **({} if method.weights is None else _weights(method.weights)),
+        **{name: value for name, value in found.items() if value is not None},
+        "seconds": method.seconds,
+        "simulations": method.simulations,
     }
-    found |= {key: value for key, value in optional.items() if value is not None}
-    return found | {"seconds": method.seconds, "simulations": method.simulations}
 
 
 def _weights(weights: Weights) -> dict[str, Any]:
     return {"Q": weights.Q, "R": weights.R, "condition_number": condition_number(weights)}
-
-
-def _identifiability(found: Identifiability) -> dict[str, Any]:
-    return {
-        "free": found.free,
-        "rank": found.rank,
-        "chosen": found.chosen,
-        "singular_values": found.singular_values,
-        "tolerance": found.tolerance,
-        "others": [
-            {**_weights(item.weights), "state_misfit": item.misfit} for item in found.others
-        ],
-    }

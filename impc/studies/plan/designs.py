@@ -62,15 +62,6 @@ class Design:
 
 
 @dataclass(frozen=True)
-class _Trial(Frozen):
-    """A simulated trial that does not end in a fall."""
-
-    push: Array  # Disturbance (samples, d)
-    outputs: Array  # Without noise (samples, p)
-    inputs: Array  # (samples, m)
-
-
-@dataclass(frozen=True)
 class Outcome(Frozen):
     """What an experiment would give."""
 
@@ -103,23 +94,25 @@ def try_design(
     if len(kept) < trials:
         nothing = frozen(np.full(len(plant.outputs), np.nan))
         return Outcome(design, falls, float("nan"), nothing, nothing, None, None)
-    outputs = np.concatenate([trial.outputs for trial in kept])
+    outputs = np.concatenate([trial.outputs for trial, _ in kept])
     power = np.mean(outputs**2, axis=0)
     sides = np.array(limits.u_min), np.array(limits.u_max)
-    problem = _problem_of(person, kept[:trials])
+    problem = _problem_of(person, [trial for trial, _ in kept[:trials]])
     return Outcome(
         design,
         falls,
-        float(np.mean([saturated_share(np.array(trial.inputs), *sides) for trial in kept])),
+        float(np.mean([saturated_share(inputs, *sides) for _, inputs in kept])),
         frozen(np.max(np.abs(outputs), axis=0)),
         frozen(100 * power / (power + person.deviation**2)),
         problem,
-        _expected(person, problem),
+        expected_intervals(
+            problem, np.array(person.cost_weights), np.array(person.deviation), root=person.root
+        ),
     )
 
 
-def _held(person: Person, push: Array) -> _Trial | None:
-    """The trial, or None for a fall: the perturbation, and a rest as long."""
+def _held(person: Person, push: Array) -> tuple[Recording, Array] | None:
+    """The recording of a `push` (samples, d) and its inputs (samples, m), or None for a fall."""
     plant, samples = person.controller.plant, len(push)
     alone = np.vstack([push, np.zeros_like(push)])
     run = simulate(person.controller, scenario(plant, np.zeros(plant.n), disturbance=alone))
@@ -129,19 +122,15 @@ def _held(person: Person, push: Array) -> _Trial | None:
     peaks, end = np.max(motion[:samples], axis=0), np.max(motion[-samples // 10 :], axis=0)
     if np.any(peaks > person.stops) or np.any(end > _CALM * peaks):
         return None
-    return _Trial(
-        frozen(push), frozen((run.x @ plant.C.T)[:samples]), frozen(np.array(run.u)[:samples])
-    )
+    outputs = (run.x @ plant.C.T)[:samples]
+    return Recording(plant, outputs, push, np.zeros(plant.n)), np.array(run.u)[:samples]
 
 
-def _problem_of(person: Person, trials: Sequence[_Trial]) -> Problem:
+def _problem_of(person: Person, recordings: Sequence[Recording]) -> Problem:
     """The inverse problem of simulated trials."""
-    controller, plant = person.controller, person.controller.plant
-    recordings = [
-        Recording(plant, trial.outputs, trial.push, np.zeros(plant.n)) for trial in trials
-    ]
+    controller = person.controller
     return Problem(
-        plant,
+        controller.plant,
         controller.bounds,
         controller.horizon,
         recordings,
@@ -152,15 +141,13 @@ def _problem_of(person: Person, trials: Sequence[_Trial]) -> Problem:
     )
 
 
-def _expected(person: Person, problem: Problem) -> Expectation:
-    return expected_intervals(
-        problem, np.array(person.cost_weights), np.array(person.deviation), root=person.root
-    )
-
-
 def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome]:
     """The A-optimal experiment and the D-optimal one."""
-    held = [item for item in outcomes if item.expected is not None and item.falls <= falls]
+    held = [
+        (item, item.expected)
+        for item in outcomes
+        if item.expected is not None and item.falls <= falls
+    ]
     if not held:
         least = min(item.falls for item in outcomes)
         raise SolverError(
@@ -169,8 +156,7 @@ def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome
             "perturbation",
             "lower amplitude, or raise u_max or falls",
         )
-    usable = [(item, item.expected) for item in held if item.expected is not None]
     return (
-        min(usable, key=lambda pair: pair[1].mean_variance)[0],
-        min(usable, key=lambda pair: pair[1].log_determinant)[0],
+        min(held, key=lambda pair: pair[1].mean_variance)[0],
+        min(held, key=lambda pair: pair[1].log_determinant)[0],
     )

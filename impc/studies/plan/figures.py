@@ -6,10 +6,12 @@ See docs/planning.md.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from impc.assess.covariance import TWO_SIDED
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, GREEN, INK, VERMILLION, new_figure
@@ -43,7 +45,6 @@ def cost_weights_figure(plan: Plan) -> Figure:
         ax.yaxis.set_major_formatter("{x:g}")
         ax.yaxis.set_minor_formatter("{x:g}")
         ax.tick_params(axis="y", which="minor", labelsize=6)
-        _axis(ax, plan)
     for ax in axes[len(names) :]:
         ax.set_visible(False)
     if len(plan.outcomes) > len(plan.settings.amplitude):
@@ -62,7 +63,6 @@ def experiments_figure(plan: Plan) -> Figure:
     falls.axhline(plan.settings.falls, color=INK, linewidth=0.8, linestyle=":")
     for ax in (at_limit, falls):
         ax.set_ylim(bottom=-1)
-        _axis(ax, plan)
     if len(plan.outcomes) > len(plan.settings.amplitude):
         at_limit.legend()
     return figure
@@ -77,31 +77,17 @@ def _factor(index: int, item: Outcome) -> float:
 
 def _lines(ax: Axes, plan: Plan, value: Callable[[Outcome], float]) -> None:
     """One line a dwell; a ring about the best experiment."""
-    dwells = sorted({item.design.dwell for item in plan.outcomes})
-    for place, dwell in enumerate(dwells):
-        mine = [
-            item
-            for item in plan.outcomes
-            if item.design.dwell == dwell or (math.isnan(dwell) and math.isnan(item.design.dwell))
-        ]
-        color, marker, line = _LINES[place % len(_LINES)]
-        ax.plot(
-            [item.design.amplitude for item in mine],
-            [value(item) for item in mine],
-            color=color,
-            marker=marker,
-            linestyle=line,
-            label="as recorded" if math.isnan(dwell) else f"held for {dwell:g} s",
-        )
-    best = plan.best
-    ax.plot(
-        best.design.amplitude, value(best), marker="o", markersize=11, color=INK, fillstyle="none"
+    points = pd.DataFrame(
+        [(item.design.dwell, item.design.amplitude, value(item)) for item in plan.outcomes]
     )
-
-
-def _axis(ax: Axes, plan: Plan) -> None:
+    by_dwell = points.groupby(0, dropna=False)  # NaN where it is as recorded
+    for (dwell, mine), style in zip(by_dwell, itertools.cycle(_LINES), strict=False):
+        label = "as recorded" if plan.settings.files else f"held for {dwell:g} s"
+        color, marker, line = style
+        ax.plot(mine[1], mine[2], color=color, marker=marker, linestyle=line, label=label)
+    ring: Any = {"marker": "o", "markersize": 11, "color": INK, "fillstyle": "none"}
+    ax.plot(plan.best.design.amplitude, value(plan.best), **ring)
     plant = plan.person.controller.plant
-    name = plant.disturbances[0]
-    label = "factor (-)" if plan.settings.files else f"amplitude ({plant.unit(name)})"
-    ax.set_xlabel(label)
+    amplitude = f"amplitude ({plant.unit(plant.disturbances[0])})"
+    ax.set_xlabel("factor (-)" if plan.settings.files else amplitude)
     ax.margins(x=0.08)

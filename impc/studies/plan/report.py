@@ -6,6 +6,7 @@ See docs/planning.md.
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from markupsafe import Markup
 
 from impc.model.plant import gain_unit
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit, signal_words
 from impc.reporting.style import drawn, journal_style
@@ -32,8 +33,7 @@ _PICTURES = (
         "cost_weights",
         "How far each cost weight would be identified, over the amplitude of the perturbation",
         "Half an interval of 95 %, as a factor of the cost weight: farther down is better, 1 is "
-        "exact. "
-        "Each line is a dwell; the large ring marks the experiment above.",
+        "exact. Each line is a dwell; the large ring marks the experiment above.",
     ),
     Picture(
         "experiments",
@@ -76,27 +76,26 @@ def _experiments(plan: Plan) -> Finding:
     """Every experiment and what it would say, as factors of the presumed cost weights (95 %)."""
     rows: list[dict[str, Any]] = []
     for item in plan.outcomes:
-        best = [word for word, one in (("A-optimal", plan.best), ("D-optimal", plan.sharpest))
-                if item is one]  # fmt: skip
-        row = {
+        row: dict[str, Any] = {
             "amplitude": float(item.design.amplitude),
             "dwell": float(item.design.dwell),
             "falls_percent": 100 * float(item.falls),
             "at_the_limit_percent": 100 * float(item.at_limit),
         }
         for index, name in enumerate(plan.person.structure.unknowns):
-            interval = None if item.expected is None else item.expected.intervals[index]
-            for end in ("low", "high"):
-                away = np.nan if interval is None else getattr(interval, end) - interval.value
-                row[f"{name}_{end}"] = float(np.exp(away))
-            expected = item.expected
-            error = np.nan if expected is None else float(expected.deviations[index])
-            row[f"{name}_standard_error"] = error
-        rows.append({**row, "best": ", ".join(best)})
+            low, high, error = np.nan, np.nan, np.nan
+            if item.expected is not None:
+                interval = item.expected.intervals[index]
+                ends = interval.low, interval.high
+                low, high = (float(np.exp(end - interval.value)) for end in ends)
+                error = float(item.expected.deviations[index])
+            row |= {f"{name}_low": low, f"{name}_high": high, f"{name}_standard_error": error}
+        best = {"A-optimal": plan.best, "D-optimal": plan.sharpest}
+        row["best"] = ", ".join(word for word, one in best.items() if item is one)
+        rows.append(row)
     caption = (
         "Expected intervals of 95 %, as factors of the presumed cost weight, and standard errors "
-        "of its "
-        "logarithm; dwell in s."
+        "of its logarithm; dwell in s."
     )
     return Finding("experiments", pd.DataFrame(rows), caption, digits=3)
 
@@ -106,106 +105,96 @@ def _best(plan: Plan) -> list[Finding]:
     if expected is None:
         return []
     plant, truth, fits = person.controller.plant, np.array(person.controller.K), plan.simulated
-    scatter = None if fits is None or len(fits.cost_weights) == 0 else spread(fits.cost_weights)
-    cost_weights = table_of(
-        range(len(person.structure.unknowns)),
+    count = len(person.structure.unknowns)
+    known = fits is not None and len(fits.cost_weights) > 0
+    scatter = spread(fits.cost_weights) if fits is not None and known else np.full(count, np.nan)
+    cost_weights = pd.DataFrame(
         {
-            "cost_weight_of": lambda k: person.structure.unknowns[k],
-            "presumed": lambda k: math.exp(float(person.cost_weights[k])),
-            "low": lambda k: math.exp(expected.intervals[k].low),
-            "high": lambda k: math.exp(expected.intervals[k].high),
-            "standard_error_of_the_logarithm": lambda k: float(expected.deviations[k]),
-            "in_simulated_fits": lambda k: np.nan if scatter is None else float(scatter[k]),
-        },
+            "cost_weight_of": person.structure.unknowns,
+            "presumed": np.exp(person.cost_weights),
+            "low": [math.exp(item.low) for item in expected.intervals],
+            "high": [math.exp(item.high) for item in expected.intervals],
+            "standard_error_of_the_logarithm": np.array(expected.deviations),
+            "in_simulated_fits": scatter,
+        }
     )
-    gains = table_of(
-        [(i, j) for i in range(plant.m) for j in range(plant.n)],
+    places = [(control, state) for control in plant.controls for state in plant.states]
+    gains = pd.DataFrame(
         {
-            "gain": lambda at: number_name(
-                plant, f"K.{plant.controls[at[0]]}.{plant.states[at[1]]}"
-            ),
-            "unit": lambda at: gain_unit(plant, plant.controls[at[0]], plant.states[at[1]]),
-            "presumed": lambda at: float(truth[at]),
-            "half_an_interval": lambda at: 1.96 * float(expected.gain.entries[at]),
-            "identified": lambda at: bool(expected.gain.individually_identified[at]),
-        },
+            "gain": [number_name(plant, f"K.{control}.{state}") for control, state in places],
+            "unit": [gain_unit(plant, control, state) for control, state in places],
+            "presumed": truth.ravel(),
+            "half_an_interval": 1.96 * np.ravel(expected.gain.entries),
+            "identified": np.ravel(expected.gain.individually_identified),
+        }
     )
+    with_one = "Cost weights, with one for the first command, 95 %."
     along = int(np.count_nonzero(expected.gain.identified))
     caption = (
         f"Gains fitted without a structure: {along} of {truth.size} directions would be identified "
         "to a fifth of their natural size. Half an interval is that of 95 %."
     )
     return [
-        Finding(
-            "cost_weights",
-            cost_weights,
-            "Cost weights, with one for the first command, 95 %.",
-            digits=3,
-        ),
+        Finding("cost_weights", cost_weights, with_one, digits=3),
         Finding("gain", gains, caption, digits=3),
     ]
 
 
 def _groups(plan: Plan) -> Finding:
     settings = plan.settings
-    powers = {
-        f"power_with_{size}_a_group_percent": (lambda item, k=k: 100 * float(item.powers[k]))
-        for k, size in enumerate(settings.groups)
-    }
-    table = table_of(
-        plan.groups,
-        {
-            "cost_weight_of": lambda item: item.feature,
-            "standard_deviation_within_a_group": lambda item: float(item.deviation),
-            **powers,
-            "persons_a_group_for_80_percent": lambda item: float(item.needed),
-        },
-    )
+    rows = [
+        (item.feature, item.deviation, *(100 * np.array(item.powers)), item.needed)
+        for item in plan.groups
+    ]
+    powers = [f"power_with_{size}_a_group_percent" for size in settings.groups]
+    heads = ["cost_weight_of", "standard_deviation_within_a_group", *powers,
+             "persons_a_group_for_80_percent"]  # fmt: skip
     caption = (
         f"Two groups whose cost weight differs by {settings.difference:g} %, t-test of the "
-        "logarithms at "
-        f"5 %; persons within a group differ by {settings.between:g} %."
+        f"logarithms at 5 %; persons within a group differ by {settings.between:g} %."
     )
-    return Finding("groups", table, caption, digits=3)
+    return Finding("groups", pd.DataFrame(rows, columns=heads), caption, digits=3)
 
 
 def _presumed(plan: Plan) -> tuple[Terms, ...]:
     person, plant = plan.person, plan.person.controller.plant
-    noise = []
-    for name, value in zip(plant.outputs, person.deviation, strict=True):
-        factor, unit = shown_unit(plant, name)
-        noise.append(f"{name}: {number(factor * float(value))} {unit}")
-    cost_weights = [
-        f"{name}: {number(math.exp(float(value)))}"
-        for name, value in zip(person.structure.unknowns, person.cost_weights, strict=True)
-    ]
+    shown = [(name, *shown_unit(plant, name)) for name in plant.outputs]
     tau = plan.settings.correlation
     kind = f"correlated over {tau:g} s" if tau > 0 else "white"
-    limits = [
-        f"{name}: {number(float(value))} {plant.unit(name)}"
-        for name, value in zip(plant.controls, person.controller.bounds.u_max, strict=True)
-    ]
-    return (
-        Terms(
+    bounds = person.controller.bounds
+    terms = [
+        (
+            "Cost weights",
             [
-                ("Cost weights", cost_weights),
-                (f"Noise in the recorder, {kind}", noise),
-                ("Limit", limits),
-                ("Horizon", (f"{person.controller.horizon} samples of {plant.dt:g} s",)),
-            ]
+                f"{name}: {number(math.exp(float(value)))}"
+                for name, value in zip(person.structure.unknowns, person.cost_weights, strict=True)
+            ],
         ),
-    )
+        (
+            f"Noise in the recorder, {kind}",
+            [
+                f"{name}: {number(factor * float(value))} {unit}"
+                for (name, factor, unit), value in zip(shown, person.deviation, strict=True)
+            ],
+        ),
+        (
+            "Limit",
+            [
+                f"{name}: {number(float(value))} {plant.unit(name)}"
+                for name, value in zip(plant.controls, bounds.u_max, strict=True)
+            ],
+        ),
+        ("Horizon", [f"{person.controller.horizon} samples of {plant.dt:g} s"]),
+    ]
+    return (Terms(terms),)
 
 
 def _data(plan: Plan) -> dict[str, Any]:
     person, expected, fits = plan.person, plan.best.expected, plan.simulated
     names = person.structure.unknowns
     found: dict[str, Any] = {
-        "best": {"amplitude": plan.best.design.amplitude, "dwell": plan.best.design.dwell},
-        "sharpest": {
-            "amplitude": plan.sharpest.design.amplitude,
-            "dwell": plan.sharpest.design.dwell,
-        },
+        "best": asdict(plan.best.design),
+        "sharpest": asdict(plan.sharpest.design),
         "structure": person.structure.name,
         "presumed": dict(zip(names, np.exp(person.cost_weights), strict=True)),
         "gain": {"presumed": person.controller.K},

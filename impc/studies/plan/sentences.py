@@ -51,9 +51,9 @@ def plan_sentences(plan: Plan) -> tuple[str, ...]:
     count = len(plan.outcomes)
     which = "The experiment" if count == 1 else f"The best of {count} experiments"
     trials = "trial" if settings.trials == 1 else "trials"
+    length = "their recorded length" if settings.files else f"{settings.duration:g} s"
     return (
-        f"{which}, {settings.trials} {trials} of {_length(plan)}: "
-        f"{design_name(plan, best.design)}.",
+        f"{which}, {settings.trials} {trials} of {length}: {design_name(plan, best.design)}.",
         _cost_weights(plan),
         _limits(plan),
         _how_it_goes(plan, best),
@@ -64,29 +64,17 @@ def plan_sentences(plan: Plan) -> tuple[str, ...]:
     )
 
 
-def _length(plan: Plan) -> str:
-    return "their recorded length" if plan.settings.files else f"{plan.settings.duration:g} s"
-
-
 def _cost_weights(plan: Plan) -> str:
     expected = plan.best.expected
     if expected is None:
         return "Nothing is identified."
-    parts = [
-        f"{name} {stated_as(item)}"
-        for name, item in zip(plan.person.structure.unknowns, expected.intervals, strict=True)
-    ]
-    wide = [
-        name
-        for name, item in zip(plan.person.structure.unknowns, expected.intervals, strict=True)
-        if item.high - item.low > _WIDE
-    ]
+    named = dict(zip(plan.person.structure.unknowns, expected.intervals, strict=True))
+    parts = [f"{name} {stated_as(item)}" for name, item in named.items()]
+    wide = [name for name, item in named.items() if item.high - item.low > _WIDE]
     text = (
         f"Beside the presumed cost weight, an interval of 95 % would be for {'; for '.join(parts)}."
     )
-    if wide:
-        text += f" That says next to nothing of {', '.join(wide)}."
-    return text
+    return f"{text} That says next to nothing of {', '.join(wide)}." if wide else text
 
 
 def _limits(plan: Plan) -> str:
@@ -140,16 +128,12 @@ def _seen(plan: Plan) -> tuple[str, ...]:
     held = fits.inside(expected)
     names = plan.person.structure.unknowns
     worst = int(np.argmin(held))
-    ratios = [
-        float(one / two)
-        for one, two in zip(spread(fits.cost_weights), expected.deviations, strict=True)
-        if np.isfinite(one) and np.isfinite(two)
-    ]
+    ratios = spread(fits.cost_weights) / np.array(expected.deviations)
+    known = ratios[np.isfinite(ratios)]
     text = (
         f"Of {len(fits.cost_weights)} fits of simulated recordings {100 * np.mean(held):.0f} % of "
-        "the "
-        f"cost weights lay in these intervals ({100 * held[worst]:.0f} % of {names[worst]})"
+        f"the cost weights lay in these intervals ({100 * held[worst]:.0f} % of {names[worst]})"
     )
-    if ratios:
-        text += f", and they scattered {min(ratios):.2f} to {max(ratios):.2f} times as foreseen"
+    if len(known):
+        text += f", and they scattered {known.min():.2f} to {known.max():.2f} times as foreseen"
     return (f"{text}; {fits.failed} fits failed.",)

@@ -59,17 +59,14 @@ class PlanSettings:
     files: list[str] = field(default_factory=list)
     # Trials that are simulated of each experiment to see how often the person falls
     draws: Annotated[int, Meta(ge=1, le=1000)] = 20
-    falls: Annotated[float, Meta(ge=0, le=100)] = (
-        5.0  # Largest share of them that may end in a fall, %
-    )
+    # Largest share of them that may end in a fall, %
+    falls: Annotated[float, Meta(ge=0, le=100)] = 5.0
     # Persons in each of two groups that are to be distinguished
     groups: Annotated[list[Persons], Some] = field(default_factory=lambda: [10, 20])
-    difference: Annotated[float, Meta(ge=0.1, le=1e4)] = (
-        50.0  # By which a cost weight differs between the groups, %
-    )
-    between: Annotated[float, Meta(ge=0, le=1000)] = (
-        30.0  # Standard deviation of the logarithm of a cost weight within a group, %
-    )
+    # By which a cost weight differs between the groups, %
+    difference: Annotated[float, Meta(ge=0.1, le=1e4)] = 50.0
+    # Standard deviation of the logarithm of a cost weight within a group, %
+    between: Annotated[float, Meta(ge=0, le=1000)] = 30.0
     # Fits of simulated recordings of the best experiment, to compare with; 0 for none
     fits: Annotated[int, Meta(ge=0, le=10_000)] = 0
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 0  # All that is drawn follows from it

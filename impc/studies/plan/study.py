@@ -23,20 +23,10 @@ from impc.checking import replace
 from impc.errors import ImpcError
 from impc.inverse.structured_fit import structured_estimate
 from impc.inverse.structured_search import search_from
-from impc.model.recordings import Recording
 from impc.studies.effort import SECONDS_A_SAMPLE, Effort
-from impc.studies.plan.designs import (
-    Design,
-    Outcome,
-    best_of,
-    designs,
-    try_design,
-)
+from impc.studies.plan.designs import Design, Outcome, best_of, designs, try_design
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.arrays import Array
     from impc.assess.expected import Expectation
     from impc.inverse.problem import Problem
     from impc.studies.plan.designs import Person, Perturbation
@@ -156,17 +146,13 @@ def plan_effort(person: Person, settings: PlanSettings) -> Effort:
 
 # Correlation left of the noise before the first sample: 1e-6.
 _FORGOTTEN = 14.0
-# Of a normal distribution, one deviation to each side.
-_MIDDLE = (15.866, 84.134)
 
 
 @dataclass(frozen=True)
 class SimulatedFits(Frozen):
     """What so many fits found."""
 
-    cost_weights: (
-        Array  # Unknowns of the structure (fits, count); minus infinity for a cost weight of zero
-    )
+    cost_weights: Array  # Unknowns (fits, count); minus infinity for a cost weight of zero
     gains: Array  # Gain without a structure, as it is printed with intervals (fits, m, n)
     failed: int  # Fits that ended without an answer
 
@@ -179,7 +165,7 @@ class SimulatedFits(Frozen):
 
 def spread(values: Array) -> Array:
     """Half of what the middle 68 % span (k,), of values (fits, k): a deviation without tails."""
-    low, high = np.percentile(values, _MIDDLE, axis=0, method="inverted_cdf")
+    low, high = np.percentile(values, (15.866, 84.134), axis=0, method="inverted_cdf")
     return np.asarray((high - low) / 2)
 
 
@@ -230,12 +216,7 @@ def simulated_fits(
 
 def _measured(person: Person, problem: Problem, rng: np.random.Generator) -> Problem:
     trials = [
-        Recording(
-            problem.plant,
-            trial.outputs + recorded_noise(person, trial.samples, rng),
-            trial.disturbance,
-            trial.x0,
-        )
+        replace(trial, outputs=trial.outputs + recorded_noise(person, trial.samples, rng))
         for trial in problem.recordings
     ]
     return replace(problem, recordings=trials, output_scale=person.deviation)

@@ -21,7 +21,7 @@ root: NaN, which says that curves differ more than frequencies do.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,6 @@ from impc.studies.reliability.anova import (
 )
 from impc.studies.reliability.icc import icc, measurement_error
 from impc.studies.reliability.measures import (
-    ComplexArray,
     band_energy,
     passband,
     rms,
@@ -47,12 +46,11 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.model.recordings import Recording
     from impc.studies.reliability.anova import Anova, PairedTest, Trend, VarianceComponent
-    from impc.studies.reliability.icc import Form, Icc, MeasurementError
-    from impc.studies.reliability.measures import Passband, TransferFunction
+    from impc.studies.reliability.icc import Icc, MeasurementError
+    from impc.studies.reliability.measures import ComplexArray, Passband, TransferFunction
 
 #: Name of a measure -> what it is.
 MEASURES = {"rms": "root-mean-square about upright", "energy": "mean bandpass signal energy (2.1)"}
-_FORM: Form = "A,k"
 
 
 @dataclass(frozen=True)
@@ -64,36 +62,32 @@ class Trials:
     # (subject, visit, condition) -> the trials analysed, in order
     cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
 
-    def labels(self, index: int) -> tuple[str, ...]:
-        """Subjects (`index` 0), visits (1) or conditions (2) in the order in which they come."""
-        return tuple(dict.fromkeys(key[index] for key in self.cells))
-
 
 @dataclass(frozen=True)
 class MeasureResult:
     """One measure of one output in one condition."""
 
-    measure: str  # Of which, by name; the measure is one of `MEASURES`
+    measure: str  # One of `MEASURES`
     output: str
     condition: str
     # (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy)
     scores: Array
-    icc: Icc | None  # (A,k), between visits, with the generalised interval
+    icc: Icc | None = None  # (A,k), between visits, with the generalised interval
     # Of the score of one visit, with the minimal detectable change (95 %), in the score's unit
-    error: MeasurementError | None
-    anova: Anova | None
-    pairs: tuple[PairedTest, ...]
-    trend: Trend | None  # Learning: change from visit to visit
+    error: MeasurementError | None = None
+    anova: Anova | None = None
+    pairs: tuple[PairedTest, ...] = ()
+    trend: Trend | None = None  # Learning: change from visit to visit
     # Of subjects, visits and trials; empty when trials are too few
-    components: tuple[VarianceComponent, ...]
-    notes: tuple[str, ...]  # Why something is missing
+    components: tuple[VarianceComponent, ...] = ()
+    notes: tuple[str, ...] = ()  # Why something is missing
 
 
 @dataclass(frozen=True)
 class CmcResult:
     """Coefficients of multiple correlation of one output in one condition, by subject."""
 
-    output: str  # Of which, by name
+    output: str
     condition: str
     within: Array  # (subjects,), NaN where there is none
     between: Array
@@ -120,61 +114,57 @@ def analyse(trials: Trials) -> Reliability:
     """Analyse a study."""
     if not trials.cells:
         raise DataError("study", "has no trial", "check where it looks for recordings")
-    subjects, visits, conditions = (trials.labels(index) for index in range(3))
-    samples = min(item.samples for cell in trials.cells.values() for item in cell)
-    longest = max(item.samples for cell in trials.cells.values() for item in cell)
+    # In the order in which they come.
+    subjects, visits, conditions = (
+        tuple(dict.fromkeys(one)) for one in zip(*trials.cells, strict=True)
+    )
+    lengths = [item.samples for cell in trials.cells.values() for item in cell]
+    samples, rate = min(lengths), trials.rate
     notes = []
-    if longest > samples:
-        notes.append(f"Trials have {samples} to {longest} samples: all were cut to {samples}.")
-    first = next(iter(trials.cells.values()))[0]
-    band = passband(first.disturbance[:samples, 0], trials.rate)
+    if max(lengths) > samples:
+        notes.append(f"Trials have {samples} to {max(lengths)} samples: all were cut to {samples}.")
+    inputs = {
+        key: [item.disturbance[:samples, 0] for item in cell] for key, cell in trials.cells.items()
+    }
+    outputs = {key: [item.outputs[:samples] for item in cell] for key, cell in trials.cells.items()}
+    band = passband(next(iter(inputs.values()))[0], rate)
+    responses = {
+        key: transfer_function(inputs[key], outputs[key], rate, band) for key in trials.cells
+    }
+    # Of each trial: scores by measure (p,), and its own transfer function (frequencies, p).
+    scores: dict[str, dict[tuple[str, str, str], list[Array]]] = {
+        "rms": {key: [rms(item) for item in cell] for key, cell in outputs.items()},
+        "energy": {
+            key: [band_energy(item, rate, band.low, band.high) for item in cell]
+            for key, cell in outputs.items()
+        },
+    }
+    curves = {
+        key: [
+            transfer_function([one], [other], rate, band).response
+            for one, other in zip(inputs[key], outputs[key], strict=True)
+        ]
+        for key in trials.cells
+    }
     measures, cmc = [], []
     for condition in conditions:
-        for output in range(len(trials.outputs)):
-            for name in MEASURES:
-                table = _trial_scores(trials, name, output, condition, band, samples)
-                measures.append(_measure(name, trials.outputs[output], condition, table, visits))
-            cmc.append(_cmc(trials, output, condition, band, samples))
-    responses = {
-        key: transfer_function(
-            [item.disturbance[:samples, 0] for item in cell],
-            [item.outputs[:samples] for item in cell],
-            trials.rate,
-            band,
-        )
-        for key, cell in trials.cells.items()
-    }
+        keys = [[(subject, visit, condition) for visit in visits] for subject in subjects]
+        for place, output in enumerate(trials.outputs):
+            for name, found in scores.items():
+                table = [
+                    [[float(one[place]) for one in found.get(key, ())] for key in row]
+                    for row in keys
+                ]
+                measures.append(_measure(name, output, condition, table, visits))
+            own = [
+                [[one[:, place] for one in curves[key]] for key in row if key in curves]
+                for row in keys
+            ]
+            cmc.append(_cmc(output, condition, own))
     return Reliability(
-        subjects,
-        visits,
-        conditions,
-        trials.outputs,
-        band,
-        tuple(measures),
-        tuple(cmc),
-        responses,
+        subjects, visits, conditions, trials.outputs, band, tuple(measures), tuple(cmc), responses,
         tuple(notes),
-    )
-
-
-def _trial_scores(
-    trials: Trials, measure: str, output: int, condition: str, band: Passband, samples: int
-) -> list[list[list[float]]]:
-    """Scores of every trial, by subject and visit; an empty list where a cell is missing."""
-
-    def score(trial: Recording) -> float:
-        values = trial.outputs[:samples, output : output + 1]
-        if measure == "rms":
-            return float(rms(values)[0])
-        return float(band_energy(values, trials.rate, band.low, band.high)[0])
-
-    return [
-        [
-            [score(item) for item in trials.cells.get((subject, visit, condition), ())]
-            for visit in trials.labels(1)
-        ]
-        for subject in trials.labels(0)
-    ]
+    )  # fmt: skip
 
 
 def _measure(
@@ -184,113 +174,70 @@ def _measure(
     table: list[list[list[float]]],
     visits: tuple[str, ...],
 ) -> MeasureResult:
+    """Scores of every trial, by subject and visit, analysed; an empty list is a missing cell."""
     scores = np.array([[np.mean(cell) if cell else np.nan for cell in row] for row in table])
+    found: dict[str, Any] = {}
     notes: list[str] = []
-    found, measured, anova, trend = None, None, None, None
-    pairs: tuple[PairedTest, ...] = ()
     try:
-        found = icc(scores, _FORM, method="generalised")
-        measured = measurement_error(scores)
-        if found.left_out:
-            notes.append(f"{found.left_out} subjects lack a visit and are left out")
-        anova = visit_anova(scores)
-        pairs = paired_tests(scores, visits)
-        trend = learning_trend(scores)
+        found |= {
+            "icc": icc(scores, "A,k", method="generalised"),
+            "error": measurement_error(scores),
+        }
+        if found["icc"].left_out:
+            notes.append(f"{found['icc'].left_out} subjects lack a visit and are left out")
+        found["anova"] = visit_anova(scores)
+        found["pairs"] = paired_tests(scores, visits)
+        found["trend"] = learning_trend(scores)
     except DataError as error:
         notes.append(str(error))
-    components: tuple[VarianceComponent, ...] = ()
+    complete = [row for row in table if all(row)]
     try:
-        components = variance_components(_even(table))
+        if not complete:
+            raise DataError("scores", "are complete for no subject", "record every visit")
+        fewest = min(len(cell) for row in complete for cell in row)
+        even = np.array([[cell[-fewest:] for cell in row] for row in complete])
+        found["components"] = variance_components(even)
     except DataError as error:
         notes.append(f"variance components: {error}")
-    return MeasureResult(
-        measure,
-        output,
-        condition,
-        scores,
-        found,
-        measured,
-        anova,
-        pairs,
-        trend,
-        components,
-        tuple(notes),
-    )
+    return MeasureResult(measure, output, condition, scores, **found, notes=tuple(notes))
 
 
-def _even(table: list[list[list[float]]]) -> Array:
-    """Scores (subjects, visits, trials) of the subjects with all visits, trials cut alike."""
-    complete = [row for row in table if all(row)]
-    if not complete:
-        raise DataError("scores", "are complete for no subject", "record every visit")
-    fewest = min(len(cell) for row in complete for cell in row)
-    return np.array([[cell[-fewest:] for cell in row] for row in complete])
-
-
-def _cmc(trials: Trials, output: int, condition: str, band: Passband, samples: int) -> CmcResult:
-    within, between, undefined = [], [], 0
-    for subject in trials.labels(0):
-        cells = [trials.cells.get((subject, visit, condition), ()) for visit in trials.labels(1)]
-        present = [cell for cell in cells if cell]
-        fewest = min((len(cell) for cell in present), default=0)
-        pair = [float("nan"), float("nan")]
-        if fewest:
-            curves = np.array(
-                [
-                    [_curve(item, trials.rate, band, samples, output) for item in cell[-fewest:]]
-                    for cell in present
-                ]
-            )
-            for place, (make, count) in enumerate(
-                ((cmc_within, curves.shape[1]), (cmc_between, curves.shape[0]))
-            ):
-                if count > 1:
-                    pair[place] = make(curves)
-                    undefined += np.isnan(pair[place])
-        within.append(pair[0])
-        between.append(pair[1])
-    return CmcResult(
-        trials.outputs[output], condition, np.array(within), np.array(between), int(undefined)
-    )
-
-
-def _curve(trial: Recording, rate: float, band: Passband, samples: int, output: int) -> Array:
-    found = transfer_function(
-        [trial.disturbance[:samples, 0]], [trial.outputs[:samples]], rate, band
-    )
-    return np.asarray(found.response[:, output])
+def _cmc(output: str, condition: str, subjects: list[list[list[ComplexArray]]]) -> CmcResult:
+    """Of the curves (frequencies,) of every trial, by subject and visit."""
+    found, undefined = np.full((2, len(subjects)), np.nan), 0
+    for place, visits in enumerate(subjects):
+        fewest = min((len(trials) for trials in visits), default=0)
+        if not fewest:
+            continue
+        curves = np.array([trials[-fewest:] for trials in visits])
+        for row, make, count in ((0, cmc_within, fewest), (1, cmc_between, len(visits))):
+            if count > 1:
+                found[row, place] = make(curves)
+                undefined += int(np.isnan(found[row, place]))
+    return CmcResult(output, condition, found[0], found[1], undefined)
 
 
 def cmc_within(curves: ComplexArray) -> float:
     """Within visits; curves (visits, trials, frequencies)."""
-    M, N, T = _shape(curves, trials=2)
+    M, N, T = curves.shape
+    if N < 2 or T < 2:
+        raise DataError("curves", f"are of {N} trials, {T} frequencies", "a CMC needs 2 or more")
     own = np.sum(np.abs(curves - curves.mean(axis=1, keepdims=True)) ** 2)
     all_of_visit = np.sum(np.abs(curves - curves.mean(axis=(1, 2), keepdims=True)) ** 2)
-    return _root(own / (M * T * (N - 1)), all_of_visit / (M * (N * T - 1)))
+    return _root(own / (M * T * (N - 1)), all_of_visit, M * (N * T - 1))
 
 
 def cmc_between(curves: ComplexArray) -> float:
     """Between visits; curves (visits, trials, frequencies)."""
-    M, N, T = _shape(curves, visits=2)
+    M, N, T = curves.shape
+    if M < 2 or T < 2:
+        raise DataError("curves", f"are of {M} visits, {T} frequencies", "a CMC needs 2 or more")
     own = np.sum(np.abs(curves - curves.mean(axis=(0, 1), keepdims=True)) ** 2)
     everything = np.sum(np.abs(curves - curves.mean()) ** 2)
-    return _root(own / (T * (M * N - 1)), everything / (M * N * T - 1))
+    return _root(own / (T * (M * N - 1)), everything, M * N * T - 1)
 
 
-def _shape(curves: ComplexArray, visits: int = 1, trials: int = 1) -> tuple[int, int, int]:
-    if curves.ndim != 3:
-        raise DataError(
-            "curves", f"have {curves.ndim} dimensions", "give visits, trials, frequencies"
-        )
-    M, N, T = curves.shape
-    for count, least, name in ((M, visits, "visits"), (N, trials, "trials"), (T, 2, "frequencies")):
-        if count < least:
-            raise DataError("curves", f"are of {count} {name}", f"a CMC needs {least} or more")
-    return M, N, T
-
-
-def _root(own: float, total: float) -> float:
-    if total == 0:
-        return float("nan")
-    share = 1 - own / total
+def _root(own: float, squares: float, freedom: int) -> float:
+    """Of one less the share of `own` in the mean square; NaN where there is none."""
+    share = 1 - own * freedom / squares if squares else -1.0
     return float(np.sqrt(share)) if share >= 0 else float("nan")

@@ -24,37 +24,36 @@ and are reported as they are.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import scipy.stats
-from statsmodels.stats.anova import AnovaRM
+from scipy.stats import chi2
 
 from impc.arrays import Array
 from impc.assess.several_tests import holm
 from impc.errors import DataError
+from impc.studies.reliability.icc import complete_rows, mean_squares
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+# Of an interval of 95 %, on each side.
+_TAIL = 0.025
 
-@dataclass(frozen=True)
-class Anova:
+
+class Anova(NamedTuple):
     """F test of a difference between visits."""
 
     F: float  # Mean square of visits over that of visits by subjects
-    freedom: tuple[float, float]  # Of numerator and denominator, uncorrected
+    freedom: tuple[int, int]  # Of numerator and denominator, uncorrected
     p: float  # Uncorrected
     epsilon: float  # Greenhouse and Geisser's, between 1 / (k - 1) and 1
     p_corrected: float  # With both degrees of freedom times epsilon
-    subjects: int  # With all visits, and without
-    left_out: int
+    left_out: int  # Subjects who lack a visit
 
 
-@dataclass(frozen=True)
-class PairedTest:
+class PairedTest(NamedTuple):
     """Paired t between two visits."""
 
     first: str  # The visits
@@ -64,42 +63,32 @@ class PairedTest:
     p_holm: float
 
 
-@dataclass(frozen=True)
-class Trend:
+class Trend(NamedTuple):
     """Slope over visits."""
 
     slope: float  # Mean of the subjects' least-squares slopes, in the score's unit a visit
-    low: float  # Ends of its interval
+    low: float  # Ends of its interval of 95 %
     high: float
     p: float  # Of Student's t that the mean slope is zero
 
 
 def visit_anova(scores: Array) -> Anova:
     """Test of visits; scores (subjects, visits), NaN where missing."""
-    kept, left_out = _complete(scores)
-    n, k = kept.shape
-    long = pd.DataFrame(
-        {
-            "subject": np.repeat(np.arange(n), k),
-            "visit": np.tile(np.arange(k), n),
-            "score": kept.ravel(),
-        }
-    )
+    kept, left_out = complete_rows(scores)
+    squares = mean_squares(kept)
     if np.ptp(kept - kept.mean(axis=1, keepdims=True)) == 0:
         raise DataError("scores", "are the same at every visit", "there is nothing to test")
-    table = AnovaRM(long, "score", "subject", within=["visit"]).fit().anova_table
-    F = float(table["F Value"].iloc[0])
+    F = squares.occasions / squares.error if squares.error else np.inf
+    freedom = (squares.k - 1, (squares.n - 1) * (squares.k - 1))
     epsilon = _greenhouse_geisser(kept)
-    freedom = (float(k - 1), float((n - 1) * (k - 1)))
-    corrected = float(scipy.stats.f.sf(F, epsilon * freedom[0], epsilon * freedom[1]))
-    return Anova(F, freedom, float(table["Pr > F"].iloc[0]), epsilon, corrected, n, left_out)
+    p, corrected = (
+        float(scipy.stats.f.sf(F, share * freedom[0], share * freedom[1])) for share in (1, epsilon)
+    )
+    return Anova(F, freedom, p, epsilon, corrected, left_out)
 
 
 def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
-    """Every pair of visits; subjects who lack one of the two are left out of that pair.
-
-    `scores` (subjects, visits).
-    """
+    """Every pair of visits, of subjects who have both; `scores` (subjects, visits)."""
     rows = []
     for i, j in itertools.combinations(range(len(visits)), 2):
         both = scores[np.all(np.isfinite(scores[:, [i, j]]), axis=1)]
@@ -114,19 +103,14 @@ def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]
     return tuple(PairedTest(*row, float(p)) for row, p in zip(rows, corrected, strict=True))
 
 
-def learning_trend(scores: Array, level: float = 0.95) -> Trend:
-    """Whether scores rise or fall from visit to visit; scores (subjects, visits).
-
-    `level` is that of the interval, between 0 and 1.
-    """
-    kept, _ = _complete(scores)
+def learning_trend(scores: Array) -> Trend:
+    """Whether scores rise or fall from visit to visit; scores (subjects, visits)."""
+    kept, _ = complete_rows(scores)
     visit = np.arange(kept.shape[1]) - (kept.shape[1] - 1) / 2
     slopes = kept @ visit / float(visit @ visit)
     test: Any = scipy.stats.ttest_1samp(slopes, 0.0)
-    interval = test.confidence_interval(level)
-    return Trend(
-        float(slopes.mean()), float(interval.low), float(interval.high), float(test.pvalue)
-    )
+    low, high = test.confidence_interval(0.95)
+    return Trend(float(slopes.mean()), float(low), float(high), float(test.pvalue))
 
 
 def _greenhouse_geisser(scores: Array) -> float:
@@ -138,29 +122,16 @@ def _greenhouse_geisser(scores: Array) -> float:
     return float(np.clip(np.trace(S) ** 2 / below, 1 / (k - 1), 1.0)) if below > 0 else 1.0
 
 
-def _complete(scores: Array) -> tuple[Array, int]:
-    table = np.asarray(scores, dtype=np.float64)
-    if table.ndim != 2 or table.shape[1] < 2:
-        raise DataError("scores", "are of one visit", "a test between visits needs two or more")
-    kept = table[np.all(np.isfinite(table), axis=1)]
-    if len(kept) < 2:
-        raise DataError(
-            "scores", f"are complete for {len(kept)} subject", "a test needs two or more"
-        )
-    return kept, len(table) - len(kept)
-
-
-@dataclass(frozen=True)
-class VarianceComponent:
+class VarianceComponent(NamedTuple):
     """One component."""
 
     name: str  # "subject", "visit" or "trial"
-    value: float  # Estimate and ends of the interval, in the score's unit squared
+    value: float  # Estimate and ends of its interval of 95 %, in the score's unit squared
     low: float
     high: float
 
 
-def variance_components(scores: Array, level: float = 0.95) -> tuple[VarianceComponent, ...]:
+def variance_components(scores: Array) -> tuple[VarianceComponent, ...]:
     """Components of subjects, visits and trials; `scores` (subjects, visits, trials)."""
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 3 or min(table.shape) < 2:
@@ -168,8 +139,6 @@ def variance_components(scores: Array, level: float = 0.95) -> tuple[VarianceCom
             "scores", f"are {' x '.join(map(str, table.shape))}",
             "give two or more subjects, visits and trials",
         )  # fmt: skip
-    if not np.all(np.isfinite(table)):
-        raise DataError("scores", "lack cells", "leave out subjects that are not complete")
     n, v, t = table.shape
     cells, subjects = table.mean(axis=2), table.mean(axis=(1, 2))
     squares = (
@@ -178,36 +147,26 @@ def variance_components(scores: Array, level: float = 0.95) -> tuple[VarianceCom
         float(np.sum((table - cells[..., None]) ** 2)) / (n * v * (t - 1)),
     )
     freedom = (n - 1, n * (v - 1), n * v * (t - 1))
-    tail = (1 - level) / 2
-    trial = squares[2]
-    low = trial * freedom[2] / scipy.stats.chi2.ppf(1 - tail, freedom[2])
-    high = trial * freedom[2] / scipy.stats.chi2.ppf(tail, freedom[2])
+    scaled = squares[2] * freedom[2]
+    low, high = (scaled / float(chi2.ppf(share, freedom[2])) for share in (1 - _TAIL, _TAIL))
     return (
-        _difference("subject", squares[:2], freedom[:2], t * v, tail),
-        _difference("visit", squares[1:], freedom[1:], t, tail),
-        VarianceComponent("trial", trial, float(low), float(high)),
+        VarianceComponent("subject", *_difference(squares[:2], freedom[:2], t * v)),
+        VarianceComponent("visit", *_difference(squares[1:], freedom[1:], t)),
+        VarianceComponent("trial", squares[2], low, high),
     )
 
 
 def _difference(
-    name: str, squares: tuple[float, ...], freedom: tuple[int, ...], over: int, tail: float
-) -> VarianceComponent:
-    """(MS_1 - MS_2) / over with Ting's interval."""
-    (first, second), (f1, f2) = squares, freedom
-    chi2, F = scipy.stats.chi2.ppf, scipy.stats.f.ppf
-    G1 = 1 - f1 / chi2(1 - tail, f1)
-    H1 = f1 / chi2(tail, f1) - 1
-    G2 = 1 - f2 / chi2(1 - tail, f2)
-    H2 = f2 / chi2(tail, f2) - 1
-    upper, lower = F(1 - tail, f1, f2), F(tail, f1, f2)
+    squares: tuple[float, ...], freedom: tuple[int, ...], over: int
+) -> tuple[float, float, float]:
+    """(MS_1 - MS_2) / over, and the ends of Ting's interval."""
+    first, second = squares
+    f = np.array(freedom)
+    (G1, G2), (H1, H2) = 1 - f / chi2.ppf(1 - _TAIL, f), f / chi2.ppf(_TAIL, f) - 1
+    upper, lower = (scipy.stats.f.ppf(share, *freedom) for share in (1 - _TAIL, _TAIL))
     G12 = ((upper - 1) ** 2 - (G1 * upper) ** 2 - H2**2) / upper
     H12 = ((1 - lower) ** 2 - (H1 * lower) ** 2 - G2**2) / lower
     below = (G1 * first) ** 2 + (H2 * second) ** 2 + G12 * first * second
     above = (H1 * first) ** 2 + (G2 * second) ** 2 + H12 * first * second
-    value = (first - second) / over
-    return VarianceComponent(
-        name,
-        value,
-        value - float(np.sqrt(max(below, 0.0))) / over,
-        value + float(np.sqrt(max(above, 0.0))) / over,
-    )
+    value, reach = (first - second) / over, np.sqrt(np.maximum([below, above], 0.0)) / over
+    return value, value - float(reach[0]), value + float(reach[1])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import scipy.signal
 
 from impc.reporting.shown_units import shown_angle
@@ -21,8 +22,6 @@ from impc.reporting.style import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from matplotlib.figure import Figure
 
     from impc.studies.reliability.analysis import Reliability, Trials
@@ -32,17 +31,17 @@ _LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, ":"), (INK, "-."))
 
 def reliability_figures(trials: Trials, result: Reliability) -> dict[str, bytes]:
     """Draw all figures: PNG and PDF by file name."""
-    first = (result.subjects[0], result.visits[0], result.conditions[0])
+    subject, visit, condition = result.subjects[0], result.visits[0], result.conditions[0]
     with journal_style():
         figures = {
             "visits": _visits(result),
-            "time-series": _time_series(trials, result),
+            "time-series": _time_series(trials),
             "spectra": _spectra(trials, result),
             "transfer-visits": _responses(
-                result, [(first[0], visit, first[2]) for visit in result.visits[:4]], 1, "visit"
+                result, {f"visit {one}": (subject, one, condition) for one in result.visits}
             ),
             "transfer-subjects": _responses(
-                result, [(name, first[1], first[2]) for name in result.subjects[:4]], 0, "subject"
+                result, {f"subject {one}": (one, visit, condition) for one in result.subjects}
             ),
         }
         return drawn(figures)
@@ -62,9 +61,7 @@ def _visits(result: Reliability) -> Figure:
         scores = factor * item.scores
         for person in scores:
             ax.plot(across, person, color=BLUE, linewidth=0.6, marker="o", markersize=2.5)
-        counted = [column[np.isfinite(column)] for column in scores.T]
-        means = [np.mean(known) if len(known) else np.nan for known in counted]
-        ax.plot(across, means, color=INK, linewidth=2.0)
+        ax.plot(across, pd.DataFrame(scores).mean(), color=INK, linewidth=2.0)
         ax.set_title(f"{item.output}, {item.condition}", loc="left")
         ax.set_ylabel(f"root-mean-square ({unit})")
         ax.set_xticks(across, result.visits)
@@ -74,19 +71,18 @@ def _visits(result: Reliability) -> Figure:
     return figure
 
 
-def _time_series(trials: Trials, result: Reliability) -> Figure:
+def _time_series(trials: Trials) -> Figure:
     """Figure 2.3: input and outputs of one trial."""
     trial = next(iter(trials.cells.values()))[0]
     time = np.arange(trial.samples) / trials.rate
-    rows = 1 + len(result.outputs)
+    rows = 1 + len(trials.outputs)
     figure = new_figure(DOUBLE_COLUMN, 1.2 * rows + 0.4)
     axes = figure.subplots(rows, 1, sharex=True)
     factor, unit = shown_angle()
     axes[0].step(time, trial.disturbance[:, 0], where="post", color=INK, linewidth=0.9)
     axes[0].set_ylabel("perturbation\n(N m)")
-    for index, name in enumerate(result.outputs):
-        ax = axes[1 + index]
-        ax.plot(time, factor * trial.outputs[:, index], color=BLUE, linewidth=1.0)
+    for ax, name, values in zip(axes[1:], trials.outputs, trial.outputs.T, strict=True):
+        ax.plot(time, factor * values, color=BLUE, linewidth=1.0)
         ax.set_ylabel(f"{name}\n({unit})")
     axes[-1].set_xlabel("time (s)")
     for place, ax in enumerate(axes):
@@ -102,10 +98,8 @@ def _spectra(trials: Trials, result: Reliability) -> Figure:
     excited = result.band.excited
     factor, angle = shown_angle()
     signals = [("perturbation", trial.disturbance[:, 0], "N²m²/Hz")]
-    signals += [
-        (name, factor * trial.outputs[:, index], f"{angle}²/Hz")
-        for index, name in enumerate(result.outputs)
-    ]
+    for name, values in zip(result.outputs, trial.outputs.T, strict=True):
+        signals.append((name, factor * values, f"{angle}²/Hz"))
     for ax, (name, values, unit) in zip(axes, signals, strict=True):
         frequency, power = scipy.signal.periodogram(values, trials.rate, detrend=False)
         inside = excited[excited < len(power)]
@@ -118,25 +112,19 @@ def _spectra(trials: Trials, result: Reliability) -> Figure:
     return figure
 
 
-def _responses(
-    result: Reliability, keys: Sequence[tuple[str, str, str]], varied: int, word: str
-) -> Figure:
-    """Figures 2.5 and 2.6: amplitude and phase of the averaged estimates of several cells."""
+def _responses(result: Reliability, cells: dict[str, tuple[str, str, str]]) -> Figure:
+    """Figures 2.5 and 2.6: amplitude and phase of the averaged estimates of four cells."""
     figure = new_figure(DOUBLE_COLUMN, 3.6)
     axes = figure.subplots(2, len(result.outputs), sharex=True, squeeze=False)
     factor, unit = shown_angle()
-    for (color, line), key in zip(_LINES, keys, strict=False):
+    for (color, line), (label, key) in zip(_LINES, cells.items(), strict=False):
         found = result.responses.get(key)
         if found is None:
             continue
-        for index in range(len(result.outputs)):
-            response = factor * found.response[:, index]
-            label = f"{word} {key[varied]}"
-            axes[0, index].loglog(
-                found.frequency, np.abs(response), color=color, linestyle=line, label=label
-            )
-            phase = np.degrees(np.unwrap(np.angle(response)))
-            axes[1, index].semilogx(found.frequency, phase, color=color, linestyle=line)
+        style: Any = {"color": color, "linestyle": line, "label": label}
+        for (above, below), response in zip(axes.T, factor * found.response.T, strict=True):
+            above.loglog(found.frequency, np.abs(response), **style)
+            below.semilogx(found.frequency, np.degrees(np.unwrap(np.angle(response))), **style)
     for index, name in enumerate(result.outputs):
         axes[0, index].set_title(f"({'AB'[index % 2]}) {name}", loc="left")
         axes[1, index].set_xlabel("frequency (Hz)")

@@ -1,4 +1,4 @@
-"""Intraclass correlation in all forms of McGraw and Wong (1996), with F-based intervals.
+"""Intraclass correlation of agreement (McGraw and Wong 1996), with intervals.
 
 n subjects are measured on k occasions. From the two-way analysis of variance
 
@@ -7,12 +7,8 @@ n subjects are measured on k occasions. From the two-way analysis of variance
     MSE = sum_ij (x_ij - m_i. - m_.j + m)^2 / ((n - 1)(k - 1))
     MSW = sum_ij (x_ij - m_i.)^2 / (n (k - 1))                within subjects, one-way
 
-    (1)     (MSR - MSW) / (MSR + (k - 1) MSW)                 one-way, single score
-    (k)     (MSR - MSW) / MSR                                 one-way, mean of k
-    (C,1)   (MSR - MSE) / (MSR + (k - 1) MSE)                 consistency
-    (C,k)   (MSR - MSE) / MSR
-    (A,1)   (MSR - MSE) / (MSR + (k - 1) MSE + k (MSC - MSE) / n)      absolute agreement
-    (A,k)   (MSR - MSE) / (MSR + (MSC - MSE) / n)
+    (A,1)   (MSR - MSE) / (MSR + (k - 1) MSE + k (MSC - MSE) / n)      of a single score
+    (A,k)   (MSR - MSE) / (MSR + (MSC - MSE) / n)                      of the mean of k
 
 Whether occasions are random or fixed changes the meaning and not the number. Estimates may be
 negative, and are reported as they are.
@@ -34,7 +30,6 @@ with ICC(A,k), the reliability of a mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -47,12 +42,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 _ALIKE = 1e-24  # of mean squares: round-off of means
-#: One of `FORMS`, for annotations.
-Form = Literal["1", "k", "C,1", "C,k", "A,1", "A,k"]
-#: Names of the forms, as above.
-FORMS: tuple[Form, ...] = ("1", "k", "C,1", "C,k", "A,1", "A,k")
+_LEVEL = 0.95
+#: Of a single score, or of the mean over all occasions.
+Form = Literal["A,1", "A,k"]
+FORMS: tuple[Form, ...] = ("A,1", "A,k")
 
-#: How an interval is made: McGraw and Wong's, or the generalised one (absolute agreement only).
+#: How an interval is made: McGraw and Wong's, or the generalised one.
 Method = Literal["F", "generalised"]
 # Draws behind a generalised interval: its ends then vary by .01 of its width from seed to seed.
 _DRAWS = 20_000
@@ -69,50 +64,47 @@ class MeanSquares(NamedTuple):
     k: int
 
 
-@dataclass(frozen=True)
-class Icc:
-    """One intraclass correlation."""
+class Icc(NamedTuple):
+    """One intraclass correlation with its interval of 95 %."""
 
-    form: Form  # One of `FORMS`
-    # Estimate and ends of the interval; NaN when all scores are equal, or the denominator is not
-    # positive. An estimate of 1 has the interval 1 to 1.
+    # NaN when all scores are equal, or the denominator is not positive. An estimate of 1 has the
+    # interval 1 to 1.
     value: float
     low: float
     high: float
-    level: float  # Of the interval
-    subjects: int  # How many there were of each
-    occasions: int
+    subjects: int
     left_out: int  # Subjects that lacked a score on some occasion
 
 
-@dataclass(frozen=True)
-class MeasurementError:
-    """Error of one measurement of one subject."""
+class MeasurementError(NamedTuple):
+    """Error of one measurement of one subject, in the scores' unit."""
 
-    sem: float  # Standard error of measurement, in the scores' unit
-    freedom: float  # Satterthwaite's degrees of freedom of its square; NaN when it is zero
-    # Minimal detectable change: what the difference of two measurements exceeds by error alone in 1
-    # - level of all subjects, in the scores' unit
+    sem: float  # Standard error of measurement
+    # Minimal detectable change: what the difference of two measurements exceeds by error alone in
+    # 5 % of all subjects
     mdc: float
-    level: float  # Of the MDC
 
 
-def icc(scores: ArrayLike, form: Form = "A,k", level: float = 0.95, method: Method = "F") -> Icc:
+def icc(scores: ArrayLike, form: Form = "A,k", method: Method = "F") -> Icc:
     """Intraclass correlation of scores; `scores` (subjects, occasions)."""
     if form not in FORMS:
-        raise InputError(f"ICC form {form!r}", "is not known", f"known: {', '.join(FORMS)}")
-    if method != "F" and form not in ("A,1", "A,k"):
-        raise InputError(f"interval {method!r}", f"is not one of ICC({form})", "take 'F'")
-    if not 0 < level < 1:
-        raise InputError("level", f"got {level}", "give a share between 0 and 1")
-    complete, left_out = _complete(scores)
+        raise InputError(f"ICC form {form!r}", "is not one of agreement", "take 'A,1' or 'A,k'")
+    complete, left_out = complete_rows(scores)
     squares = mean_squares(complete)
     value = _estimate(squares, form)
-    limits = _interval if method == "F" else _generalised
     # Of subjects whose means are the same number nothing says how far others might differ.
     alike = squares.subjects <= _ALIKE * (squares.within + squares.occasions)
-    low, high = (np.nan, np.nan) if alike else limits(squares, form, value, level)
-    return Icc(form, value, low, high, level, squares.n, squares.k, left_out)
+    if alike or np.isnan(value):
+        low, high = np.nan, np.nan
+    elif value == 1:
+        low, high = 1.0, 1.0
+    else:
+        low, high = _f_limits(squares) if method == "F" else _generalised(squares)
+        if form == "A,k":
+            low, high = (_stepped_up(end, squares.k) for end in (low, high))
+        if method == "generalised":
+            low, high = min(low, value), max(high, value)
+    return Icc(value, low, high, squares.n, left_out)
 
 
 def mean_squares(scores: Array) -> MeanSquares:
@@ -130,23 +122,22 @@ def mean_squares(scores: Array) -> MeanSquares:
     )
 
 
-def measurement_error(scores: ArrayLike, level: float = 0.95) -> MeasurementError:
+def measurement_error(scores: ArrayLike) -> MeasurementError:
     """Error of one measurement, and the change that it hides; `scores` (subjects, occasions)."""
-    if not 0 < level < 1:
-        raise InputError("level", f"got {level}", "give a share between 0 and 1")
-    complete = _complete(scores)[0]
+    complete = complete_rows(scores)[0]
+    if np.ptp(complete - complete[:, :1]) == 0:
+        return MeasurementError(0.0, 0.0)
     squares = mean_squares(complete)
     parts = np.array([(squares.n - 1) * squares.error, squares.occasions])
-    if np.ptp(complete - complete[:, :1]) == 0:
-        return MeasurementError(0.0, float("nan"), 0.0, level)
     each = np.array([(squares.n - 1) * (squares.k - 1), squares.k - 1])
     freedom = float(np.sum(parts) ** 2 / np.sum(parts**2 / each))
     sem = float(np.sqrt(squares.within))
-    quantile = float(scipy.stats.t.ppf(0.5 + level / 2, freedom))
-    return MeasurementError(sem, freedom, quantile * np.sqrt(2) * sem, level)
+    quantile = float(scipy.stats.t.ppf(0.5 + _LEVEL / 2, freedom))
+    return MeasurementError(sem, quantile * np.sqrt(2) * sem)
 
 
-def _complete(scores: ArrayLike) -> tuple[Array, int]:
+def complete_rows(scores: ArrayLike) -> tuple[Array, int]:
+    """Scores (subjects, occasions) of the subjects who have all, and how many lack one."""
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 2:
         raise DataError("scores", f"have {table.ndim} dimensions", "give (subjects, occasions)")
@@ -161,70 +152,25 @@ def _complete(scores: ArrayLike) -> tuple[Array, int]:
 
 
 def _estimate(squares: MeanSquares, form: Form) -> float:
-    r, c, e, w, n, k = squares
-    error = w if form in ("1", "k") else e
-    denominator = {
-        "1": r + (k - 1) * w,
-        "k": r,
-        "C,1": r + (k - 1) * e,
-        "C,k": r,
-        "A,1": r + (k - 1) * e + k * (c - e) / n,
-        "A,k": r + (c - e) / n,
-    }[form]
+    r, c, e, _, n, k = squares
+    denominator = r + (c - e) / n if form == "A,k" else r + (k - 1) * e + k * (c - e) / n
     # Where subjects differ less than error makes them differ, the ratio for a mean can lose its
     # denominator, and with it its meaning.
-    return float((r - error) / denominator) if denominator > 0 else float("nan")
+    return float((r - e) / denominator) if denominator > 0 else float("nan")
 
 
-def _interval(squares: MeanSquares, form: Form, value: float, level: float) -> tuple[float, float]:
-    if np.isnan(value):
-        return float("nan"), float("nan")
-    if value == 1:
-        return 1.0, 1.0
-    single = {"k": "1", "C,k": "C,1", "A,k": "A,1"}
-    if form in single:  # Spearman and Brown's step-up of the limits for a single score
-        k = squares.k
-        base: Form = single[form]  # type: ignore[assignment]
-        ends = _interval(squares, base, _estimate(squares, base), level)
-        low, high = (_stepped_up(end, k) for end in ends)
-        return low, high
-    tail = 0.5 + level / 2
-    if form == "A,1":
-        return _agreement_limits(squares, value, tail)
-    r, _, e, w, n, k = squares
-    error, freedom = (w, n * (k - 1)) if form == "1" else (e, (n - 1) * (k - 1))
-    if error == 0:
-        return 1.0, 1.0
-    ratio = r / error
-    low = ratio / scipy.stats.f.ppf(tail, n - 1, freedom)
-    high = ratio * scipy.stats.f.ppf(tail, freedom, n - 1)
-    return float((low - 1) / (low + k - 1)), float((high - 1) / (high + k - 1))
-
-
-def _generalised(
-    squares: MeanSquares, form: Form, value: float, level: float
-) -> tuple[float, float]:
-    """Tian and Cappelleri's limits; the same draws for every table, so that nothing is random."""
-    if np.isnan(value):
-        return float("nan"), float("nan")
-    if value == 1:
-        return 1.0, 1.0
+def _generalised(squares: MeanSquares) -> tuple[float, float]:
+    """Tian and Cappelleri's limits of ICC(A,1); the same draws for every table."""
     n, k = squares.n, squares.k
     rng = np.random.default_rng(0)
     r, c, e = (
         square / (rng.chisquare(freedom, _DRAWS) / freedom)
-        for square, freedom in (
-            (squares.subjects, n - 1),
-            (squares.occasions, k - 1),
-            (squares.error, (n - 1) * (k - 1)),
-        )
+        for square, freedom in zip(squares[:3], (n - 1, k - 1, (n - 1) * (k - 1)), strict=True)
     )
     # Occasions whose variance would be negative have none.
     drawn = (r - e) / (r + (k - 1) * e + k * np.maximum(c - e, 0.0) / n)
-    low, high = map(float, percentiles(drawn, level))
-    if form == "A,k":
-        low, high = (_stepped_up(end, k) for end in (low, high))
-    return min(low, value), max(high, value)
+    low, high = percentiles(drawn, _LEVEL)
+    return float(low), float(high)
 
 
 def _stepped_up(limit: float, k: int) -> float:
@@ -234,9 +180,10 @@ def _stepped_up(limit: float, k: int) -> float:
     return float(k * limit / (1 + (k - 1) * limit))
 
 
-def _agreement_limits(squares: MeanSquares, rho: float, tail: float) -> tuple[float, float]:
+def _f_limits(squares: MeanSquares) -> tuple[float, float]:
     """McGraw and Wong's limits of ICC(A,1), with Satterthwaite's degrees of freedom."""
     r, c, e, _, n, k = squares
+    rho, tail = _estimate(squares, "A,1"), 0.5 + _LEVEL / 2
     a = k * rho / (n * (1 - rho))
     b = 1 + k * rho * (n - 1) / (n * (1 - rho))
     spread = (a * c) ** 2 / (k - 1) + (b * e) ** 2 / ((n - 1) * (k - 1))

@@ -34,7 +34,6 @@ from impc.errors import DataError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_SHARE = 0.03
 # Power below this share of the peak is none: rounding, and what a window leaks.
 _NOTHING = 1e-6
 # A period's odd harmonics are half of all frequencies.
@@ -57,11 +56,8 @@ def rms(outputs: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(np.asarray(outputs) ** 2, axis=0)))
 
 
-def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
-    """Largest contiguous range of excited frequencies with power above a share of the peak.
-
-    `signal` (samples,); `rate` in second.
-    """
+def passband(signal: Array, rate: float) -> Passband:
+    """Largest contiguous range of excited frequencies of a `signal` (samples,) at `rate` per s."""
     frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
     power[0] = 0.0
     peak = float(power.max(initial=0.0))
@@ -71,7 +67,7 @@ def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
     if len(excited) > _MOST_LINES * len(power):  # no line spectrum
         power = scipy.ndimage.uniform_filter1d(power, _NEIGHBOURS)
         peak = float(power.max())
-    above = power[excited] > share * peak
+    above = power[excited] > 0.03 * peak
     runs = np.split(np.arange(len(excited)), np.flatnonzero(np.diff(above.astype(int))) + 1)
     inside = [run for run in runs if above[run[0]]]
     best = max(inside, key=lambda run: int(excited[run[-1]] - excited[run[0]]))
@@ -80,10 +76,7 @@ def passband(signal: Array, rate: float, share: float = _SHARE) -> Passband:
 
 
 def band_energy(outputs: Array, rate: float, low: float, high: float) -> Array:
-    """Mean bandpass signal energy (2.1) of each output (p,), in its unit squared.
-
-    `outputs` (samples, p); `rate` in second.
-    """
+    """(2.1) of outputs (samples, p) at `rate` per s: (p,), in their unit squared."""
     frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=0)
     step = float(frequency[1] - frequency[0])
     rounding = 1e-6 * step
@@ -112,10 +105,7 @@ class TransferFunction:
 def transfer_function(
     inputs: Sequence[Array], outputs: Sequence[Array], rate: float, band: Passband
 ) -> TransferFunction:
-    """Estimate from one or several trials of the same length.
-
-    `inputs` (samples,); `outputs` (samples, p); `rate` in second.
-    """
+    """From trials of one length: inputs (samples,), outputs (samples, p), at `rate` per s."""
     if not inputs:
         raise DataError("transfer function", "has no trial", "give one or more")
     lengths = {len(item) for item in (*inputs, *outputs)}

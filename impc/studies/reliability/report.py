@@ -5,10 +5,8 @@ Its tables are counterparts of tables 2.2 to 2.6.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
@@ -31,6 +29,7 @@ _TABLES = {
     "2. Over visits": ("visits-rms", "visits-energy", "pairs", "dissertation"),
     "3. Where the variance is": ("components-rms", "components-energy"),
 }
+_VISIT_TABLES = {"rms": "2.5", "energy": "2.6"}
 _PICTURES = (
     Picture(
         "time-series",
@@ -53,8 +52,6 @@ _PICTURES = (
         "Counterpart of figure 2.6: one condition and visit, several subjects.",
     ),
 )
-
-
 _VISITS = Picture(
     "visits",
     "Root-mean-square of every person at every visit, one line a person",
@@ -72,47 +69,38 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         )
         for item in findings(result)
     ]
+    said, band = answer(result), result.band
     summary = (
         f"{len(result.subjects)} subjects, {len(result.visits)} visits, conditions "
-        f"{', '.join(result.conditions)}; passband {result.band.low:.2f} to "
-        f"{result.band.high:.2f} Hz, {len(result.band.excited)} excited frequencies."
+        f"{', '.join(result.conditions)}; passband {band.low:.2f} to {band.high:.2f} Hz, "
+        f"{len(band.excited)} excited frequencies."
     )
     # One visit has no reliability: a table of dashes says less than the sentence above it.
     shown = _TABLES if len(result.visits) > 1 else {"1. The visit": ("visits-rms", "visits-energy")}
-    shown_names = [name for names in shown.values() for name in names]
+    blocks = {title: [tables.pop(name) for name in names] for title, names in shown.items()}
+    first, *others = blocks
     sections = [
-        *(
-            Section(title, [*([] if number else [_VISITS]), *(tables[name] for name in names)])
-            for number, (title, names) in enumerate(shown.items())
-        ),
+        Section(first, [_VISITS, *blocks[first]]),
+        *(Section(title, blocks[title]) for title in others),
         Section("4. Pictures", _PICTURES),
         Section("5. The dissertation's findings, looked for here", (Lines(found),), folded=True),
         Section("6. Versions", (Markup("<code>{}</code>").format(command),), folded=True),
     ]
-    said = answer(result)
     return Report(
         "impc reliability",
         "Reliability of a test",
         (Verdict(said[0]), *((Lines(said[1:]),) if said[1:] else ()), summary, *result.notes),
         sections,
         figures=reliability_figures(trials, result),
-        beside=[one for name, one in tables.items() if name not in shown_names],
-        data=_data(result),
+        beside=list(tables.values()),
+        data={
+            "passband": {"low": band.low, "high": band.high},
+            "dissertation": [item._asdict() for item in findings(result)],
+            "notes": result.notes,
+        },
         provenance=Provenance(command=command, inputs=inputs),
         words=[(name, "A condition of this study.") for name in result.conditions],
     )
-
-
-def _data(result: Reliability) -> dict[str, Any]:
-    return {
-        "passband": {"low": result.band.low, "high": result.band.high},
-        "dissertation": [asdict(item) for item in findings(result)],
-        "notes": result.notes,
-    }
-
-
-_NUMBERS = {"rms": "2.2", "energy": "2.3"}
-_VISIT_TABLES = {"rms": "2.5", "energy": "2.6"}
 
 
 def reliability_findings(result: Reliability) -> dict[str, Finding]:
@@ -128,23 +116,17 @@ def _icc(own: Sequence[MeasureResult], measure: str) -> Finding:
     rows = []
     for item in own:
         factor, unit = shown_score(item)
-        found, error = item.icc, item.error
         row: dict[str, Any] = {"condition": item.condition, "output": item.output}
-        if found is not None and error is not None:
-            row |= {
-                "icc": found.value,
-                "low": found.low,
-                "high": found.high,
-                "reliability": interval_band(found.low, found.high),
-                "sem": factor * error.sem,
-                "mdc": factor * error.mdc,
-                "unit": unit,
-                "subjects": found.subjects,
-            }
+        if item.icc is not None and item.error is not None:
+            value, low, high, subjects, _ = item.icc
+            row |= {"icc": value, "low": low, "high": high}
+            row |= {"reliability": interval_band(low, high)}
+            row |= {"sem": factor * item.error.sem, "mdc": factor * item.error.mdc}
+            row |= {"unit": unit, "subjects": subjects}
         rows.append(row | {"notes": "; ".join(item.notes)})
     caption = (
-        f"Counterpart of table {_NUMBERS[measure]}: between-visit reliability of "
-        f"{MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
+        f"Counterpart of table {'2.2' if measure == 'rms' else '2.3'}: between-visit reliability "
+        f"of {MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
         "interval, which allows for few visits that differ; standard error of measurement (SEM) "
         "and minimal detectable change (MDC, 95 %) of the score of a single visit. The word is "
         "that of the whole interval."
@@ -163,12 +145,9 @@ def _visits(own: Sequence[MeasureResult], measure: str, result: Reliability) -> 
             row |= {"F": item.anova.F, "p": item.anova.p}
             row |= {"p_greenhouse_geisser": item.anova.p_corrected}
         if item.trend is not None:
-            row |= {
-                "change_per_visit": factor * item.trend.slope,
-                "change_low": factor * item.trend.low,
-                "change_high": factor * item.trend.high,
-                "p_change": item.trend.p,
-            }
+            heads = ("change_per_visit", "change_low", "change_high", "p_change")
+            slope, low, high, p = item.trend
+            row |= zip(heads, (factor * slope, factor * low, factor * high, p), strict=True)
         rows.append(row)
     caption = (
         f"Counterpart of table {_VISIT_TABLES[measure]}: {MEASURES[measure]} across visits, mean "
@@ -179,31 +158,24 @@ def _visits(own: Sequence[MeasureResult], measure: str, result: Reliability) -> 
 
 
 def _components(own: Sequence[MeasureResult], measure: str) -> Finding:
-    rows = [
-        {
-            "condition": item.condition,
-            "output": item.output,
-            "unit": f"({shown_score(item)[1]})²",
-            "variance_of": f"{part.name}s",
-            **{
-                name: shown_score(item)[0] ** 2 * float(getattr(part, name))
-                for name in ("value", "low", "high")
-            },
-        }
-        for item in own
-        for part in item.components
-    ]
+    rows = []
+    for item in own:
+        factor, unit = shown_score(item)
+        for name, *values in item.components:
+            shown = (factor**2 * float(one) for one in values)
+            rows.append((item.condition, item.output, f"({unit})²", f"{name}s", *shown))
+    heads = ["condition", "output", "unit", "variance_of", "value", "low", "high"]
+    table = pd.DataFrame(rows, columns=heads) if rows else pd.DataFrame()
     caption = f"Variance of subjects, visits and trials behind {MEASURES[measure]}, 95 % intervals."
-    return Finding(f"components-{measure}", pd.DataFrame(rows), caption, digits=3)
+    return Finding(f"components-{measure}", table, caption, digits=3)
 
 
 def _correlations(result: Reliability) -> Finding:
-    rows = []
-    for item in result.cmc:
-        (within, sd_within), (between, sd_between) = map(_mean_sd, (item.within, item.between))
-        rows.append(
-            (item.condition, item.output, within, sd_within, between, sd_between, item.undefined)
-        )
+    rows = [
+        (item.condition, item.output, *_mean_sd(item.within), *_mean_sd(item.between),
+         item.undefined)
+        for item in result.cmc
+    ]  # fmt: skip
     heads = ["condition", "output", "within_visits", "sd_within", "between_visits", "sd_between",
              "undefined"]  # fmt: skip
     caption = (
@@ -217,10 +189,10 @@ def _pairs(result: Reliability) -> Finding:
     rows = []
     for item in result.measures:
         factor, unit = shown_score(item)
-        for pair in item.pairs:
-            rows.append((item.condition, item.output, MEASURES[item.measure],
-                         f"{pair.second} - {pair.first}", factor * float(pair.difference), unit,
-                         float(pair.p), float(pair.p_holm)))  # fmt: skip
+        for first, second, difference, *p in item.pairs:
+            visits = f"{second} - {first}"
+            rows.append((item.condition, item.output, MEASURES[item.measure], visits,
+                         factor * difference, unit, *p))  # fmt: skip
     heads = ["condition", "output", "measure", "visits", "difference", "unit", "p", "p_holm"]
     caption = "Paired t between visits, without and with Holm's correction."
     return Finding("pairs", pd.DataFrame(rows, columns=heads), caption, digits=3)
@@ -228,9 +200,9 @@ def _pairs(result: Reliability) -> Finding:
 
 def _quoted() -> Finding:
     rows = [
-        (_VISIT_TABLES[measure], MEASURES[measure], condition, lower, upper)
+        (_VISIT_TABLES[measure], MEASURES[measure], condition, *p)
         for measure, conditions in QUOTED.items()
-        for condition, (lower, upper) in conditions.items()
+        for condition, p in conditions.items()
     ]
     heads = ["table", "measure", "condition", "p_lower_body", "p_upper_body"]
     caption = (
@@ -241,6 +213,5 @@ def _quoted() -> Finding:
 
 
 def _mean_sd(values: Array) -> tuple[float, float]:
-    known = values[np.isfinite(values)]
-    mean = float(np.mean(known)) if len(known) else np.nan
-    return mean, float(np.std(known, ddof=1)) if len(known) > 1 else np.nan
+    known = pd.Series(values)
+    return float(known.mean()), float(known.std())

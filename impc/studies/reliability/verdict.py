@@ -10,8 +10,7 @@ The lower body is the first output, the upper body the second, as in the dissert
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,8 +18,6 @@ from impc.reporting.shown_units import shown_angle
 from impc.studies.reliability.analysis import MEASURES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from impc.studies.reliability.analysis import MeasureResult, Reliability
 
 _BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
@@ -52,52 +49,41 @@ def answer(result: Reliability) -> tuple[str, ...]:
             "Whether the test is reliable cannot be said of one visit: measure the same people "
             "again, at least once, in the same conditions.",
         )
-    known = [item for item in result.measures if item.icc is not None]
+    known = [(item, item.icc) for item in result.measures if item.icc is not None]
     if not known:
         return (
             "Whether the test is reliable cannot be said: no measure has a full set of scores.",
         )
-    words = {id(item): _word(item) for item in known}
-    lines = []
-    for word in ("excellent", "good", "fair", "poor"):
-        found = [item for item in known if words[id(item)] == word]
-        if found:
-            lines.append(f"Reliability between visits is {word} for {_named(found)}.")
-    open_ = [item for item in known if words[id(item)].startswith("not identified")]
-    if open_:
-        lines.append(
-            f"For {_named(open_)} {len(result.subjects)} subjects and {len(result.visits)} visits "
-            "do not say: the interval reaches from one word to another. More subjects or visits "
-            "narrow it."
-        )
-    return (*lines, *_changes(known))
-
-
-def _word(item: MeasureResult) -> str:
-    assert item.icc is not None
-    return interval_band(item.icc.low, item.icc.high)
-
-
-def _named(items: Sequence[MeasureResult]) -> str:
-    return "; ".join(
-        f"{MEASURES[item.measure]} of {item.output}, {item.condition}" for item in items
-    )
-
-
-def _changes(known: Sequence[MeasureResult]) -> list[str]:
-    """What a single person's score must change by, of the first measure in each condition."""
-    first = [item for item in known if item.measure == known[0].measure and item.error is not None]
-    if not first:
-        return []
-    parts = []
-    for item in first:
-        assert item.error is not None
-        factor, unit = shown_score(item)
-        parts.append(f"{factor * item.error.mdc:.2g} {unit} ({item.output}, {item.condition})")
-    return [
-        f"A change of one person's {MEASURES[known[0].measure]} between two visits is more than "
-        f"the test's own scatter, at 95 %, from: {'; '.join(parts)}."
+    named: dict[str, list[str]] = {}
+    for item, found in known:
+        one = f"{MEASURES[item.measure]} of {item.output}, {item.condition}"
+        named.setdefault(interval_band(found.low, found.high).partition(":")[0], []).append(one)
+    lines = [
+        f"Reliability between visits is {word} for {'; '.join(named[word])}."
+        for _, word in reversed(_BANDS)
+        if word in named
     ]
+    if "not identified" in named:
+        lines.append(
+            f"For {'; '.join(named['not identified'])} {len(result.subjects)} subjects and "
+            f"{len(result.visits)} visits do not say: the interval reaches from one word to "
+            "another. More subjects or visits narrow it."
+        )
+    # What a single person's score must change by, of the first measure in each condition.
+    first = known[0][0].measure
+    changes = []
+    for item, _ in known:
+        if item.measure == first and item.error is not None:
+            factor, unit = shown_score(item)
+            changes.append(
+                f"{factor * item.error.mdc:.2g} {unit} ({item.output}, {item.condition})"
+            )
+    if changes:
+        lines.append(
+            f"A change of one person's {MEASURES[first]} between two visits is more than the "
+            f"test's own scatter, at 95 %, from: {'; '.join(changes)}."
+        )
+    return tuple(lines)
 
 
 #: p-values of tables 2.5 (RMS) and 2.6 (energy) that survive in the text, lower and upper body.
@@ -108,8 +94,7 @@ QUOTED = {
 }
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """A statement of the dissertation, and what this study says of it."""
 
     statement: str  # Of the dissertation, chapter 2
@@ -136,29 +121,30 @@ def findings(result: Reliability) -> tuple[Finding, ...]:
         )
     if len(result.outputs) > 1 and values:
         lower, upper = (
-            [value for key, value in values.items() if key[1] == result.outputs[place]]
-            for place in (0, 1)
+            float(np.mean([value for key, value in values.items() if key[1] == name]))
+            for name in result.outputs[:2]
         )
         verdicts.append(
             Finding(
                 "The lower body is more reliable than the upper body.",
-                float(np.mean(lower)) > float(np.mean(upper)),
-                f"mean ICC {np.mean(lower):.2f} ({result.outputs[0]}) and {np.mean(upper):.2f} "
-                f"({result.outputs[1]})",
+                lower > upper,
+                f"mean ICC {lower:.2f} ({result.outputs[0]}) and {upper:.2f} ({result.outputs[1]})",
             )
         )
-    pairs = [
-        (float(np.nanmean(item.within)), float(np.nanmean(item.between)))
-        for item in result.cmc
-        if np.any(np.isfinite(item.within)) and np.any(np.isfinite(item.between))
-    ]
-    if pairs:
+    pairs = np.array(
+        [
+            (np.nanmean(item.within), np.nanmean(item.between))
+            for item in result.cmc
+            if np.any(np.isfinite(item.within)) and np.any(np.isfinite(item.between))
+        ]
+    )
+    if len(pairs):
+        within, between = pairs.T
         verdicts.append(
             Finding(
                 "Transfer functions agree better within a visit than between visits (CMC).",
-                all(one > other for one, other in pairs),
-                f"mean CMC {np.mean([a for a, _ in pairs]):.3f} within, "
-                f"{np.mean([b for _, b in pairs]):.3f} between",
+                bool(np.all(within > between)),
+                f"mean CMC {within.mean():.3f} within, {between.mean():.3f} between",
             )
         )
     return tuple(verdicts)

@@ -40,13 +40,10 @@ from impc.studies.selection.lasso import Lasso, lasso_of_size, table_c1
 from impc.studies.selection.model import Trial
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from impc.arrays import Array
     from impc.assess.resampling import Draw
-    from impc.studies.selection.estimation import Estimate
-    from impc.studies.selection.fisher import Selection
-    from impc.studies.selection.model import ParametricModel, Trial
+    from impc.studies.selection.model import ParametricModel
     from impc.studies.selection.model_source import Runner
     from impc.studies.selection.settings import SelectSettings
 
@@ -80,7 +77,11 @@ def select_study(
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
     informations = [np.asarray(item.information.F) for item in nominal.values()]
     worst = sweep(informations, settings.bounds, settings.least)
-    free = _free(informations, worst, nominal, settings)
+    at_bound = largest_subsets(informations, settings.bound, settings.least)
+    free = _free(at_bound, worst, nominal)
+    largest = (
+        set(largest_subsets([F], settings.bound, settings.least).subsets) for F in informations
+    )
     chosen = run(fit_chosen, Chosen, {name: (trials[name], settings, free) for name in trials})
     seconds = {
         "fim": float(np.mean([item.seconds for item in nominal.values()])),
@@ -92,7 +93,7 @@ def select_study(
     return StudySelection(
         nominal,
         worst,
-        _intersection(informations, settings),
+        tuple(sorted(set.intersection(*largest))),
         free,
         chosen,
         Counter(item.lasso.selected for item in chosen.values()).most_common(1)[0][0],
@@ -101,35 +102,19 @@ def select_study(
 
 
 def _free(
-    informations: list[Array],
-    worst: tuple[Selection, ...],
-    nominal: Mapping[str, Nominal],
-    settings: SelectSettings,
+    at_bound: Selection, worst: tuple[Selection, ...], nominal: Mapping[str, Nominal]
 ) -> tuple[int, ...]:
-    at_bound = largest_subsets(informations, settings.bound, settings.least)
     for selection in (at_bound, *worst):
         if selection.subsets:
             return selection.subsets[0]
     counted = Counter(
-        subset
-        for item in nominal.values()
-        for selection in item.sweep[:1]
-        for subset in selection.subsets
+        subset for item in nominal.values() for first in item.sweep[:1] for subset in first.subsets
     )
     if not counted:
         raise DataError(
             "selection", "no subset is feasible at any bound", "raise [select] bound or lower least"
         )
     return counted.most_common(1)[0][0]
-
-
-def _intersection(
-    informations: list[Array], settings: SelectSettings
-) -> tuple[tuple[int, ...], ...]:
-    lists = [
-        set(largest_subsets([F], settings.bound, settings.least).subsets) for F in informations
-    ]
-    return tuple(sorted(set.intersection(*lists)))
 
 
 @dataclass(frozen=True)
@@ -165,9 +150,8 @@ def fit_nominal(
     found = fisher_information(model, np.array(nominal.theta), trials)
     swept = sweep([found.F], settings.bounds, settings.least)
     seconds = time.perf_counter() - started
-    return Nominal(
-        nominal, found, null_directions(model, found), unseen_scalings(model, found), swept, seconds
-    )
+    unseen, scalings = null_directions(model, found), unseen_scalings(model, found)
+    return Nominal(nominal, found, unseen, scalings, swept, seconds)
 
 
 def fit_chosen(
@@ -189,18 +173,13 @@ def fit_chosen(
     return Chosen(refit, intervals, lasso, nelder_mead, between - started, ended - between)
 
 
-_THREADS = 2
-
-
 @dataclass(frozen=True)
 class BootstrapIntervals(Frozen):
-    """Percentiles of the replicates."""
+    """From the 2.5th to the 97.5th percentile of the replicates."""
 
-    names: tuple[str, ...]  # Free parameters
-    value: Array  # (free,), in their units
+    value: Array  # Free parameters (free,), in their units
     low: Array
     high: Array
-    level: float  # Share of the replicates inside
     drawn: Array  # (replicates, free)
 
     @property
@@ -210,10 +189,7 @@ class BootstrapIntervals(Frozen):
 
 
 def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """A `Draw` row by row: residuals `parts` (samples, p) of each trial to as many, (samples, p).
-
-    Rows come from all trials; `rng` is what is drawn from.
-    """
+    """A `Draw` row by row of all trials: residuals `parts` (samples, p) of each, drawn by `rng`."""
     pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
 
@@ -228,9 +204,6 @@ def bootstrap_subset(
     replicates: int,
     seed: int,
     draw: Draw = draw_single,
-    *,
-    level: float = 0.95,
-    progress: Callable[[], None] = lambda: None,
 ) -> BootstrapIntervals:
     """Intervals of the free parameters of a fit."""
     theta = np.array(fit.theta)
@@ -243,18 +216,11 @@ def bootstrap_subset(
             Trial(item.input, outputs + noise)
             for item, outputs, noise in zip(trials, clean, draw(left, rng), strict=True)
         ]
-        found = np.array(estimate(model, again, fit.free, theta).theta)[list(fit.free)]
-        progress()
-        return found
+        return np.array(estimate(model, again, fit.free, theta).theta)[list(fit.free)]
 
-    with threads(_THREADS) as pool:
+    with threads(2) as pool:
         drawn = np.array(list(pool.map(one, range(replicates))))
-    low, high = percentiles(drawn, level)
+    low, high = percentiles(drawn, 0.95)
     return BootstrapIntervals(
-        tuple(model.names[index] for index in fit.free),
-        frozen(theta[list(fit.free)]),
-        frozen(low),
-        frozen(high),
-        level,
-        frozen(drawn),
+        frozen(theta[list(fit.free)]), frozen(low), frozen(high), frozen(drawn)
     )

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, Frozen, IntArray, frozen
-from impc.assess.variance_accounted_for import vaf
+from impc.assess.variance_accounted_for import vaf as share_explained
 from impc.errors import DataError, InputError
 from impc.studies.selection.model import normalised, physical, sensitivity
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from impc.studies.selection.model import ParametricModel, Trial
-
-_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,7 @@ def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...
 
 
 def estimate(
-    model: ParametricModel,
-    trials: Sequence[Trial],
-    free: Sequence[int],
-    start: Array,
-    *,
-    max_evaluations: int = 200,
+    model: ParametricModel, trials: Sequence[Trial], free: Sequence[int], start: Array
 ) -> Estimate:
     """Fit the free parameters to all trials at once; `start` (k,)."""
     if not trials:
@@ -63,42 +56,21 @@ def estimate(
     if not np.all(np.isfinite(residual(begin))):
         raise DataError("model", "is not finite at the start", "start elsewhere")
     found = scipy.optimize.least_squares(
-        residual,
-        begin,
-        jac=derivative,
-        bounds=(-1.0, 1.0),
-        ftol=_TOLERANCE,
-        xtol=_TOLERANCE,
-        gtol=1e-12,
-        max_nfev=max_evaluations,
-    )
+        residual, begin, jac=derivative, bounds=(-1.0, 1.0), ftol=1e-10, xtol=1e-10, gtol=1e-12,
+        max_nfev=200,
+    )  # fmt: skip
     full = base.copy()
     full[chosen] = found.x
     theta = physical(model, full)
-    stuck = tuple(int(item) for item in chosen[np.abs(found.x) > 1 - 1e-6])
-    return Estimate(
-        frozen(theta),
-        tuple(int(item) for item in chosen),
-        2 * float(found.cost),
-        frozen(pooled_vaf(model, theta, trials)),
-        int(found.nfev),
-        stuck,
-    )
+    stuck = tuple(chosen[np.abs(found.x) > 1 - 1e-6].tolist())
+    vaf, misfit = frozen(pooled_vaf(model, theta, trials)), 2 * float(found.cost)
+    return Estimate(frozen(theta), tuple(chosen.tolist()), misfit, vaf, int(found.nfev), stuck)
 
 
 def multi_start(
-    model: ParametricModel,
-    trials: Sequence[Trial],
-    free: Sequence[int],
-    starts: int,
-    seed: int,
-    *,
-    spread: float = 0.5,
+    model: ParametricModel, trials: Sequence[Trial], free: Sequence[int], starts: int, seed: int
 ) -> tuple[Estimate, ...]:
-    """Fits from the typical values and from points drawn about them, the best first.
-
-    Points at which the model is not finite are drawn again.
-    """
+    """Fits from the typical values and points about them at which it is finite, best first."""
     rng = np.random.default_rng(seed)
     typical = normalised(model, np.asarray(model.typical))
     found: list[Estimate] = []
@@ -111,7 +83,7 @@ def multi_start(
                 raise
         moved = typical.copy()
         chosen = np.asarray(free, dtype=int)
-        moved[chosen] += spread * rng.standard_normal(len(chosen))
+        moved[chosen] += 0.5 * rng.standard_normal(len(chosen))
         begin = np.clip(moved, -0.98, 0.98)
     return tuple(sorted(found, key=lambda item: item.misfit))
 
@@ -125,7 +97,7 @@ def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) ->
     """VAF (4.4) over all trials, % (p,), at theta (k,) in its units."""
     recorded = np.concatenate([item.outputs for item in trials])
     simulated = np.concatenate([model.simulate(theta, item.input) for item in trials])
-    return np.asarray(vaf(recorded, simulated))
+    return np.asarray(share_explained(recorded, simulated))
 
 
 def _evaluation(
@@ -139,21 +111,12 @@ def _evaluation(
         if last is None or last[0] != t.tobytes():
             full = base.copy()
             full[chosen] = t
-            parts = [_part(model, full, trial, chosen) for trial in trials]
-            residual, jacobian = (np.concatenate(item) for item in zip(*parts, strict=True))
-            last = (t.tobytes(), residual, jacobian)
+            theta, residuals, slopes = physical(model, full), [], []
+            for trial in trials:
+                outputs, derivative = sensitivity(model, theta, trial.input, chosen)
+                residuals.append((outputs - trial.outputs).ravel())
+                slopes.append(derivative.reshape(-1, len(chosen)))
+            last = (t.tobytes(), np.concatenate(residuals), np.concatenate(slopes))
         return last[1], last[2]
 
-    def residual(t: Array) -> Array:
-        return evaluated(t)[0]
-
-    def derivative(t: Array) -> Array:
-        return evaluated(t)[1]
-
-    return residual, derivative
-
-
-def _part(model: ParametricModel, t: Array, trial: Trial, chosen: IntArray) -> tuple[Array, Array]:
-    outputs, derivative = sensitivity(model, physical(model, t), trial.input, chosen)
-    residual = (outputs - trial.outputs).ravel()
-    return residual, derivative.reshape(residual.size, len(chosen))
+    return lambda t: evaluated(t)[0], lambda t: evaluated(t)[1]

@@ -32,13 +32,10 @@ from impc.studies.selection.model import sensitivity
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from impc.arrays import Array
     from impc.studies.selection.model import ParametricModel, Trial
 
 # Singular values of the sensitivity below this, of the largest, are rounding or as good as that.
 _RANK = 1e-6
-_NAMED = 0.1
-_UNSEEN = 1.0
 
 
 @dataclass(frozen=True)
@@ -81,22 +78,13 @@ def fisher_information(
     in_logarithms = table / model.gain * theta
     _, logarithmic, relative = np.linalg.svd(in_logarithms / sigma, full_matrices=False)
     rank = int(np.count_nonzero(logarithmic > _RANK * logarithmic[0]))
-    return Information(
-        frozen(table.T @ table / sigma2),
-        frozen(values),
-        frozen(directions),
-        frozen(np.column_stack([logarithmic, relative])),
-        float(sigma2),
-        rank,
-    )
+    both = np.column_stack([logarithmic, relative])
+    F, singular = table.T @ table / sigma2, frozen(values)
+    return Information(frozen(F), singular, frozen(directions), frozen(both), float(sigma2), rank)
 
 
 def common_scaling(model: ParametricModel, found: Information, names: Sequence[str]) -> float:
-    """How much scaling the parameters `names` together changes the outputs, over their noise.
-
-    The norm over all samples of the change per logarithm of the scale, in deviations of the noise:
-    below 1 nobody sees a scaling by e.
-    """
+    """Change of the outputs when `names` are scaled by e together, in deviations of the noise."""
     together = np.array([float(name in names) for name in model.names])
     values, vectors = found.relative[:, 0], found.relative[:, 1:]
     return float(np.linalg.norm(values * (vectors @ together)))
@@ -113,7 +101,7 @@ def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[s
     return tuple(
         tuple(names)
         for kind, names in kinds.items()
-        if kind and len(names) > 1 and common_scaling(model, found, names) <= _UNSEEN
+        if kind and len(names) > 1 and common_scaling(model, found, names) <= 1
     )
 
 
@@ -124,16 +112,14 @@ def null_directions(model: ParametricModel, found: Information) -> tuple[NullDir
     for index in range(model.size - 1, found.rank - 1, -1):
         v = vectors[index] * np.sign(vectors[index][np.argmax(np.abs(vectors[index]))])
         order = np.argsort(-np.abs(v), kind="stable")
-        shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= _NAMED}
+        shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= 0.1}
         parts = ", ".join(f"{name} {share:+.2f}" for name, share in shares.items())
-        nulls.append(
-            NullDirection(
-                float(values[index] / values[0]),
-                shares,
-                f"changing {parts} (relative changes) together changes the outputs by "
-                f"{values[index] / values[0]:.0e} of what the best seen direction does",
-            )
+        seen = float(values[index] / values[0])
+        sentence = (
+            f"changing {parts} (relative changes) together changes the outputs by {seen:.0e} of "
+            "what the best seen direction does"
         )
+        nulls.append(NullDirection(seen, shares, sentence))
     return tuple(nulls)
 
 
@@ -199,9 +185,11 @@ def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2)
                 "lower bound and bounds in [select]",
             )  # fmt: skip
         kept = _feasible(informations, grown, bound) if grown else []
-    if not best or len(best[0][0]) < least:
-        return Selection(bound, (), ())
-    ordered = sorted(best, key=lambda item: item[1])
+    return _selected(bound, best if best and len(best[0][0]) >= least else [])
+
+
+def _selected(bound: float, feasible: list[tuple[tuple[int, ...], float]]) -> Selection:
+    ordered = sorted(feasible, key=lambda item: item[1])
     return Selection(bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered))
 
 
@@ -216,10 +204,7 @@ def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, 
 
 
 def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
-    """`largest_subsets` by trying every subset: for checks, and up to twenty parameters.
-
-    `informations` (k, k).
-    """
+    """`largest_subsets` by trying every subset of up to twenty; informations (k, k)."""
     count = len(informations[0])
     if count > 20:
         raise InputError("parameters", f"are {count}", "use `largest_subsets`")
@@ -227,20 +212,14 @@ def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> S
         subsets = list(itertools.combinations(range(count), size))
         found = _feasible(informations, subsets, bound)
         if found:
-            ordered = sorted(found, key=lambda item: item[1])
-            return Selection(
-                bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered)
-            )
-    return Selection(bound, (), ())
+            return _selected(bound, found)
+    return _selected(bound, [])
 
 
 def sweep(
     informations: Sequence[Array], bounds: Sequence[float], least: int = 2
 ) -> tuple[Selection, ...]:
-    """Selections over several bounds: .05, .15, ... .95 in the dissertation.
-
-    `informations` (k, k) and `least` are those of `largest_subsets`.
-    """
+    """Selections over several bounds, as `largest_subsets`; informations (k, k)."""
     return tuple(largest_subsets(informations, bound, least) for bound in bounds)
 
 
@@ -249,8 +228,5 @@ def _feasible(
 ) -> list[tuple[tuple[int, ...], float]]:
     parts = [subsets[at : at + _AT_ONCE] for at in range(0, len(subsets), _AT_ONCE)]
     variances = np.concatenate([subset_variances(informations, part) for part in parts])
-    return [
-        (subset, float(value))
-        for subset, value in zip(subsets, variances, strict=True)
-        if value <= bound
-    ]
+    kept = np.flatnonzero(variances <= bound).tolist()
+    return [(subsets[place], float(variances[place])) for place in kept]

@@ -85,10 +85,7 @@ def key_parameters(
     least_reliability: float = 0.75,
     most: int = 20,
 ) -> KeyParameters:
-    """Choose key parameters of a study of several subjects and visits.
-
-    `recorded` (subject, visit).
-    """
+    """Choose key parameters of a study; `recorded` by (subject, visit)."""
     trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
     informations = [np.asarray(item.information.F) for item in nominal.values()]
@@ -99,47 +96,39 @@ def key_parameters(
     for place, subset in enumerate(subsets):
         fits = [item.fits[place] for item in refits.values()]
         vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
-        reliability = _reliability(_by_visit(recorded, fits, subset))
-        diversity = len({model.pathways[index] for index in subset})
+        tables = [between_visits(table) for table in _by_visit(recorded, fits, subset)]
+        # (5.6): the least of the subset's; NaN without several subjects and visits.
+        reliability = float(np.min([np.nan if one is None else one.value for one in tables]))
         kept = vaf > least_vaf and reliability >= least_reliability
-        variance = selection.variances[place]
-        candidates.append(Candidate(subset, variance, vaf, reliability, diversity, kept))
+        diversity = len({model.pathways[index] for index in subset})
+        candidates.append(
+            Candidate(subset, selection.variances[place], vaf, reliability, diversity, kept)
+        )
     candidates.sort(
         key=lambda item: (not item.kept, -item.diversity, -np.nan_to_num(item.reliability))
     )
     chosen = candidates[0].subset if candidates and candidates[0].kept else ()
-    swept = sweep(informations, settings.bounds, settings.least)
-    everything = tuple(range(model.size))
     alone = [item.fits[subsets.index(chosen)] for item in refits.values()] if chosen else []
     return KeyParameters(
         selection,
-        swept,
+        sweep(informations, settings.bounds, settings.least),
         tuple(candidates),
         chosen,
-        _by_visit(recorded, [item.fit for item in nominal.values()], everything),
+        _by_visit(recorded, [item.fit for item in nominal.values()], range(model.size)),
         _by_visit(recorded, alone, chosen),
     )
 
 
 def _by_visit(
-    keys: Iterable[tuple[str, str]], fits: Sequence[Estimate], subset: tuple[int, ...]
+    keys: Iterable[tuple[str, str]], fits: Sequence[Estimate], subset: Sequence[int]
 ) -> Array:
     """Estimates of a subset (len(subset), subjects, visits); NaN where a visit is missing."""
-    pairs = list(keys)
-    subjects = list(dict.fromkeys(subject for subject, _ in pairs))
-    visits = list(dict.fromkeys(visit for _, visit in pairs))
+    subjects, visits = (list(dict.fromkeys(one)) for one in zip(*keys, strict=True))
     values = np.full((len(subset), len(subjects), len(visits)), np.nan)
-    if subset:
-        for (subject, visit), found in zip(pairs, fits, strict=True):
-            place = subjects.index(subject), visits.index(visit)
-            values[:, place[0], place[1]] = np.array(found.theta)[list(subset)]
+    for (subject, visit), found in zip(keys, fits, strict=bool(subset)):
+        place = subjects.index(subject), visits.index(visit)
+        values[:, *place] = np.array(found.theta)[list(subset)]
     return frozen(values)
-
-
-def _reliability(values: Array) -> float:
-    """(5.6): the least ICC(A,k) of a subset's parameters; NaN without several of both."""
-    coefficients = [between_visits(table) for table in values]
-    return float(np.min([item.value if item else np.nan for item in coefficients]))
 
 
 def between_visits(values: Array) -> Icc | None:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from impc.reporting.document import Details, Lines, Report, Section, Verdict
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.selection.key_parameters import between_visits
 from impc.studies.selection.report import command_section, names_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
@@ -41,7 +40,7 @@ def key_report(
         "filled ones pass all filters."
     )
     with journal_style():
-        figures = drawn({"solution-space": _solution_figure(model, found)})
+        figures = drawn({"solution-space": _solution_figure(found)})
     return Report(
         "impc: Key parameters",
         "Key parameters",
@@ -59,46 +58,33 @@ def key_report(
             command_section(command),
         ],
         figures=figures,
-        data=_data(model, found),
+        data={
+            "chosen": model.named(found.chosen),
+            "size": found.selection.size,
+            "subsets": len(found.selection.subsets),
+            "sweep": [
+                {
+                    "bound": item.bound,
+                    "size": item.size,
+                    "subsets": [model.named(subset) for subset in item.subsets],
+                }
+                for item in found.sweep
+            ],
+        },
         provenance=Provenance(command=command, inputs=inputs),
         words=model.words,
     )
 
 
 def _candidates(model: ParametricModel, found: KeyParameters) -> Finding:
-    table = table_of(
-        found.candidates,
-        {
-            "subset": lambda item: names_of(model, item.subset),
-            "largest_variance": lambda item: float(item.variance),
-            "mean_vaf_percent": lambda item: float(item.vaf),
-            "least_icc": lambda item: float(item.reliability),
-            "pathways": lambda item: item.diversity,
-            "kept": lambda item: item.kept,
-        },
-    )
-    return Finding("candidates", table, "Subsets and the filters that they pass, best first.")
-
-
-def _data(model: ParametricModel, found: KeyParameters) -> dict[str, Any]:
-    def names(subset: Sequence[int]) -> list[str]:
-        return [model.names[index] for index in subset]
-
-    return {
-        "chosen": names(found.chosen),
-        "size": found.selection.size,
-        "subsets": len(found.selection.subsets),
-        "sweep": [
-            {"bound": item.bound, "size": item.size, "subsets": [names(s) for s in item.subsets]}
-            for item in found.sweep
-        ],
-    }
-
-
-def _icc(values: Array) -> dict[str, float]:
-    """With its 95 % interval; NaN where there is none."""
-    coefficient = between_visits(values)
-    return {key: float(getattr(coefficient, key, np.nan)) for key in ("value", "low", "high")}
+    rows = [
+        (names_of(model, item.subset), item.variance, item.vaf, item.reliability, item.diversity,
+         item.kept)
+        for item in found.candidates
+    ]  # fmt: skip
+    heads = ["subset", "largest_variance", "mean_vaf_percent", "least_icc", "pathways", "kept"]
+    caption = "Subsets and the filters that they pass, best first."
+    return Finding("candidates", pd.DataFrame(rows, columns=heads), caption)
 
 
 def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
@@ -115,8 +101,9 @@ def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
             if free == "chosen":
                 for visit, own in enumerate(values.T, start=1):
                     row[f"mean_visit_{visit}"], row[f"sd_visit_{visit}"] = _mean_sd(own)
-            icc = {"icc": "value", "icc_low": "low", "icc_high": "high"}
-            rows.append(row | {key: _icc(values)[end] for key, end in icc.items()})
+            icc = between_visits(values)
+            ends = (np.nan,) * 3 if icc is None else (icc.value, icc.low, icc.high)
+            rows.append(row | dict(zip(("icc", "icc_low", "icc_high"), ends, strict=True)))
     caption = (
         "Estimates, mean and SD over subjects, with all parameters free and with the chosen ones; "
         "ICC(A,k) between visits with its 95 % interval."
@@ -133,34 +120,30 @@ def _sweep(model: ParametricModel, found: KeyParameters) -> Finding:
     """How the first filter depends on its bound, and which parameters its subsets have."""
     rows = []
     for item in found.sweep:
-        inside = [sum(index in subset for subset in item.subsets) for index in range(model.size)]
-        counts = ", ".join(
-            f"{name} {count}" for name, count in zip(model.names, inside, strict=True) if count
-        )
+        inside = Counter(index for subset in item.subsets for index in subset)
+        counts = ", ".join(f"{model.names[index]} {inside[index]}" for index in sorted(inside))
         rows.append((item.bound, item.size, len(item.subsets), counts))
     heads = ["variance_bound", "size", "subsets", "in_how_many_of_them"]
     caption = "The first filter, for every subject and visit at once (5.5)."
     return Finding("sweep", pd.DataFrame(rows, columns=heads), caption)
 
 
-def _solution_figure(model: ParametricModel, found: KeyParameters) -> Figure:
+def _solution_figure(found: KeyParameters) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 2.8)
     ax = figure.subplots()
-    markers = "osD^v"
+    markers = {item.diversity: "osD^v"[min(item.diversity, 5) - 1] for item in found.candidates}
     for item in found.candidates:
-        if np.isnan(item.reliability):
-            continue
         ax.plot(
             item.reliability,
             item.vaf,
-            marker=markers[min(item.diversity, len(markers)) - 1],
+            marker=markers[item.diversity],
             color=BLUE if item.kept else INK,
             markerfacecolor=BLUE if item.kept else "white",
             linestyle="none",
         )
-    for diversity in sorted({item.diversity for item in found.candidates}):
+    for diversity in sorted(markers):
         ax.plot(
-            [], [], marker=markers[min(diversity, len(markers)) - 1], color=INK, linestyle="none",
+            [], [], marker=markers[diversity], color=INK, linestyle="none",
             markerfacecolor="white", label=f"{diversity} pathways",
         )  # fmt: skip
     ax.set_xlabel("reliability, least ICC(A,k) (-)")

@@ -46,11 +46,11 @@ class Lasso(Frozen):
 
 
 def proximal_lasso(
-    model: ParametricModel, trials: Sequence[Trial], weight: float, start: Array | None = None
+    model: ParametricModel, trials: Sequence[Trial], weight: float
 ) -> tuple[Array, float]:
-    """Solve (C.5): normalised parameters (k,) and the objective; `start` (k,)."""
+    """Solve (C.5): normalised parameters (k,) and the objective."""
     typical = normalised(model, np.asarray(model.typical))
-    t = typical.copy() if start is None else np.clip(start, -1, 1)
+    t = typical.copy()
 
     def value(at: Array) -> float:
         return _mean_square(model, trials, at) + weight * float(np.sum(np.abs(at - typical)))
@@ -59,14 +59,11 @@ def proximal_lasso(
     for _ in range(_ROUNDS):
         H, g = _quadratic(model, trials, t)
         step = _box_lasso(H + damping * np.eye(len(t)), g, t, typical, weight) - t
-        share, accepted = 1.0, False
-        for _ in range(_HALVINGS):
+        for share in 0.5 ** np.arange(_HALVINGS):
             moved = value(t + share * step)
             if moved < current:
-                accepted = True
                 break
-            share /= 2
-        if not accepted:
+        else:
             break
         gained = current - moved
         t, current = t + share * step, moved
@@ -82,20 +79,18 @@ def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -
     """The largest selection of at most `count` parameters along lambda, by bisection."""
     low, high, solves = 1e-8, 1e3, 0
     best: tuple[float, Array, float] | None = None
-    for _ in range(40):
+    while solves < 40 and high / low >= 1.01:
         middle = float(np.sqrt(low * high))
         t, objective = proximal_lasso(model, trials, middle)
         solves += 1
         chosen = _selected(model, t)
-        if len(chosen) <= count:
-            high = middle
-            if best is None or len(chosen) >= len(_selected(model, best[1])):
-                best = (middle, t, objective)
-            if len(chosen) == count:
-                break
-        else:
+        if len(chosen) > count:
             low = middle
-        if high / low < 1.01:
+            continue
+        high = middle
+        if best is None or len(chosen) >= len(_selected(model, best[1])):
+            best = (middle, t, objective)
+        if len(chosen) == count:
             break
     if best is None:
         best = (high, *proximal_lasso(model, trials, high))
@@ -165,11 +160,11 @@ def _mean_square(model: ParametricModel, trials: Sequence[Trial], t: Array) -> f
 
 def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tuple[Array, Array]:
     """H and g of the mean square about t: g'd + d'Hd/2."""
-    size = model.size
-    H, g, count = np.zeros((size, size)), np.zeros(size), 0
+    theta, count = physical(model, t), 0
+    H, g = np.zeros((model.size, model.size)), np.zeros(model.size)
     for trial in trials:
-        outputs, derivative = sensitivity(model, physical(model, t), trial.input)
-        J = derivative.reshape(-1, size)
+        outputs, derivative = sensitivity(model, theta, trial.input)
+        J = derivative.reshape(-1, model.size)
         H += J.T @ J
         g += J.T @ (outputs - trial.outputs).ravel()
         count += len(J)

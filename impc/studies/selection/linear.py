@@ -52,11 +52,9 @@ def linear_functions(
         A, B, C = (item.full() for item in matrices(theta))
         n = len(A)
         exponential = np.asarray(scipy.linalg.expm(_joined(A, B) * dt))
-        x = _states(
-            np.ascontiguousarray(exponential[:n, :n]),
-            np.ascontiguousarray(exponential[:n, n:]),
-            np.ascontiguousarray(given),
-        )
+        none = np.zeros((0, n, n)), np.zeros((0, *B.shape))
+        Ad, Bd = map(np.ascontiguousarray, np.split(exponential[:n], [n], axis=1))
+        x, _ = _with_derivatives(Ad, Bd, *none, np.ascontiguousarray(given))
         return np.asarray(x @ C.T)
 
     def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
@@ -83,14 +81,8 @@ def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
     exponential, change = _exponentials(joined, along)
     dA, dB = change[:, :n, :n].copy(), change[:, :n, n:].copy()
     dC = derivatives[2].T.reshape(k, n, C.shape[0]).transpose(0, 2, 1)
-    return Discrete(
-        np.ascontiguousarray(exponential[:n, :n]),
-        np.ascontiguousarray(exponential[:n, n:]),
-        np.asarray(C),
-        dA,
-        dB,
-        np.ascontiguousarray(dC),
-    )
+    A, B = map(np.ascontiguousarray, np.split(exponential[:n], [n], axis=1))
+    return Discrete(A, B, np.asarray(C), dA, dB, np.ascontiguousarray(dC))
 
 
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
@@ -114,21 +106,6 @@ def _joined(A: Array, B: Array) -> Array:
     joined = np.zeros((n + d, n + d))
     joined[:n, :n], joined[:n, n:] = A, B
     return joined
-
-
-@njit(cache=True, nogil=True)
-def _states(A: Any, B: Any, given: Any) -> Any:
-    samples, n, d = len(given), A.shape[0], B.shape[1]
-    x = np.zeros((samples, n))
-    for k in range(samples - 1):
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += A[i, j] * x[k, j]
-            for j in range(d):
-                total += B[i, j] * given[k, j]
-            x[k + 1, i] = total
-    return x
 
 
 @njit(cache=True, nogil=True)

@@ -60,6 +60,10 @@ class ParametricModel(Frozen):
             if meaning
         )
 
+    def named(self, subset: Sequence[int]) -> list[str]:
+        """Names of the parameters whose indices are `subset`."""
+        return [self.names[index] for index in subset]
+
     @property
     def size(self) -> int:
         """Number of parameters."""
@@ -95,9 +99,9 @@ def parametric_model(
             raise InputError(
                 f"parameter {name}", f"typical value {value:g} lies outside its range", "widen it"
             )
-    groups = tuple(pathways) if pathways is not None else ("",) * count
-    measured = tuple(units) if units is not None else ("",) * count
-    words = tuple(meanings) if meanings is not None else ("",) * count
+    groups, measured, words = (
+        ("",) * count if given is None else tuple(given) for given in (pathways, units, meanings)
+    )
     return ParametricModel(
         tuple(names), frozen(low), frozen(high), frozen(typical), groups, measured, simulate,
         jacobian, words,
@@ -117,10 +121,7 @@ def physical(model: ParametricModel, t: Array) -> Array:
 def sensitivity(
     model: ParametricModel, theta: Array, given: Array, free: IntArray | None = None
 ) -> tuple[Array, Array]:
-    """Outputs of the model, and their derivative with respect to normalised parameters.
-
-    `theta` (k,); `given` (samples, d); `free` (f,).
-    """
+    """Outputs at theta (k,), input (samples, d); derivatives by normalised parameters (f,)."""
     along = np.arange(model.size) if free is None else free
     if model.jacobian is not None:
         outputs, derivative = model.jacobian(theta, given, along)
@@ -128,11 +129,7 @@ def sensitivity(
     outputs = np.asarray(model.simulate(theta, given))
     t = normalised(model, theta)
     columns = []
-    for index in along:
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = t.copy()
-            moved[index] += sign * _STEP
-            ends.append(model.simulate(physical(model, moved), given))
-        columns.append((ends[0] - ends[1]) / (2 * _STEP))
+    for step in _STEP * np.eye(model.size)[along]:
+        above, below = (model.simulate(physical(model, t + end), given) for end in (step, -step))
+        columns.append((above - below) / (2 * _STEP))
     return outputs, np.stack(columns, axis=-1)

@@ -74,17 +74,9 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
     simulate, jacobian = returned.get("simulate"), returned.get("jacobian")
     if "matrices" in returned:
         simulate, jacobian = linear_functions(returned["matrices"], 1 / rate)
-    model = parametric_model(
-        returned["names"],
-        returned["low"],
-        returned["high"],
-        returned["typical"],
-        simulate,
-        pathways=returned.get("pathways"),
-        units=returned.get("units"),
-        meanings=returned.get("meanings"),
-        jacobian=jacobian,
-    )
+    names, low, high, typical = (returned[key] for key in _NEEDED[:4])
+    said = {key: returned.get(key) for key in ("pathways", "units", "meanings")}
+    model = parametric_model(names, low, high, typical, simulate, jacobian=jacobian, **said)
     return ModelSource(
         name, dict(arguments), model, tuple(returned["inputs"]), tuple(returned["outputs"]), rate
     )

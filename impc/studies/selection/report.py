@@ -10,7 +10,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from impc.reporting.document import Lines, Report, Section, Verdict
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 
@@ -33,23 +33,19 @@ def selection_report(
         "ranges: a point a subject, a bar at the mean."
     )
     picture = Picture("intervals", caption, caption)
+    verdict = (
+        f"The recordings identify {len(found.free)} of the {model.size} parameters well enough at "
+        f"once: {names_of(model, found.free)}."
+    )
     with journal_style():
         figures = drawn({"intervals": _interval_figure(model, found)})
     return Report(
         "impc: Sensitive parameters",
         "Sensitive parameters",
-        (Verdict(_verdict(model, found)), Lines(_findings(model, found))),
+        (Verdict(verdict), Lines(_findings(model, found))),
         [
-            Section(
-                "1. Estimates",
-                (picture, _intervals(model, found)),
-                "Estimates",
-            ),
-            Section(
-                "2. Methods of selection",
-                (method_finding(model, found),),
-                "Methods",
-            ),
+            Section("1. Estimates", (picture, _intervals(model, found)), "Estimates"),
+            Section("2. Methods of selection", (_methods(model, found),), "Methods"),
             Section(
                 "3. Subsets and directions",
                 (_sweep(model, found), _ranks(model, found)),
@@ -70,65 +66,50 @@ def command_section(command: str) -> Section:
     return Section("Made by", (Markup("<code>{}</code>").format(command),), folded=True)
 
 
-def _verdict(model: ParametricModel, found: StudySelection) -> str:
-    return (
-        f"The recordings identify {len(found.free)} of the {model.size} parameters well enough at "
-        f"once: {names_of(model, found.free)}."
-    )
-
-
-def method_finding(model: ParametricModel, found: StudySelection) -> Finding:
+def _methods(model: ParametricModel, found: StudySelection) -> Finding:
     """What each method selects, and what it costs."""
     vaf = np.mean([np.mean(item.refit.vaf) for item in found.chosen.values()])
     full = np.mean([np.mean(item.fit.vaf) for item in found.nominal.values()])
-    fits = {
-        "lasso": [item.lasso for item in found.chosen.values()],
-        "nelder_mead": [item.nelder_mead for item in found.chosen.values() if item.nelder_mead],
-    }
     rows = [
         ("all parameters", f"all {model.size}", float(full), np.nan),
         ("information (FIM)", names_of(model, found.free), float(vaf), found.seconds["fim"]),
     ]
     for label, key in (("LASSO, proximal", "lasso"), ("LASSO, Table C.1", "nelder_mead")):
-        shares = [np.mean(item.refit.vaf) for item in fits[key] if item.refit is not None]
-        if shares:
-            known = (item.selected for item in fits[key] if item.refit is not None)
-            chosen = Counter(known).most_common(1)[0][0]
-            rows.append((label, names_of(model, chosen), float(np.mean(shares)),
-                         found.seconds[key]))  # fmt: skip
+        fits = [getattr(item, key) for item in found.chosen.values()]
+        known = [item for item in fits if item is not None and item.refit is not None]
+        if known:
+            share = float(np.mean([np.mean(item.refit.vaf) for item in known]))
+            chosen = Counter(item.selected for item in known).most_common(1)[0][0]
+            rows.append((label, names_of(model, chosen), share, found.seconds[key]))
     heads = ["method", "selected", "mean_vaf_percent", "seconds_a_subject"]
     return Finding("methods", pd.DataFrame(rows, columns=heads), "Methods of selection.")
 
 
 def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
-    lines = []
     ranks = [item.information.rank for item in found.nominal.values()]
     seen = f"{min(ranks)} to {max(ranks)}" if min(ranks) < max(ranks) else f"{ranks[0]}"
-    lines.append(f"Of {model.size} parameters {seen} directions are identifiable.")
-    for names in dict.fromkeys(names for item in found.nominal.values() for names in item.scalings):
-        lines.append(
-            f"Scaling {', '.join(names)} together changes the outputs by less than their noise."
-        )
-    lines.append(f"Selected by LASSO: {names_of(model, found.lasso) or 'none'}.")
+    scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
     both = sorted(set(found.free) & set(found.lasso))
-    lines.append(f"In common: {names_of(model, both) or 'none'}.")
-    return lines
+    return [
+        f"Of {model.size} parameters {seen} directions are identifiable.",
+        *(
+            f"Scaling {', '.join(names)} together changes the outputs by less than their noise."
+            for names in scalings
+        ),
+        f"Selected by LASSO: {names_of(model, found.lasso) or 'none'}.",
+        f"In common: {names_of(model, both) or 'none'}.",
+    ]
 
 
 def _ranks(model: ParametricModel, found: StudySelection) -> Finding:
-    table = table_of(
-        found.nominal.items(),
-        {
-            "subject": lambda pair: pair[0],
-            "rank": lambda pair: pair[1].information.rank,
-            "vaf_percent": lambda pair: float(np.mean(pair[1].fit.vaf)),
-            "at_a_bound": lambda pair: names_of(model, pair[1].fit.at_bound),
-            "directions_that_are_not_seen": lambda pair: "; ".join(
-                direction.sentence for direction in pair[1].unseen
-            ),
-        },
-    )
-    return Finding("identifiability", table, "Identifiability, before any selection.")
+    rows = [
+        (subject, item.information.rank, float(np.mean(item.fit.vaf)),
+         names_of(model, item.fit.at_bound), "; ".join(one.sentence for one in item.unseen))
+        for subject, item in found.nominal.items()
+    ]  # fmt: skip
+    heads = ["subject", "rank", "vaf_percent", "at_a_bound", "directions_that_are_not_seen"]
+    caption = "Identifiability, before any selection."
+    return Finding("identifiability", pd.DataFrame(rows, columns=heads), caption)
 
 
 def _sweep(model: ParametricModel, found: StudySelection) -> Finding:
@@ -144,18 +125,13 @@ def _sweep(model: ParametricModel, found: StudySelection) -> Finding:
 
 
 def _intervals(model: ParametricModel, found: StudySelection) -> Finding:
-    rows = [
-        (
-            subject,
-            name,
-            model.units[index],
-            *(float(ends[place]) for ends in (item.intervals.value, item.intervals.low,
-                                              item.intervals.high)),
-            50 * float(item.intervals.width[place]) / float(model.gain[index]),
-        )
-        for place, (index, name) in enumerate((k, model.names[k]) for k in found.free)
-        for subject, item in found.chosen.items()
-    ]  # fmt: skip
+    rows = []
+    for place, index in enumerate(found.free):
+        for subject, item in found.chosen.items():
+            own = item.intervals
+            value, low, high = (float(end[place]) for end in (own.value, own.low, own.high))
+            width = 50 * (high - low) / float(model.gain[index])
+            rows.append((subject, model.names[index], model.units[index], value, low, high, width))
     heads = ["subject", "parameter", "unit", "value", "low", "high", "width_percent_of_the_range"]
     caption = "The chosen parameters of each subject, with 95 % bootstrap intervals."
     return Finding("intervals", pd.DataFrame(rows, columns=heads), caption)
@@ -177,28 +153,21 @@ def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
 
 
 def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
-    def names(subset: Sequence[int]) -> list[str]:
-        return [model.names[index] for index in subset]
-
+    names, chosen = model.named, found.chosen.items()
+    lasso = {key: item.lasso.refit for key, item in chosen}
+    tables = {key: item.nelder_mead for key, item in chosen if item.nelder_mead is not None}
     return {
         "selected": {
             "fim": names(found.free),
             "lasso": names(found.lasso),
-            "nelder_mead": {
-                key: names(item.nelder_mead.selected)
-                for key, item in found.chosen.items()
-                if item.nelder_mead is not None
-            },
+            "nelder_mead": {key: names(item.selected) for key, item in tables.items()},
         },
         "common": names(sorted(set(found.free) & set(found.lasso))),
         "intersection": [names(subset) for subset in found.intersection],
         "vaf": {
             "nominal": {key: item.fit.vaf for key, item in found.nominal.items()},
-            "fim": {key: item.refit.vaf for key, item in found.chosen.items()},
-            "lasso": {
-                key: None if item.lasso.refit is None else item.lasso.refit.vaf
-                for key, item in found.chosen.items()
-            },
+            "fim": {key: item.refit.vaf for key, item in chosen},
+            "lasso": {key: None if fit is None else fit.vaf for key, fit in lasso.items()},
         },
         "unseen_scalings": {key: item.scalings for key, item in found.nominal.items()},
         "unseen": {
@@ -214,4 +183,4 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
 
 def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
     """Names of a subset, with commas."""
-    return ", ".join(model.names[index] for index in subset)
+    return ", ".join(model.named(subset))

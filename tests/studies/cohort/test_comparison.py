@@ -9,8 +9,7 @@ import scipy.stats
 
 from experiments.coverage import cart
 from impc.inverse.noisy_fit import fit_controller
-from impc.studies.cohort.comparison import compare_cohort
-from impc.studies.cohort.identified import not_identified, unidentified_sentences
+from impc.studies.cohort.comparison import compare_cohort, not_identified, unidentified_sentences
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 from tests.studies.cohort.carts import subject_trial

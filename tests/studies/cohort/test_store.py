@@ -61,7 +61,7 @@ def test_results_of_another_subject_or_number_are_not_used(tmp_path: Path) -> No
         (one / "replicate-0000.json", one / "replicate-0001.json"),
     ):
         shutil.copy(source, target)
-        assert store.replicate(NAMES[0], 1) is None
+        assert store.fit(NAMES[0], 1) is None
     shutil.copy(other / "fit.json", one / "fit.json")
     assert store.fit(NAMES[0]) is None
 

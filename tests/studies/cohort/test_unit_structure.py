@@ -15,9 +15,8 @@ from impc.files.plant_sources import plant_source
 from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.engine import Store
 from impc.studies.cohort.study import Study, read_study
-from impc.studies.cohort.tables import cohort_tables
+from impc.studies.cohort.tables import cohort_tables, structure_row
 from impc.studies.cohort.tasks import fit_unit, study_tasks
-from impc.studies.cohort.unit_structure import structure_row
 from tests.studies.cohort.carts import write_study
 
 pytestmark = pytest.mark.full

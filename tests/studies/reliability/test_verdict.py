@@ -20,7 +20,6 @@ def study(scores: Array, outputs: int = 1) -> Reliability:
             "rms", f"theta{number + 1}", "EO", frozen(scores),
             icc(scores, "A,k", method="generalised") if visits > 1 else None,
             measurement_error(scores) if visits > 1 else None,
-            None, (), None, (), (),
         )
         for number in range(outputs)
     )  # fmt: skip
