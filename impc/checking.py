@@ -126,16 +126,36 @@ class Value(Frozen):
 
 
 def replace(value: _V, **changes: Any) -> _V:
-    """Return a dataclass with other fields, checked as when it was made.
+    """Return a copy of a value of this package with other fields, checked as when it was made.
 
-    `dataclasses.replace` would call the constructor, which in a `Value` may take other things.
+    Parameters
+    ----------
+    value : Problem, Plant, Controller, ...
+    **changes
+        Fields by name, with what they become.
+
+    Raises
+    ------
+    InputError
+        When there is no such field, or it cannot have that value.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    >>> impc.replace(impc.Bounds(plant), u_max=[2.0]).u_max
+    array([2.])
     """
     if not isinstance(value, Value):
         return dataclasses.replace(value, **changes)  # type: ignore[type-var]
     fields = vars(value)
     unknown = sorted(changes.keys() - fields.keys())
     if unknown:
-        raise TypeError(f"{type(value).__name__} has no field {', '.join(unknown)}")
+        known = ", ".join(fields)
+        raise InputError(
+            type(value).__name__, f"has no field {', '.join(unknown)}", f"it has {known}"
+        )
     made = object.__new__(type(value))
     made._fill(**(fields | changes))
     return made

@@ -228,7 +228,7 @@ def test_the_page_ends_with_the_words_that_it_uses() -> None:
     folded = Section("One", blocks, contents="One", folded=True)
     page = Report("a", "A", (), [folded], words=[("theta1", "Tilt <of> a seat.")]).page()
     assert re.findall(r'<dt id="word-([a-z0-9-]+)">', page) == [
-        "theta1", "condition-number", "eigenvalue", "kappa", "lqr", "cost_weight", "vaf", "weights"
+        "theta1", "condition-number", "cost-weight", "eigenvalue", "kappa", "lqr", "vaf", "weights"
     ]  # fmt: skip
     assert "Tilt &lt;of&gt; a seat." in page
     assert page.count('href="#word-vaf"') == 1

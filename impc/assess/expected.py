@@ -87,7 +87,7 @@ def expected_intervals(
     ----------
     problem : Problem
         Its recordings are those of the presumed subject, without noise; with a structure.
-    cost weights : array_like
+    cost_weights : array_like
         The subject's unknowns of that structure (count,), logarithms of cost weights.
     deviation : array_like
         Standard deviation of the noise in the recorder, in the outputs' units, one or (p,).

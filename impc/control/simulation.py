@@ -133,7 +133,7 @@ class Simulation(Frozen):
     >>> run.x.shape, run.u.shape, run.complete
     ((21, 2), (20, 1), True)
     >>> run.statuses[0], run.frame().columns.tolist()
-    (<Status.ACTIVE: 1>, ['time', 'x[0]', 'x[1]', 'y[0]', 'y[1]', 'u[0]'])
+    (<Status.ACTIVE: 1>, ['time', 'x1', 'x2', 'u'])
     """
 
     plant: Plant

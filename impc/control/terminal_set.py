@@ -100,7 +100,7 @@ class TerminalSet(Value):
     bases: Mapping[int, IntArray] = field(repr=False, compare=False)
 
     def contains(self, x: ArrayLike) -> bool:
-        """Whether the state x (n,) is in the set, within its tolerance of each bound."""
+        """Whether the state `x` (n,) is in the set, within its tolerance of each bound."""
         state = finite_array("x", x, (self.H.shape[1],))
         return bool(np.all(self.H @ state <= self.h * (1 + self.tolerance)))
 
@@ -118,7 +118,12 @@ class TerminalSet(Value):
         return corners(self.H / self.h[:, None])
 
     def project(self, first: int, second: int) -> Array:
-        """Corners (v, 2) of its shadow on two states, by their places; counter-clockwise.
+        """Corners (v, 2) of its shadow on two states; counter-clockwise.
+
+        Parameters
+        ----------
+        first, second : int
+            Places of the states, counted from 0.
 
         Raises
         ------

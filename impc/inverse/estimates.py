@@ -117,7 +117,7 @@ class Estimate(Frozen):
         Time of the method, given what it starts from, s.
     fit : Goodness
         What its simulation of the recordings says against it.
-    cost weights : Array or None
+    cost_weights : Array or None
         Unknowns of the problem's structure (count,), for the method that searches them; minus
         infinity is a cost weight of zero.
 
@@ -131,7 +131,7 @@ class Estimate(Frozen):
     >>> trial = impc.Recording(plant, truth.simulate([1.0], steps=20).x)
     >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial]))
     >>> found
-    <Estimate inverse_mpc: explained, misfit 0>
+    <Estimate inverse_mpc: explained, misfit ...>
     >>> found.status.sentence
     'The weights reproduce the recordings to 1e-9 of them.'
     >>> found.intervals().round(3)
@@ -319,7 +319,17 @@ class Estimate(Frozen):
     def simulate(
         self, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
     ) -> Simulation:
-        """Simulate the controller found from another state, as `Controller.simulate`."""
+        """Simulate the controller found from another state, as `Controller.simulate`.
+
+        Parameters
+        ----------
+        x0 : array_like
+            (n,).
+        steps : int, optional
+            Needed when there is no disturbance.
+        disturbance : array_like, optional
+            (steps, d), or (steps,) for a single one.
+        """
         return self.controller().simulate(x0, steps=steps, disturbance=disturbance)
 
     def summary(self) -> str:

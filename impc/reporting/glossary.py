@@ -13,8 +13,7 @@ WORDS: dict[str, str] = {
     "A-optimal": "Of experiments: with the least mean variance of the logarithms of the cost "
     "weights.",
     "AIC": "Akaike's information criterion: misfit plus a penalty for each number that was "
-    "fitted. "
-    "Less is better; differences below 2 say nothing.",
+    "fitted. Less is better; differences below 2 say nothing.",
     "analytic centre": "Of all weights with the same gain the one that is farthest from the edge "
     "of their set. It does not depend on units.",
     "ANOVA": "Analysis of variance: splits the spread of measurements into parts, between people, "
@@ -24,28 +23,26 @@ WORDS: dict[str, str] = {
     "bound": "The most that the subject can do, as the settings give it: no command is larger.",
     "CMC": "Coefficient of multiple correlation: how alike whole curves are, 1 at most.",
     "coloured": "Of a residual: neighbouring samples resemble each other, as those of people do.",
-    "condition number": "Largest over smallest eigenvalue of the weights: how unequally they cost "
-    "weight "
-    "directions. It depends on units.",
+    "condition number": "Largest over smallest eigenvalue of the weights: how unequally they "
+    "penalise directions. It depends on units.",
+    "cost weight": "An entry on the diagonal of Q or R: what the square of a state or command "
+    "costs.",
     "Cramér-Rao": "The least variance that any unbiased estimate can have, if the residuals are "
     "white.",
     "D-optimal": "Of experiments: with the least determinant of the covariance of the cost "
-    "weights, the "
-    "smallest volume of uncertainty.",
+    "weights, the smallest volume of uncertainty.",
     "direction of the gain": "A combination of entries of the gain. Recordings determine some "
     "combinations well although no entry by itself.",
     "dominant direction": "The combination of states on which the weights set the highest cost "
     "weight.",
     "dominant cost": "The largest part of the cost: the combination of states with the highest "
-    "cost_weight.",
+    "cost weight.",
     "dwell": "For how long a perturbation keeps each of its values.",
     "eigenvalue": "Of weights: the cost weight of one of the combinations of states that are "
-    "penalised "
-    "apart.",
+    "penalised apart.",
     "ETFE": "Empirical transfer function estimate: response over perturbation at each frequency.",
     "FIM": "Fisher's information matrix: what the recordings identify of the parameters, its "
-    "inverse "
-    "being the least variance.",
+    "inverse being the least variance.",
     "gain": "K of the law u = -K x: how much command the controller gives for each state where no "
     "bound interferes.",
     "Hedges' g": "Difference of two means over their standard deviation, corrected for small "
@@ -63,8 +60,8 @@ WORDS: dict[str, str] = {
     "left out": "Predicted by a fit of the other trials: what a fit is worth on what it has not "
     "seen.",
     "Ljung and Box": "A test of whether a residual is white; a small p-value says that it is not.",
-    "LQR": "Linear-quadratic regulator: the controller that minimises the sum of penalised squares "
-    "when nothing is bounded.",
+    "LQR": "Linear-quadratic regulator: the controller that minimises the sum of penalised "
+    "squares when nothing is bounded.",
     "MDC": "Minimal detectable change: a person's change between two visits that is larger than "
     "the test's own scatter, at 95 %.",
     "MPC": "Model predictive control: at each sample the best plan over the horizon inside the "
@@ -74,8 +71,6 @@ WORDS: dict[str, str] = {
     "command.",
     "p-value": "How often chance alone would show as much; below 0.05 it is seldom believed to be "
     "chance.",
-    "cost_weight": "An entry on the diagonal of Q or R: what the square of a state or command "
-    "costs.",
     "profile likelihood": "Interval of one number: how far it can be moved, all others fitted "
     "again, until the recordings object.",
     "QR": "A factorisation of a matrix; pivoted, it takes first the columns that add most.",
