@@ -314,8 +314,7 @@ _TABLE = (
         "structured",
         "inverse MPC within a structure",
         "Cost weights of the features that the user names, whose controller, with its bounds, "
-        "fits the "
-        "outputs best.",
+        "fits the outputs best.",
         _as_posed,
         _structured,
     ),

@@ -255,8 +255,7 @@ def _parameters(fit: OptimalFit) -> Finding:
     heads = ["parameter", "unit", "value", "low", "high", "level", "identified", "start"]
     caption = (
         "Value with its 95 % interval, and where the search began. One that is not individually "
-        "identified "
-        "stays near its start; section 2 says what of it is identified."
+        "identified stays near its start; section 2 says what of it is identified."
     )
     figure = Picture(
         "parameters",

@@ -201,14 +201,13 @@ def _gain_identified(report: PersonReport) -> list[str]:
     identified = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
     said = (
         f"{identified} of the {len(entries)} entries of this person's gain are distinguishable "
-        "from zero: their "
-        "intervals (95 %) leave it out."
+        "from zero: their intervals (95 %) leave it out."
     )
     if identified == 0:
         said = (
             f"None of the {len(entries)} entries of this person's gain is distinguishable from "
-            "zero (95 %): "
-            "the values stand for gains that are several times as large or as small."
+            "zero (95 %): the values stand for gains that are several times as large or as "
+            "small."
         )
     loose = "" if fit.converged else " The search did not settle: another may end beside it."
     return [f"{said}{loose}"]
@@ -226,8 +225,7 @@ def _apart(report: PersonReport, sizes: Array) -> list[str]:
     more = "more" if found.levels[level] * sizes[entry] > 0 else "less"
     return [
         f"Gain and noise are hardly distinguished here (correlation {found.correlation:.2f}): a "
-        "gain "
-        f"{names[entry]} that is {100 * abs(sizes[entry]):.0f} % larger goes with "
+        f"gain {names[entry]} that is {100 * abs(sizes[entry]):.0f} % larger goes with "
         f"{100 * abs(np.expm1(abs(found.levels[level]))):.0f} % {more} of the noise "
         f"{fit.space.names[level]}."
     ]

@@ -103,8 +103,7 @@ def direction_finding(result: FitResult) -> Finding:
         "Directions of the gain, best determined first, as commands at typical states. The "
         "standard error is relative to the natural size of a gain: 1 means practically unknown. "
         f"Above {IDENTIFIED:g} a direction is not identified, and the estimate stays near that of "
-        "the "
-        "weights.",
+        "the weights.",
         folded="Combinations of entries: directions of the gain",
         digits=2,
     )

@@ -20,8 +20,7 @@ _BLIND = 0.1
 # docs/structures.md, What was measured.
 _AT_ZERO = (
     "Where the best cost weight is zero, intervals of 95 % held the truth of simulated seats in "
-    "78 to "
-    "96 %: take those of all cost weights for somewhat wider."
+    "78 to 96 %: take those of all cost weights for somewhat wider."
 )
 # The test holds its level where noise is in the recorder and the plant is the body.
 _OF_THE_MODEL = (
@@ -66,8 +65,8 @@ def _verdict(found: StructureFit) -> str:
     if test.freedom == 0:
         return (
             f"Within the structure “{name}” statements on cost weights need no convention. "
-            "Whether it "
-            "holds was not tested: the recordings identify nothing of the gain beyond it."
+            "Whether it holds was not tested: the recordings identify nothing of the gain "
+            "beyond it."
         )
     return (
         f"Within the structure “{name}”, which the recordings do not refuse "
@@ -141,8 +140,7 @@ def _identified(found: StructureFit) -> str:
     structure = found.structure
     text = (
         f"Of its {structure.count} unknowns the recordings identify {found.identified} "
-        "combinations to a "
-        f"factor of {IDENTIFIED_FACTOR:g} or better"
+        f"combinations to a factor of {IDENTIFIED_FACTOR:g} or better"
     )
     pair = _best_pair(found)
     text += f": {pair}." if pair else "."
@@ -198,10 +196,8 @@ def _power(found: StructureFit) -> str:
     if powers[0].power < _BLIND:
         return (
             "The test is blind to cross terms here: cost weights of its features one by one make "
-            "nearly "
-            "every gain that cost weights of their products would make, so it cannot be said "
-            "whether "
-            "there are any."
+            "nearly every gain that cost weights of their products would make, so it cannot be "
+            "said whether there are any."
         )
     most, least = powers[0], powers[-1]
     text = (

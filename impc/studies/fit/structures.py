@@ -28,8 +28,8 @@ _PICTURE = Picture(
     "structured-weights",
     "Cost weights of the features with their intervals, one row each, on a logarithmic axis",
     "Cost weights within the structure, at a cost weight of one for the first input, with "
-    "intervals of 95 % "
-    "for the colour of the residuals. An arrow: no lower end, the cost weight may be zero.",
+    "intervals of 95 % for the colour of the residuals. An arrow: no lower end, the cost weight "
+    "may be zero.",
     narrow=True,
 )
 
@@ -161,8 +161,7 @@ def _combinations(found: StructureFit) -> Finding:
         table,
         "Combinations of the unknowns (sums of logarithms), best determined first: "
         f"{covariance.rank} of {found.structure.count} above rounding, {found.identified} "
-        "identified to "
-        f"a factor of {IDENTIFIED_FACTOR:g} at 95 %.",
+        f"identified to a factor of {IDENTIFIED_FACTOR:g} at 95 %.",
         digits=2,
     )
 

@@ -306,8 +306,7 @@ def _determined(result: FitResult) -> str:
     return (
         f"Of the {len(values)} directions of the gain the recordings determine {count} above "
         f"rounding and identify {identified}: their standard error is below {IDENTIFIED:g} of a "
-        "natural gain. "
-        f"{entries} of its entries are individually identified. Of the {found.free} directions of "
-        f"the weights the recordings determine {found.rank}; the other {found.chosen} are a "
-        "convention."
+        f"natural gain. {entries} of its entries are individually identified. Of the "
+        f"{found.free} directions of the weights the recordings determine {found.rank}; the "
+        f"other {found.chosen} are a convention."
     )

@@ -95,8 +95,7 @@ def _tried(summary: WeightsSummary) -> str:
     return (
         "Statements on the states that are recorded or cost most, at the size that they have in "
         f"the recordings. {tried} Low and high are those of the difference, or of the mixed cost "
-        "weight, "
-        "over the cost weight of the state named first, at the fitted gain."
+        "weight, over the cost weight of the state named first, at the fitted gain."
     )
 
 
