@@ -136,7 +136,7 @@ class Estimate(Frozen):
     'The weights reproduce the recordings to 1e-9 of them.'
     >>> found.intervals().round(3)
             name unit  value    low   high  identified
-    0  K.u[0].x[0]   SI  0.553  0.553  0.553        True
+    0  K.u[0].x[0]   SI  0.538  0.538  0.538        True
     >>> found.vaf, found.outputs[0].shape
     (array([100.]), (21, 1))
     """

@@ -177,8 +177,8 @@ def test_what_is_no_controller_is_nan(example_plant: Plant) -> None:
     assert np.isnan(weights(-np.eye(2), 1, [1, 3], still)[0].full()).all()
     slope = weights.jacobian()(-np.eye(2), 1, [1, 3], still, 0, 0)[0].full()
     assert np.isnan(slope.reshape(2, 6, 4)[:, 1:]).all()  # the first state is x0 all the same
-    with pytest.raises(InputError, match=r"^of: got 'cost weight'; choose gain or weights$"):
-        closed_loop_function(law, 5, of="cost_weight")
+    with pytest.raises(InputError, match=r"^of: got 'price'; choose gain or weights$"):
+        closed_loop_function(law, 5, of="price")
 
 
 def test_a_bilevel_program_of_ones_own_finds_the_weights(

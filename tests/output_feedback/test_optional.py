@@ -37,6 +37,7 @@ def test_the_rest_works_without_it(tmp_path: Path) -> None:
     )
     code = TRIED.replace("impc.read_settings", "fit_settings") + (
         "from impc.studies.fit.settings import fit_settings\n"
+        "from impc.studies.fit.subject import fit_recordings\n"
         "print(np.abs(fit().fitted.K - law.K).max() < 1e-6)\n"
         "for ask in (lambda: fit(observer={}), lambda: impc.fit_output_feedback):\n"
         "    try:\n"
