@@ -362,6 +362,21 @@ def test_pytope_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> 
         maximal_invariant_set(*example()).to_pytope()
 
 
+def test_corners_and_shadow_of_three_states_support_what_linear_programs_do() -> None:
+    rng = np.random.default_rng(4)
+    A = 0.8 * np.array([[1.0, 0.3, 0.0], [0.0, 0.9, 0.4], [0.1, 0.0, 0.8]])
+    plant = sampled(A, [[0.0], [0.0], [1.0]])
+    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=[-2, -1, -3], x_max=[1, 2, 3])
+    terminal = maximal_invariant_set(plant, [[0.1, 0.1, 0.2]], bounds)
+    corners, shadow = terminal.vertices(), terminal.project(0, 2)
+    assert all(terminal.contains(corner) for corner in corners)
+    for direction in rng.standard_normal((20, 3)):
+        for points, along in ((corners, direction), (shadow, direction[[0, 2]])):
+            whole = direction if points is corners else direction * [1, 0, 1]
+            most = -linprog(-whole, terminal.H, terminal.h, bounds=(None, None)).fun
+            assert np.max(points @ along) == pytest.approx(most, rel=1e-9)
+
+
 def test_polygon_refuses_what_it_cannot_draw() -> None:
     plant = sampled(np.diag([0.5, 0.8]), [[1.0], [0.0]])
     strip = maximal_invariant_set(plant, [[0.3, 0.0]], Bounds(plant, u_min=-1, u_max=1))
