@@ -236,4 +236,5 @@ def interval_table(fitted: Estimate) -> pd.DataFrame:
         (item.name, unit, item.value, item.low, item.high, item.identified)
         for item, unit in zip(items, units, strict=True)
     ]
-    return pd.DataFrame(rows, columns=["name", "unit", "value", "low", "high", "identified"])
+    heads = ["name", "unit", "value", "low", "high", "identified"]
+    return pd.DataFrame(rows, columns=heads).set_index("name")

@@ -112,9 +112,10 @@ class Simulation(Frozen):
     ----------
     plant : Plant
     x : Array
-        States (steps + 1, n). Samples that were not reached repeat the last state.
+        States (steps + 1, n). Of samples that were not reached NaN; in a search, which goes on
+        with them, the last state.
     u : Array
-        Inputs (steps, m); zero at samples that were not reached.
+        Inputs (steps, m); NaN, or zero, at samples that were not reached.
     status : Array of Status
         (steps,).
     weakly_active : int

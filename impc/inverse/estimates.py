@@ -135,8 +135,9 @@ class Estimate(Frozen):
     >>> found.status.sentence
     'The weights reproduce the recordings to 1e-9 of them.'
     >>> found.intervals().round(3)
-            name unit  value    low   high  identified
-    0  K.u[0].x[0]   SI  0.538  0.538  0.538        True
+                unit  value    low   high  identified
+    name
+    K.u[0].x[0]   SI  0.538  0.538  0.538        True
     >>> found.vaf, found.outputs[0].shape
     (array([100.]), (21, 1))
     """
@@ -265,7 +266,7 @@ class Estimate(Frozen):
 
     @property
     def time(self) -> tuple[Array, ...]:
-        """Of the samples of each trial, s; so are the next ones, a trial each."""
+        """Of the samples, s: a tuple with an array for each trial, as the next three are."""
         return tuple(run.time for run in self.simulations)
 
     @property
@@ -302,9 +303,10 @@ class Estimate(Frozen):
     def intervals(self) -> pd.DataFrame:
         """The gain, and fitted parameters, with 95 % intervals, a row each.
 
-        Columns `name`, `unit`, `value`, `low`, `high` and `identified`: whether the recordings
-        determine this number by itself. The value is that of least squares along what they
-        determine (docs/fitting.md), and may differ from K, which is that of weights.
+        By name, such as "K.u.x1" for the entry from the state x1 to the input u: `unit`, `value`,
+        `low`, `high` and `identified`, whether the recordings determine this number by itself.
+        The value is that of least squares along what they determine (docs/fitting.md), and may
+        differ from K, which is that of weights.
         """
         from impc.assess.printed_gain import interval_table  # noqa: PLC0415
 
@@ -339,7 +341,11 @@ class Estimate(Frozen):
         return summary(self)
 
     def plot(self, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
-        """Draw the outputs and inputs of a trial, counted from 0; returns matplotlib axes."""
+        """Draw the outputs and inputs of a trial, counted from 0; returns matplotlib axes.
+
+        `found.plot()[0].figure.savefig("fit.png")` keeps it. `axes` are an array of your own, one
+        for each output and input.
+        """
         from impc.reporting.estimate_text import plot  # noqa: PLC0415
 
         return plot(self, trial, axes)

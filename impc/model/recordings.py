@@ -57,7 +57,8 @@ class Recording(Value):
     outputs : array_like
         (samples, p), or (samples,) for one output; at least two samples.
     disturbance : array_like, optional
-        (samples, d), or (samples,) for one; zero by default.
+        (samples, d), or (samples,) for one; zero by default. The last row is not used and may be
+        left out, as of what drove a simulation.
     x0 : array_like, optional
         (n,). By default the first output, which must then be the full state; a plant with other
         outputs starts at rest.
@@ -120,7 +121,7 @@ class Recording(Value):
         if len(y) < 2:
             raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
         width = plant.E.shape[1]
-        d = np.zeros((len(y), width)) if disturbance is None else _columns(disturbance)
+        d = _pushes(disturbance, len(y), width)
         start = x0
         if start is None:
             full = plant.C.shape == (plant.n, plant.n) and np.array_equal(plant.C, np.eye(plant.n))
@@ -151,6 +152,20 @@ def _require_no_end(values: Array) -> None:
             f"end at sample {end}, and NaN follows",
             "a simulation that ended has no more: start it elsewhere or widen its bounds",
         )
+
+
+def _pushes(given: ArrayLike | None, samples: int, width: int) -> ArrayLike:
+    """The disturbance with a row a sample."""
+    if given is None:
+        return np.zeros((samples, width))
+    d = np.asarray(_columns(given))
+    if width == 0 and d.size:
+        remedy = (
+            "name its controls: Plant(system, controls=[...]); the other inputs are disturbances"
+        )
+        raise DataError("disturbance", "is given, and the plant has none", remedy)
+    short = d.ndim == 2 and len(d) == samples - 1
+    return np.vstack([d, np.zeros((1, d.shape[1]))]) if short else d
 
 
 def _columns(values: ArrayLike) -> ArrayLike:

@@ -31,7 +31,7 @@ def summary(estimate: Estimate) -> str:
     plant = estimate.problem.plant
     shares = zip(plant.outputs, estimate.vaf, strict=True)
     lines.append("VAF, %:     " + ", ".join(f"{name} {value:.4g}" for name, value in shares))
-    lines += ["-" * _WIDTH, estimate.intervals().round(6).to_string(index=False), "-" * _WIDTH]
+    lines += ["-" * _WIDTH, estimate.intervals().round(6).to_string(), "-" * _WIDTH]
     if estimate.weights is not None:
         parts = (("Q", estimate.weights.Q), ("R", estimate.weights.R))
         for name, matrix in parts:
@@ -91,9 +91,9 @@ def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any
     import matplotlib.pyplot as plt  # noqa: PLC0415  # a second
 
     problem, plant = estimate.problem, estimate.problem.plant
-    if not 0 <= trial < len(problem.recordings):
+    if not isinstance(trial, int) or not 0 <= trial < len(problem.recordings):
         last = len(problem.recordings) - 1
-        raise InputError("trial", f"got {trial}", f"give 0 to {last}")
+        raise InputError("trial", f"got {trial!r:.40}", f"give 0 to {last}")
     run, recorded = estimate.simulations[trial], problem.recordings[trial].outputs
     count = len(plant.outputs) + plant.m
     if axes is None:

@@ -49,7 +49,7 @@ def test_vaf_is_that_of_its_definition(found: impc.Estimate) -> None:
 
 def test_intervals_are_around_the_values_and_identified(found: impc.Estimate) -> None:
     table = found.intervals()
-    assert table.name.tolist() == [f"K.{u}.{x}" for u in found.problem.plant.controls
+    assert table.index.tolist() == [f"K.{u}.{x}" for u in found.problem.plant.controls
                                    for x in found.problem.plant.states]  # fmt: skip
     assert np.all((table.low < table.value) & (table.value < table.high))
     np.testing.assert_allclose(table.value, found.gain.ravel(), rtol=0.2)
@@ -154,3 +154,15 @@ def test_the_log_is_silent_unless_asked(
     assert capsys.readouterr() == ("", "")
     assert logging.getLogger("impc").level == logging.NOTSET
     assert json.dumps(found.status.value) == '"settled"'
+
+
+def test_what_drove_a_simulation_drives_its_recording() -> None:
+    """The last row is not used: a simulation of n steps has n + 1 states and n disturbances."""
+    push = np.ones(20)
+    x = impc.Controller(cart(), impc.Weights(np.eye(cart().n), 1), impc.Bounds(cart()), 3)
+    run = x.simulate(np.zeros(cart().n), disturbance=push)
+    one = impc.Recording(cart(), run.outputs, push)
+    np.testing.assert_array_equal(one.disturbance[:, 0], [*push, 0.0])
+    bare = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    with pytest.raises(DataError, match="the plant has none; name its controls"):
+        impc.Recording(bare, np.ones(5), np.ones(5))
