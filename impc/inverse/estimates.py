@@ -189,6 +189,10 @@ class Estimate(Frozen):
         share = self.misfit / recorded_size(self.problem)
         if share > _MUCH:
             doubts.append(f"It leaves {100 * share:.0f} % of the recordings.")
+            still = not any(np.any(trial.disturbance) for trial in self.problem.recordings)
+            if still and self.problem.plant.disturbances:
+                names = ", ".join(self.problem.plant.disturbances)
+                doubts.append(f"No recording has a disturbance, although the plant has {names}.")
         if self.misfit > _MORE * self.noise:
             doubts.append(
                 f"But another gain leaves less, {self.noise:.3g}: not all of it is noise."

@@ -373,7 +373,7 @@ def test_corners_and_shadow_of_three_states_support_what_linear_programs_do() ->
     for direction in rng.standard_normal((20, 3)):
         for points, along in ((corners, direction), (shadow, direction[[0, 2]])):
             whole = direction if points is corners else direction * [1, 0, 1]
-            most = -linprog(-whole, terminal.H, terminal.h, bounds=(None, None)).fun
+            most = -float(linprog(-whole, terminal.H, terminal.h, bounds=(None, None)).fun or 0)
             assert np.max(points @ along) == pytest.approx(most, rel=1e-9)
 
 

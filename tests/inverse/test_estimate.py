@@ -147,6 +147,14 @@ def test_a_body_and_a_family_are_given_again(tmp_path: Path) -> None:
     assert np.array_equal(impc.load(file, plant=moving).gain, other.gain)  # type: ignore[union-attr]
 
 
+def test_a_forgotten_disturbance_is_named() -> None:
+    trial = noisy_trial(1, 0.0)
+    still = impc.Recording(cart(), trial.outputs)
+    found = impc.fit(impc.fit_problem(cart(), [still], FitSettings(horizon=10, u_max=1.0)))
+    assert any("No recording has a disturbance, although the plant has" in one
+               for one in found.doubts)  # fmt: skip
+
+
 def test_the_log_is_silent_unless_asked(
     found: impc.Estimate, capsys: pytest.CaptureFixture[str]
 ) -> None:
