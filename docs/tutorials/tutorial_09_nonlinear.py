@@ -3,7 +3,7 @@ A nonlinear problem of your own, from file to page
 ==================================================
 
 A cart carries a pole that hangs, and somebody swings it up. The equations are known but for the
-masses; the force has a limit that nobody identified, and an angle has a price in force that nobody
+masses; the force has a limit that nobody measured, and an angle has a cost weight that nobody
 knows. What was recorded is where the cart was, how the pole stood, and the force: not a speed. The
 problem is a function in CasADi, the rest is a file that says what the columns mean.
 """
@@ -12,7 +12,7 @@ from terminal import RESULTS, show, terminal, write
 
 # %%
 # **The problem**: states, inputs and parameters are symbols with names; dynamics, cost and limits
-# are expressions. The price of force is 1, which fixes the scale of the others. Units say the
+# are expressions. The cost weight of force is 1, which fixes the scale of the others. Units say the
 # reader of recordings what a column may be, and ``dt`` on which clock.
 write(
     "swing.py",
@@ -28,17 +28,17 @@ def swing_up(length=1.0, horizon=30):
     """Return the problem; length of the pole in m, horizon in samples of 0.1 s."""
     place, angle, speed, rate = x = [ca.SX.sym(n) for n in ("place", "angle", "speed", "rate")]
     force = ca.SX.sym("force")
-    cart, pole, limit, price = (ca.SX.sym(n) for n in ("cart", "pole", "limit", "price"))
+    cart, pole, limit, weight = (ca.SX.sym(n) for n in ("cart", "pole", "limit", "weight"))
 
     push = force + pole * ca.sin(angle) * (length * rate**2 + 9.81 * ca.cos(angle))
     acceleration = push / (cart + pole * ca.sin(angle) ** 2)
     turning = -(acceleration * ca.cos(angle) + 9.81 * ca.sin(angle)) / length
     derivative = ca.vertcat(speed, rate, acceleration, turning)
-    cost = price * (angle - ca.pi) ** 2 + 0.5 * (place**2 + speed**2 + rate**2)
+    cost = weight * (angle - ca.pi) ** 2 + 0.5 * (place**2 + speed**2 + rate**2)
     return impc.OptimalControlProblem(
         x,
         force,
-        {"cart": cart, "pole": pole, "limit": limit, "price": price},
+        {"cart": cart, "pole": pole, "limit": limit, "weight": weight},
         next_state=ca.vertcat(*x) + 0.1 * derivative,
         stage_cost=cost + force**2,
         terminal_cost=cost,
@@ -63,7 +63,7 @@ import numpy as np
 sys.path.insert(0, str(RESULTS))
 from swing import swing_up
 
-truth = {"cart": 0.5, "pole": 0.4, "limit": 4.0, "price": 20.0}
+truth = {"cart": 0.5, "pole": 0.4, "limit": 4.0, "weight": 20.0}
 plan = swing_up().plan(truth, [0, 0, 0, 0])
 rng = np.random.default_rng(3)
 recorded = np.column_stack(
@@ -118,7 +118,7 @@ x0 = { place = 0.0, angle = 0.0, speed = 0.0, rate = 0.0 }
 cart = { start = 600.0, unit = "gram" }
 pole = { start = 0.35 }
 limit = { start = 5.0 }
-price = { start = 15.0 }
+weight = { start = 15.0 }
 """,
 )
 
