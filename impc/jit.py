@@ -56,7 +56,7 @@ _waiting: list[Callable[[str], None]] = []
 
 
 def _listen() -> None:
-    """Tell whoever waits, once, when numba compiles."""
+    """Say on the screen, once, that numba compiles."""
     from numba.core import event  # noqa: PLC0415  # with numba, not before
 
     class Once(event.Listener):
@@ -93,7 +93,7 @@ def _base() -> Path | None:
 
 
 def keep_caches() -> str:
-    """Give numba and matplotlib a folder where they have none; what to say the user, or nothing.
+    """Give numba and matplotlib a folder where they have none; what to tell the user, or nothing.
 
     To be called before either is imported; processes that are begun later inherit it.
     """

@@ -34,7 +34,7 @@ terminal(
 show("fit/trajectories-trial-1.png")
 
 # %%
-# **Mistakes are identified in one line**, and nothing is written. Angles in degrees that are said
+# **Mistakes are reported in one line**, and nothing is written. Angles in degrees that are said
 # to be radians:
 terminal("cp subject/subject.toml wrong.toml")
 change("wrong.toml", 'unit = "deg"', 'unit = "rad"')

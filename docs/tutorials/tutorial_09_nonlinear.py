@@ -140,7 +140,7 @@ for one in impc.load(RESULTS / "swing-fit").table("parameters").itertuples():
     )
 
 # %%
-# **What a recording cannot say.** With the length free as well, the page would say which
+# **What a recording does not identify.** With the length free as well, the page would say which
 # combinations are known and which are not (:doc:`/nonlinear`).
 # A wrong file, a wrong expression or a start without a plan ends in one line:
 (RESULTS / "far.toml").write_text(

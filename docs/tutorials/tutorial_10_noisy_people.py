@@ -71,7 +71,7 @@ least_deviations = gain_covariance(
 ).entries
 
 # %%
-# **Maximum likelihood** is identified that there is motor noise, not how much (0.1 is where it
+# **Maximum likelihood** is given that there is motor noise, not how much (0.1 is where it
 # begins). It finds the gain, the noise of the hand and that of the camera together.
 likely = impc.fit_output_feedback(least, impc.Observer(plant, motor=0.1))
 covariance = person_covariance(likely)

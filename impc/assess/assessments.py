@@ -20,7 +20,6 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.variance_accounted_for import vaf
 from impc.control.simulation import Simulation
-from impc.inverse.problem import simulated
 from impc.model.plant import Plant
 from impc.model.weights import condition_number
 
@@ -73,7 +72,7 @@ def evaluate_method(estimate: Estimate, bounds: Bounds) -> MethodFit:
     problem = estimate.problem
     if estimate.K is None:
         return _without_gain(estimate, bounds)
-    runs = tuple(simulated(problem, estimate.gain, estimate.metric))
+    runs = estimate.simulations
     commands = np.concatenate([run.applied for run in runs])
     beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
         commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)

@@ -96,7 +96,7 @@ class GainCovariance(Frozen):
 
     @property
     def individually_identified(self) -> BoolArray:
-        """Which entries of K they say by themselves, not only together with others (m, n)."""
+        """Which entries of K they identify individually, not only with others (m, n)."""
         return np.asarray(self.foreign < FOREIGN)
 
 

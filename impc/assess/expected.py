@@ -1,4 +1,4 @@
-"""What recordings would say that nobody has made yet: intervals before anyone is measured.
+"""What recordings would identify that nobody has made yet: intervals before anyone is measured.
 
 A presumed subject is simulated, and the recordings are taken as they come out without noise. At the
 truth the residual is then zero, and the derivatives of the outputs are those of the recordings to
@@ -44,7 +44,7 @@ _UNSEEN = 1e-12
 
 @dataclass(frozen=True)
 class Expectation(Frozen):
-    """What the recordings of a problem would say."""
+    """What the recordings of a problem would identify."""
 
     cost_weights: WeightCovariance  # Of the unknowns of the structure, to first order
     # Of each unknown, by its profile; by its deviation where products of features have cost weights

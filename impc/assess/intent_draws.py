@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 #: Draws whose range is an interval of 95 %.
 DRAWS = 39
-# Of the logarithm of weights that nothing says: a factor of ten.
+# Of the logarithm of weights that nothing identifies: a factor of ten.
 _DECADE = np.log(10.0)
 # Steps of the sampler between two draws that are used.
 _STEPS = 6

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 _FRANK_WOLFE = 12
-# A range that ends this near to zero, of its width, does not say the sign.
+# A range that ends this near to zero, of its width, does not decide the sign.
 _TOUCHES = 1e-6
 # 38 of 39, see `intent_draws`.
 _AGREE = 38 / 39 - 1e-9

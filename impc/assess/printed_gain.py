@@ -2,7 +2,7 @@
 
 The weights of a fit are chosen with a penalty on their condition number, which moves their gain,
 and they are confined to gains that some weights have. A gain without weights that is free in every
-direction is no better: along those that the recordings hardly say it wanders off, often to the edge
+direction is no better: along those that are hardly identified it drifts, often to the edge
 of stability, where every derivative is another one and deviations come out too small
 (docs/fitting.md has the measurements). So the gain of the weights is moved along the directions
 that the recordings identify (`gain_covariance.IDENTIFIED`), by plain least squares together with S,

@@ -13,7 +13,7 @@ initial states and parameters. If the structure holds, U'e is a sum of noise alo
     T = (U'e)' V^-1 U'e,      V = cov(U'e) for the colour that the residuals show
 
 is chi-squared with as many degrees of freedom as U has columns (docs/structures.md). Nothing is
-fitted outside of the structure: a free gain wanders along what recordings hardly say, and a ratio
+fitted outside of the structure: a free gain drifts along what is hardly identified, and a ratio
 of misfits is no chi-squared for coloured residuals. Only directions are used that the recordings
 say of a gain (`covariance.IDENTIFIED`), which depends on their derivatives and not on e. What a
 cost weight of zero would do below zero is one of them: a structure is refused too when it wants

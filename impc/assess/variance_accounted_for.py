@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
 
 
-# One second of lags says a rhythm that was missed; fewer than ten say nothing.
+# One second of lags shows a rhythm that was missed; fewer than ten show nothing.
 _LEAST_LAGS = 10
 
 
@@ -239,7 +239,7 @@ def verdict(one: Alternative, other: Alternative) -> str:
     distance = worse.aic - better.aic
     pair = f"{better.name} and {worse.name}"
     if distance < _SAME:
-        return f"the recordings cannot say {pair} apart (AIC differs by {distance:.1f})"
+        return f"the recordings do not distinguish {pair} (AIC differs by {distance:.1f})"
     strength = "rule out" if distance > _RULED_OUT else "speak weakly against"
     return (
         f"the recordings {strength} {worse.name} beside {better.name} (AIC +{distance:.0f}, "

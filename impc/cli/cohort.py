@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Of the settings that ask for more, those that a worker takes.
 _USED = ("replicates", "structure")
-# Seconds between two lines of cohort.log that say the time left.
+# Seconds between two lines of cohort.log that give the time left.
 _LOGGED = 10.0
 
 

@@ -1,4 +1,4 @@
-"""`impc plan`: what an experiment would say, before anyone is measured."""
+"""`impc plan`: what an experiment would identify, before anyone is measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`impc select` and `impc key-parameters`: which parameters of a model recordings can say."""
+"""`impc select` and `impc key-parameters`: which parameters of a model recordings identify."""
 
 from __future__ import annotations
 

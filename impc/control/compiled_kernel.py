@@ -378,7 +378,7 @@ def answer(
     lam: Buffer,
     active: int,
 ) -> tuple[int, bool]:
-    """Write v and dv0 of `work` from the multipliers of one sample, where they say the input.
+    """Write v and dv0 of `work` from the multipliers of one sample, where they give the input.
 
     `unit` (m,); `x` (n,); `dx` (n, p); `lam` (r,).
     """

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
-# Units of a clock that says none, and how many make a second: the first in which the steps are
+# Units of a clock that has none, and how many make a second: the first in which the steps are
 # shorter than those of any recording of movement, s.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2

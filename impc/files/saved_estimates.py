@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import frozen
+from impc.arrays import frozen, with_shape
 from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, InputError
 from impc.files.disk import unwritable, write_whole
@@ -25,6 +25,7 @@ from impc.inverse.estimates import Estimate, Goodness, Status
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
+from impc.model.plant_family import plant_at
 from impc.model.recordings import Label, Recording
 from impc.model.structure import Structure
 from impc.model.weights import Weights
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
     from impc.model.plant_family import PlantFamily
 
+_SIGNALS = ("states", "controls", "disturbances", "outputs")
 # A plant that is given again is the one that was saved up to this, of its entries.
 _SAME = 1e-9
 
@@ -106,7 +108,7 @@ def load(
         return decode_estimate(_problem(content["problem"], plant, family), content["estimate"])
     except ImpcError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:80]
         problem = f"is damaged ({type(error).__name__}: {reason})"
         raise DataError(f"file {place}", problem, "save the estimate again") from None
@@ -125,7 +127,8 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
 
 def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
     """Make an estimate again of the problem as its method saw it."""
-    m, weights = seen.plant.m, kept["weights"]
+    m, n, weights = seen.plant.m, seen.plant.n, kept["weights"]
+    sizes = {"K": (m, n), "S": (m, m), "cost_weights": (None,)}
     posed = replace(seen, terminal_set=kept["terminal_set"])
     values = dict(kept) | {
         "problem": posed.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=float)),
@@ -134,8 +137,10 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
         "status": Status(kept["status"]),
         "fit": Goodness(**kept["fit"]),
         **{
-            name: None if kept[name] is None else frozen(kept[name])
-            for name in ("K", "S", "cost_weights")
+            name: None
+            if kept[name] is None
+            else frozen(with_shape(name, np.array(kept[name], dtype=float), size))
+            for name, size in sizes.items()
         },
     }
     return Estimate(**{item.name: values[item.name] for item in fields(Estimate)})
@@ -165,16 +170,15 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
     saved, names = kept["plant"], kept["family"]
     if names and (family is None or list(family.names) != names):
         raise InputError("family", f"of {', '.join(names)} is needed", "give load(..., family=...)")
-    if saved["body"] and plant is None and family is None:
+    if family is not None and names:
+        plant = plant_at(family, np.array(kept["logarithms"], dtype=float))
+    if saved["body"] and plant is None:
         raise InputError("plant", "has a body that is in no file", "give load(..., plant=...)")
     if plant is None:
-        fixed = ("states", "controls", "disturbances", "outputs")
+        fixed = {name: tuple(saved[name]) for name in _SIGNALS}
         pairs = {name: tuple(map(tuple, saved[name])) for name in ("units", "words")}
-        given = {name: tuple(saved[name]) for name in fixed}
-        plant = _filled(Plant, saved | given | pairs | {"body": None})
-    for name in "ABEC":
-        if not np.allclose(getattr(plant, name), saved[name], rtol=_SAME, atol=0):
-            raise InputError("plant", f"has another {name} than was saved", "give the same plant")
+        plant = _filled(Plant, saved | fixed | pairs | {"body": None})
+    _require_same(plant, saved)
     structure = kept["structure"]
     found: Problem = _filled(
         Problem,
@@ -189,6 +193,19 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
         },
     )
     return found
+
+
+def _require_same(plant: Plant, saved: Mapping[str, Any]) -> None:
+    """Refuse a plant that is given again and is another one."""
+    other = [name for name in _SIGNALS if list(getattr(plant, name)) != saved[name]]
+    for name in ("A", "B", "E", "C", "dt"):
+        own, kept = np.asarray(getattr(plant, name)), np.asarray(saved[name], dtype=float)
+        if own.shape != kept.shape or not np.allclose(own, kept, rtol=_SAME, atol=0):
+            other.append(name)
+    if (plant.body is not None) != saved["body"]:
+        other.append("body")
+    if other:
+        raise InputError("plant", f"has another {other[0]} than was saved", "give the same plant")
 
 
 def _recording(kept: Mapping[str, Any]) -> Recording:

@@ -1,4 +1,4 @@
-"""Weights behind a fitted gain, judged by what they do: the second half of the reduced form.
+"""Weights behind a fitted gain, evaluated by what they do: the second half of the reduced form.
 
     all weights with the gain and, along what is identified of it, the metric
         ->  least condition number  ->  simulated and compared

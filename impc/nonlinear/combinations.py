@@ -132,7 +132,7 @@ def combinations(
         own = own - rest @ np.linalg.lstsq(rest, own, rcond=None)[0]
     _, values, right = np.linalg.svd(own, full_matrices=True)
     values = np.append(values, np.zeros(p - len(values)))
-    # Not by the noise: what it leaves open by a factor of ten is identified that roughly, and which
+    # Not by the noise: what it leaves open by a factor of ten is identified roughly, and which
     # products are identified does not change from one recording to the next (docs/nonlinear.md).
     identified = values > _NOTHING * values[0]
     covariance = _covariance(jacobian, residual, signals, int(np.sum(~identified)))[:p, :p]

@@ -105,11 +105,11 @@ def verdict(fit: OptimalFit) -> str:
     open_ones = [name for name, (low, high) in ends if not high - low < np.inf]
     if not open_ones:
         return (
-            "The problem explains the recordings, which say every parameter by itself, as far as "
-            "the intervals say."
+            "The problem explains the recordings, which identify every parameter by itself, as far "
+            "as the intervals say."
         )
     return (
-        "The problem explains the recordings, but they do not say all of its parameters: "
+        "The problem explains the recordings, but they do not identify all of its parameters: "
         f"{', '.join(open_ones)} may be others, alone or together, as the sentences below say."
     )
 

@@ -41,7 +41,7 @@ _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 _ASKED, _BESIDE = 250, 60
 # Of the command that is noise, where the search begins: what isometric force has, and less.
 _SHARE = 0.1
-# One second of lags says a rhythm that was missed; fewer than ten say nothing.
+# One second of lags shows a rhythm that was missed; fewer than ten show nothing.
 _LEAST_LAGS = 10
 
 

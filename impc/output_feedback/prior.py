@@ -41,7 +41,7 @@ class Place(NamedTuple):
 
 
 class Prior:
-    """What holds directions that nothing says, as a share of a log-likelihood.
+    """What holds directions that nothing identifies, as a share of a log-likelihood.
 
     A normal number about the start for each coordinate of gain, cost weights and parameters, and a
     barrier before gains that do not stabilise. Initial states are as any other state of their

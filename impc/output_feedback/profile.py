@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _HARDLY = 0.25
 # Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
 _FALLEN, _CLOSE = 1.385903, 0.04
-#: No end is looked for farther away, and what is identified to no more is not identified: some
+#: No end is looked for farther away, and what is known to no more is not identified: some
 #: thousands of a
 #: level, which is then none, or that of a sense which is not used.
 FARTHEST = 9.0

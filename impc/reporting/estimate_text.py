@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
 
+    from impc.arrays import Array
     from impc.inverse.estimates import Estimate
+    from impc.model.plant import Plant
 
 _WIDTH = 78
 # Rows of a matrix that is printed whole.
@@ -68,20 +70,20 @@ def as_html(estimate: Estimate) -> str:
     head = f"<p>{escape(METHODS[estimate.method].label)}: {escape(estimate.status.sentence)}</p>"
     if estimate.K is None:
         return head + f"<p>{escape(estimate.reason)}</p>"
-    table = gain_table(estimate).to_html(index=False, float_format="{:.4g}".format)
+    table = gain_table(estimate.problem.plant, estimate.gain)
+    shown = table.to_html(index=False, float_format="{:.4g}".format)
     doubts = "".join(f"<p>{escape(text)}</p>" for text in estimate.doubts)
-    return head + table + doubts
+    return head + shown + doubts
 
 
-def gain_table(estimate: Estimate) -> pd.DataFrame:
-    """The gain of u = -Kx, a row an entry: input, state, unit and value."""
+def gain_table(plant: Plant, gain: Array) -> pd.DataFrame:
+    """A gain (m, n) of u = -Kx, a row an entry: input, state, unit and value."""
     import pandas as pd  # noqa: PLC0415  # a third of a second
 
-    plant, K = estimate.problem.plant, estimate.gain
     rows = [
-        (control, state, gain_unit(plant, control, state), float(K[i, j]))
-        for i, control in enumerate(plant.controls)
-        for j, state in enumerate(plant.states)
+        (control, state, gain_unit(plant, control, state), float(value))
+        for control, row in zip(plant.controls, gain, strict=True)
+        for state, value in zip(plant.states, row, strict=True)
     ]
     return pd.DataFrame(rows, columns=["input", "state", "unit", "value"])
 

@@ -133,7 +133,7 @@ class Steps:
         return found
 
     def kept(self) -> str:
-        """What to say whoever interrupts the command."""
+        """The message for a user who interrupts the command."""
         if not self.names:
             return "nothing was done yet"
         done = ", ".join(self.names)

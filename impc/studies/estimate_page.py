@@ -20,6 +20,7 @@ from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
 from impc.reporting.document import Block, Lines, Report, Section, Verdict
+from impc.reporting.estimate_text import gain_table
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
@@ -32,7 +33,6 @@ from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import FitProgress, fit_recordings
 from impc.studies.methods_table import (
     column_terms,
-    gain_entries,
     methods_data,
     methods_finding,
     weight_entries,
@@ -196,8 +196,7 @@ def _findings(fit: MethodFit) -> list[str]:
 
 
 def _gain(estimate: Estimate) -> Finding:
-    rows = gain_entries(estimate.problem.plant, estimate.gain)
-    table = pd.DataFrame(rows, columns=["input", "state", "unit", "value"])
+    table = gain_table(estimate.problem.plant, estimate.gain)
     return Finding("gain", table, "Gain K of u = -Kx.", digits=6)
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.inverse.methods import METHODS
-from impc.model.plant import gain_unit, weight_unit
+from impc.model.plant import weight_unit
 from impc.reporting.document import Terms
 from impc.reporting.finding import Finding
 
@@ -82,15 +82,6 @@ def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, 
         )
         for i, one in enumerate(names)
         for j, other in enumerate(names[: i + 1])
-    ]
-
-
-def gain_entries(plant: Plant, gain: Array) -> list[tuple[str, str, str, float]]:
-    """One row an entry of a gain (m, n): input, state, unit, value."""
-    return [
-        (control, state, gain_unit(plant, control, state), float(value))
-        for control, row in zip(plant.controls, gain, strict=True)
-        for state, value in zip(plant.states, row, strict=True)
     ]
 
 

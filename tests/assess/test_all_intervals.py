@@ -72,12 +72,12 @@ def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -
     first = by_name["as fitted"]
     assert "rule out no limit" in verdict(first, by_name["no limit"])
     assert by_name["no limit"].held_out < first.held_out
-    assert "cannot say" in verdict(first, by_name["horizon 20"])
+    assert "do not distinguish" in verdict(first, by_name["horizon 20"])
 
 
 def test_verdicts() -> None:
     one = Alternative("as fitted", 10, 1.0, 0.0, 90.0, "")
-    assert "cannot say" in verdict(one, replace(one, name="b", aic=1.9))
+    assert "do not distinguish" in verdict(one, replace(one, name="b", aic=1.9))
     assert "speak weakly against b" in verdict(one, replace(one, name="b", aic=5.0))
     assert "rule out b" in verdict(one, replace(one, name="b", aic=50.0))
     assert "rule out as fitted" in verdict(replace(one, aic=50.0), replace(one, name="b"))

@@ -106,6 +106,8 @@ def test_a_search_goes_on_from_an_earlier_answer(found: impc.Estimate) -> None:
         (lambda text: text.replace('"schema": 4', '"schema": 3'), "another version"),
         (lambda text: text.replace('"status": "settled"', '"status": "odd"'), "is damaged"),
         (lambda text: text.replace('"K": [[', '"K": [["x", '), "is damaged"),
+        (lambda text: text.replace('"K": [[', '"K": [[1.0, '), "K: expected shape"),
+        (lambda text: text.replace('"recordings": [{', '"recordings": [7, {'), "is damaged"),
         (lambda text: text.replace('"A": [[', '"A": [[1, '), "is damaged"),
     ],
 )
@@ -130,10 +132,25 @@ def test_a_body_and_a_family_are_given_again(tmp_path: Path) -> None:
     file = found.save(tmp_path / "family.json")
     with pytest.raises(InputError, match="family"):
         impc.load(file)
+    other_family = impc.PlantFamily(lambda v: plant_of(v * 1.1), ["a"], [0.9])
+    with pytest.raises(InputError, match="another A"):
+        impc.load(file, family=other_family)
     again = impc.load(file, family=family)
     assert isinstance(again, impc.Estimate)
     assert again.problem.family is family
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
+
+    def moving_plant(values: np.ndarray) -> impc.Plant:
+        step = ca.Function("step", [x, u], [float(values[0]) * ca.sin(x) + u])
+        return impc.Plant(control.ss([[float(values[0])]], [[1]], [[1]], 0, 1), body=step)
+
+    bodies = impc.PlantFamily(moving_plant, ["a"], [0.9])
+    first = moving_plant(np.array([0.9]))
+    found = impc.fit(impc.Problem(first, impc.Bounds(first), 3, [trial], family=bodies))
+    again = impc.load(found.save(tmp_path / "bodies.json"), family=bodies)
+    assert isinstance(again, impc.Estimate)
+    assert again.problem.plant.body is not None
+    np.testing.assert_array_equal(again.outputs[0], found.outputs[0])
     body = ca.Function("body", [x, u], [0.9 * ca.sin(x) + u])
     moving = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1), body=body)
     law = impc.Controller(moving, impc.Weights(1, 1), impc.Bounds(moving), 3)
@@ -142,8 +159,10 @@ def test_a_body_and_a_family_are_given_again(tmp_path: Path) -> None:
     file = other.save(tmp_path / "body.json")
     with pytest.raises(InputError, match="body"):
         impc.load(file)
-    with pytest.raises(InputError, match="another A"):
-        impc.load(file, plant=impc.Plant(control.ss([[0.8]], [[1]], [[1]], 0, 1)))
+    wrong = {"A": [[0.8]], "body": [[0.9]]}
+    for what, A in wrong.items():
+        with pytest.raises(InputError, match=f"another {what}"):
+            impc.load(file, plant=impc.Plant(control.ss(A, [[1]], [[1]], 0, 1)))
     assert np.array_equal(impc.load(file, plant=moving).gain, other.gain)  # type: ignore[union-attr]
 
 

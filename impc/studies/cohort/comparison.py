@@ -6,7 +6,7 @@
     all visits     a mixed model of cost weights within a structure: group, visit, a mean for each
     subject reliability    ICC(A,1) between visits
 
-A gain that the recordings of a unit do not say is no datum (`not_identified`).
+A gain that the recordings of a unit do not identify is no datum (`not_identified`).
 Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
 """
 
@@ -80,7 +80,7 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
 
 
 def compare_cohort(units: pd.DataFrame) -> tuple[Comparison, ...]:
-    """Answer every question that the units allow; gains that a unit does not say are left out."""
+    """Answer every question that the units allow, without gains that a unit does not identify."""
     if len(units) == 0:
         return ()
     chosen = measures_of(units)
@@ -215,7 +215,7 @@ def _holm(found: list[Comparison]) -> list[Comparison]:
 
 
 def not_identified(units: pd.DataFrame) -> dict[str, int]:
-    """How many units do not say a gain, by its column; gains that all of them say are in none.
+    """How many units do not identify a gain, by its column; none for gains of all units.
 
     A unit says an entry whose standard deviation is at most twice the median size of the entry
     over the units that give a deviation. The deviation counts what the entry may owe to directions

@@ -169,7 +169,7 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
     for name, task in tasks.items():
         try:
             problem, settings = unit_problem(task)
-        except ImpcError:  # identified as the unit's own when its turn comes
+        except ImpcError:  # reported as the unit's own when its turn comes
             continue
         alone = replace(settings, profiles=[], horizons=[], unknown_limit=False)
         return fit_effort(problem, alone), sum(sizes.values()) / max(sizes[name], 1)

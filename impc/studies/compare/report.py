@@ -12,13 +12,13 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
+from impc.reporting.estimate_text import gain_table
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.shown_units import axis_label, body_sentence, signal_words
 from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
 from impc.studies.charts import chart_figure, methods_chart
 from impc.studies.methods_table import (
     column_terms,
-    gain_entries,
     methods_data,
     methods_finding,
     trajectory_table,
@@ -167,7 +167,7 @@ def _gain(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
         (f"K.{control}.{state}", unit, item.name, value)
         for item in compared
         if (K := item.estimate.K) is not None
-        for control, state, unit, value in gain_entries(problem.plant, K)
+        for control, state, unit, value in gain_table(problem.plant, K).itertuples(index=False)
     ]
     return Finding("gain", pd.DataFrame(rows, columns=["number", "unit", "method", "value"]))
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 4.2  # inches: 8 points are 9 pixels at the width of a phone
 _SOFT = "#8C8C8C"
-# Beside what the recordings identify; intervals of what they do not say have no size.
+# Beside what the recordings identify; intervals of what they do not identify have no size.
 _MARGIN = 0.15
 _LETTERS = 62  # of a line of the figure's width
 _MOST = 12

@@ -150,7 +150,7 @@ def _identified(found: StructureFit) -> str:
         if TWO_SIDED * own >= np.log(IDENTIFIED_FACTOR)
     ]
     if blind:
-        text += f" By themselves they do not say {', '.join(blind)}."
+        text += f" By themselves they do not identify {', '.join(blind)}."
     return text
 
 

@@ -1,1 +1,1 @@
-"""Before anyone is measured: what a planned experiment would say of a presumed person."""
+"""Before anyone is measured: what a planned experiment would identify of a presumed person."""

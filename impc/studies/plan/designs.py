@@ -74,7 +74,7 @@ class Outcome(Frozen):
     # The recordings, without noise, of so many trials as a person does; None where too few trials
     # end without a fall
     problem: Problem | None
-    expected: Expectation | None  # What they would say
+    expected: Expectation | None  # What they would identify
 
 
 def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Design, ...]:

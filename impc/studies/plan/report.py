@@ -52,7 +52,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
     first, *rest = plan_sentences(plan)
     sections = [
         Section("1. The experiments", (*_PICTURES, _experiments(plan)), "Experiments"),
-        Section("2. What the best one would say", _best(plan), "Best"),
+        Section("2. What the best one would identify", _best(plan), "Best"),
         Section("3. Groups", (_groups(plan),), "Groups"),
         Section("4. The presumed person", _presumed(plan), "Person"),
         Section(
@@ -62,7 +62,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
     ]
     return Report(
         "impc plan",
-        "What an experiment would say",
+        "What an experiment would identify",
         (Verdict(first), Lines(rest)),
         sections,
         figures=figures,
@@ -73,7 +73,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
 
 
 def _experiments(plan: Plan) -> Finding:
-    """Every experiment and what it would say, as factors of the presumed cost weights (95 %)."""
+    """Every experiment and what it would identify, as factors of the cost weights (95 %)."""
     rows: list[dict[str, Any]] = []
     for item in plan.outcomes:
         row: dict[str, Any] = {

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Wider than this, from end to end of an interval, a cost weight is not called identified.
 _WIDE = math.log(100)
-# Nearer to one on both sides, an interval is identified in percent.
+# Nearer to one on both sides, an interval is printed in percent.
 _NARROW = 1.5
 
 
@@ -87,7 +87,7 @@ def _limits(plan: Plan) -> str:
             lines.append(f"the limit of {name} to ±{number(196 * float(deviation), 2)} %")
         else:
             lines.append(f"nothing on the limit of {name}, which is never met")
-    return f"It would say {'; '.join(lines)}."
+    return f"It would identify {'; '.join(lines)}."
 
 
 def _how_it_goes(plan: Plan, best: Outcome) -> str:

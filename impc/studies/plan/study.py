@@ -52,7 +52,7 @@ class GroupPower(Frozen):
 
 @dataclass(frozen=True)
 class Plan(Frozen):
-    """What experiments would say of a presumed person."""
+    """What experiments would identify of a presumed person."""
 
     person: Person
     settings: PlanSettings

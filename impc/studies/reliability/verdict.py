@@ -66,7 +66,7 @@ def answer(result: Reliability) -> tuple[str, ...]:
     if "not identified" in named:
         lines.append(
             f"For {'; '.join(named['not identified'])} {len(result.subjects)} subjects and "
-            f"{len(result.visits)} visits do not say: the interval reaches from one word to "
+            f"{len(result.visits)} visits do not decide: the interval reaches from one word to "
             "another. More subjects or visits narrow it."
         )
     # What a single person's score must change by, of the first measure in each condition.

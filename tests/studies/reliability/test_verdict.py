@@ -60,5 +60,5 @@ def test_few_subjects_tell_nothing_however_high_the_estimate() -> None:
     found = icc(made, "A,k", method="generalised")
     assert found.value > 0.6
     lines = answer(study(made))
-    assert "4 subjects and 2 visits do not say" in lines[0]
+    assert "4 subjects and 2 visits do not decide" in lines[0]
     assert not any("is excellent" in line or "is good" in line for line in lines)
