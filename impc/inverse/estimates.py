@@ -339,7 +339,7 @@ class Estimate(Frozen):
         return self.controller().simulate(x0, steps=steps, disturbance=disturbance)
 
     def summary(self) -> str:
-        """Method, problem, agreement, gain with intervals, weights and doubts as text."""
+        """Method, problem, agreement and doubts, then gain with intervals and weights, as text."""
         from impc.reporting.estimate_text import summary  # noqa: PLC0415
 
         return summary(self)

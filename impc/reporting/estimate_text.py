@@ -26,13 +26,15 @@ _SMALL = 4
 
 
 def summary(estimate: Estimate) -> str:
-    """Method, problem, agreement, gain with intervals, weights and doubts, a line each."""
+    """Method, problem, agreement and doubts, then gain with intervals and weights."""
     lines = [METHODS[estimate.method].label, "=" * _WIDTH, *_problem(estimate)]
     if estimate.K is None:
         return "\n".join([*lines, "-" * _WIDTH, estimate.status.sentence, estimate.reason])
     plant = estimate.problem.plant
     shares = zip(plant.outputs, estimate.vaf, strict=True)
     lines.append("VAF, %:     " + ", ".join(f"{name} {value:.4g}" for name, value in shares))
+    said = (estimate.status.sentence, estimate.reason, *estimate.doubts)
+    lines += [text for text in said if text]  # before the numbers that they are about
     lines += ["-" * _WIDTH, estimate.intervals().round(6).to_string(), "-" * _WIDTH]
     if estimate.weights is not None:
         parts = (("Q", estimate.weights.Q), ("R", estimate.weights.R))
@@ -42,8 +44,7 @@ def summary(estimate: Estimate) -> str:
             text = text.replace("\n", "\n    ") if small else f"{matrix.shape}, see .weights"
             lines.append(f"{name} = {text}")
         lines.append("The intervals are of the gain by itself; .K is the gain of these weights.")
-    said = [estimate.status.sentence, estimate.reason, *estimate.doubts]
-    return "\n".join([*lines, *(text for text in said if text)])
+    return "\n".join(lines)
 
 
 def _problem(estimate: Estimate) -> list[str]:

@@ -59,6 +59,8 @@ def test_summary_repr_and_html_are_short_and_escaped(found: impc.Estimate) -> No
     text = found.summary()
     for part in ("horizon 10", "VAF", "K.", "Q =", found.status.sentence):
         assert part in text
+    for doubt in found.doubts:  # before the numbers that they are about
+        assert text.index(doubt) < text.index("K.")
     assert len(repr(found)) < 100
     assert len(repr(found.problem)) < 1000
     plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1, states=["<b>"], inputs=["u"]))

@@ -181,7 +181,9 @@ def test_page_tables_terminal_and_numbers_say_the_same(folder: Path, done: Resul
     for sentence in (found.content["verdict"], *found.content["sentences"]):
         assert sentence in page
         assert sentence in done.stdout
-    assert "they do not identify all of its parameters: far may be others" in found.content["verdict"]
+    assert (
+        "they do not identify all of its parameters: far may be others" in found.content["verdict"]
+    )
     assert "far is not identified: near its value nothing that was measured depends on it." in page
     table = pd.read_csv(out / "parameters.csv").set_index("parameter")
     kept = found.table("parameters").set_index("parameter")
