@@ -28,7 +28,7 @@ FILES = (
     "tests/assess/test_variance_accounted_for.py",
     "tests/control/test_closed_loop.py",
     "tests/inverse/test_equivalent_weights.py",
-    "tests/test_exact_mpc.py",
+    "tests/control/test_exact_mpc.py",
     "tests/inverse/test_noisy_fit.py",
     "tests/control/test_hard_plants.py",
     "tests/experiments/test_inverse_kkt.py",
