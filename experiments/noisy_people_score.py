@@ -175,7 +175,7 @@ def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
     truth = own.natural(np.array(who.controller.K))
     theta[: space.gain] = np.tensordot(own.natural(own.gains), truth, 2)
     starts = np.array([trial.x0 for trial in own.problem.recordings])
-    theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.start_unit, starts.T).T)
+    theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.own_unit, starts.T).T)
     levels = np.concatenate([who.person.levels, who.recorder])
     theta[space.own :] = np.log(levels[space.moving])
     return theta

@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from impc.assess.command_table import command_regression as command_regression
     from impc.assess.expected import expected_intervals as expected_intervals
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.variance_accounted_for import whiteness as whiteness
@@ -52,6 +53,8 @@ if TYPE_CHECKING:
     from impc.inverse.solution_set import gain_fibre as gain_fibre
     from impc.inverse.table31 import table_3_1 as table_3_1
     from impc.model.bounds import Bounds as Bounds
+    from impc.model.foresight import with_observer as with_observer
+    from impc.model.foresight import with_preview as with_preview
     from impc.model.plant import Plant as Plant
     from impc.model.plant_family import PlantFamily as PlantFamily
     from impc.model.recordings import Label as Label
@@ -59,6 +62,7 @@ if TYPE_CHECKING:
     from impc.model.riccati import gain_gradients as gain_gradients
     from impc.model.riccati import solve_lqr as solve_lqr
     from impc.model.structure import Structure as Structure
+    from impc.model.targets import steady_state as steady_state
     from impc.model.weights import Weights as Weights
     from impc.model.weights import weight_error as weight_error
     from impc.nonlinear.fit import fit_optimal_control as fit_optimal_control
@@ -72,6 +76,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
+    "assess.command_table": "command_regression",
     "assess.expected": "expected_intervals",
     "assess.weights_test": "identifiability",
     "assess.variance_accounted_for": "vaf whiteness",
@@ -100,11 +105,13 @@ _NAMES = {
     "inverse.table31": "table_3_1",
     "model.bounds": "Bounds",
     "output_feedback.observer": "Observer",
+    "model.foresight": "with_observer with_preview",
     "model.plant": "Plant",
     "model.plant_family": "PlantFamily",
     "model.recordings": "Label Recording",
     "model.riccati": "gain_gradients solve_lqr",
     "model.structure": "Structure",
+    "model.targets": "steady_state",
     "model.weights": "Weights weight_error",
     "nonlinear.fit": "fit_optimal_control",
     "nonlinear.problem": "OptimalControlProblem",

@@ -25,8 +25,14 @@ def first_input(
     u_max: float,
     x_max: float = np.inf,
     terminal: tuple[Matrix, Matrix] | None = None,
+    targets: tuple[Matrix, Matrix] | None = None,
+    drift: Matrix | None = None,
 ) -> Matrix:
-    """The first input of (3.1) with P from scipy's Riccati solver; |u| <= u_max, |x| <= x_max."""
+    """The first input of (3.1) with P from scipy's Riccati solver; |u| <= u_max, |x| <= x_max.
+
+    The cost is that of the distance from targets of states (N + 1, n) and inputs (N, m), or from 0;
+    `drift` (n,) is added to every next state.
+    """
     n, m = B.shape
     P = scipy.linalg.solve_discrete_are(A, B, Q, R)
     powers = [np.linalg.matrix_power(A, k) for k in range(horizon + 1)]
@@ -36,18 +42,22 @@ def first_input(
         for i in range(k):
             gamma[k * n : (k + 1) * n, i * m : (i + 1) * m] = powers[k - 1 - i] @ B
     weight = scipy.linalg.block_diag(*[Q] * horizon, P)
+    free = phi @ x
+    for k in range(1, horizon + 1 if drift is not None else 0):
+        free[k * n :] += np.vstack(powers[: horizon + 1 - k]) @ drift
     H = gamma.T @ weight @ gamma + np.kron(np.eye(horizon), R)
-    f = gamma.T @ weight @ phi @ x
+    f = gamma.T @ weight @ free
+    if targets is not None:
+        f -= gamma.T @ weight @ targets[0].ravel() + (targets[1] @ R).ravel()
     rows = [np.eye(horizon * m), -np.eye(horizon * m)]
     limits = [np.full(2 * horizon * m, u_max)]
     if np.isfinite(x_max):
         inside = slice(n, horizon * n)
         rows += [gamma[inside], -gamma[inside]]
-        free = phi[inside] @ x
-        limits += [x_max - free, x_max + free]
+        limits += [x_max - free[inside], x_max + free[inside]]
     if terminal is not None:
         rows.append(terminal[0] @ gamma[-n:])
-        limits.append(terminal[1] - terminal[0] @ phi[-n:] @ x)
+        limits.append(terminal[1] - terminal[0] @ free[-n:])
     G, h = np.vstack(rows), np.concatenate(limits)
     settings = clarabel.DefaultSettings()
     settings.verbose = False

@@ -183,12 +183,9 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
 
 
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
-    """The `rows` (r, ...) of all trials as one (samples, p, ...) array a trial."""
-    p, row, parts = len(problem.plant.outputs), 0, []
-    for trial in problem.recordings:
-        mine = rows[row : row + trial.outputs.size]
-        parts.append(mine.reshape(trial.samples, p, *rows.shape[1:]))
-        row += trial.outputs.size
+    """The `rows` (r, ...) of all trials as one (samples, q, ...) array a trial."""
+    q, ends = len(problem.measured), np.cumsum(problem.trial_sizes)[:-1]
+    parts = [part.reshape(-1, q, *rows.shape[1:]) for part in np.split(rows, ends)]
     return parts
 
 
@@ -202,7 +199,7 @@ def _identified_metric(alone: Array) -> Array:
 def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
     """What initial states and the columns `shared` can explain."""
     sizes = problem.trial_sizes
-    return trial_span(found.dx0, sizes, np.hstack(shared))
+    return trial_span(found.own, sizes, np.hstack(shared))
 
 
 def _parameter_deviations(

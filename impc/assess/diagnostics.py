@@ -28,9 +28,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
+from impc.assess.covariance import by_trial
 from impc.assess.loop_noise import LoopNoise, loop_noise
 from impc.checking import replace
 from impc.inverse.least_squares import trial_span
+from impc.inverse.problem import recorded
 from impc.inverse.residuals import evaluate
 
 if TYPE_CHECKING:
@@ -56,11 +58,8 @@ def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> Residu
     found = evaluate(problem, gain, metric)
     if found.reason:
         return ResidualDiagnostics(None, None)
-    p, row, residuals = len(problem.plant.outputs), 0, []
-    for trial in problem.recordings:
-        mine = found.residual[row : row + trial.outputs.size].reshape(-1, p)
-        residuals.append(-mine * problem.output_scale)
-        row += trial.outputs.size
+    p = len(problem.plant.outputs)
+    residuals = [-part[:, :p] * problem.output_scale for part in by_trial(problem, found.residual)]
     structure = residual_structure(problem, gain, found)
     # Nothing but rounding is left of an exact fit: neither test has anything to say.
     loop = None if structure is None else loop_noise(problem.plant, gain, residuals)
@@ -146,20 +145,21 @@ def residual_structure(
 ) -> ResidualStructure | None:
     """Test both families; `gain` (m, n)."""
     problem, found = _thinned(problem, found)
-    p = len(problem.plant.outputs)
+    p = len(problem.measured)
     lengths = [trial.samples for trial in problem.recordings]
     residual = found.residual.reshape(-1, p)
-    recorded = np.concatenate([item.outputs for item in problem.recordings]) / problem.output_scale
+    values = np.concatenate([recorded(problem, item) for item in problem.recordings])
+    known = np.nan_to_num(values / problem.scale)
     size = np.sqrt(np.mean(residual**2, axis=0))
-    if found.reason or min(lengths) < 20 * _LAGS or np.any(size <= _EXACT * np.std(recorded)):
+    if found.reason or min(lengths) < 20 * _LAGS or np.any(size <= _EXACT * np.std(known)):
         return None
     weights = np.tile(1 / size, len(residual))
     fitted = np.hstack([found.dK.reshape(len(weights), -1), found.dparameters])
     sizes = problem.trial_sizes
-    basis = trial_span(found.dx0 * weights[:, None], sizes, fitted * weights[:, None])
+    basis = trial_span(found.own * weights[:, None], sizes, fitted * weights[:, None])
     identified = np.ravel(residual / size)
     shifted = _shifted(residual / size, lengths, np.random.default_rng(0))
-    simulated = residual + recorded
+    simulated = residual + known
     span = _settling(problem, gain)
     results = []
     for columns in (_linear(problem), _nonlinear(simulated / np.std(simulated, axis=0))):

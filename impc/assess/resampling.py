@@ -25,7 +25,7 @@ import scipy.signal
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.printed_gain import Interval, entry_names, identified_gain
 from impc.checking import replace
-from impc.inverse.problem import simulated
+from impc.inverse.problem import modelled, recorded, simulated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,30 +55,30 @@ class BootstrapModel(Frozen):
     problem: Problem  # At its initial states and parameters
     K: Array  # (m, n)
     S: Array  # (m, m)
-    outputs: tuple[Array, ...]  # Simulated without noise, (samples, p) of each trial
+    measured: tuple[Array, ...]  # Simulated without noise, (samples, q) of each trial
 
 
 def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapModel:
     """Simulate an estimate once, for all replicates; `gain` (m, n); `metric` (m, m)."""
     runs = simulated(problem, gain, metric)
-    outputs = tuple(frozen(run.x @ problem.plant.C.T) for run in runs)
-    return BootstrapModel(problem, frozen(gain), frozen(metric), outputs)
+    pairs = zip(problem.recordings, runs, strict=True)
+    measured = tuple(frozen(modelled(problem, trial, run)) for trial, run in pairs)
+    return BootstrapModel(problem, frozen(gain), frozen(metric), measured)
 
 
 def replicate(model: BootstrapModel, index: int, seed: int, resample: Draw) -> Replicate:
     """One replicate, by its number."""
     recordings = model.problem.recordings
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-    residuals = [
-        np.asarray(trial.outputs - outputs)
-        for trial, outputs in zip(recordings, model.outputs, strict=True)
-    ]
-    drawn = resample(residuals, rng)
-    trials = tuple(
-        replace(trial, outputs=frozen(outputs + noise))
-        for trial, outputs, noise in zip(recordings, model.outputs, drawn, strict=True)
-    )
-    again = identified_gain(replace(model.problem, recordings=trials), model.K, model.S)
+    pairs = list(zip(recordings, model.measured, strict=True))
+    residuals = [np.nan_to_num(recorded(model.problem, one) - values) for one, values in pairs]
+    drawn, p = resample(residuals, rng), len(model.problem.plant.outputs)
+    trials = []
+    for (trial, values), noise in zip(pairs, drawn, strict=True):
+        new = values + noise + 0 * recorded(model.problem, trial)  # what is missing stays so
+        commands = new[:, p:] if len(trial.commands) else trial.commands
+        trials.append(replace(trial, outputs=frozen(new[:, :p]), commands=frozen(commands)))
+    again = identified_gain(replace(model.problem, recordings=tuple(trials)), model.K, model.S)
     return Replicate(again.K, frozen(again.parameters))
 
 

@@ -79,7 +79,7 @@ class Tangent(Frozen):
     def span(self, *beside: Array) -> TrialSpan:
         """What initial states, parameters and columns `beside` (r, b) can make up."""
         sizes = self.problem.trial_sizes
-        return trial_span(self.found.dx0, sizes, np.hstack([self.on_parameters, *beside]))
+        return trial_span(self.found.own, sizes, np.hstack([self.on_parameters, *beside]))
 
     def gain_columns(self) -> tuple[Array, Array]:
         """Derivatives with respect to gain and metric."""

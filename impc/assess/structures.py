@@ -119,7 +119,7 @@ def assess_structure(
     sizes = feature_sizes(there, structure, np.array(found.gain), np.array(found.metric))
     runs = [simulate(found.controller(), drive) for drive in scenarios(there)]
     u = np.concatenate([run.applied for run in runs]) @ structure.input_features[0]
-    recorded = np.concatenate([trial.outputs for trial in there.recordings])
+    recorded = np.concatenate([trial.without_offset for trial in there.recordings])
     left = _left_out(problem, structure, found, settle) if held_out else []
     nothing = np.full(len(problem.plant.outputs), np.nan)
     intervals, ratios = _intervals(at, covariance, sizes)

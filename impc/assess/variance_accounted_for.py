@@ -55,7 +55,7 @@ class TrialAgreement(Frozen):
     saturated: float  # Share of the samples at which an input bound is reached
 
 
-@checked(recorded="i j", simulated="i j")
+@checked(recorded="~i j", simulated="i j")
 def vaf(recorded: Array, simulated: Array) -> Array:
     """Variance accounted for (3.24): (1 - sum (y - y_sim)^2 / sum y^2) 100 %, one for each column.
 
@@ -67,7 +67,7 @@ def vaf(recorded: Array, simulated: Array) -> Array:
     Returns
     -------
     Array
-        % (p,); NaN where the recorded output is zero throughout.
+        % (p,); NaN where the recorded output is zero throughout. Missing samples do not count.
 
     Examples
     --------
@@ -78,17 +78,17 @@ def vaf(recorded: Array, simulated: Array) -> Array:
     >>> impc.vaf(recorded, [[0.9], [-1.8], [0.45]]).round(6)
     array([99.])
     """
-    left = np.sum((recorded - simulated) ** 2, axis=0)
-    total = np.sum(recorded**2, axis=0)
+    left = np.nansum((recorded - simulated) ** 2, axis=0)
+    total = np.nansum(recorded**2, axis=0)
     share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
     return np.asarray(100 * (1 - share))
 
 
-@checked(recorded="i j", simulated="i j")
+@checked(recorded="~i j", simulated="i j")
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
     """As `vaf`, with the means removed from what was recorded and from what is left."""
-    left = np.var(recorded - simulated, axis=0)
-    total = np.var(recorded, axis=0)
+    left = np.nanvar(recorded - simulated, axis=0)
+    total = np.nanvar(recorded, axis=0)
     share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
     return np.asarray(100 * (1 - share))
 
@@ -147,11 +147,11 @@ def agreement(
 ) -> TrialAgreement:
     """Compare a trial with its simulation from the first sample to the last."""
     simulated = run.x @ plant.C.T
-    residual = trial.outputs - simulated
+    residual = np.nan_to_num(trial.without_offset - simulated)
     lags = min(max(round(1 / plant.dt), _LEAST_LAGS), trial.samples // 5)
     return TrialAgreement(
-        frozen(vaf(trial.outputs, simulated)),
-        frozen(centred_vaf(trial.outputs, simulated)),
+        frozen(vaf(trial.without_offset, simulated)),
+        frozen(centred_vaf(trial.without_offset, simulated)),
         frozen(whiteness(residual, max(lags, 1))),
         frozen(np.sqrt(np.mean(residual**2, axis=0))),
         saturated_share(run.applied, u_min, u_max),
@@ -183,7 +183,7 @@ def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
     if other.problem.unknown_start:
         started = with_fitted_starts(alone, gain, metric, max(first, alone.plant.n))
     run = simulate(controller_for(started, gain, metric), scenarios(started)[0])
-    recorded, simulated = trial.outputs[first:], (run.x @ started.plant.C.T)[first:]
+    recorded, simulated = trial.without_offset[first:], (run.x @ started.plant.C.T)[first:]
     if not run.complete:
         nothing = frozen(np.full(recorded.shape[1], np.nan))
         return HeldOut(nothing, nothing)
@@ -274,7 +274,7 @@ def residuals_of(found: Estimate, problem: Problem) -> list[Array]:
     ends = np.cumsum(problem.trial_sizes)[:-1]
     parts = np.split(flat, ends)
     return [
-        part.reshape(trial.outputs.shape)
+        part.reshape(trial.samples, -1)
         for part, trial in zip(parts, problem.recordings, strict=True)
     ]
 

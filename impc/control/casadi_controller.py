@@ -130,7 +130,7 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
     status = _judge(excess[mpc.soft] / rows.b[mpc.soft], v)
     row = -1
     if not solved or violation > _EXCEEDED:
-        row = excluded_row(rows, state)
+        row = excluded_row(rows, rows.b - rows.T @ state)
         status = Status.INFEASIBLE if row >= 0 else Status.UNSOLVED
     plan, states = _unroll(controller, state, v)
     return MpcStep(plan[0], plan, states, status, violation, row)
@@ -140,6 +140,8 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
 def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
     """Simulate with a program at every sample; the slow counterpart of `closed_loop.simulate`."""
     plant = mpc.controller.plant
+    if given.signals or np.any(plant.observer):
+        raise InputError("target", "is given", "this way regulates to rest: use impc.simulate")
     x, u = np.zeros((given.steps + 1, plant.n)), np.zeros((given.steps, plant.m))
     status = np.full(given.steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], failed_row = given.x0, -1

@@ -26,8 +26,17 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.checking import checked
+from impc.control.aims import aim_of
 from impc.control.body_steps import body_tape, pushes
-from impc.control.compiled_kernel import LoopMatrices, answer_with, run, workspace
+from impc.control.compiled_kernel import (
+    LoopMatrices,
+    answer_with,
+    deviate,
+    fill_slack,
+    return_to,
+    run,
+    workspace,
+)
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.named_solver import (
     COMPILED,
@@ -39,6 +48,7 @@ from impc.control.named_solver import (
 from impc.control.simulation import Sensitivity, Simulation, Status
 
 if TYPE_CHECKING:
+    from impc.control.compiled_kernel import Workspace
     from impc.control.constraint_rows import Directions, Rows
     from impc.control.controller import Controller
     from impc.control.simulation import Scenario
@@ -136,12 +146,14 @@ def run_loop(
     x[0], dx[0] = given.x0, along.x0
     multipliers = np.zeros(len(prepared.rows.b))
     program, asked = prepared.program, prepared.program is not None
+    aim = aim_of(prepared.controller, given, along)
+    work = workspace(prepared.rows, prepared.row_directions, m)
     loop = (
         *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
         body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
         _pushes(prepared, given),
-        *(np.array(given.disturbance), _divergence(prepared.matrices.E, given), prepared.unit),
-        workspace(prepared.rows, m, p),
+        *(np.array(given.disturbance), aim, _divergence(prepared.matrices.E, given)),
+        *(prepared.unit, work),
     )
     written = (x, u, dx, du, status, multipliers)
     t, weakly_active = 0, 0
@@ -153,7 +165,10 @@ def run_loop(
             break
         if program is None:  # a second opinion on a sample that the compiled method does not solve
             program = build_program(_SECOND, prepared.rows)
-        status[t], weak, row = _ask_solver(prepared, program, x[t], dx[t], u[t], du[t])
+        away, daway = x[t].copy(), dx[t].copy()
+        deviate(aim, prepared.rows, prepared.row_directions, work, t, away, daway)
+        status[t], weak, row = _ask_solver(prepared, program, work, away, daway, u[t], du[t])
+        return_to(aim, t, u[t], du[t])
         weakly_active += weak
         if status[t] > Status.SOFTENED:
             failed_row = failed_row if row >= 0 and failed_row >= 0 else row
@@ -171,19 +186,27 @@ def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
 
 
 def _ask_solver(
-    prepared: PreparedLoop, program: Program, x: Array, dx: Array, u: Array, du: Array
+    prepared: PreparedLoop,
+    program: Program,
+    work: Workspace,
+    x: Array,
+    dx: Array,
+    u: Array,
+    du: Array,
 ) -> tuple[Status, bool, int]:
-    """Write the input of one sample, and its derivative, that the controller's solver finds."""
+    """Write the input of one deviation, and its derivative, that the controller's solver finds."""
     controller, rows = prepared.controller, prepared.rows
-    found = active_set(program, rows.b - rows.T @ x)
+    fill_slack(work, x)
+    slack = work.slack.copy()
+    found = active_set(program, slack)
     if found is not None:
-        v = np.empty(rows.M.shape[1])
         status, weak = answer_with(
             prepared.matrices,
             prepared.matrix_directions,
             rows,
             prepared.row_directions,
             prepared.unit,
+            work,
             found.tight,
             found.given_up,
             x,
@@ -191,12 +214,11 @@ def _ask_solver(
             u,
             du,
             np.empty(len(rows.b)),
-            v,
         )
-        w = (v.reshape(-1, len(u)) @ np.linalg.cholesky(controller.S)).ravel()
+        w = (work.v.reshape(-1, len(u)) @ np.linalg.cholesky(controller.S)).ravel()
         if status <= Status.SOFTENED and np.max(np.abs(w - found.w)) <= found.agrees:
             return Status(status), weak, -1
-    row = excluded_row(rows, x)
+    row = excluded_row(rows, slack)
     return Status.INFEASIBLE if row >= 0 else Status.UNSOLVED, False, row
 
 

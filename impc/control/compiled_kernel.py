@@ -60,9 +60,31 @@ class LoopMatrices(NamedTuple):
     S: Buffer  # S^-1 (m, m); derivatives are those of S, (m, m, p)
 
 
+class Aim(NamedTuple):
+    """What the controller regulates to, sample by sample; all of length 0 where that is rest.
+
+    Bounds are those of the deviations: what the target takes of each.
+    """
+
+    x: Buffer  # Target states (steps, n) and commands (steps, m)
+    u: Buffer
+    # E x + F u of every bound at the target, of which some are known ahead (steps + ahead, c), and
+    # what an expected disturbance adds (steps, c)
+    taken: Buffer
+    held: Buffer
+    dx: Buffer  # Derivatives along p directions, (steps, n, p) and so on; or of length 0
+    du: Buffer
+    dtaken: Buffer
+    dheld: Buffer
+
+
 class Workspace(NamedTuple):
     """Arrays that one sample after the other uses."""
 
+    # Right sides of the rows at the sample (r,), less than b by what a target takes, and their
+    # derivatives (r, p)
+    right: Buffer
+    dright: Buffer
     # Of the rows (r,), the violation of each that counts as kept (r,), the free rows (a + 1,)
     slack: Buffer
     kept: Buffer
@@ -80,12 +102,15 @@ class Workspace(NamedTuple):
 
 
 @njit(cache=True)
-def workspace(rows: Rows, m: int, p: int) -> Workspace:
-    """Arrays that `law` works in, for `m` inputs and `p` directions of given `rows`."""
+def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
+    """Arrays that `law` works in, for `m` inputs, given `rows` and their derivatives."""
     count, width = rows.M.shape
+    p = drows.b.shape[1]
     room = min(count, width) + 1
     # One column of T and M after the other: sums over columns then run over all rows at once.
     return Workspace(
+        rows.b.copy(),
+        drows.b.copy(),
         np.empty(count),
         _KEPT * rows.b,
         np.empty(room, dtype=np.int64),
@@ -118,6 +143,7 @@ def run(
     body: BodyTape,
     pushes: Buffer,
     disturbance: Buffer,
+    aim: Aim,
     divergence: float,
     unit: Buffer,
     work: Workspace,
@@ -138,14 +164,18 @@ def run(
     """
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
+    away, daway = np.empty(x.shape[1]), np.empty(dx.shape[1:])
     for t in range(first, len(u)):
         if status[t] > SOFTENED:
+            away[:], daway[:] = x[t], dx[t]
+            deviate(aim, rows, drows, work, t, away, daway)
             status[t], near, row = law(
-                loop, dloop, rows, drows, unit, work, x[t], dx[t], lam, gain_only, u[t], du[t]
+                loop, dloop, rows, drows, unit, work, away, daway, lam, gain_only, u[t], du[t]
             )
             if status[t] > SOFTENED:
                 _hold(x, dx, t)
                 return weakly_active, row
+            return_to(aim, t, u[t], du[t])
             weakly_active += near
         if body.address:
             move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
@@ -164,6 +194,33 @@ def run(
             _hold(x, dx, t)
             return weakly_active, -1
     return weakly_active, -1
+
+
+@njit(cache=True, inline="always")
+def deviate(
+    aim: Aim, rows: Rows, drows: RowDirections, work: Workspace, t: int, x: Buffer, dx: Buffer
+) -> None:
+    """Turn a state `x` (n,) and `dx` (n, p) at sample t into what the target leaves of it."""
+    if len(aim.x) == 0:
+        return
+    x -= aim.x[t]
+    ahead = len(aim.taken) - len(aim.x)
+    for r in range(len(work.right)):
+        at, c = t + min(rows.stage[r], ahead), rows.family[r]
+        work.right[r] = rows.b[r] - aim.taken[at, c] - aim.held[t, c]
+        if len(aim.dx):
+            work.dright[r] = drows.b[r] - aim.dtaken[at, c] - aim.dheld[t, c]
+    if len(aim.dx):
+        dx -= aim.dx[t, :, : dx.shape[1]]
+
+
+@njit(cache=True, inline="always")
+def return_to(aim: Aim, t: int, u: Buffer, du: Buffer) -> None:
+    """Add the target's command to `u` (m,) of the deviation, and to `du` (m, p)."""
+    if len(aim.x):
+        u += aim.u[t]
+        if len(aim.dx):
+            du += aim.du[t, :, : du.shape[1]]
 
 
 @njit(cache=True, inline="always")
@@ -226,7 +283,7 @@ def law(
     `x` (n,); `dx` (n, p); `u` (m,); `du` (m, p).
     """
     v = work.v
-    needs_qp, near = _look(work.T, rows.b, work.kept, x, work.slack)
+    needs_qp, near = _look(work, rows.b, x)
     v[: len(u)] = 0.0
     work.dv0[:] = 0.0
     begin, work.active[0] = work.active[0], 0
@@ -243,10 +300,10 @@ def law(
 
 
 @njit(cache=True, inline="always")
-def _look(T: Buffer, b: Buffer, kept: Buffer, x: Buffer, slack: Buffer) -> tuple[bool, bool]:
+def _look(work: Workspace, b: Buffer, x: Buffer) -> tuple[bool, bool]:
     """Write the slack of the gain; whether a row is broken, and whether one is about to be."""
-    broken, near = False, False
-    _fill_slack(T, b, x, slack)
+    broken, near, slack, kept = False, False, work.slack, work.kept
+    fill_slack(work, x)
     for r in range(len(slack)):
         broken |= not slack[r] >= -kept[r]
         near |= abs(slack[r]) < _WEAK * b[r]
@@ -254,14 +311,15 @@ def _look(T: Buffer, b: Buffer, kept: Buffer, x: Buffer, slack: Buffer) -> tuple
 
 
 @njit(cache=True, inline="always")
-def _fill_slack(T: Buffer, b: Buffer, x: Buffer, slack: Buffer) -> None:
-    """slack = b - T'x, with T one column of the rows after the other."""
+def fill_slack(work: Workspace, x: Buffer) -> None:
+    """slack = right - T'x, with T one column of the rows after the other."""
+    slack, T = work.slack, work.T
     slack[:] = 0.0
     for i in range(len(x)):
         for r in range(len(slack)):
             slack[r] += T[i, r] * x[i]
     for r in range(len(slack)):
-        slack[r] = b[r] - slack[r]
+        slack[r] = work.right[r] - slack[r]
 
 
 @njit(cache=True)
@@ -306,6 +364,7 @@ def answer_with(
     rows: Rows,
     drows: RowDirections,
     unit: Buffer,
+    work: Workspace,
     tight: Buffer,
     given_up: Buffer,
     x: Buffer,
@@ -313,17 +372,16 @@ def answer_with(
     u: Buffer,
     du: Buffer,
     lam: Buffer,
-    v: Buffer,
 ) -> tuple[int, bool]:
     """Input of one sample and its derivative, where another solver has found the active set.
 
     `unit` (m,); `x` (n,); `dx` (n, p); `tight` (a,); `given_up` (r,); `u` (m,); `du` (m, p);
-    `lam` (r,); `v` (N m,).
+    `lam` (r,). The workspace has the right sides, and gets v.
     """
-    work, active = workspace(rows, du.shape[0], du.shape[1]), len(tight)
+    active = len(tight)
     if active >= len(work.free):
         return UNSOLVED, False
-    _fill_slack(work.T, rows.b, x, work.slack)
+    fill_slack(work, x)
     for i in range(active):
         work.free[i] = tight[i]
         new = append_row(rows.W, tight[i], i, work.factor, work.basis)
@@ -337,7 +395,6 @@ def answer_with(
         if lam[tight[i]] > rows.limit[tight[i]]:
             return UNSOLVED, False
     status, near = answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
-    v[:] = work.v
     if status != UNSOLVED:
         _apply(loop, dloop, work.v, work.dv0, x, dx, u, du)
     return status, near
@@ -505,12 +562,12 @@ def _differentiate(
     for i in range(width):
         for j in range(m):
             for c in range(p):
-                q[i, c] += dloop.S[i % m, j, c] * v[i - i % m + j]
+                q[i, c] += dloop.S[i % len(dloop.S), j, c] * v[i - i % m + j]
     _add_pulls(rows, drows, lam, m, q)
     for a in range(active):
         r = free[a]
         for c in range(p):
-            dlam[a, c] = -drows.b[r, c]
+            dlam[a, c] = -work.dright[r, c]
         for i in range(n):
             for c in range(p):
                 dlam[a, c] += drows.T[r, i, c] * x[i] + rows.T[r, i] * dx[i, c]

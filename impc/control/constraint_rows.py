@@ -65,6 +65,8 @@ class Directions:
     K: Array  # Gain (m, n, p)
     S: Array  # Metric (m, m, p), of the scaled metric of `Controller`
     bounds: Array  # Right sides b of `bound_rows` (c, p)
+    C: Array  # Outputs (outputs, n, p) and the observer's rates (d, p): they move targets
+    observer: Array
     x0: Array  # Initial state (n, p)
     # For each direction, bodies nearby with factors (`PlantDifferential`); may be left empty
     bodies: tuple[tuple[tuple[float, Body], ...], ...] = ()
@@ -111,6 +113,8 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         "K": controller.K.shape,
         "S": controller.S.shape,
         "bounds": rows.b.shape,
+        "C": plant.C.shape,
+        "observer": plant.observer.shape,
         "x0": (plant.n,),
     }
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}

@@ -203,9 +203,13 @@ class Controller(Value):
         )
         return made
 
-    @checked(steps=(1, 10_000_000), x0="n")
+    @checked(steps=(1, 10_000_000))
     def simulate(
-        self, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+        self,
+        x0: ArrayLike,
+        steps: int | None = None,
+        disturbance: ArrayLike | None = None,
+        target: Mapping[str, Any] | None = None,
     ) -> Simulation:
         """Simulate the plant under this controller.
 
@@ -217,6 +221,8 @@ class Controller(Value):
             Needed when there is no disturbance; otherwise its length is taken.
         disturbance : array_like, optional
             (steps, d), or (steps,) for a single disturbance.
+        target : mapping, optional
+            Set points of outputs or states by name, in their units: a number, or (steps + 1,).
 
         Returns
         -------
@@ -239,7 +245,7 @@ class Controller(Value):
         >>> law.simulate([1.0], steps=4).x.shape
         (5, 1)
         """
-        run = simulate(self, scenario(self.plant, x0, steps, disturbance))
+        run = simulate(self, scenario(self.plant, x0, steps, disturbance, target))
         if run.complete:
             return run
         end = run.reached

@@ -105,6 +105,10 @@ def closed_loop_function(
     if of not in ("gain", "weights"):
         raise InputError("of", f"got {of!r}", "choose gain or weights")
     plant = controller.plant
+    if np.any(plant.observer) or plant.ahead:
+        raise InputError(
+            "plant", "has targets that move", "a function of the loop regulates to rest alone"
+        )
     drive = scenario(plant, np.zeros(plant.n), steps, disturbance).disturbance
     loop = _loop_of_gain(controller, drive, disturbance is not None)
     if of == "gain":

@@ -209,20 +209,22 @@ def active_set(program: Program, d: Array) -> ActiveSet | None:
     return ActiveSet(tight, given_up, program.unit * z, _AGREES * program.unit * size)
 
 
-def excluded_row(rows: Rows, x: Array) -> int:
+def excluded_row(rows: Rows, slack: Array) -> int:
     """A hard row that no input sequence keeps beside the others, by linear programming; -1 if none.
 
-    The least share t of their bounds by which all rows are exceeded, T x + M v <= (1 + t) b, is
-    positive; the row is the one that weighs most in the dual. `x` (n,).
+    The least share t of their bounds by which all rows are exceeded, M v <= slack + t b, is
+    positive; the row is the one that weighs most in the dual. `slack` (r,).
     """
     hard = np.isinf(rows.limit)
     width, b = rows.M.shape[1], rows.b[hard]
-    if not (np.all(np.isfinite(rows.M)) and np.all(np.isfinite(x))):  # of a plant that runs away
+    if not (
+        np.all(np.isfinite(rows.M)) and np.all(np.isfinite(slack))
+    ):  # of a plant that runs away
         return -1
     answer: Any = scipy.optimize.linprog(
         np.r_[np.zeros(width), 1.0],
         A_ub=np.column_stack([rows.M[hard] / b[:, None], -np.ones(len(b))]),
-        b_ub=1 - rows.T[hard] @ x / b,
+        b_ub=slack[hard] / b,
         bounds=[*[(None, None)] * width, (-1.0, None)],
         method="highs",
     )

@@ -7,7 +7,7 @@ docs/theory.md, section 4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,6 +19,8 @@ from impc.control import compiled_kernel
 from impc.control.constraint_rows import build_rows
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.model.bounds import bound_rows
+from impc.model.foresight import physical_disturbances, with_steps
+from impc.model.targets import reference
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -80,6 +82,10 @@ class Scenario(Value):
         Initial state (n,).
     disturbance : Array
         One row for each sample (steps, d).
+    target : Array
+        Targets of some signals, one row for each sample (steps + 1, q) or fewer: the last stays.
+    signals : tuple of str
+        Outputs or states that have one (q,).
 
     Examples
     --------
@@ -93,10 +99,13 @@ class Scenario(Value):
     _rules: ClassVar[Mapping[str, Any]] = {
         "x0": "n",
         "disturbance": "* d",
+        "target": "* q",
     }
 
     x0: Array
     disturbance: Array
+    target: Array = field(default_factory=lambda: frozen(np.zeros((0, 0))))
+    signals: tuple[str, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -210,9 +219,13 @@ class Sensitivity(Frozen):
     u: Array  # Of the inputs (steps, m, p)
 
 
-@checked(x0="n", steps=(1, 10_000_000))
+@checked(steps=(1, 10_000_000))
 def scenario(
-    plant: Plant, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
+    plant: Plant,
+    x0: ArrayLike,
+    steps: int | None = None,
+    disturbance: ArrayLike | None = None,
+    target: Mapping[str, Any] | None = None,
 ) -> Scenario:
     """Check and freeze an initial state with a number of steps or a disturbance.
 
@@ -224,6 +237,8 @@ def scenario(
         Needed when there is no disturbance; otherwise its length is taken.
     disturbance : array_like, optional
         (steps, d), or (steps,) for a single disturbance.
+    target : mapping, optional
+        Set points of outputs or states by name, in their units: a number, or (steps + 1,).
 
     Raises
     ------
@@ -237,17 +252,19 @@ def scenario(
     >>> impc.scenario(impc.Plant(yalmip_example()), x0=[1, 3], steps=20).x0
     array([1., 3.])
     """
-    start = finite_array("x0", x0, (plant.n,))
-    count = plant.E.shape[1]
+    count = physical_disturbances(plant)
     if disturbance is None:
         if steps is None:
             raise DataError("steps", "got None without a disturbance", "give at least 1")
-        return Scenario(frozen(start), frozen(np.zeros((steps, count))))
-    columns = as_numbers("disturbance", disturbance)
-    given = finite_array(
-        "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
-    )
-    return Scenario(frozen(start), frozen(given))
+        pushes: Array = np.zeros((steps, count))
+    else:
+        columns = as_numbers("disturbance", disturbance)
+        pushes = finite_array(
+            "disturbance", columns[:, None] if columns.ndim == 1 else columns, (steps, count)
+        )
+    values, names = reference(plant, target, len(pushes) + 1)
+    start, pushes = with_steps(plant, x0, pushes, values, names)
+    return Scenario(frozen(start), frozen(pushes), frozen(values), names)
 
 
 def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str, str]:

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import frozen, with_shape
+from impc.arrays import finite_array, frozen
 from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, InputError
 from impc.files.disk import unwritable, write_whole
 from impc.files.results import SCHEMA, ResultFile, read_content, read_result
 from impc.inverse.estimates import Estimate, Goodness, Status
+from impc.inverse.methods import METHODS
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily
 
 _SIGNALS = ("states", "controls", "disturbances", "outputs")
+# How a plain field is read.
+_PLAIN: dict[Any, Any] = {"bool": bool, "int": int, "str": str}
 # A plant that is given again is the one that was saved up to this, of its entries.
 _SAME = 1e-9
 
@@ -120,6 +123,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
     problem = estimate.problem
     return kept | {
         "starts": problem.starts.tolist(),
+        "shifts": problem.shifts.tolist(),
         "logarithms": problem.logarithms.tolist(),
         "terminal_set": bool(problem.terminal_set),
     }
@@ -128,18 +132,27 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
 def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
     """Make an estimate again of the problem as its method saw it."""
     m, n, weights = seen.plant.m, seen.plant.n, kept["weights"]
-    sizes = {"K": (m, n), "S": (m, m), "cost_weights": (None,)}
+    sizes = {"K": (m, n), "S": (m, m)}
     posed = replace(seen, terminal_set=kept["terminal_set"])
+    own = (np.array(kept[name], dtype=float) for name in ("starts", "logarithms", "shifts"))
+    numbers = {name: float(kept[name]) for name in ("misfit", "noise", "seconds")}
+    if kept["method"] not in METHODS or not isinstance(kept["reason"], str):
+        raise ValueError("no such method, or a reason that is no text")
+    if not set(seen.offsets) <= set(seen.plant.outputs):
+        raise ValueError("an offset of no output")
     values = dict(kept) | {
-        "problem": posed.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=float)),
+        **numbers,
+        "evaluations": int(kept["evaluations"]),
+        "cost_weights": None if kept["cost_weights"] is None else frozen(kept["cost_weights"]),
+        "problem": posed.at(*own),
         "weights": None if weights is None else Weights(weights["Q"], weights["R"]),
         "metrics": frozen(np.reshape(kept["metrics"], (-1, m, m))),
         "status": Status(kept["status"]),
-        "fit": Goodness(**kept["fit"]),
+        "fit": Goodness(
+            **{item.name: _PLAIN[item.type](kept["fit"][item.name]) for item in fields(Goodness)}
+        ),
         **{
-            name: None
-            if kept[name] is None
-            else frozen(with_shape(name, np.array(kept[name], dtype=float), size))
+            name: None if kept[name] is None else frozen(finite_array(name, kept[name], size))
             for name, size in sizes.items()
         },
     }
@@ -177,7 +190,9 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
     if plant is None:
         fixed = {name: tuple(saved[name]) for name in _SIGNALS}
         pairs = {name: tuple(map(tuple, saved[name])) for name in ("units", "words")}
-        plant = _filled(Plant, saved | fixed | pairs | {"body": None})
+        previewed = {"previewed": tuple(saved["previewed"])}
+        plant = _filled(Plant, saved | fixed | pairs | previewed | {"body": None})
+        _require_names(plant)
     _require_same(plant, saved)
     structure = kept["structure"]
     found: Problem = _filled(
@@ -185,8 +200,9 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
         kept
         | {
             "plant": plant,
-            "bounds": _filled(Bounds, kept["bounds"]),
-            "recordings": tuple(_recording(item) for item in kept["recordings"]),
+            "bounds": Bounds(plant, **kept["bounds"]),
+            "recordings": tuple(_recording(item, plant) for item in kept["recordings"]),
+            "offsets": tuple(kept["offsets"]),
             "family": family if names else None,
             "structure": None if structure is None else _filled(Structure, _tuples(structure)),
             "feedback_states": tuple(kept["feedback_states"]),
@@ -195,10 +211,22 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
     return found
 
 
+def _require_names(plant: Plant) -> None:
+    """Refuse signals without a name, or names that are no text."""
+    sizes = (plant.n, plant.m, plant.E.shape[1], len(plant.C))
+    for signals, size in zip(_SIGNALS, sizes, strict=True):
+        names = getattr(plant, signals)
+        if len(names) != size or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{signals} without names")
+    for pairs in (plant.units, plant.words):
+        if not all(isinstance(text, str) for pair in pairs for text in pair):
+            raise ValueError("a unit that is no text")
+
+
 def _require_same(plant: Plant, saved: Mapping[str, Any]) -> None:
     """Refuse a plant that is given again and is another one."""
     other = [name for name in _SIGNALS if list(getattr(plant, name)) != saved[name]]
-    for name in ("A", "B", "E", "C", "dt"):
+    for name in ("A", "B", "E", "C", "dt", "observer", "ahead"):
         own, kept = np.asarray(getattr(plant, name)), np.asarray(saved[name], dtype=float)
         if own.shape != kept.shape or not np.allclose(own, kept, rtol=_SAME, atol=0):
             other.append(name)
@@ -208,9 +236,15 @@ def _require_same(plant: Plant, saved: Mapping[str, Any]) -> None:
         raise InputError("plant", f"has another {other[0]} than was saved", "give the same plant")
 
 
-def _recording(kept: Mapping[str, Any]) -> Recording:
-    label, findings = Label(**kept["label"]), tuple(kept["findings"])
-    found: Recording = _filled(Recording, {**kept, "label": label, "findings": findings})
+def _recording(kept: Mapping[str, Any], plant: Plant) -> Recording:
+    values = dict(kept) | {
+        "label": Label(**kept["label"]),
+        "findings": tuple(kept["findings"]),
+        "signals": tuple(kept["signals"]),
+        "commands": np.reshape(kept["commands"], (-1, plant.m)),
+        "target": np.reshape(kept["target"], (len(kept["outputs"]), -1)),
+    }
+    found: Recording = _filled(Recording, values)
     return found
 
 

@@ -10,7 +10,8 @@ Gain and metric are independent: where no bound is active S has no effect, and d
 No optimal regulator has a K T of norm above (tr(B'PB)/R)^(1/2), because white noise costs it
 tr(B'PB) a sample, of which R u^2 is a part.
 
-Initial states are measured in those of the trials themselves (`start_unit`), and a parameter in
+Initial states are measured in those of the trials themselves (`start_unit`), offsets in the
+size of their outputs, and a parameter in
 thirds of itself (docs/fitting.md).
 """
 
@@ -93,7 +94,7 @@ class Coordinates:
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
         self.T, self.G = natural_coordinates(plant, gain)
-        self.start_unit = start_unit(problem, gain)
+        self.own_unit, self.own = own_unit(problem, gain), problem.own_unknowns
         self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
         if gains is None:
             entries = np.eye(self.m * self.n).reshape(-1, self.m, self.n)
@@ -106,7 +107,7 @@ class Coordinates:
         sizes = (
             len(gains),
             len(self.tril[0]) - 1,
-            self.trials * self.n if problem.unknown_start else 0,
+            self.trials * self.own,
             len(problem.logarithms),
         )
         self.ends = np.cumsum(sizes)
@@ -127,10 +128,11 @@ class Coordinates:
 
     def problem_at(self, starts: Array, parameters: Array) -> Problem:
         """The problem at coordinates of its other unknowns; `parameters` (k,)."""
-        given = np.array([trial.x0 for trial in self.problem.recordings])
-        if len(starts):
-            given = given + starts.reshape(self.trials, self.n) @ self.start_unit.T
-        return self.problem.at(given, self.problem.logarithms + PARAMETER_UNIT * parameters)
+        problem = self.problem
+        moved = starts.reshape(self.trials, self.own) @ self.own_unit.T
+        there = with_own(problem, moved)
+        logarithms = problem.logarithms + PARAMETER_UNIT * parameters
+        return there.at(np.array(there.starts), logarithms)
 
     def at(self, z: Array) -> Compressed:
         """Residual and derivative at z (q,)."""
@@ -153,10 +155,11 @@ class Coordinates:
         on_gain, on_metric = np.tensordot(change, found.dK, 1), np.tensordot(change, found.dS, 1)
         pulled = np.tensordot(dK, on_gain, 2) + np.tensordot(dS, on_metric, 2)
         first, last, row = int(self.ends[1]), int(self.ends[2]), 0
-        for trial, place in enumerate(range(first, last, self.n)):
-            mine = slice(row, row + self.problem.recordings[trial].outputs.size)
+        sizes = self.problem.trial_sizes if self.own else []
+        for size, place in zip(sizes, range(first, last, self.own or 1), strict=True):
+            mine = slice(row, row + size)
             row = mine.stop
-            pulled[place : place + self.n] += change[mine] @ found.dx0[mine] @ self.start_unit
+            pulled[place : place + self.own] += change[mine] @ found.own[mine] @ self.own_unit
         pulled[last:] += PARAMETER_UNIT * (change @ found.dparameters)
         return pulled
 
@@ -219,13 +222,13 @@ class Coordinates:
             along += found.dS.reshape(-1, self.m**2) @ dS[shared].reshape(len(shared), -1).T
         rows, row = [], 0
         sizes = self.problem.trial_sizes
-        if not self.problem.unknown_start:  # no column belongs to one trial: all are one block
+        if not self.own:  # no column belongs to one trial: all are one block
             sizes = [sum(sizes)]
         for size in sizes:
             mine = slice(row, row + size)
             row = mine.stop
             blocks = [along[mine, :first]]
-            blocks += [found.dx0[mine] @ self.start_unit] if found.dx0.shape[1] else []
+            blocks += [found.own[mine] @ self.own_unit] if self.own else []
             parameters = found.dparameters[mine] * PARAMETER_UNIT + along[mine, first:]
             blocks += [parameters, found.residual[mine, None]]
             triangle = triangular_rows(blocks)
@@ -233,7 +236,7 @@ class Coordinates:
             full[: len(triangle)] = triangle
             rows.append(full)
         table = np.stack(rows)
-        own = slice(first, first + found.dx0.shape[1])
+        own = slice(first, first + self.own)
         rest = np.delete(table[..., :-1], own, axis=2)
         return Compressed(Rows(table[..., -1], rest, table[..., own]), first)
 
@@ -263,7 +266,7 @@ class _Along:
         self.space, self.z = space, z
         self.first, self.last = int(space.ends[1]), int(space.ends[2])
         self.columns = np.eye(len(z) - self.last + self.first) if along is None else along
-        self.shape = (space.trials, space.n) if self.last > self.first else (1, 0)
+        self.shape = (space.trials, space.own) if space.own else (1, 0)
         self.begin = self.apart(z)
         self.count = space.problem.recorded_numbers
         self.here = z
@@ -317,6 +320,41 @@ def _factor_changes(first: Array, lower: Array) -> Array:
         change = np.outer(first[:, row], lower[:, column])
         found.append(change + change.T)
     return np.array(found).reshape(-1, *first.shape)
+
+
+def with_own(problem: Problem, moved: Array) -> Problem:
+    """The problem at initial states and offsets that differ by `moved` (trials, own)."""
+    if not moved.size:
+        return problem
+    starts, shifts, size = (
+        np.array(problem.starts),
+        np.array(problem.shifts),
+        problem.searched_states,
+    )
+    starts[:, :size] += moved[:, :size]
+    for place, name in enumerate(problem.offsets):
+        shifts[:, problem.plant.outputs.index(name)] += moved[:, size + place]
+    return problem.at(starts, np.array(problem.logarithms), shifts)
+
+
+def own_values(problem: Problem) -> Array:
+    """Initial states and offsets that are searched (trials, own)."""
+    places = [problem.plant.outputs.index(name) for name in problem.offsets]
+    return np.hstack([problem.starts[:, : problem.searched_states], problem.shifts[:, places]])
+
+
+def own_unit(problem: Problem, gain: Array) -> Array:
+    """Unit of what is a trial's own (own, own): that of `start_unit`, and of the outputs."""
+    unit, size, count = np.eye(problem.own_unknowns), problem.searched_states, len(problem.offsets)
+    if size:
+        whole = start_unit(problem, gain)
+        square = size == len(whole)
+        unit[:size, :size] = (
+            whole if square else np.linalg.cholesky((whole @ whole.T)[:size, :size])
+        )
+    scales = [problem.output_scale[problem.plant.outputs.index(name)] for name in problem.offsets]
+    unit[size:, size:] = np.diag(scales) if count else unit[size:, size:]
+    return unit
 
 
 def start_unit(problem: Problem, gain: Array) -> Array:

@@ -20,7 +20,7 @@ from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
 from impc.inverse.least_squares import trial_span
-from impc.inverse.problem import controller_for, explains, misfit, recorded_size, simulated
+from impc.inverse.problem import controller_for, explains, misfit, missed, recorded_size, simulated
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.riccati import stabilises
@@ -442,7 +442,7 @@ def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
     stable = stabilises(plant, gain)
     T, G = natural_coordinates(plant, gain) if stable else (np.eye(plant.n), np.eye(plant.m))
     beside = np.hstack([found.dS.reshape(len(found.residual), -1), found.dparameters])
-    left = trial_span(found.dx0, problem.trial_sizes, beside).without(found.along_gain(T, G))
+    left = trial_span(found.own, problem.trial_sizes, beside).without(found.along_gain(T, G))
     values: Array = np.asarray(np.linalg.svd(left, compute_uv=False), dtype=np.float64)
     return int(np.count_nonzero(determined(problem, values)))
 
@@ -455,7 +455,7 @@ def determined(problem: Problem, values: Array) -> BoolArray:
 def _is_white(problem: Problem, runs: list[Simulation]) -> bool:
     before, after = [], []
     for run, trial in zip(runs, problem.recordings, strict=True):
-        left = (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
+        left = missed(problem, trial, run)[:, : len(problem.plant.outputs)]
         before.append(left[:-1])
         after.append(left[1:])
     first, second = np.concatenate(before), np.concatenate(after)

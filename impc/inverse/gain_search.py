@@ -209,6 +209,7 @@ def _predictions(problem: Problem, begin: LqrSolution, ratio: float) -> Coordina
         problem,
         plant=problem.plant.linear(),
         terminal_set=False,
+        offsets=(),
         family=None,
         logarithms=frozen([]),
     )
@@ -290,6 +291,7 @@ def drawn_start(
     if not problem.unknown_start:
         return problem, regulator
     unseen = np.eye(plant.n) - np.linalg.pinv(plant.C) @ plant.C
+    unseen[problem.searched_states :] = 0.0
     drawn = rng.standard_normal((len(problem.recordings), plant.n)) @ sizes.T @ unseen.T
     return problem.at(problem.starts + drawn, np.array(problem.logarithms)), regulator
 

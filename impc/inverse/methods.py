@@ -23,6 +23,7 @@ import numpy as np
 
 from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError, WeightsError
+from impc.inverse.command_regression import regress_commands
 from impc.inverse.delayed_feedback import preliminary_gain
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
@@ -93,7 +94,7 @@ def of_gain(
     """
     metric = start.metric if S is None else S
     settled = METHODS[name].restrict(start.problem.with_nuisance_fixed()) if seen is None else seen
-    if problem.unknown_start:
+    if problem.own_unknowns:
         settled = with_fitted_starts(settled, K, metric)
     return simulated_estimate(
         name,
@@ -205,6 +206,12 @@ def _preliminary(problem: Problem, start: Estimate) -> Estimate:
     return of_gain("preliminary", problem, start, K, seen=there.with_nuisance_fixed())
 
 
+def _commands(problem: Problem, start: Estimate) -> Estimate:
+    seen = start.problem.with_nuisance_fixed()
+    found = regress_commands(seen, np.array(start.gain), np.array(start.metric))
+    return of_gain("command_regression", problem, start, np.array(found.K))
+
+
 def _structured(problem: Problem, start: Estimate) -> Estimate:
     if problem.structure is None:
         raise InputError(
@@ -309,6 +316,13 @@ _TABLE = (
         "Weights whose controller, with its bounds, fits the outputs best.",
         _as_posed,
         lambda problem, start: fit_controller(problem, start.stage_weights),
+    ),
+    Method(
+        "command_regression",
+        "regression on recorded commands",
+        "The gain that recorded commands follow at samples without a bound; no loop is simulated.",
+        _as_posed,
+        _commands,
     ),
     Method(
         "structured",

@@ -20,10 +20,10 @@ import numpy as np
 import scipy.optimize
 import scipy.special
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.coordinates import Coordinates, start_unit
+from impc.inverse.coordinates import Coordinates, own_unit, with_own
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, simulated_estimate
 from impc.inverse.explaining_weights import metric_family, unidentified_metrics, weights_behind
@@ -38,7 +38,7 @@ from impc.inverse.natural_search import (
 )
 from impc.inverse.problem import EXPLAINED, misfit, recorded_size, with_or_without_set
 from impc.inverse.proximal_search import weights_near
-from impc.inverse.residuals import keeps_hard, misfit_or_reason, start_residual, verify_hard
+from impc.inverse.residuals import keeps_hard, misfit_or_reason, own_residual, verify_hard
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
     from impc.model.plant import Plant
+    from impc.model.recordings import Recording
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
@@ -117,7 +118,7 @@ def _fitted(problem: Problem, start: Weights | None) -> Estimate:
         found, more = _weights(free, found.weights)
         spent += more
     settled = free.problem
-    if problem.unknown_start:
+    if problem.own_unknowns:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     return _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
 
@@ -157,7 +158,7 @@ def _unlikely(free: GainFit) -> float:
     """Ratio of misfits of the truth and of the best gain that noise rarely exceeds."""
     plant, problem = free.problem.plant, free.problem
     unknowns = plant.m * plant.n + plant.m * (plant.m + 1) // 2 - 1 + len(problem.logarithms)
-    unknowns += plant.n * len(problem.recordings) if problem.unknown_start else 0
+    unknowns += problem.own_unknowns * len(problem.recordings)
     samples = problem.recorded_numbers
     return float(np.exp(scipy.special.chdtri(unknowns, _RARE) / (2 * samples)))
 
@@ -250,44 +251,49 @@ _ROUNDS, _SHARE = 2, 1e-4
 def with_fitted_starts(
     problem: Problem, gain: Array, metric: Array, samples: int | None = None
 ) -> Problem:
-    """Return the problem with each trial's x0 fitted to its first samples under a controller.
+    """Return the problem with x0 and offsets of each trial fitted to its first samples.
 
-    From the given x0, by trust-region least squares. Where the samples leave x0 free it stays: it
-    is given a normal prior of the size of the trial's other states (`start_unit`), which weighs as
-    the residual's own noise does.
+    Under a controller, from the given x0, by trust-region least squares. Where the samples leave x0
+    free it stays: it is given a normal prior of the size of the trial's other states (`own_unit`),
+    which weighs as the residual's own noise does.
 
     `gain` (m, n); `metric` (m, m).
     """
     fitted = []
     for trial in problem.recordings:
         seen = trial.samples if samples is None else min(samples, trial.samples)
-        short = replace(trial, outputs=trial.outputs[:seen], disturbance=trial.disturbance[:seen])
+        parts = {name: getattr(trial, name)[:seen] for name in ("outputs", "disturbance", "target")}
+        short = replace(trial, commands=trial.commands[:seen], **parts)
         one = replace(problem, recordings=(short,), unknown_start=True)
-        fitted.append(replace(trial, x0=frozen(_fit(one, gain, metric))))
+        fitted.append(replace(trial, **_fit(one, gain, metric)))
     return replace(problem, recordings=tuple(fitted))
 
 
-def _fit(problem: Problem, gain: Array, metric: Array) -> Array:
-    unit = start_unit(problem, gain)
-    (trial,) = problem.recordings
-    simulated = start_residual(problem, gain, metric)
+def _fit(problem: Problem, gain: Array, metric: Array) -> dict[str, Array]:
+    unit = own_unit(problem, gain)
+    simulated = own_residual(problem, gain, metric)
+
+    def placed(z: Array) -> Recording:
+        return with_own(problem, (unit @ z)[None]).recordings[0]
 
     @functools.lru_cache(maxsize=1)  # the search asks for residual and derivative one by one
     def seen(z: tuple[float, ...]) -> tuple[Array, Array]:
-        residual, slope = simulated(trial.x0 + unit @ np.array(z))
+        moved = placed(np.array(z))
+        residual, slope = simulated(np.array(moved.x0), np.array(moved.offset))
         return residual, slope @ unit
 
     def at(z: Array) -> tuple[Array, Array]:
         return seen(tuple(z))
 
-    z: Array = np.zeros(problem.plant.n)
+    z: Array = np.zeros(len(unit))
     before = np.inf
     for _ in range(_ROUNDS):
         noise = _noise(*at(z))
         if abs(noise - before) <= _SHARE * noise:
             break
         z, before = _round(at, z, noise), noise
-    return np.asarray(trial.x0 + unit @ z)
+    moved = placed(z)
+    return {"x0": moved.x0, "offset": moved.offset}
 
 
 def _noise(residual: Array, derivative: Array) -> float:

@@ -25,10 +25,11 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-from impc.control.simulation import Scenario
+from impc.checking import replace
 from impc.inverse.problem import scenarios
 
 if TYPE_CHECKING:
+    from impc.control.simulation import Scenario
     from impc.inverse.problem import Problem
 
 # Noise that reaches every mode, of that of the commands: for modes that B misses. The larger ones
@@ -60,14 +61,21 @@ class Correction:
 
     def drives(self, problem: Problem) -> list[Scenario]:
         """What drives each recording: its disturbance and its outputs, one sample later."""
-        kept = self.kept(problem)
-        return [
-            Scenario(
-                kept @ trial.x0 + self.M @ trial.outputs[0],
-                np.hstack([drive.disturbance, trial.outputs[1:]]),
-            )
-            for trial, drive in zip(problem.recordings, scenarios(problem), strict=True)
-        ]
+        kept, drives = self.kept(problem), []
+        for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
+            y = without_gaps(trial.outputs) - trial.offset
+            pushes = np.hstack([drive.disturbance, y[1:]])
+            drives.append(replace(drive, x0=kept @ trial.x0 + self.M @ y[0], disturbance=pushes))
+        return drives
+
+
+def without_gaps(outputs: Array) -> Array:
+    """The outputs (samples, p), missing ones between their neighbours; zero where all are."""
+    filled, places = np.nan_to_num(outputs), np.arange(len(outputs))
+    for column, known in enumerate(np.isfinite(outputs).T):
+        if np.any(known) and not np.all(known):
+            filled[:, column] = np.interp(places, places[known], outputs[known, column])
+    return filled
 
 
 def correction(problem: Problem, ratio: float) -> Correction:

@@ -3,9 +3,10 @@
 For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings in a row and every output
 divided by its scale, and its derivatives with respect to K and S are exact. The weights enter
 through K and S only, so every method of the package is one of two searches over this residual: for
-a gain, or for weights. What else is not known of a recording, the state in which each trial starts
-and physical parameters of the plant, is searched together with the gain; `moved` gives the problem
-at other values of these (docs/theory.md, section 6; docs/fitting.md).
+a gain, or for weights. What else is not known of a recording, the state in which each trial starts,
+offsets of outputs and physical parameters of the plant, is searched together with the gain; `at`
+gives the problem at other values of these (docs/theory.md, section 6; docs/fitting.md). Commands
+that were recorded are fitted as further outputs; of what is missing nothing is asked.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from impc.control.named_solver import COMPILED, require_solver
 from impc.control.simulation import Scenario
 from impc.errors import DataError, InputError, SolverError, WeightsError
 from impc.model.bounds import Bounds
+from impc.model.foresight import physical_states
 from impc.model.plant_family import plant_at
 
 if TYPE_CHECKING:
@@ -60,6 +62,10 @@ class Problem(Value):
     output_scale : array_like, optional
         (p,), positive; by default the root-mean-square of each output over all recordings, so
         that no answer depends on units. An output that is zero throughout counts as the largest.
+    command_scale : array_like, optional
+        (m,), the same of recorded commands. Smaller ones say that the commands are better known.
+    offsets : sequence of str
+        See the attributes.
 
     Attributes
     ----------
@@ -77,6 +83,10 @@ class Problem(Value):
         `Controller`. An answer says how many of its samples do.
     output_scale : Array
         What each output is divided by in the residual (p,), in its unit.
+    command_scale : Array
+        What each recorded command is divided by there (m,), in its unit.
+    offsets : tuple of str
+        Outputs of which every trial has an offset that is not known, constant over the trial.
     unknown_start : bool
         Whether the initial states are searched too, from the `x0` of the recordings. By default
         they are, unless the recordings are exact: all states, and the plant follows them to
@@ -115,6 +125,7 @@ class Problem(Value):
     _rules: ClassVar[Mapping[str, Any]] = {
         "horizon": (1, LONGEST_HORIZON),
         "output_scale": "p",
+        "command_scale": "m",
         "logarithms": "*",
     }
 
@@ -125,6 +136,8 @@ class Problem(Value):
     terminal_set: bool | None
     softening: float
     output_scale: Array
+    command_scale: Array
+    offsets: tuple[str, ...]
     unknown_start: bool
     family: PlantFamily | None
     logarithms: Array
@@ -132,7 +145,7 @@ class Problem(Value):
     feedback_states: tuple[str, ...]
     solver: str
 
-    @checked(horizon=(1, LONGEST_HORIZON), output_scale="p")
+    @checked(horizon=(1, LONGEST_HORIZON), output_scale="p", command_scale="m")
     def __init__(
         self,
         plant: Plant,
@@ -143,6 +156,8 @@ class Problem(Value):
         terminal_set: bool | None = None,
         softening: float = 1e6,
         output_scale: ArrayLike | None = None,
+        command_scale: ArrayLike | None = None,
+        offsets: Sequence[str] = (),
         unknown_start: bool | None = None,
         family: PlantFamily | None = None,
         structure: Structure | None = None,
@@ -152,18 +167,24 @@ class Problem(Value):
         plant.require_discrete()
         if not recordings:
             raise DataError("recordings", "there are none", "give at least one trial")
-        given = _root_mean_square(recordings) if output_scale is None else output_scale
-        scale = finite_array("output_scale", given, (len(plant.outputs),))
-        if np.any(scale <= 0):
-            raise InputError("output_scale", f"got {scale.tolist()}", "give positive numbers")
+        outputs = [trial.outputs for trial in recordings]
+        commands = [trial.commands for trial in recordings if len(trial.commands)]
+        scale = _scale("output_scale", output_scale, outputs, len(plant.outputs))
+        for name in offsets:
+            if name not in plant.outputs:
+                known = ", ".join(plant.outputs)
+                raise InputError("offsets", f"there is no output {name!r}", f"choose of {known}")
+        aimed = np.any(plant.observer) or any(trial.signals for trial in recordings)
         self._fill(
             plant=plant,
             bounds=bounds,
             horizon=horizon,
             recordings=tuple(recordings),
-            terminal_set=terminal_set,
+            terminal_set=False if terminal_set is None and aimed else terminal_set,
             softening=softening,
             output_scale=frozen(scale),
+            command_scale=frozen(_scale("command_scale", command_scale, commands, plant.m)),
+            offsets=tuple(offsets),
             unknown_start=(
                 not follows_plant(plant, recordings) if unknown_start is None else unknown_start
             ),
@@ -179,15 +200,15 @@ class Problem(Value):
         return replace(self, bounds=Bounds(self.plant), terminal_set=False)
 
     def with_nuisance_fixed(self) -> Problem:
-        """Return the problem with its initial states and parameters taken as they stand."""
-        return replace(self, unknown_start=False, family=None, logarithms=frozen([]))
+        """Return the problem with its initial states, offsets and parameters as they stand."""
+        return replace(self, unknown_start=False, offsets=(), family=None, logarithms=frozen([]))
 
     def leaving_out(self, trial: int) -> Problem:
         """Return the problem without one trial, counted from 0."""
         return replace(self, recordings=self.recordings[:trial] + self.recordings[trial + 1 :])
 
-    def at(self, starts: Array, logarithms: Array) -> Problem:
-        """Return the problem at other initial states and other parameters.
+    def at(self, starts: Array, logarithms: Array, shifts: Array | None = None) -> Problem:
+        """Return the problem at other initial states, parameters and offsets.
 
         Parameters
         ----------
@@ -195,9 +216,13 @@ class Problem(Value):
             Initial states (trials, n).
         logarithms : Array
             Of the family's parameters over their nominal values (k,).
+        shifts : Array, optional
+            Offsets of the outputs (trials, p); by default those that there are.
         """
+        moved = self.shifts if shifts is None else shifts
         recordings = tuple(
-            replace(trial, x0=frozen(x0)) for trial, x0 in zip(self.recordings, starts, strict=True)
+            replace(trial, x0=frozen(x0), offset=frozen(offset))
+            for trial, x0, offset in zip(self.recordings, starts, moved, strict=True)
         )
         plant = self.plant
         if self.family is not None and not np.array_equal(logarithms, self.logarithms):
@@ -210,22 +235,79 @@ class Problem(Value):
         return frozen([trial.x0 for trial in self.recordings])
 
     @property
+    def shifts(self) -> Array:
+        """Offsets of the outputs of the trials, (trials, p)."""
+        return frozen([trial.offset for trial in self.recordings])
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Names of what was recorded (q,): the outputs, and the controls where commands were."""
+        commands = any(len(trial.commands) for trial in self.recordings)
+        return (*self.plant.outputs, *self.plant.controls) if commands else self.plant.outputs
+
+    @property
+    def scale(self) -> Array:
+        """What each of these is divided by in the residual (q,)."""
+        both = np.concatenate([self.output_scale, self.command_scale])
+        return both[: len(self.measured)]
+
+    @property
+    def searched_states(self) -> int:
+        """How many states of a trial's start are searched: the first ones, or none."""
+        return physical_states(self.plant) if self.unknown_start else 0
+
+    @property
+    def own_unknowns(self) -> int:
+        """How many unknowns belong to one trial: initial states, then offsets."""
+        return self.searched_states + len(self.offsets)
+
+    @property
     def trial_sizes(self) -> list[int]:
-        """How many numbers were recorded in each trial."""
-        return [trial.outputs.size for trial in self.recordings]
+        """How many numbers of the residual belong to each trial."""
+        return [trial.samples * len(self.measured) for trial in self.recordings]
 
     @property
     def recorded_numbers(self) -> int:
-        """How many numbers were recorded in all trials."""
-        return sum(self.trial_sizes)
+        """How many numbers were recorded in all trials; missing ones do not count."""
+        return sum(int(np.isfinite(recorded(self, trial)).sum()) for trial in self.recordings)
 
 
-def _root_mean_square(recordings: Sequence[Recording]) -> Array:
-    outputs = np.concatenate([trial.outputs for trial in recordings])
-    largest = np.max(np.abs(outputs), axis=0)
-    unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
-    size = largest * np.sqrt(np.mean((outputs / unit) ** 2, axis=0))
-    return np.where(size > 0, size, np.max(size) or 1.0)
+def _scale(name: str, given: ArrayLike | None, parts: Sequence[Array], size: int) -> Array:
+    """What is given (size,), or the root-mean-square of what was recorded."""
+    if given is None:
+        values = np.concatenate([*parts, np.zeros((1, size))])[:-1]
+        largest = np.max(np.abs(np.nan_to_num(values)), axis=0, initial=0.0)
+        unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
+        count = np.maximum(np.sum(np.isfinite(values), axis=0), 1)
+        rms = largest * np.sqrt(np.sum(np.nan_to_num(values / unit) ** 2, axis=0) / count)
+        given = np.where(rms > 0, rms, np.max(rms) or 1.0)
+    scale = finite_array(name, given, (size,))
+    if np.any(scale <= 0):
+        raise InputError(name, f"got {scale.tolist()}", "give positive numbers")
+    return scale
+
+
+def recorded(problem: Problem, trial: Recording) -> Array:
+    """Outputs and, where the problem has them, commands of a trial (samples, q); NaN: missing."""
+    outputs, count = trial.outputs, len(problem.measured)
+    if count == outputs.shape[1]:
+        return outputs
+    none = np.full((trial.samples, problem.plant.m), np.nan)
+    return np.hstack([outputs, trial.commands if len(trial.commands) else none])
+
+
+def modelled(problem: Problem, trial: Recording, run: Simulation) -> Array:
+    """The same of a simulation (samples, q), with the trial's offsets; no command at the end."""
+    outputs = run.x @ problem.plant.C.T + trial.offset
+    if len(problem.measured) == outputs.shape[1]:
+        return np.asarray(outputs)
+    return np.hstack([outputs, np.vstack([run.u, np.full((1, run.u.shape[1]), np.nan)])])
+
+
+def missed(problem: Problem, trial: Recording, run: Simulation) -> Array:
+    """Simulated minus recorded over the scales (samples, q), zero where something is missing."""
+    difference = (modelled(problem, trial, run) - recorded(problem, trial)) / problem.scale
+    return np.where(np.isnan(difference), 0.0, difference)
 
 
 def controller_for(
@@ -247,19 +329,25 @@ def controller_for(
 
 def scenarios(problem: Problem) -> list[Scenario]:
     """What drives each recording."""
-    return [Scenario(trial.x0, trial.disturbance[:-1]) for trial in problem.recordings]
+    return [drive_of(trial, trial.x0) for trial in problem.recordings]
+
+
+def drive_of(trial: Recording, x0: Array) -> Scenario:
+    """What drives a trial from a state (n,)."""
+    return Scenario(frozen(x0), trial.disturbance[:-1], trial.target, trial.signals)
 
 
 def recorded_size(problem: Problem) -> float:
-    """2-norm of all recorded outputs, each divided by its scale."""
-    parts = [(trial.outputs / problem.output_scale).ravel() for trial in problem.recordings]
-    return float(np.linalg.norm(np.concatenate(parts)))
+    """2-norm of all that was recorded, each divided by its scale."""
+    parts = [(recorded(problem, trial) / problem.scale).ravel() for trial in problem.recordings]
+    return float(np.linalg.norm(np.nan_to_num(np.concatenate(parts))))
 
 
 def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array] | None:
     """States (samples, n) of each trial, where the outputs determine them."""
     C = plant.C
-    if C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
+    gaps = any(np.isnan(trial.outputs).any() for trial in recordings)
+    if gaps or C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
         return None
     return [
         np.asarray(np.linalg.solve(C, trial.outputs.T).T, dtype=np.float64) for trial in recordings
@@ -320,9 +408,9 @@ def simulated(problem: Problem, gain: Array, metric: Array) -> list[Simulation]:
 
 
 def misfit(problem: Problem, simulations: list[Simulation]) -> float:
-    """2-norm of all simulated minus recorded outputs, each divided by its scale."""
+    """2-norm of all that was simulated minus what was recorded, each divided by its scale."""
     parts = [
-        (run.x @ problem.plant.C.T - trial.outputs) / problem.output_scale
+        missed(problem, trial, run)
         for run, trial in zip(simulations, problem.recordings, strict=True)
     ]
     return float(np.linalg.norm(np.concatenate([part.ravel() for part in parts])))

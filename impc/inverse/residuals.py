@@ -18,9 +18,16 @@ from impc.checking import checked, replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
 from impc.control.controller import Controller
-from impc.control.simulation import Scenario, Status
+from impc.control.simulation import Status
 from impc.errors import ImpcError
-from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.problem import (
+    controller_for,
+    drive_of,
+    missed,
+    modelled,
+    recorded,
+    scenarios,
+)
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import stabilises
@@ -28,7 +35,7 @@ from impc.model.riccati import stabilises
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.control.simulation import Simulation
+    from impc.control.simulation import Scenario, Sensitivity, Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.prediction import Correction
     from impc.inverse.problem import Problem
@@ -36,7 +43,7 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.model.weights import Weights
 
-    StartResidual = Callable[[Array], tuple[Array, Array]]
+    OwnResidual = Callable[[Array, Array], tuple[Array, Array]]
 
 # What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
 _NOT_REACHED = 1e3
@@ -49,9 +56,9 @@ class Evaluation:
     residual: Array  # (r,), simulated minus recorded outputs, each divided by its scale
     dK: Array  # (r, m, n)
     dS: Array  # (r, m, m), with respect to the metric scaled as in `Controller`
-    # (r, n), with respect to the initial state of the trial that the row belongs to; (r, 0) when
-    # the initial states are known
-    dx0: Array
+    # (r, own), with respect to what is unknown of the trial that the row belongs to: its initial
+    # state, then offsets of outputs
+    own: Array
     # (r, k), with respect to the logarithms of the parameters of the family; k may be 0
     dparameters: Array
     reason: str  # Why some samples were not reached; empty when all were
@@ -93,7 +100,7 @@ def evaluate(
         return unusable(problem, str(error))
     layout = _layout(problem)
     differential = _plant_differential(problem)
-    along = _all_directions(controller, layout, differential)
+    along = _all_directions(controller, layout, problem.searched_states, differential)
     seen = _Seen.of(problem, correction)
     if correction is not None and seen.moves is not None:
         E = np.zeros((n, seen.moves[2].shape[1], layout.count))
@@ -107,17 +114,13 @@ def evaluate(
         if not run.complete:
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
         residuals.append(_difference(problem, seen, trial, run).ravel())
-        derivative = (seen.weighting @ plant.C) @ sensitivity.x
-        if differential is not None:
-            on_outputs = np.tensordot(run.x, differential.C, ((1,), (1,)))  # (samples, p, k)
-            derivative[..., layout.parameters] += on_outputs / problem.output_scale[:, None]
-        derivatives.append(derivative.reshape(-1, layout.count))
+        derivatives.append(_slope(problem, seen, trial, run, sensitivity, layout, differential))
     jacobian = np.concatenate(derivatives)
     return Evaluation(
         np.concatenate(residuals),
         jacobian[:, layout.gain].reshape(-1, m, n),
         _symmetric(jacobian[:, layout.metric], m),
-        jacobian[:, layout.start],
+        jacobian[:, layout.own],
         jacobian[:, layout.parameters],
         reason,
         active,
@@ -126,19 +129,20 @@ def evaluate(
     )
 
 
-def start_residual(problem: Problem, gain: Array, metric: Array) -> StartResidual:
-    """Residual of the only trial of a problem as a function of its initial state."""
+def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
+    """Residual of the only trial of a problem as a function of its initial state and offsets."""
     controller = controller_for(problem, gain, metric)
-    n = problem.plant.n
-    prepared = prepare_loop(controller, directions(controller, n, x0=np.eye(n)))
+    layout = _layout(replace(problem, family=None, logarithms=frozen([])))
+    along = _all_directions(controller, layout, problem.searched_states, None)
+    prepared = prepare_loop(controller, along)
     (trial,) = problem.recordings
     seen = _Seen.of(problem, None)
-    weighting = seen.weighting @ problem.plant.C
 
-    def at(x0: Array) -> tuple[Array, Array]:
-        run, sensitivity = run_loop(prepared, Scenario(frozen(x0), trial.disturbance[:-1]))
-        difference = _difference(problem, seen, trial, run)
-        return difference.ravel(), (weighting @ sensitivity.x).reshape(-1, n)
+    def at(x0: Array, offset: Array) -> tuple[Array, Array]:
+        moved = replace(trial, offset=frozen(offset))
+        run, sensitivity = run_loop(prepared, drive_of(trial, x0))
+        slopes = _slope(problem, seen, moved, run, sensitivity, layout, None)
+        return _difference(problem, seen, moved, run).ravel(), slopes[:, layout.own]
 
     return at
 
@@ -216,17 +220,21 @@ class _Seen:
         )
 
     def off(self, problem: Problem, trial: Recording, run: Simulation) -> Array:
-        """Simulated minus recorded outputs over their scales (samples, p)."""
-        return np.asarray((run.x @ problem.plant.C.T - trial.outputs) @ self.weighting.T)
+        """Simulated minus recorded over the scales (samples, q), zero where one is missing."""
+        if self.moves is None:
+            return missed(problem, trial, run)
+        found = np.nan_to_num(modelled(problem, trial, run) - recorded(problem, trial))
+        p = len(self.weighting)
+        return np.hstack([found[:, :p] @ self.weighting.T, found[:, p:] / problem.scale[p:]])
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Which directions stand where: gain, metric, initial state, parameters."""
+    """Which directions stand where: gain, metric, what is a trial's own, parameters."""
 
     gain: slice
     metric: slice
-    start: slice
+    own: slice
     parameters: slice
 
     @property
@@ -239,7 +247,7 @@ def _layout(problem: Problem) -> _Layout:
     sizes = (
         m * n,
         m * (m + 1) // 2 if m > 1 else 0,
-        n if problem.unknown_start else 0,
+        problem.own_unknowns,
         len(problem.logarithms),
     )
     ends = np.cumsum((0, *sizes)).tolist()
@@ -253,7 +261,10 @@ def _plant_differential(problem: Problem) -> PlantDifferential | None:
 
 
 def _all_directions(
-    controller: Controller, layout: _Layout, differential: PlantDifferential | None
+    controller: Controller,
+    layout: _Layout,
+    searched: int,
+    differential: PlantDifferential | None,
 ) -> Directions:
     m, n = controller.K.shape
     count = layout.count
@@ -265,11 +276,10 @@ def _all_directions(
         at = np.arange(layout.metric.start, layout.metric.stop)
         dS[rows, columns, at] = dS[columns, rows, at] = 1.0
     dx0 = np.zeros((n, count))
-    width = layout.start.stop - layout.start.start
-    dx0[:, layout.start] = np.eye(n, width)
+    dx0[:searched, layout.own.start : layout.own.start + searched] = np.eye(searched)
     given = {"K": dK, "S": dS, "x0": dx0}
     if differential is not None:
-        for name in ("A", "B", "E"):
+        for name in ("A", "B", "E", "C", "observer"):
             part = getattr(differential, name)
             given[name] = np.zeros((*part.shape[:-1], count))
             given[name][..., layout.parameters] = part
@@ -277,6 +287,31 @@ def _all_directions(
     if differential is None:
         return along
     return replace(along, bodies=((),) * layout.parameters.start + differential.bodies)
+
+
+def _slope(
+    problem: Problem,
+    seen: _Seen,
+    trial: Recording,
+    run: Simulation,
+    moved: Sensitivity,
+    layout: _Layout,
+    differential: PlantDifferential | None,
+) -> Array:
+    """Derivative of `_Seen.off` (samples q, count), with the outputs' rows and offsets."""
+    plant, p = problem.plant, len(problem.plant.outputs)
+    slope = np.zeros((trial.samples, len(problem.measured), layout.count))
+    slope[:, :p] = (seen.weighting @ plant.C) @ moved.x
+    if differential is not None:
+        on_outputs = np.tensordot(run.x, differential.C, ((1,), (1,)))  # (samples, p, k)
+        slope[:, :p, layout.parameters] += on_outputs / problem.output_scale[:, None]
+    for place, name in enumerate(problem.offsets):
+        column = layout.own.start + problem.searched_states + place
+        slope[:, :p, column] += seen.weighting[:, plant.outputs.index(name)]
+    if slope.shape[1] > p:
+        slope[:-1, p:] = moved.u / problem.command_scale[:, None]
+    slope[np.isnan(recorded(problem, trial))] = 0.0
+    return slope.reshape(-1, layout.count)
 
 
 def _symmetric(columns: Array, m: int) -> Array:
@@ -299,7 +334,7 @@ def _difference(problem: Problem, seen: _Seen, trial: Recording, run: Simulation
 
 
 def _scale(problem: Problem, trial: Recording) -> float:
-    return float(np.sqrt(np.mean((trial.outputs / problem.output_scale) ** 2))) or 1.0
+    return float(np.sqrt(np.nanmean((trial.outputs / problem.output_scale) ** 2))) or 1.0
 
 
 def unusable(problem: Problem, reason: str) -> Evaluation:
@@ -307,16 +342,16 @@ def unusable(problem: Problem, reason: str) -> Evaluation:
     m, n = problem.plant.m, problem.plant.n
     residual = np.concatenate(
         [
-            np.full(trial.outputs.size, _NOT_REACHED * _scale(problem, trial))
-            for trial in problem.recordings
+            np.full(size, _NOT_REACHED * _scale(problem, trial))
+            for size, trial in zip(problem.trial_sizes, problem.recordings, strict=True)
         ]
     )
-    size, starts = len(residual), n if problem.unknown_start else 0
+    size, own = len(residual), problem.own_unknowns
     return Evaluation(
         residual,
         np.zeros((size, m, n)),
         np.zeros((size, m, m)),
-        np.zeros((size, starts)),
+        np.zeros((size, own)),
         np.zeros((size, len(problem.logarithms))),
         reason,
         0,

@@ -24,7 +24,7 @@ import scipy.linalg
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.errors import WeightsError
-from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point, descend
+from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point, descend, own_values
 from impc.inverse.least_squares import Stop
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate, scaled_changes, unusable
@@ -33,7 +33,7 @@ from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
 
 if TYPE_CHECKING:
     from impc.arrays import BoolArray
-    from impc.inverse.coordinates import Compressed
+    from impc.inverse.coordinates import Compressed, own_values
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
     from impc.model.structure import Structure
@@ -97,8 +97,8 @@ class WeightCoordinates(Coordinates):
         z = self.start.copy()
         first, last = int(self.ends[1]), int(self.ends[2])
         if last > first:
-            away = np.asarray(there.starts) - np.asarray(self.problem.starts)
-            z[first:last] = np.linalg.solve(self.start_unit, away.T).T.ravel()
+            away = own_values(there) - own_values(self.problem)
+            z[first:last] = np.linalg.solve(self.own_unit, away.T).T.ravel()
         z[last:] = (there.logarithms - self.problem.logarithms) / PARAMETER_UNIT
         return z
 

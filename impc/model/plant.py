@@ -61,6 +61,13 @@ class Plant(Value):
         Names of signals with what they are; `word` finds one.
     body : Body or None
         What moves in every simulation; None where it is the linear plant itself.
+    observer : Array
+        Rate at which the controller learns each disturbance, 1/s (d,): 0 where it takes none for
+        lasting, infinite where it knows it; see `with_observer`.
+    ahead : int
+        Samples that targets are known ahead; see `with_preview`.
+    previewed : tuple of str
+        Signals whose targets are.
 
     Raises
     ------
@@ -85,6 +92,7 @@ class Plant(Value):
         "E": "n d",
         "C": "p n",
         "dt": 0,
+        "observer": "~d",
     }
 
     A: Array
@@ -99,6 +107,9 @@ class Plant(Value):
     units: tuple[tuple[str, str], ...]
     words: tuple[tuple[str, str], ...]
     body: Body | None
+    observer: Array
+    ahead: int
+    previewed: tuple[str, ...]
 
     @checked
     def __init__(
@@ -136,6 +147,9 @@ class Plant(Value):
             units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
             words=_texts(system, "words", words, 'few words, as in {"angle": "tilt of the seat"}'),
             body=None if moves is None else read_body(moves, order, len(matrices["A"])),
+            observer=frozen(np.zeros(len(rest))),
+            ahead=0,
+            previewed=(),
         )
         _require_stabilisable(self)
         if moves is not None:

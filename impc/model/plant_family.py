@@ -98,12 +98,13 @@ class PlantFamily(Frozen):
 
 
 class PlantDifferential(NamedTuple):
-    """Derivatives of A, B, E and C with respect to the logarithms; the parameters' axis is last."""
+    """Derivatives with respect to the logarithms of parameters, whose axis is last."""
 
     A: Array  # (n, n, k)
     B: Array  # (n, m, k)
     E: Array  # (n, d, k)
     C: Array  # (p, n, k)
+    observer: Array  # Of the rates of the observer (d, k)
     # For each parameter, bodies nearby with their factors: the sum of what they do at a sample is
     # the derivative of the plant's own. Empty where it has none.
     bodies: tuple[tuple[tuple[float, Body], ...], ...]
@@ -130,8 +131,8 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
         parts.append(tuple((4 * b - a) / 3 for a, b in zip(coarse, fine, strict=True)))
         shares = [(4 / 3 * factor, body) for factor, body in near]
         bodies.append((*shares, *((-factor / 3, body) for factor, body in far)))
-    A, B, E, C = (np.stack(group, axis=-1) for group in zip(*parts, strict=True))
-    return PlantDifferential(A, B, E, C, tuple(bodies))
+    A, B, E, C, observer = (np.stack(group, axis=-1) for group in zip(*parts, strict=True))
+    return PlantDifferential(A, B, E, C, observer, tuple(bodies))
 
 
 def _central(
@@ -141,7 +142,11 @@ def _central(
     shift = np.zeros(len(family.names))
     shift[index] = step
     above, below = plant_at(family, logarithms + shift), plant_at(family, logarithms - shift)
-    pairs = ((above.A, below.A), (above.B, below.B), (above.E, below.E), (above.C, below.C))
+    finite = np.where(np.isinf(below.observer), 0.0, [above.observer, below.observer])
+    pairs = (
+        *((above.A, below.A), (above.B, below.B), (above.E, below.E), (above.C, below.C)),
+        tuple(finite),
+    )
     ends = ((1 / (2 * step), above.body), (-1 / (2 * step), below.body))
     return (
         tuple((up - down) / (2 * step) for up, down in pairs),

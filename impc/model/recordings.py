@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from impc.arrays import Array, as_numbers, finite_array, frozen
+from impc.arrays import Array, as_numbers, finite_array, frozen, require_finite, with_shape
 from impc.checking import Value, checked
 from impc.errors import DataError
+from impc.model.foresight import physical_disturbances, physical_states, with_steps
+from impc.model.targets import reference
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,13 +57,21 @@ class Recording(Value):
     plant : Plant
         Gives the number of outputs, disturbances and states.
     outputs : array_like
-        (samples, p), or (samples,) for one output; at least two samples.
+        (samples, p), or (samples,) for one output; at least two samples. NaN where one is missing.
     disturbance : array_like, optional
         (samples, d), or (samples,) for one; zero by default. The last row is not used and may be
         left out, as of what drove a simulation.
     x0 : array_like, optional
         (n,). By default the first output, which must then be the full state; a plant with other
         outputs starts at rest.
+    target : mapping, optional
+        Set points of outputs or states by name, in their units: a number, or (samples,). What has
+        none is regulated to rest.
+    commands : array_like, optional
+        Commands that were recorded (samples - 1, m) or, the last not used, (samples, m); of one
+        control (samples - 1,). NaN where one is missing. They are fitted beside the outputs.
+    offset : array_like, optional
+        What the recorded outputs have too much (p,); zero by default. See `Problem.offsets`.
     label : Label, optional
     findings : tuple of str
         What the checks of the file found, for the report.
@@ -69,11 +79,18 @@ class Recording(Value):
     Attributes
     ----------
     outputs : Array
-        (samples, p), in the units of the plant's outputs.
+        (samples, p), in the units of the plant's outputs; NaN where missing.
     disturbance : Array
         (samples, d); row k acts between samples k and k + 1, so that the last is not used.
     x0 : Array
         State at the first sample (n,): known, or where a fit of it starts.
+    target : Array
+        Set points of some signals (samples, q), and their names `signals`.
+    signals : tuple of str
+    commands : Array
+        Recorded commands (samples, m), the last row NaN; (0, m) where there are none.
+    offset : Array
+        (p,), in the units of the outputs.
     label : Label
     findings : tuple of str
         What the checks of its file found and let pass, one sentence each.
@@ -93,14 +110,21 @@ class Recording(Value):
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
-        "outputs": "* p",
+        "outputs": "~* p",
         "disturbance": "* d",
         "x0": "n",
+        "target": "* q",
+        "commands": "~* m",
+        "offset": "p",
     }
 
     outputs: Array
     disturbance: Array
     x0: Array
+    target: Array
+    signals: tuple[str, ...]
+    commands: Array
+    offset: Array
     label: Label
     findings: tuple[str, ...]
 
@@ -112,27 +136,49 @@ class Recording(Value):
         disturbance: ArrayLike | None = None,
         x0: ArrayLike | None = None,
         *,
+        target: Mapping[str, Any] | None = None,
+        commands: ArrayLike | None = None,
+        offset: ArrayLike | None = None,
         label: Label | None = None,
         findings: tuple[str, ...] = (),
     ) -> None:
         given = _columns(outputs)
         _require_no_end(np.asarray(given))
-        y = finite_array("outputs", given, (None, len(plant.outputs)))
+        y = _with_gaps("outputs", given, (None, len(plant.outputs)))
         if len(y) < 2:
             raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
-        width = plant.E.shape[1]
+        if not np.any(np.isfinite(y)):
+            raise DataError("outputs", "has no number", "give a recording")
+        width = physical_disturbances(plant)
         d = _pushes(disturbance, len(y), width)
         start = x0
         if start is None:
             full = plant.C.shape == (plant.n, plant.n) and np.array_equal(plant.C, np.eye(plant.n))
-            start = y[0] if full else np.zeros(plant.n)
+            start = np.nan_to_num(y[0]) if full else np.zeros(physical_states(plant))
+        values, names = reference(plant, target, len(y))
+        begin, driven = with_steps(
+            plant,
+            start,
+            finite_array("disturbance", d, (len(y), width)),
+            values,
+            names,
+        )
         self._fill(
             outputs=frozen(y),
-            disturbance=frozen(finite_array("disturbance", d, (len(y), width))),
-            x0=frozen(finite_array("x0", start, (plant.n,))),
+            disturbance=frozen(driven),
+            x0=frozen(begin),
+            target=frozen(values),
+            signals=names,
+            commands=frozen(_commands(commands, len(y), plant.m)),
+            offset=frozen(np.zeros(y.shape[1]) if offset is None else offset),
             label=label or Label(),
             findings=findings,
         )
+
+    @property
+    def without_offset(self) -> Array:
+        """Outputs less their offset (samples, p)."""
+        return np.asarray(self.outputs - self.offset)
 
     @property
     def samples(self) -> int:
@@ -152,6 +198,23 @@ def _require_no_end(values: Array) -> None:
             f"end at sample {end}, and NaN follows",
             "a simulation that ended has no more: start it elsewhere or widen its bounds",
         )
+
+
+def _with_gaps(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """The same as float64 of that shape, in which NaN says that a sample is missing."""
+    array = with_shape(name, as_numbers(name, values), shape)
+    require_finite(name, np.where(np.isnan(array), 0.0, array))
+    return array
+
+
+def _commands(given: ArrayLike | None, samples: int, width: int) -> Array:
+    """Recorded commands with a row a sample, the last of which is not used; or none (0, m)."""
+    if given is None:
+        return np.zeros((0, width))
+    u = _with_gaps("commands", _columns(given), (None, width))
+    if len(u) not in (samples - 1, samples):
+        raise DataError("commands", f"has {len(u)} rows", f"give {samples - 1} or {samples}")
+    return np.vstack([u[: samples - 1], np.full((1, width), np.nan)])
 
 
 def _pushes(given: ArrayLike | None, samples: int, width: int) -> ArrayLike:

@@ -22,9 +22,12 @@ from impc.control.compiled_kernel import (
     DIVERGED,
     LARGEST,
     SOFTENED,
+    Aim,
     LoopMatrices,
     Workspace,
+    deviate,
     law,
+    return_to,
     workspace,
 )
 from impc.control.constraint_rows import RowDirections, Rows
@@ -105,6 +108,7 @@ def run_filter(
     parts: FilterParts,
     outputs: Buffer,
     disturbance: Buffer,
+    aim: Aim,
     z: Buffer,
     dz: Buffer,
     P: Buffer,
@@ -118,12 +122,13 @@ def run_filter(
     answer or the state leaves every range; and at the first one that remembers nothing of the first
     state, from where `lasting` directions are enough. z, dz, P and dP are those before that sample.
 
-    `outputs` (samples, p); `disturbance` (samples, d); `z` (z,); `dz` (z, q); `P` (z, z);
-    `dP` (k, z, z).
+    `outputs` (samples, p); `disturbance` (samples, d), with an aim a sample; `z` (z,);
+    `dz` (z, q); `P` (z, z); `dP` (k, z, z).
     """
     joint, djoint, steady, at = parts.joint, parts.djoint, parts.steady, parts.at
     (m, n), q, k, rows = parts.loop.K.shape, dz.shape[1], len(dP), parts.rows
-    work, lam, u, du = workspace(rows, m, q), np.zeros(len(rows.b)), np.empty(m), np.empty((m, q))
+    work, lam = workspace(rows, parts.drows, m), np.zeros(len(rows.b))
+    u, du = np.empty(m), np.empty((m, q))
     plain = np.ascontiguousarray(parts.dloop.K[:, :, :k].transpose((2, 0, 1)))
     settled, quiet = False, 0
     known = _weigh(parts, P, dP)
@@ -131,7 +136,8 @@ def run_filter(
         if quiet > 2 * len(z) and q > parts.lasting:
             return t
         quiet = quiet + 1 if _update(parts, known, outputs[t], z, dz, result, t) else 0
-        x, dx = z[at : at + n], dz[at : at + n]
+        x, dx = z[at : at + n].copy(), dz[at : at + n].copy()
+        deviate(aim, rows, parts.drows, work, t, x, dx)
         status, _, _ = law(
             parts.loop, parts.dloop, rows, parts.drows, parts.unit, work, x, dx, lam, False, u, du
         )
@@ -139,6 +145,7 @@ def run_filter(
         result.status[t] = status
         if status > SOFTENED:
             return t
+        return_to(aim, t, u, du)
         slope, dslope = _slope_of_law(parts, work, plain)
         noise, dnoise = np.zeros(m), np.zeros((k, m))
         if parts.clip.used:

@@ -160,6 +160,7 @@ def fit_output_feedback(
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     problem = found.problem
+    _require_plain(problem)
     shortest = min(trial.samples for trial in problem.recordings)
     if counted >= shortest:
         left = f"got {counted}, and the shortest trial has {shortest} samples"
@@ -190,6 +191,19 @@ def fit_output_feedback(
             break
     end = max(ends, key=lambda one: one.place.identified.value)
     return person_at(end.prior, end.place, end.unseen, end.settled, spent)
+
+
+def _require_plain(problem: Problem) -> None:
+    """Refuse what the likelihood has no terms for."""
+    gaps = any(np.isnan(trial.outputs).any() for trial in problem.recordings)
+    for there, what, remedy in (
+        (gaps, "outputs with missing samples", "cut the trials there"),
+        (bool(problem.offsets), "unknown offsets", "take them out of the recordings"),
+        (len(problem.measured) > len(problem.plant.outputs), "commands", "leave them out"),
+        (problem.plant.ahead > 0, "targets known ahead", "give a plant without preview"),
+    ):
+        if there:
+            raise InputError("problem", f"has {what}, which this fit does not know", remedy)
 
 
 class _End(NamedTuple):

@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import RowDirections, Rows
-from impc.control.simulation import Status
+from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.output_feedback.compiled_clip import Clip
@@ -129,9 +130,11 @@ def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likel
         counted,
     )
     outputs, disturbance = np.array(trial.outputs), np.array(trial.disturbance)
+    drive = Scenario(trial.x0, trial.disturbance, trial.target, trial.signals)
+    aim = aim_of(law.controller, drive, law.along)
     P, dP, first = joint.P0.copy(), parts.djoint.P0.copy(), 0
     while first < count and result.status[first] not in _FAILED:
-        first = run_filter(parts, outputs, disturbance, z, dz, P, dP, result, first)
+        first = run_filter(parts, outputs, disturbance, aim, z, dz, P, dP, result, first)
         dz, dP = np.ascontiguousarray(dz[:, : parts.lasting]), dP[: parts.lasting]
     failed = np.flatnonzero(np.isin(result.status, _FAILED))
     if len(failed):

@@ -11,10 +11,11 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
+from impc.control.aims import aim_of, window
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
 from impc.errors import ImpcError
-from impc.inverse.problem import controller_for
+from impc.inverse.problem import controller_for, drive_of
 from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
 from impc.output_feedback import profile
@@ -197,9 +198,11 @@ def prediction_errors(fit: OutputFeedbackFit, ahead: tuple[int, ...]) -> Array:
     errors = []
     for trial, identified in zip(problem.recordings, fit.identified.trials, strict=True):
         starts = range(0, trial.samples - farthest, max(1, trial.samples // _STARTS))
+        aim = aim_of(controller, drive_of(trial, trial.x0), law.along)
         for t in starts:
             driven = np.array(trial.disturbance[t : t + farthest])
-            z, _, _ = run_joint(law, joint, identified.filtered[t], driven, quiet)
+            start, part = identified.filtered[t], window(aim, t, farthest)
+            z, _, _ = run_joint(law, joint, start, driven, part, quiet)
             expected = z[list(ahead)] @ joint.C.T
             errors.append(expected - trial.outputs[t + np.array(ahead)])
     if not errors:

@@ -61,7 +61,7 @@ class Prior:
     ) -> None:
         self.space, self.scales, self.center = space, scales, space.start.copy()
         self.weights = np.diag(np.where(np.arange(len(space.start)) < space.own, spread**-2.0, 0.0))
-        unit, size = space.space.start_unit, space.after - space.shared
+        unit, size = space.space.own_unit, space.after - space.shared
         for first in range(space.shared, space.shared + size, len(unit)):
             mine = slice(first, first + len(unit))
             trial = space.space.problem.recordings[(first - space.shared) // len(unit)]

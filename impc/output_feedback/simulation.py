@@ -13,14 +13,27 @@ import numpy as np
 
 from impc.arrays import Array, Buffer, Frozen, finite_array, frozen
 from impc.checking import checked
+from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
-from impc.control.compiled_kernel import DIVERGED, LARGEST, SOFTENED, LoopMatrices, law, workspace
+from impc.control.compiled_kernel import (
+    DIVERGED,
+    LARGEST,
+    SOFTENED,
+    Aim,
+    LoopMatrices,
+    deviate,
+    law,
+    return_to,
+    workspace,
+)
 from impc.control.constraint_rows import RowDirections, Rows, directions
 from impc.control.simulation import Status, scenario
 from impc.jit import njit
 from impc.output_feedback.joint_loop import JointLoop, joint_loop
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import ArrayLike
 
     from impc.control.closed_loop import PreparedLoop
@@ -45,7 +58,7 @@ class PersonTrial(Frozen):
         return int(np.count_nonzero(self.status <= Status.SOFTENED))
 
 
-@checked(x0="n", steps=(1, 10_000_000))
+@checked(steps=(1, 10_000_000))
 def simulate_person(
     controller: Controller,
     person: Observer,
@@ -54,11 +67,12 @@ def simulate_person(
     steps: int | None = None,
     recorder: ArrayLike = 0.0,
     x0: ArrayLike | None = None,
+    target: Mapping[str, Any] | None = None,
     seed: Any = 0,
 ) -> PersonTrial:
     """Simulate one trial; `recorder` (p,); `x0` (n,)."""
     plant = controller.plant
-    given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance)
+    given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance, target)
     rng, p = np.random.default_rng(seed), len(plant.outputs)
     white = finite_array("recorder", np.full(p, recorder, dtype=np.float64), (p,))
     joint = joint_loop(plant, person, white)
@@ -69,7 +83,9 @@ def simulate_person(
     noise = rng.standard_normal((given.steps, size)) @ _root(joint.Q).T
     shared = rng.standard_normal((given.steps, m))
     law = prepare_loop(controller, directions(controller, 0))
-    z, u, status = run_joint(law, joint, start, np.array(given.disturbance), (noise, shared))
+    aim = aim_of(controller, given, law.along)
+    pushes = np.array(given.disturbance)
+    z, u, status = run_joint(law, joint, start, pushes, aim, (noise, shared))
     z = z[:-1]
     estimates = z[:, at : at + plant.n]
     states = estimates + z[:, : plant.n] if person.estimates else estimates
@@ -82,6 +98,7 @@ def run_joint(
     joint: JointLoop,
     start: Array,
     disturbance: Array,
+    aim: Aim,
     noise: tuple[Array, Array],
 ) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
     """States of plant and estimate, and commands, with noise that has been drawn."""
@@ -98,6 +115,7 @@ def run_joint(
         joint,
         0 if len(start) == n else n,
         disturbance,
+        aim,
         *noise,
         z,
         u,
@@ -123,6 +141,7 @@ def run_person(
     joint: JointLoop,
     at: int,
     disturbance: Buffer,
+    aim: Aim,
     noise: Buffer,
     shared: Buffer,
     z: Buffer,
@@ -131,13 +150,15 @@ def run_person(
 ) -> int:
     """Simulate from z[0] with noise that has been drawn, without derivatives."""
     n = loop.K.shape[1]
-    work = workspace(rows, u.shape[1], 0)
+    work = workspace(rows, drows, u.shape[1])
     lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
     for t in range(len(u)):
-        x = z[t, at : at + n]
+        x = z[t, at : at + n].copy()
+        deviate(aim, rows, drows, work, t, x, dx)
         status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
         if status[t] > SOFTENED:
             return t
+        return_to(aim, t, u[t], du)
         z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
         z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
         if not np.max(np.abs(z[t + 1])) < LARGEST:

@@ -201,7 +201,7 @@ class PersonCoordinates:
             at = np.arange(len(own), len(moved.shared))
             levels[self.moving, at] = self.levels(theta)[self.moving]
             given["x0"] = np.zeros((plant.n, count))
-            given["x0"][:, count - moved.start :] = self.space.start_unit[:, : moved.start]
+            given["x0"][:, count - moved.start :] = self.space.own_unit[:, : moved.start]
             family = person.point.problem.family
             if family is not None:
                 differential = plant_differential(family, person.point.problem.logarithms)

@@ -60,10 +60,25 @@ def _problem(estimate: Estimate) -> list[str]:
         for name, low, high in zip(names, lows, highs, strict=True)
         if np.isfinite(low) or np.isfinite(high)
     ]
-    return [
+    lines = [
         f"Recordings: {len(problem.recordings)} trials, {samples} samples of {plant.dt:g} s",
         f"Controller: horizon {problem.horizon}, {', '.join(limits) or 'no bounds'}",
     ]
+    signals = dict.fromkeys(name for trial in problem.recordings for name in trial.signals)
+    if signals:
+        known = f", known {plant.ahead} samples ahead" if plant.ahead else ""
+        lines.append(f"Targets:    {', '.join(signals)}{known}")
+    rates = zip(plant.disturbances, plant.observer, strict=True)
+    learned = [f"{name} at {rate:.4g} 1/s" for name, rate in rates if rate > 0]
+    if learned:
+        lines.append(f"Observer:   {', '.join(learned)}")
+    if len(problem.measured) > len(plant.outputs):
+        lines.append(f"Commands:   recorded, {', '.join(plant.controls)}")
+    for name, values in zip(plant.outputs, problem.shifts.T, strict=True):
+        if np.any(values):
+            listed = ", ".join(f"{value:.4g}" for value in values)
+            lines.append(f"Offsets:    {name} {listed} {plant.unit(name)}, a trial each")
+    return lines
 
 
 def as_html(estimate: Estimate) -> str:
@@ -97,7 +112,7 @@ def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any
     if not isinstance(trial, int) or not 0 <= trial < len(problem.recordings):
         last = len(problem.recordings) - 1
         raise InputError("trial", f"got {trial!r:.40}", f"give 0 to {last}")
-    run, recorded = estimate.simulations[trial], problem.recordings[trial].outputs
+    run, recorded = estimate.simulations[trial], problem.recordings[trial].without_offset
     count = len(plant.outputs) + plant.m
     if axes is None:
         _, axes = plt.subplots(count, sharex=True, layout="constrained")

@@ -134,7 +134,7 @@ def test_false_alarms_of_structure(colour: float, most: float) -> None:
     fitted = fit_controller(problem)
     problem, K = fitted.problem, np.array(fitted.gain)
     clean = evaluate(problem, K, np.array(fitted.metric))
-    columns = np.hstack([clean.dK.reshape(len(clean.residual), -1), clean.dx0])
+    columns = np.hstack([clean.dK.reshape(len(clean.residual), -1), clean.own])
     basis = np.linalg.qr(columns)[0]
     alarms = 0
     for seed in range(60):

@@ -165,7 +165,9 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(fitted: Estim
     found = replicate(model, 0, SEED, keep)
     trials = tuple(
         replace(trial, outputs=outputs + noise)
-        for trial, outputs, noise in zip(at.problem.recordings, model.outputs, kept[0], strict=True)
+        for trial, outputs, noise in zip(
+            at.problem.recordings, model.measured, kept[0], strict=True
+        )
     )
     whole = gain_estimate(fit_controller(replace(fitted.problem, recordings=trials)))
     assert np.all(np.abs(found.K - whole.K) < 0.01 * whole.covariance.entries)

@@ -213,7 +213,7 @@ def _held(at: Tangent, cost_weights: np.ndarray, end: float) -> float:
 def _start_columns(place: Tangent) -> np.ndarray:
     """Derivative with respect to every trial's initial state, zero outside of the trial."""
     sizes = [trial.outputs.size for trial in place.problem.recordings]
-    parts = np.split(np.asarray(place.found.dx0), np.cumsum(sizes)[:-1])
+    parts = np.split(np.asarray(place.found.own), np.cumsum(sizes)[:-1])
     whole = np.zeros((sum(sizes), sum(part.shape[1] for part in parts)))
     row = column = 0
     for part in parts:

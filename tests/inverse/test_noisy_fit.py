@@ -185,11 +185,11 @@ def test_physical_parameters_are_found_with_the_gain() -> None:
 def test_an_evaluation_knows_what_a_problem_lacks() -> None:
     problem, work = seat_family()
     found = evaluate(problem, np.array(work.controller.K), np.eye(1))
-    assert found.dx0.shape == (len(found.residual), 10)
+    assert found.own.shape == (len(found.residual), 10)
     assert found.dparameters.shape == (len(found.residual), 2)
     known = replace(problem, unknown_start=False, family=None, logarithms=np.zeros(0))
     other = evaluate(known, np.array(work.controller.K), np.eye(1))
-    assert other.dx0.shape == (len(found.residual), 0)
+    assert other.own.shape == (len(found.residual), 0)
     np.testing.assert_array_equal(other.dK, found.dK)
 
 
@@ -215,7 +215,7 @@ def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
     K = np.array(work.controller.K)
     covariance = gain_covariance(here, K, np.array(fit_controller(problem).metric))
     found = evaluate(here, K, np.eye(1))
-    J = np.hstack([found.dK.reshape(len(found.residual), -1), found.dx0])
+    J = np.hstack([found.dK.reshape(len(found.residual), -1), found.own])
     scale = np.linalg.norm(J, axis=0)
     inverse = np.linalg.pinv((J / scale).T @ (J / scale), rcond=1e-15)
     theory = subject_noise * np.sqrt(np.diag(inverse)) / scale

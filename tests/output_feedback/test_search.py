@@ -60,7 +60,7 @@ def test_levels_that_slide_do_not_hold_back_the_rest(sliding: OutputFeedbackFit)
     along = np.tensordot(own.natural(own.gains), own.natural(np.array(truth)), 2)
     theta[: space.gain] = along
     starts = np.array([trial.x0 for trial in own.problem.recordings])
-    theta[space.shared : space.after] = -np.linalg.solve(own.start_unit, starts.T).T.ravel()
+    theta[space.shared : space.after] = -np.linalg.solve(own.own_unit, starts.T).T.ravel()
     theta[space.own :] = np.log([0.4, 0.002, 0.004, 0.01])
     assert sliding.log_likelihood > space.value(theta)
 
@@ -94,7 +94,7 @@ def test_initial_states_are_as_any_other_state(sliding: OutputFeedbackFit) -> No
     begin = space.unpack(prior.center).point.problem
     np.testing.assert_allclose([trial.x0 for trial in begin.recordings], 0, atol=1e-12)
     theta, x0 = prior.center.copy(), np.array([0.4, -0.7])
-    unit = space.space.start_unit
+    unit = space.space.own_unit
     theta[space.shared : space.shared + 2] += np.linalg.solve(unit, x0)
     away = prior.value(prior.center) - prior.value(theta)
     assert away == pytest.approx(x0 @ np.linalg.solve(unit @ unit.T + driven, x0) / 2)

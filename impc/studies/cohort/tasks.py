@@ -225,7 +225,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         # Of the first trial, a few hundred points.
         "trajectory": {
             "dt": plant.dt * step,
-            "recorded": first.outputs[::step],
+            "recorded": first.without_offset[::step],
             "simulated": (fit.runs[0].x @ plant.C.T)[::step],
         },
         "structure": _structure(problem, fitted, settings),

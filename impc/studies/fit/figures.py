@@ -75,7 +75,7 @@ def trajectory_figure(result: FitResult, index: int) -> Figure:
         ax = axes[column]
         ax.plot(
             time,
-            factor * trial.outputs[:, column],
+            factor * trial.without_offset[:, column],
             color=_SOFT,
             linewidth=1.6,
             label="recorded",
@@ -136,7 +136,7 @@ def _residuals(result: FitResult) -> Figure:
     for column, name in enumerate(plant.outputs):
         factor, unit = shown_unit(plant, name)
         series = [
-            factor * (trial.outputs - run.x @ plant.C.T)[:, column]
+            factor * (trial.without_offset - run.x @ plant.C.T)[:, column]
             for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
         ]
         offset = 6 * max(float(np.std(part)) for part in series)
@@ -232,7 +232,7 @@ def _methods(result: FitResult) -> Figure:
     figure = new_figure(DOUBLE_COLUMN, 3.4)
     above, below = figure.subplots(2, 1, sharex=True)
     factor, _ = shown_unit(plant, plant.outputs[0])
-    recorded = factor * trial.outputs[window, 0]
+    recorded = factor * trial.without_offset[window, 0]
     above.plot(time, recorded, color=_SOFT, linewidth=1.8, label="recorded")
     for name, method in shown.items():
         color, line = _METHOD_LINES[name]

@@ -1,0 +1,106 @@
+"""How often 95 % intervals hold the gain where there are targets, pushes, commands and gaps.
+
+    python -m experiments.tracking_coverage [recordings]
+
+A cart on a weak spring (mass 1 kg, .1 s) whose position is regulated to jumps of its target, 30 s,
+with recorder noise of 5 % of the positions' size; half of the carts are at their limit. Every
+recording has weights, targets and noise of its own.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+import control
+import numpy as np
+from scipy.stats import beta
+
+import impc
+
+STEPS, HORIZON = 300, 8
+
+KINDS = (
+    "target",
+    "target known 3 samples ahead",
+    "lasting push, learned at 1 1/s",
+    "change of the command",
+    "commands recorded with noise",
+    "offset, and a third missing",
+)
+
+
+def cart() -> impc.Plant:
+    """Position and velocity, pushed by a command and by the wind; the position is recorded."""
+    system = control.ss(
+        [[1, 0.1], [-0.02, 0.97]], [[0, 0], [0.1, 0.1]], [[1, 0]], 0, 0.1,
+        states=["x", "v"], inputs=["push", "wind"], outputs=["x"],
+    )  # fmt: skip
+    return impc.Plant(system, controls=["push"])
+
+
+def covered(task: tuple[str, int]) -> tuple[int, int, int]:
+    """Of one recording: intervals of identified entries, how many hold them, samples at a limit."""
+    kind, seed = task
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    plant, limits = cart(), {"u_max": 0.5 if seed % 2 else 9.0, "u_min": -0.5 if seed % 2 else -9.0}
+    more: dict[str, Any] = {}
+    if kind == "target known 3 samples ahead":
+        plant = impc.with_preview(plant, ["x"], 3)
+    elif kind.startswith("lasting"):
+        plant = impc.with_observer(plant, 1.0)
+    elif kind.startswith("change"):
+        plant = impc.with_rates(plant)
+        limits = {"x_min": {"push": limits["u_min"]}, "x_max": {"push": limits["u_max"]}}
+    Q = np.zeros((plant.n, plant.n))
+    Q[:2, :2] = np.diag(10 ** rng.uniform(-0.5, 1, 2))
+    if kind.startswith("change"):
+        Q[2, 2] = 0.5
+    bounds = impc.Bounds(plant, **limits)
+    weights = impc.Weights(Q + 1e-9 * np.eye(plant.n), 1)
+    law = impc.Controller(plant, weights, bounds, HORIZON, terminal_set=False)
+    jumps = (rng.random(STEPS + 1) < 0.05) * rng.normal(size=STEPS + 1)
+    target = {"x": 0.5 * np.cumsum(jumps) / np.sqrt(1 + np.arange(STEPS + 1) / 30)}
+    wind = 0.2 * np.cumsum((rng.random(STEPS) < 0.03) * rng.normal(size=STEPS))
+    if kind != "lasting push, learned at 1 1/s":
+        wind = 0.1 * rng.normal(size=STEPS)
+    start = np.zeros(2 if plant.ahead else plant.n)
+    run = law.simulate(start, disturbance=wind, target=target)
+    y = run.x @ plant.C.T
+    y = y + 0.05 * np.std(y) * rng.normal(size=y.shape)
+    if kind.startswith("commands"):
+        more["commands"] = run.u + 0.1 * np.std(run.u) * rng.normal(size=run.u.shape)
+    if kind.startswith("offset"):
+        y = y + 0.2
+        y[rng.random(len(y)) < 1 / 3] = np.nan
+    trial = impc.Recording(plant, y, wind, target=target, **more)
+    offsets = ["x"] if kind.startswith("offset") else []
+    found = impc.fit(impc.Problem(plant, bounds, HORIZON, [trial], offsets=offsets))
+    table = found.intervals()
+    true = np.ravel(law.K)
+    inside = (table["low"] <= true) & (true <= table["high"])
+    known = table["identified"].to_numpy(dtype=bool)
+    return int(known.sum()), int((inside & known).sum()), int(np.count_nonzero(run.status))
+
+
+def rate(inside: int, count: int) -> str:
+    """A share with its 95 % interval of Clopper and Pearson."""
+    low = beta.ppf(0.025, inside, count - inside + 1) if inside else 0.0
+    high = beta.ppf(0.975, inside + 1, count - inside) if inside < count else 1.0
+    return f"{inside} of {count} = {100 * inside / count:.1f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def main(recordings: int, report: Callable[[str], None] = print) -> None:
+    """Print the rates of all kinds."""
+    with ProcessPoolExecutor(2) as pool:
+        for kind in KINDS:
+            found = np.array(list(pool.map(covered, [(kind, seed) for seed in range(recordings)])))
+            known, inside, _ = found.sum(axis=0)
+            at_limit = int(np.count_nonzero(found[:, 2]))
+            report(f"{kind}: {rate(int(inside), int(known))}; {at_limit} recordings at a limit")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 60)

@@ -1,0 +1,83 @@
+"""What a controller regulates to, sample by sample, from targets and expected disturbances.
+
+    u_t = u_s - K (x_t - x_s) + v_0
+
+The target (x_s, u_s) is that of the sample; the controller plans as if it stayed, or, where the
+plant knows it some samples ahead (`with_preview`), with the targets to come. Bounds are those of
+the deviations (docs/theory.md, section 9).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.control.compiled_kernel import Aim
+from impc.errors import InputError
+from impc.model.bounds import bound_rows
+from impc.model.targets import PlantChange, SteadyStates, expected_disturbance, signal_rows
+
+if TYPE_CHECKING:
+    from impc.control.constraint_rows import Directions
+    from impc.control.controller import Controller
+    from impc.control.simulation import Scenario
+
+# Of its bound: what a target takes of none.
+_NOTHING = 1e-9
+
+
+def window(aim: Aim, first: int, steps: int) -> Aim:
+    """The targets of some samples of a scenario, without their derivatives."""
+    ahead = len(aim.taken) - len(aim.x)
+    parts = [part[first : first + steps] for part in aim]
+    return Aim(*parts)._replace(taken=aim.taken[first : first + steps + ahead])
+
+
+def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
+    """The targets of a scenario, and their derivatives where the directions move them."""
+    plant, bounds = controller.plant, bound_rows(controller.bounds, controller.plant)
+    n, m, steps, p = plant.n, plant.m, given.steps, along.count
+    count = len(bounds.b)
+    still = [np.zeros((0, size, p)) for size in (n, m, count, count)]
+    if not given.signals and not np.any(plant.observer):
+        return Aim(*(np.zeros(part.shape[:2]) for part in still), *still)
+    # Beyond the last sample the last target stays: nobody recorded what came.
+    places = np.minimum(np.arange(steps + plant.ahead), len(given.target) - 1)
+    values = given.target[places] if given.signals else np.zeros((len(places), 0))
+    width = plant.E.shape[1]  # predictions are driven by recorded outputs too
+    pushes = given.disturbance[:, :width]
+    expected, dexpected = expected_disturbance(plant, pushes, along.observer)
+    held = np.minimum(np.arange(len(values)), steps - 1)
+    expected, dexpected = expected[held], dexpected[held]
+    states = SteadyStates(plant, signal_rows(plant, given.signals), controller.bounds)
+    z, groups = states.at(values, expected)
+    # What is to come is a target, without the disturbance that is believed to last.
+    alone = states.at(values, 0 * expected) if np.any(expected) else (z, groups)
+    table = np.hstack([bounds.E, bounds.F])
+    taken, held = alone[0] @ table.T, (z - alone[0])[:steps] @ table.T
+    if controller.terminal is not None and np.any(np.abs(z @ table.T) > _NOTHING * bounds.b):
+        raise InputError(
+            "terminal set",
+            "is that of rest at 0, and a target takes of the bounds",
+            "leave it out: terminal_set=False",
+        )
+    aim = [np.ascontiguousarray(part) for part in (z[:steps, :n], z[:steps, n:], taken, held)]
+    moving = (along.A, along.B, along.E[:, :width], along.C, along.observer, along.bounds)
+    if not any(np.any(part) for part in moving):
+        return Aim(*aim, *still)
+    dH = [along.C[plant.outputs.index(name)] if name in plant.outputs else np.zeros((n, p))
+          for name in given.signals]  # fmt: skip
+    change = PlantChange(
+        along.A, along.B, along.E[:, :width], np.array(dH).reshape(-1, n, p), along.bounds
+    )
+    slopes = states.slopes(values, expected, dexpected, groups, change)
+    ahead = slopes
+    if np.any(expected):
+        ahead = states.slopes(values, 0 * expected, 0 * dexpected, alone[1], change)
+    dtaken, dheld = (
+        np.tensordot(part, table, (1, 1)).transpose(0, 2, 1)
+        for part in (ahead, (slopes - ahead)[:steps])
+    )
+    parts = slopes[:steps, :n], slopes[:steps, n:], dtaken, dheld
+    return Aim(*aim, *(np.ascontiguousarray(part) for part in parts))

@@ -1,0 +1,239 @@
+"""Where a plant can rest: the target calculator.
+
+    minimise |H x_s - r|^2 + |D z_s|^2 over z_s = (x_s, u_s)
+    subject to x_s = A x_s + B u_s + E d,  E_b x_s + F_b u_s <= b
+
+r are targets of the signals H x, d a lasting disturbance. D spans what neither the equation nor the
+targets determine, so that there the smallest of all targets is taken. Where a disturbance leaves no
+rest within the bounds they are left out: the controller then stays at its limit. With the active
+bounds at hand z_s solves one linear system, whose derivative is that of the target (docs/theory.md,
+section 9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import scipy.signal
+
+from impc.arrays import Array, as_numbers
+from impc.checking import checked
+from impc.errors import DataError
+from impc.model.bounds import Bounds, bound_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from impc.model.bounds import BoundRows
+    from impc.model.plant import Plant
+
+# Violation of a bound, of the bound, up to which a target keeps it.
+_KEPT = 1e-12
+
+
+@dataclass(frozen=True)
+class PlantChange:
+    """Changes of a plant along p directions, which are the last axis of every array."""
+
+    A: Array  # (n, n, p), (n, m, p), (n, d, p) and (q, n, p), of the targets' rows
+    B: Array
+    E: Array
+    H: Array
+    bounds: Array  # Of the right sides (c, p)
+
+
+@checked
+def steady_state(
+    plant: Plant,
+    target: Mapping[str, float] | None = None,
+    disturbance: ArrayLike | None = None,
+    bounds: Bounds | None = None,
+) -> tuple[Array, Array]:
+    """State and command at which a plant rests at a target, as near as its bounds allow.
+
+    Parameters
+    ----------
+    plant : Plant
+        Discrete.
+    target : mapping of str to float, optional
+        Values of outputs or states by name, in their units.
+    disturbance : array_like, optional
+        Lasting disturbance (d,); none by default.
+    bounds : Bounds, optional
+
+    Returns
+    -------
+    x, u : Array
+        (n,) and (m,). Of several such states the smallest.
+
+    Raises
+    ------
+    DataError
+        When the plant has no such signal, or a value is not finite.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> spring = control.ss([[0.9, 0.1], [-0.2, 0.8]], [[0], [0.1]], [[1, 0]], 0, 0.1)
+    >>> plant = impc.Plant(spring)
+    >>> x, u = impc.steady_state(plant, {"y[0]": 0.5})
+    >>> x.round(3), u.round(3)
+    (array([0.5, 0.5]), array([2.]))
+    """
+    plant.require_discrete()
+    values, names = reference(plant, target, 1)
+    push = np.zeros((1, plant.E.shape[1]))
+    if disturbance is not None:
+        push = push + as_numbers("disturbance", disturbance).reshape(1, -1)
+    found = SteadyStates(plant, signal_rows(plant, names), bounds or Bounds(plant))
+    z, _ = found.at(values, push)
+    return z[0, : plant.n], z[0, plant.n :]
+
+
+def reference(
+    plant: Plant, target: Mapping[str, Any] | None, samples: int
+) -> tuple[Array, tuple[str, ...]]:
+    """Targets by name as columns (samples, q), with their names; a number holds for all samples."""
+    names = tuple(target or {})
+    signal_rows(plant, names)
+    columns = np.empty((samples, len(names)))
+    for place, (name, given) in enumerate((target or {}).items()):
+        values = as_numbers(f"target {name}", given)
+        if values.shape not in ((), (samples,)) or not np.all(np.isfinite(values)):
+            raise DataError(
+                f"target {name}",
+                f"has shape {values.shape}, or values that are not finite",
+                f"give a number or {samples} of them",
+            )
+        columns[:, place] = values
+    return columns, names
+
+
+def signal_rows(plant: Plant, names: tuple[str, ...]) -> Array:
+    """Rows (q, n) of outputs or states by name."""
+    rows = dict(zip(plant.states, np.eye(plant.n), strict=True))
+    rows |= dict(zip(plant.outputs, plant.C, strict=True))
+    for name in names:
+        if name not in rows:
+            known = ", ".join(dict.fromkeys((*plant.outputs, *plant.states)))
+            raise DataError("target", f"there is no signal {name!r}", f"choose of {known}")
+    return np.array([rows[name] for name in names]).reshape(len(names), plant.n)
+
+
+def expected_disturbance(plant: Plant, disturbance: Array, rates: Array) -> tuple[Array, Array]:
+    """What the observer of a plant expects (steps, d), and its derivative along rates (d, p).
+
+    dh+ = dh + (1 - exp(-rate dt)) (d - dh), from dh = 0; d itself where the rate is infinite.
+    """
+    expected = np.array(disturbance)
+    slopes = np.zeros((*disturbance.shape, rates.shape[1]))
+    for place, rate in enumerate(plant.observer):
+        if np.isinf(rate):
+            continue
+        left = np.exp(-rate * plant.dt)
+        late = np.r_[0.0, disturbance[:-1, place]] if len(disturbance) else disturbance[:, place]
+        expected[:, place] = scipy.signal.lfilter([1 - left], [1, -left], late)
+        missed = np.r_[0.0, late[1:] - expected[:-1, place]]
+        slope = scipy.signal.lfilter([plant.dt * left], [1, -left], missed)
+        slopes[:, place] = np.multiply.outer(slope, rates[place])
+    return expected, slopes
+
+
+class SteadyStates:
+    """Targets of one plant with given rows (q, n) of the signals that have one."""
+
+    def __init__(self, plant: Plant, H: Array, bounds: Bounds) -> None:
+        self.plant, self.n, size = plant, plant.n, plant.n + plant.m
+        self.rows: BoundRows = bound_rows(bounds, plant)
+        self.G = np.hstack([self.rows.E, self.rows.F])
+        self.rest = np.hstack([plant.A - np.eye(plant.n), plant.B])
+        wide = np.hstack([H, np.zeros((len(H), plant.m))])
+        free = scipy.linalg.null_space(np.vstack([self.rest, wide])).T
+        self.wide = np.vstack([wide, free.reshape(-1, size)])
+        self.count = len(H)
+
+    def at(self, values: Array, pushes: Array) -> tuple[Array, list[tuple[tuple[int, ...], Array]]]:
+        """Targets (T, n + m) at `values` (T, q) and `pushes` (T, d), and their active bounds.
+
+        The latter are pairs of the active bounds with the places that have them.
+        """
+        z = self._solve((), values, pushes)[:, : self.G.shape[1]]
+        excess = z @ self.G.T - self.rows.b
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for place in range(len(z)):
+            beyond = np.any(excess[place] > _KEPT * self.rows.b)
+            active = self._active(-excess[place]) if beyond else ()
+            groups.setdefault(active, []).append(place)
+        found = [(active, np.array(places)) for active, places in groups.items()]
+        for active, places in found:
+            if active:
+                z[places] = self._solve(active, values[places], pushes[places])[:, : z.shape[1]]
+        return z, found
+
+    def slopes(
+        self,
+        values: Array,
+        pushes: Array,
+        dpushes: Array,
+        groups: list[tuple[tuple[int, ...], Array]],
+        along: PlantChange,
+    ) -> Array:
+        """Derivatives (T, n + m, p) of targets along changes of the plant and the pushes."""
+        width, p = self.G.shape[1], along.A.shape[2]
+        slopes = np.zeros((len(values), width, p))
+        drest = np.concatenate([along.A, along.B], axis=1)
+        dwide = np.zeros((*self.wide.shape, p))
+        dwide[: self.count, : self.n] = along.H
+        for active, places in groups:
+            solved = self._solve(active, values[places], pushes[places])
+            z, lam = solved[:, :width], solved[:, width : width + self.n]
+            r = np.hstack([values[places], np.zeros((len(places), len(dwide) - self.count))])
+            left = r - z @ self.wide.T
+            right = np.zeros((len(places), solved.shape[1], p))
+            right[:, :width] = np.einsum("tr,rip->tip", left, dwide)
+            right[:, :width] -= np.einsum("ri,rjp,tj->tip", self.wide, dwide, z)
+            right[:, :width] -= np.einsum("rip,tr->tip", drest, lam)
+            right[:, width : width + self.n] = (
+                -np.einsum("ijp,tj->tip", along.E, pushes[places])
+                - np.einsum("ij,tjp->tip", self.plant.E, dpushes[places])
+                - np.einsum("ijp,tj->tip", drest, z)
+            )
+            right[:, width + self.n :] = along.bounds[list(active)]
+            flat = right.transpose(1, 0, 2).reshape(solved.shape[1], -1)
+            moved = np.linalg.solve(self._system(active), flat).reshape(-1, len(places), p)
+            slopes[places] = moved[:width].transpose(1, 0, 2)
+        return slopes
+
+    def _system(self, active: tuple[int, ...]) -> Array:
+        equations = np.vstack([self.rest, self.G[list(active)]])
+        zero = np.zeros((len(equations), len(equations)))
+        return np.block([[self.wide.T @ self.wide, equations.T], [equations, zero]])
+
+    def _solve(self, active: tuple[int, ...], values: Array, pushes: Array) -> Array:
+        limits = np.tile(self.rows.b[list(active)], (len(values), 1))
+        aimed = values @ self.wide[: self.count]
+        right = np.hstack([aimed, -pushes @ self.plant.E.T, limits])
+        return np.asarray(np.linalg.solve(self._system(active), right.T).T)
+
+    def _active(self, slack: Array) -> tuple[int, ...]:
+        """Bounds that are active at the target; none where no target keeps them.
+
+        From the unbounded target z the cost is |y|^2 with y = R c, z + N c, QR = wide N: a problem
+        of least distance, solved by least squares with multipliers of one sign (Lawson and Hanson).
+        """
+        N = scipy.linalg.null_space(self.rest)
+        R = np.linalg.qr(self.wide @ N, mode="r")
+        towards = -scipy.linalg.solve_triangular(R, (self.G @ N).T, trans="T") / self.rows.b
+        table = np.vstack([towards, -slack / self.rows.b])
+        wanted = np.r_[np.zeros(len(towards)), 1.0]
+        multipliers, distance = scipy.optimize.nnls(table, wanted)
+        if distance <= _KEPT:
+            return ()
+        return tuple(np.flatnonzero(multipliers > 0).tolist())

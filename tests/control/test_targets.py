@@ -1,0 +1,168 @@
+"""Targets, preview and lasting disturbances against programs and differences that share no code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+import impc
+from impc.arrays import Array
+from impc.checking import replace
+from impc.control.constraint_rows import directions
+from impc.errors import DataError, InputError, PlantError
+from impc.model.foresight import physical_states
+from impc.model.plant import Plant
+from tests.independent_mpc import first_input
+from tests.support import random_plant, random_weights
+
+STEPS = 25
+
+
+def a_loop(seed: int, *, ahead: int = 0, rate: float = 0.0) -> tuple[Any, ...]:
+    """A random plant with targets that change, its weights, and its controller with limits."""
+    rng = np.random.default_rng(seed)
+    n, m = 2 + seed % 3, 1 + seed % 2
+    plant = random_plant(rng, n, m, 1.05, d=1)
+    Q, R = random_weights(rng, n), random_weights(rng, m)
+    signals = plant.states[:m]
+    x = np.cumsum((rng.random((STEPS + 1, m)) < 0.2) * rng.normal(size=(STEPS + 1, m)), axis=0)
+    target = {name: 0.07 * column for name, column in zip(signals, x.T, strict=True)}
+    push = 0.05 * rng.normal() + 0.01 * rng.normal(size=STEPS)
+    known = impc.with_observer(plant, rate) if rate else plant
+    known = impc.with_preview(known, signals, ahead) if ahead else known
+    whole = np.zeros((known.n, known.n))
+    whole[:n, :n] = Q
+    return plant, (Q, R), known, impc.Weights(whole + 1e-13 * np.eye(known.n), R), target, push
+
+
+def rest_of(plant: Plant, values: Array, push: float, limit: float) -> tuple[Array, Array]:
+    """The nearest rest to targets of the first states, by a general solver where bounds hold."""
+    n, m, q = plant.n, plant.m, len(values)
+    still, moved = np.hstack([plant.A - np.eye(n), plant.B]), -plant.E[:, 0] * push
+    z = np.linalg.lstsq(np.vstack([still, np.eye(n + m)[:q]]), np.r_[moved, values])[0]
+    if np.any(np.abs(z[n:]) > limit):
+        minimize: Any = scipy.optimize.minimize
+        z = minimize(
+            lambda z: np.sum((z[:q] - values) ** 2),
+            np.zeros(n + m),
+            jac=lambda z: np.r_[2 * (z[:q] - values), np.zeros(n + m - q)],
+            method="SLSQP",
+            bounds=[(None, None)] * n + [(-limit, limit)] * m,
+            constraints={"type": "eq", "fun": lambda z: still @ z - moved, "jac": lambda _: still},
+            options={"ftol": 1e-16, "maxiter": 500},
+        ).x
+    return z[:n], z[n:]
+
+
+@pytest.mark.parametrize("ahead", [0, 4])
+@pytest.mark.parametrize("rate", [0.0, 0.5, np.inf])
+@pytest.mark.parametrize("seed", range(6))
+def test_inputs_are_those_of_a_program_about_the_target(seed: int, ahead: int, rate: float) -> None:
+    """The target stays, or comes as it is known; a disturbance stays as it is believed to be."""
+    plant, (Q, R), known, weights, target, push = a_loop(seed, ahead=ahead, rate=rate)
+    horizon, limit = 5, 0.6
+    bounds = impc.Bounds(known, u_min=-limit, u_max=limit)
+    law = impc.Controller(known, weights, bounds, horizon, terminal_set=False)
+    x0 = np.random.default_rng(seed).normal(size=plant.n)
+    run = law.simulate(x0, disturbance=push, target=target)
+    values, believed, checked = np.array(list(target.values())).T, 0.0, 0
+    for t in range(STEPS):
+        expected = push[t] if np.isinf(rate) else believed
+        rests = [
+            rest_of(plant, values[min(t + min(k, ahead), STEPS)], expected, limit)
+            for k in range(horizon + 1)
+        ]
+        believed += (1 - np.exp(-rate * plant.dt)) * (push[t] - believed) if rate else 0.0
+        clipped = any(np.any(np.abs(u) > limit * (1 - 1e-6)) for _, u in rests)
+        if clipped and ahead:  # targets to come are planned for as if no bound met them
+            continue
+        X, U = (np.array(part) for part in zip(*rests, strict=True))
+        drift = plant.E[:, 0] * expected if rate else np.zeros(plant.n)
+        wanted = first_input(
+            *(plant.A, plant.B, Q, R, horizon, run.x[t, : plant.n], limit),
+            targets=(X, U[:-1]),
+            drift=drift,
+        )
+        checked += 1
+        assert run.u[t] == pytest.approx(wanted, abs=1e-6 if clipped else 1e-8)
+    assert checked >= 5
+    assert np.count_nonzero(run.status == 1) > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_slopes_of_targets_are_differences(seed: int) -> None:
+    """Along plant, gain, observer's rate and bounds, with saturated samples and targets."""
+    plant, _, known, weights, target, push = a_loop(seed, rate=0.7)
+    bounds = impc.Bounds(known, u_min=-0.3, u_max=0.3)
+    law = impc.Controller(known, weights, bounds, 4, terminal_set=False)
+    drive = impc.scenario(known, np.ones(plant.n), disturbance=push, target=target)
+    rng = np.random.default_rng(seed)
+    parts = {
+        "A": rng.normal(size=plant.A.shape),
+        "B": rng.normal(size=plant.B.shape),
+        "E": rng.normal(size=plant.E.shape),
+        "observer": rng.normal(size=1),
+        "K": rng.normal(size=law.K.shape),
+    }
+
+    def at(step: float) -> Array:
+        moved = {
+            name: np.array(getattr(known, name)) + step * parts[name]
+            for name in parts
+            if name != "K"
+        }
+        plant = replace(known, **moved)
+        there = replace(law, plant=plant, K=np.array(law.K) + step * parts["K"])
+        run, _ = impc.simulate_and_differentiate(there, drive, directions(there, 0))
+        return np.hstack([run.x[:-1], run.u])
+
+    _, slope = impc.simulate_and_differentiate(
+        law,
+        drive,
+        impc.directions(law, 1, **{name: part[..., None] for name, part in parts.items()}),
+    )
+    found = np.hstack([slope.x[:-1, :, 0], slope.u[..., 0]])
+    h = 1e-6
+    wanted = (at(h) - at(-h)) / (2 * h)
+    assert found == pytest.approx(wanted, abs=2e-6 * np.max(np.abs(wanted)))
+    assert impc.simulate_and_differentiate(law, drive, directions(law, 0))[0].status.max() == 1
+
+
+def test_preview_moves_before_the_target_does() -> None:
+    plant, _, known, weights, _, _ = a_loop(0, ahead=3)
+    law = impc.Controller(known, weights, impc.Bounds(known), 3, terminal_set=False)
+    step = np.r_[np.zeros(10), np.ones(11)]
+    run = law.simulate(np.zeros(plant.n), disturbance=np.zeros(20), target={plant.states[0]: step})
+    moved = np.flatnonzero(np.any(np.abs(run.u) > 1e-9, axis=1))
+    assert moved[0] == 10 - 3
+    assert physical_states(known) == plant.n
+
+
+def test_a_rest_is_one_and_reaches_its_target() -> None:
+    plant, _, _, _, _, _ = a_loop(3)
+    x, u = impc.steady_state(plant, {plant.states[0]: 0.4}, disturbance=[0.2])
+    assert plant.A @ x + plant.B @ u + plant.E[:, 0] * 0.2 == pytest.approx(x)
+    assert x[0] == pytest.approx(0.4)
+    bounds = impc.Bounds(plant, u_min=-0.01, u_max=0.01)
+    nearer, least = impc.steady_state(plant, {plant.states[0]: 0.4}, bounds=bounds)
+    assert np.max(np.abs(least)) == pytest.approx(0.01)
+    assert abs(nearer[0] - 0.4) < 0.4
+
+
+def test_what_has_no_target_is_refused() -> None:
+    plant, _, known, weights, target, push = a_loop(0, ahead=2)
+    law = impc.Controller(known, weights, impc.Bounds(known), 3, terminal_set=False)
+    with pytest.raises(DataError, match="no signal 'elsewhere'"):
+        law.simulate(np.zeros(plant.n), disturbance=push, target={"elsewhere": 1.0})
+    with pytest.raises(PlantError, match="has none of"):
+        law.simulate(np.zeros(plant.n), disturbance=push)
+    with pytest.raises(DataError, match="give a number or 26"):
+        law.simulate(np.zeros(plant.n), disturbance=push, target={plant.states[0]: [1.0, 2.0]})
+    ended = impc.Controller(
+        plant, impc.Weights(np.eye(plant.n), 1), impc.Bounds(plant, u_min=-1, u_max=1), 3
+    )
+    with pytest.raises(InputError, match="terminal set"):
+        ended.simulate(np.zeros(plant.n), disturbance=push, target=target)
