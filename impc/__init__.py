@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from impc.model.bounds import Bounds as Bounds
     from impc.model.plant import Plant as Plant
     from impc.model.plant_family import PlantFamily as PlantFamily
+    from impc.model.rates import with_rates as with_rates
     from impc.model.recordings import Label as Label
     from impc.model.recordings import Recording as Recording
     from impc.model.riccati import gain_gradients as gain_gradients
@@ -102,6 +103,7 @@ _NAMES = {
     "output_feedback.observer": "Observer",
     "model.plant": "Plant",
     "model.plant_family": "PlantFamily",
+    "model.rates": "with_rates",
     "model.recordings": "Label Recording",
     "model.riccati": "gain_gradients solve_lqr",
     "model.structure": "Structure",

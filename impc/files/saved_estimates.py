@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from impc.model.plant_family import PlantFamily
 
-_SIGNALS = ("states", "controls", "disturbances", "outputs")
+_SIGNALS = ("states", "controls", "disturbances", "outputs", "commands")
 # A plant that is given again is the one that was saved up to this, of its entries.
 _SAME = 1e-9
 
@@ -167,7 +167,7 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | None) -> Problem:
-    saved, names = kept["plant"], kept["family"]
+    saved, names = {"commands": [], **kept["plant"]}, kept["family"]  # older files have no commands
     if names and (family is None or list(family.names) != names):
         raise InputError("family", f"of {', '.join(names)} is needed", "give load(..., family=...)")
     if family is not None and names:

@@ -59,6 +59,8 @@ class Plant(Value):
         Names of signals with their units; `unit` finds one.
     words : tuple of (str, str)
         Names of signals with what they are; `word` finds one.
+    commands : tuple of str
+        States that are the last command of a control (`with_rates`); none otherwise.
     body : Body or None
         What moves in every simulation; None where it is the linear plant itself.
 
@@ -99,6 +101,7 @@ class Plant(Value):
     units: tuple[tuple[str, str], ...]
     words: tuple[tuple[str, str], ...]
     body: Body | None
+    commands: tuple[str, ...]
 
     @checked
     def __init__(
@@ -136,6 +139,7 @@ class Plant(Value):
             units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
             words=_texts(system, "words", words, 'few words, as in {"angle": "tilt of the seat"}'),
             body=None if moves is None else read_body(moves, order, len(matrices["A"])),
+            commands=(),
         )
         _require_stabilisable(self)
         if moves is not None:
