@@ -2,8 +2,8 @@
 
     python -m experiments.tracking_coverage [recordings]
 
-A cart on a weak spring (mass 1 kg, .1 s) whose position is regulated to jumps of its target, 30 s,
-with recorder noise of 5 % of the positions' size; half of the carts are at their limit. Every
+A cart on a weak spring (mass 1 kg, .1 s) whose position follows a target that drifts, 30 s, with
+recorder noise of 5 % of the positions' size; half of the carts are at their limit. Every
 recording has weights, targets and noise of its own.
 """
 
@@ -16,6 +16,7 @@ from typing import Any
 
 import control
 import numpy as np
+import scipy.signal
 from scipy.stats import beta
 
 import impc
@@ -45,7 +46,9 @@ def covered(task: tuple[str, int]) -> tuple[int, int, int]:
     """Of one recording: intervals of identified entries, how many hold them, samples at a limit."""
     kind, seed = task
     rng = np.random.default_rng([seed, KINDS.index(kind)])
-    plant, limits = cart(), {"u_max": 0.5 if seed % 2 else 9.0, "u_min": -0.5 if seed % 2 else -9.0}
+    limit = 0.25 if seed % 2 else 9.0
+    plant = cart()
+    limits: dict[str, Any] = {"u_min": -limit, "u_max": limit}
     more: dict[str, Any] = {}
     if kind == "target known 3 samples ahead":
         plant = impc.with_preview(plant, ["x"], 3)
@@ -53,7 +56,7 @@ def covered(task: tuple[str, int]) -> tuple[int, int, int]:
         plant = impc.with_observer(plant, 1.0)
     elif kind.startswith("change"):
         plant = impc.with_rates(plant)
-        limits = {"x_min": {"push": limits["u_min"]}, "x_max": {"push": limits["u_max"]}}
+        limits = {"x_min": {"push": -limit}, "x_max": {"push": limit}}
     Q = np.zeros((plant.n, plant.n))
     Q[:2, :2] = np.diag(10 ** rng.uniform(-0.5, 1, 2))
     if kind.startswith("change"):
@@ -61,8 +64,8 @@ def covered(task: tuple[str, int]) -> tuple[int, int, int]:
     bounds = impc.Bounds(plant, **limits)
     weights = impc.Weights(Q + 1e-9 * np.eye(plant.n), 1)
     law = impc.Controller(plant, weights, bounds, HORIZON, terminal_set=False)
-    jumps = (rng.random(STEPS + 1) < 0.05) * rng.normal(size=STEPS + 1)
-    target = {"x": 0.5 * np.cumsum(jumps) / np.sqrt(1 + np.arange(STEPS + 1) / 30)}
+    walk = scipy.signal.lfilter([1], [1, -0.95], rng.normal(size=STEPS + 1))
+    target = {"x": 0.1 * walk}
     wind = 0.2 * np.cumsum((rng.random(STEPS) < 0.03) * rng.normal(size=STEPS))
     if kind != "lasting push, learned at 1 1/s":
         wind = 0.1 * rng.normal(size=STEPS)
@@ -89,7 +92,9 @@ def rate(inside: int, count: int) -> str:
     """A share with its 95 % interval of Clopper and Pearson."""
     low = beta.ppf(0.025, inside, count - inside + 1) if inside else 0.0
     high = beta.ppf(0.975, inside + 1, count - inside) if inside < count else 1.0
-    return f"{inside} of {count} = {100 * inside / count:.1f} % ({100 * low:.0f} to {100 * high:.0f})"
+    return (
+        f"{inside} of {count} = {100 * inside / count:.1f} % ({100 * low:.0f} to {100 * high:.0f})"
+    )
 
 
 def main(recordings: int, report: Callable[[str], None] = print) -> None:

@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from impc.model.foresight import with_preview as with_preview
     from impc.model.plant import Plant as Plant
     from impc.model.plant_family import PlantFamily as PlantFamily
+    from impc.model.rates import with_rates as with_rates
     from impc.model.recordings import Label as Label
     from impc.model.recordings import Recording as Recording
     from impc.model.riccati import gain_gradients as gain_gradients
@@ -108,6 +109,7 @@ _NAMES = {
     "model.foresight": "with_observer with_preview",
     "model.plant": "Plant",
     "model.plant_family": "PlantFamily",
+    "model.rates": "with_rates",
     "model.recordings": "Label Recording",
     "model.riccati": "gain_gradients solve_lqr",
     "model.structure": "Structure",

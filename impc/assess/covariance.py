@@ -84,10 +84,19 @@ class GainCovariance(Frozen):
     foreign: Array
     parameters: Array  # Standard deviation of the logarithm of each physical parameter (k,)
     noise: ResidualNoise  # The colour of the residuals
+    spread: Array  # Covariance of steps along the directions with a finite deviation (k, k)
 
     def along(self, step: Array) -> Array:
         """A step of the gain (m, n) as steps along the directions (m * n,)."""
         return np.asarray(self.directions @ np.ravel(np.linalg.solve(self.G, step @ self.T)))
+
+    def combinations(self, rows: Array) -> tuple[Array, Array]:
+        """Standard deviations of linear combinations of the entries, and what is foreign (k,).
+
+        `rows` (k, m * n): factors of the entries of K, row by row. As `entries` and `foreign`.
+        """
+        back = rows @ np.kron(self.G, np.linalg.inv(self.T).T) @ self.directions.T
+        return _entries(back, self.deviations, self.spread)
 
     @property
     def identified(self) -> BoolArray:
@@ -147,6 +156,7 @@ def gain_covariance(
         frozen(foreign.reshape(m, n)),
         frozen(_parameter_deviations(problem, found.dparameters, others, colour)),
         colour,
+        frozen(spread),
     )
 
 

@@ -262,7 +262,8 @@ def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control
     """Derivative of the residual with respect to the symmetric limit of one input (r,)."""
     controller = controller_for(problem, gain, metric)
     rows = bound_rows(controller.bounds, problem.plant)
-    moves = np.abs(rows.F[:, control]) * np.isclose(np.abs(rows.b), limit)
+    of_input = np.isclose(np.abs(rows.b), limit) & ~np.any(rows.E, axis=1)
+    moves = np.abs(rows.F[:, control]) * of_input
     along = directions(controller, 1, bounds=moves[:, None])
     seen = [
         simulate_and_differentiate(controller, drive, along)[1].x[..., 0] @ problem.plant.C.T

@@ -29,10 +29,12 @@ import scipy.special
 from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
+from impc.checking import replace
 from impc.inverse.coordinates import Coordinates, descend
 from impc.inverse.least_squares import Stop
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.residuals import evaluate
+from impc.model.continuous_gain import continuous_gain
 from impc.model.plant import UNKNOWN, gain_unit
 from impc.model.riccati import stabilises
 
@@ -226,9 +228,22 @@ def _around(value: Array, half: float) -> tuple[float, float]:
 
 def interval_table(fitted: Estimate) -> pd.DataFrame:
     """Intervals of the gain and of fitted parameters, for the noise that the residuals show."""
+    return _table(gain_estimate(fitted))
+
+
+def continuous_interval_table(fitted: Estimate) -> pd.DataFrame:
+    """The same of the gain in continuous time, to first order (delta method)."""
+    found = gain_estimate(fitted)
+    K, slopes = continuous_gain(found.problem.plant, found.K)
+    entries, foreign = found.covariance.combinations(slopes)
+    shape = {"entries": entries.reshape(K.shape), "foreign": foreign.reshape(K.shape)}
+    return _table(replace(found, K=K, covariance=replace(found.covariance, **shape)))
+
+
+def _table(found: GainEstimate) -> pd.DataFrame:
     import pandas as pd  # noqa: PLC0415  # a third of a second
 
-    found, plant = gain_estimate(fitted), fitted.problem.plant
+    plant = found.problem.plant
     units = [gain_unit(plant, u, x) for u in plant.controls for x in plant.states]
     items = covariance_intervals(found, found.covariance, "sandwich")
     units += [UNKNOWN] * (len(items) - len(units))  # of parameters

@@ -23,6 +23,7 @@ from impc.control.named_solver import COMPILED, require_solver
 from impc.control.simulation import Status, excluded_bound, scenario
 from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import InputError
+from impc.model.continuous_gain import held_gain
 from impc.model.riccati import solve_lqr, stabilises
 
 if TYPE_CHECKING:
@@ -202,6 +203,49 @@ class Controller(Value):
             solver=require_solver(solver),
         )
         return made
+
+    @classmethod
+    @checked(gain="m n", horizon=(1, LONGEST_HORIZON))
+    def from_continuous_gain(
+        cls, plant: Plant, gain: ArrayLike, bounds: Bounds, horizon: int, **settings: Any
+    ) -> Controller:
+        """Controller of a gain of continuous feedback, u(t) = -Gx(t), such as publications give.
+
+        Its own gain K is that of a held command which is, over each sample, the average of what
+        u = -Gx would command from the state at its start. After one sample the states of the two
+        loops differ by the cube of the sample time, after any time by its square; the poles agree
+        as nearly, not exactly. `Estimate.continuous_gain` is the way back.
+
+        Parameters
+        ----------
+        plant : Plant
+            Discrete: its continuous plant is found from it, as that of which it is sampled with a
+            zero-order hold.
+        gain : array_like
+            G (m, n), in continuous time.
+        bounds, horizon, **settings
+            As in `from_gain`.
+
+        Raises
+        ------
+        PlantError
+            When the plant is not sampled from a continuous one: it has a delay in whole samples,
+            or its controls are changes (`with_rates`).
+        InputError
+            As in `from_gain`.
+
+        Examples
+        --------
+        >>> import control
+        >>> import impc
+        >>> cart = control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], 0)
+        >>> plant = impc.Plant(control.c2d(cart, 0.1))
+        >>> law = impc.Controller.from_continuous_gain(plant, [[4, 3]], impc.Bounds(plant), 10)
+        >>> law.K.round(3)
+        array([[3.454, 2.759]])
+        """
+        held = held_gain(plant, finite_array("gain", gain, (plant.m, plant.n)))
+        return cls.from_gain(plant, held, bounds, horizon, **settings)
 
     @checked(steps=(1, 10_000_000))
     def simulate(

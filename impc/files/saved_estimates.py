@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from impc.model.plant_family import PlantFamily
 
-_SIGNALS = ("states", "controls", "disturbances", "outputs")
+_SIGNALS = ("states", "controls", "disturbances", "outputs", "commands")
 # How a plain field is read.
 _PLAIN: dict[Any, Any] = {"bool": bool, "int": int, "str": str}
 # A plant that is given again is the one that was saved up to this, of its entries.
@@ -213,7 +213,7 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
 
 def _require_names(plant: Plant) -> None:
     """Refuse signals without a name, or names that are no text."""
-    sizes = (plant.n, plant.m, plant.E.shape[1], len(plant.C))
+    sizes = (plant.n, plant.m, plant.E.shape[1], len(plant.C), len(plant.commands))
     for signals, size in zip(_SIGNALS, sizes, strict=True):
         names = getattr(plant, signals)
         if len(names) != size or not all(isinstance(name, str) for name in names):

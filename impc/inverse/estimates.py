@@ -316,6 +316,17 @@ class Estimate(Frozen):
 
         return interval_table(self)
 
+    def continuous_gain(self) -> pd.DataFrame:
+        """The gain of continuous feedback of which that of `intervals()` is the held one.
+
+        To compare with gains of publications; rows and columns as of `intervals()`, and the same
+        covariance to first order, with fitted parameters as they are. What is equal in the two
+        loops: `Controller.from_continuous_gain`, the way back.
+        """
+        from impc.assess.printed_gain import continuous_interval_table  # noqa: PLC0415
+
+        return continuous_interval_table(self)
+
     def identifiability(self) -> Identifiability:
         """How many directions of the weights the recordings determine (`impc.identifiability`)."""
         from impc.assess.weights_test import identifiability  # noqa: PLC0415

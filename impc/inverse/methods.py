@@ -35,7 +35,6 @@ from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of, with_fit
 from impc.inverse.proximal_search import auxiliary_weights
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.structured_fit import fit_structured
-from impc.model.bounds import Bounds
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr, stabilises
 from impc.model.weights import Weights
@@ -230,7 +229,13 @@ def _without_bounds(problem: Problem) -> Problem:
 
 def _cut_off(problem: Problem) -> Problem:
     """A horizon of one sample without state bounds or terminal set: cut off, no foresight."""
-    limits = Bounds(problem.plant, u_min=problem.bounds.u_min, u_max=problem.bounds.u_max)
+    given, plant = problem.bounds, problem.plant
+    free = ~np.isin(plant.states, plant.commands)
+    limits = replace(
+        given,
+        x_min=np.where(free, -np.inf, given.x_min),
+        x_max=np.where(free, np.inf, given.x_max),
+    )
     return replace(problem, bounds=limits, horizon=1, terminal_set=False)
 
 

@@ -2,8 +2,10 @@
 
 The bounds of (3.1), as docs/theory.md, section 3, takes them.
 
-Only finite bounds make a row. The order of the rows is fixed: input upper, input lower, state
-upper, state lower, each in the order of the signals, so that a row can be named in a message.
+Only finite bounds make a row. A bound of a state that is the last command of a control (see
+`with_rates`) is one of the command as it is applied, the next value of that state. The order of the
+rows is fixed: input upper, input lower, state upper, state lower, each in the order of the signals,
+so that a row can be named in a message.
 """
 
 from __future__ import annotations
@@ -99,7 +101,7 @@ class BoundRows(Value):
     E: Array  # Shapes (c, n), (c, m) and (c,)
     F: Array
     b: Array
-    on_state: BoolArray  # Whether the row bounds a state (c,); the others bound an input
+    on_state: BoolArray  # Whether the row bounds a state (c,); the others bound a command
     names: tuple[str, ...]  # One name a row, such as ``"u <= 1"``
 
 
@@ -114,13 +116,15 @@ def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
         f"{signals[index]} {'<=' if sign[index] > 0 else '>='} {limits[index]:g}"
         for index in np.flatnonzero(finite)
     ]
-    inputs, states = np.eye(plant.m), np.eye(plant.n)
-    on_input, on_state = np.zeros((2 * plant.n, plant.m)), np.zeros((2 * plant.m, plant.n))
+    inputs, no_state = np.eye(plant.m), np.zeros((2 * plant.m, plant.n))
+    applied = np.isin(plant.states, plant.commands)
+    states = np.where(applied[:, None], plant.A, np.eye(plant.n))
+    moved = np.where(applied[:, None], plant.B, 0.0)
     return BoundRows(
-        E=frozen(np.vstack([on_state, states, -states])[finite]),
-        F=frozen(np.vstack([inputs, -inputs, on_input])[finite]),
+        E=frozen(np.vstack([no_state, states, -states])[finite]),
+        F=frozen(np.vstack([inputs, -inputs, moved, -moved])[finite]),
         b=frozen((sign * limits)[finite]),
-        on_state=np.repeat([False, True], [2 * plant.m, 2 * plant.n])[finite],
+        on_state=np.concatenate([np.zeros(2 * plant.m, bool), ~applied, ~applied])[finite],
         names=tuple(names),
     )
 

@@ -59,6 +59,8 @@ class Plant(Value):
         Names of signals with their units; `unit` finds one.
     words : tuple of (str, str)
         Names of signals with what they are; `word` finds one.
+    commands : tuple of str
+        States that are the last command of a control (`with_rates`); none otherwise.
     body : Body or None
         What moves in every simulation; None where it is the linear plant itself.
     observer : Array
@@ -110,6 +112,7 @@ class Plant(Value):
     observer: Array
     ahead: int
     previewed: tuple[str, ...]
+    commands: tuple[str, ...]
 
     @checked
     def __init__(
@@ -150,6 +153,7 @@ class Plant(Value):
             observer=frozen(np.zeros(len(rest))),
             ahead=0,
             previewed=(),
+            commands=(),
         )
         _require_stabilisable(self)
         if moves is not None:

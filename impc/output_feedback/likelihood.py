@@ -151,8 +151,8 @@ def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
     low, high = (float(side[0]) for side in (controller.bounds.u_min, controller.bounds.u_max))
     if controller.plant.m > 1 or not (np.isfinite(low) or np.isfinite(high)):
         return law, Clip(used=False, low=-np.inf, high=np.inf, unit=1.0)
-    on_state = bound_rows(controller.bounds, controller.plant).on_state
-    kept = np.flatnonzero((rows.stage > 0) | on_state[rows.family])
+    of_state = np.any(bound_rows(controller.bounds, controller.plant).E, axis=1)
+    kept = np.flatnonzero((rows.stage > 0) | of_state[rows.family])
     inner = Rows(
         rows.T[kept],
         rows.M[kept],

@@ -46,10 +46,12 @@ def with_bound(controller: Controller, row: int, step: float) -> Controller:
     rows = bound_rows(controller.bounds, controller.plant)
     names = ("x_min", "x_max", "u_min", "u_max")
     sides = {name: np.array(getattr(controller.bounds, name)) for name in names}
-    unit = (rows.E if rows.on_state[row] else rows.F)[row]
-    signal = int(np.argmax(np.abs(unit)))
-    name = ("x" if rows.on_state[row] else "u") + ("_max" if unit[signal] > 0 else "_min")
-    sides[name][signal] += unit[signal] * step
+    signal, side, _ = rows.names[row].rsplit(" ", 2)
+    states, controls = controller.plant.states, controller.plant.controls
+    kind, signals = ("x", states) if signal in states else ("u", controls)
+    sides[kind + ("_max" if side == "<=" else "_min")][signals.index(signal)] += (
+        step if side == "<=" else -step
+    )
     changed = replace(controller, bounds=replace(controller.bounds, **sides))
     if controller.softening is None:
         return changed
@@ -128,9 +130,9 @@ def test_jacobian_of_the_example_equals_central_differences(
     check_jacobian(controller, scenario(example_plant, x0, 20))
 
 
-def check_jacobian(controller: Controller, drive: Scenario) -> None:
-    """Compare every derivative with differences of fourth order, to 1e-6."""
-    wanted = entries(controller)
+def check_jacobian(controller: Controller, drive: Scenario, *without: str) -> None:
+    """Compare every derivative, without some parts, with differences of fourth order, to 1e-6."""
+    wanted = [(part, index) for part, index in entries(controller) if part not in without]
     _, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
     for column, (part, index) in enumerate(wanted):
         errors = []
