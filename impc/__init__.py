@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from impc.assess.command_table import command_regression as command_regression
     from impc.assess.expected import expected_intervals as expected_intervals
     from impc.assess.variance_accounted_for import vaf as vaf
-    from impc.assess.variance_accounted_for import whiteness as whiteness
     from impc.assess.weights_test import identifiability as identifiability
     from impc.checking import replace as replace
     from impc.control.casadi_controller import mpc_function as mpc_function
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import directions as directions
     from impc.control.controller import Controller as Controller
     from impc.control.loop_function import closed_loop_function as closed_loop_function
-    from impc.control.simulation import Scenario as Scenario
     from impc.control.simulation import Simulation as Simulation
     from impc.control.simulation import Status as Status
     from impc.control.simulation import require_complete as require_complete
@@ -60,7 +58,6 @@ if TYPE_CHECKING:
     from impc.model.rates import with_rates as with_rates
     from impc.model.recordings import Label as Label
     from impc.model.recordings import Recording as Recording
-    from impc.model.riccati import gain_gradients as gain_gradients
     from impc.model.riccati import solve_lqr as solve_lqr
     from impc.model.structure import Structure as Structure
     from impc.model.targets import steady_state as steady_state
@@ -80,14 +77,14 @@ _NAMES = {
     "assess.command_table": "command_regression",
     "assess.expected": "expected_intervals",
     "assess.weights_test": "identifiability",
-    "assess.variance_accounted_for": "vaf whiteness",
+    "assess.variance_accounted_for": "vaf",
     "checking": "replace",
     "control.casadi_controller": "mpc_function",
     "control.closed_loop": "simulate_and_differentiate",
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
     "control.loop_function": "closed_loop_function",
-    "control.simulation": "Scenario Simulation Status require_complete scenario",
+    "control.simulation": "Simulation Status require_complete scenario",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
     "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
     " SolverError WeightsError",
@@ -111,7 +108,7 @@ _NAMES = {
     "model.plant_family": "PlantFamily",
     "model.rates": "with_rates",
     "model.recordings": "Label Recording",
-    "model.riccati": "gain_gradients solve_lqr",
+    "model.riccati": "solve_lqr",
     "model.structure": "Structure",
     "model.targets": "steady_state",
     "model.weights": "Weights weight_error",

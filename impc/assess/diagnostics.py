@@ -199,7 +199,7 @@ def _thinned(problem: Problem, found: Evaluation) -> tuple[Problem, Evaluation]:
     rows = np.repeat(chosen, sizes)
     trials = tuple(itertools.compress(problem.recordings, chosen))
     parts = {
-        name: getattr(found, name)[rows] for name in ("residual", "dK", "dS", "dx0", "dparameters")
+        name: getattr(found, name)[rows] for name in ("residual", "dK", "dS", "own", "dparameters")
     }
     return replace(problem, recordings=trials), replace(found, **parts)
 

@@ -95,33 +95,9 @@ def centred_vaf(recorded: Array, simulated: Array) -> Array:
 
 @checked(residual="i j", lags=1)
 def whiteness(residual: Array, lags: int) -> Array:
-    """p-values of Ljung and Box's test that each column is white (Ljung and Box 1978).
+    """p-values (p,) of Ljung and Box's test (1978) that columns of a residual are white.
 
-    Parameters
-    ----------
-    residual : Array
-        (samples, p).
-    lags : int
-        How many of the first autocorrelations are tested together.
-
-    Returns
-    -------
-    Array
-        (p,); NaN where nothing is left to test.
-
-    Raises
-    ------
-    InputError
-        When there are not more samples than lags.
-
-    Examples
-    --------
-    >>> import impc
-    >>> import numpy as np
-    >>> noise = np.random.default_rng(2).standard_normal((200, 1))
-    >>> white, drift = impc.whiteness(noise, 10), impc.whiteness(np.cumsum(noise, axis=0), 10)
-    >>> bool(white[0] > 0.05), bool(drift[0] < 0.001)
-    (True, True)
+    The first `lags` autocorrelations are tested together; NaN where nothing is left to test.
     """
     if lags >= len(residual):
         raise InputError("lags", f"got {lags} of {len(residual)} samples", "give fewer")

@@ -86,14 +86,6 @@ class Scenario(Value):
         Targets of some signals, one row for each sample (steps + 1, q) or fewer: the last stays.
     signals : tuple of str
         Outputs or states that have one (q,).
-
-    Examples
-    --------
-    >>> import impc
-    >>> from plants import yalmip_example
-    >>> drive = impc.scenario(impc.Plant(yalmip_example()), x0=[1, 3], steps=20)
-    >>> isinstance(drive, impc.Scenario), drive.steps, drive.disturbance.shape
-    (True, 20, (20, 0))
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {

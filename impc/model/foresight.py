@@ -64,11 +64,14 @@ def with_observer(plant: Plant, rate: ArrayLike) -> Plant:
     >>> run.x[-1].round(6) + 0.0, run.u[-1].round(6)
     (array([0., 0.]), array([-1.]))
     """
-    given = np.broadcast_to(as_numbers("rate", rate), len(plant.disturbances))
-    if not len(given) or not np.all(given >= 0):
+    given, count = as_numbers("rate", rate), len(plant.disturbances)
+    if given.shape not in ((), (1,), (count,)) or not count or not np.all(given >= 0):
         raise PlantError(
-            "rate", f"got {given.tolist()}", "name the controls, and give rates of at least 0 1/s"
+            "rate",
+            f"has shape {given.shape}, a negative value, or {count} disturbances to be for",
+            "give 1/s, of at least 0; the plant's inputs that are no controls are disturbances",
         )
+    given = np.broadcast_to(given, count)
     return replace(plant.require_discrete(), observer=frozen(given))
 
 
@@ -113,6 +116,8 @@ def with_preview(plant: Plant, signals: Sequence[str], samples: int) -> Plant:
         kind = "has a nonlinear body" if plant.body is not None else "knows targets ahead already"
         raise PlantError("plant", kind, "give plant.linear(), without a preview")
     names, n, q = tuple(signals), plant.n, len(signals)
+    if not q:
+        raise PlantError("signals", "names none", "name the outputs or states with targets")
     rest = SteadyStates(plant, signal_rows(plant, names), Bounds(plant))
     M = rest.at(np.eye(q), np.zeros((q, plant.E.shape[1])))[0][:, :n].T
     width = n + q * samples

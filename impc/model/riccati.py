@@ -138,22 +138,7 @@ def lyapunov_series(F: Array, right: Array) -> Array:
 
 @checked
 def gain_gradients(solution: LqrSolution) -> Gradients:
-    """Exact derivatives of the gain K with respect to Q and R.
-
-    Returns
-    -------
-    Gradients
-        Of shapes (m, n, n, n) and (m, n, m, m).
-
-    Examples
-    --------
-    >>> import impc
-    >>> from plants import yalmip_example
-    >>> found = impc.solve_lqr(impc.Plant(yalmip_example()), impc.Weights([[1, 0], [0, 1]], 1))
-    >>> slopes = impc.gain_gradients(found)
-    >>> slopes.Q.shape, slopes.R.shape
-    ((1, 2, 2, 2), (1, 2, 1, 1))
-    """
+    """Exact derivatives of the gain K with respect to Q (m, n, n, n) and R (m, n, m, m)."""
     B, K, F, S = solution.plant.B, solution.K, solution.F, solution.S
     m, n = K.shape
     # <G, dK> = <B S^-1 G F', dP> - <S^-1 G K', dR> for the unit matrix G of each entry.

@@ -107,7 +107,7 @@ def test_a_search_goes_on_from_an_earlier_answer(found: impc.Estimate) -> None:
         (lambda text: text[:-40], "is no result"),
         (lambda text: text.replace('"schema": 5', '"schema": 3'), "another version"),
         (lambda text: text.replace('"status": "settled"', '"status": "odd"'), "is damaged"),
-        (lambda text: text.replace('"K": [[', '"K": [["x", '), "is damaged"),
+        (lambda text: text.replace('"K": [[', '"K": [["x", '), "K: expected real numbers"),
         (lambda text: text.replace('"K": [[', '"K": [[1.0, '), "K: expected shape"),
         (lambda text: text.replace('"recordings": [{', '"recordings": [7, {'), "is damaged"),
         (lambda text: text.replace('"A": [[', '"A": [[1, '), "is damaged"),
