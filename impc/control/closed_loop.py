@@ -193,7 +193,7 @@ def _ask_solver(
             np.empty(len(rows.b)),
             v,
         )
-        w = (v.reshape(-1, len(u)) @ np.linalg.cholesky(controller.S)).ravel()
+        w = (v.reshape(-1, 1, len(u)) @ np.linalg.cholesky(controller.metrics)).ravel()
         if status <= Status.SOFTENED and np.max(np.abs(w - found.w)) <= found.agrees:
             return Status(status), weak, -1
     row = excluded_row(rows, x)

@@ -505,7 +505,7 @@ def _differentiate(
     for i in range(width):
         for j in range(m):
             for c in range(p):
-                q[i, c] += dloop.S[i % m, j, c] * v[i - i % m + j]
+                q[i, c] += dloop.S[i % len(dloop.S), j, c] * v[i - i % m + j]
     _add_pulls(rows, drows, lam, m, q)
     for a in range(active):
         r = free[a]
