@@ -201,7 +201,7 @@ class Controller(Value):
         metric : array_like, optional
             S (m, m), positive definite; the identity by default, which is no choice for one input.
         terminal_set, softening, solver
-            As in the constructor.
+            As in the constructor; a set of one's own is a pair of shapes (r, n) and (r,).
         near : TerminalSet, optional
             Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
 
