@@ -345,8 +345,15 @@ def _system(name: str, value: Any) -> Any:
 
 def _pair(name: str, value: Any) -> Any:
     if not isinstance(value, (tuple, list)) or len(value) != 2:
-        raise _refused(name, value, "give a pair (K, S) of arrays")
+        raise _refused(name, value, "give a pair of arrays")
     return _several(as_numbers)(name, value)
+
+
+def _choice_of_set(name: str, value: Any) -> Any:
+    """Whether there is a terminal set, or the set: a value, or its pair (H, h)."""
+    if type(value).__name__ == "TerminalSet":
+        return value
+    return _pair(name, value) if isinstance(value, (tuple, list)) else _truth(name, value)
 
 
 def _several(kind: Kind) -> Kind:
@@ -386,6 +393,7 @@ _MAKERS = {
     "Configuration": "read_configuration",
     "PlantSource": "plant_source",
     "LqrSolution": "solve_lqr",
+    "FiniteHorizonLqr": "Controller(..., terminal_weight=P)",
     "GainFibre": "gain_fibre",
     "EquivalentWeights": "least_condition_weights",
     "WeightsSet": "weights_set",
@@ -422,6 +430,7 @@ _KINDS: dict[str, Kind] = {
     "Mapping[int, IntArray]": _mapping,
     "System": _system,
     "tuple[Array, Array]": _pair,
+    "bool | TerminalSet | tuple[ArrayLike, ArrayLike]": _choice_of_set,
 }
 
 

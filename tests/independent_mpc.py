@@ -27,14 +27,18 @@ def first_input(
     terminal: tuple[Matrix, Matrix] | None = None,
     targets: tuple[Matrix, Matrix] | None = None,
     drift: Matrix | None = None,
+    P: Matrix | None = None,
+    softening: float | None = None,
 ) -> Matrix:
-    """The first input of (3.1) with P from scipy's Riccati solver; |u| <= u_max, |x| <= x_max.
+    """The first input of (3.1), P from scipy's Riccati solver or given; |u|, |x| <= u_max, x_max.
 
     The cost is that of the distance from targets of states (N + 1, n) and inputs (N, m), or from 0;
-    `drift` (n,) is added to every next state.
+    `drift` (n,) is added to every next state. With `softening` a slack s of a state or terminal row
+    g <= b costs softening u_max^2 s / b, beside half of the cost in which the first input, all
+    later ones optimal, weighs m in trace.
     """
     n, m = B.shape
-    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+    P = scipy.linalg.solve_discrete_are(A, B, Q, R) if P is None else P
     powers = [np.linalg.matrix_power(A, k) for k in range(horizon + 1)]
     phi = np.vstack(powers)
     gamma = np.zeros(((horizon + 1) * n, horizon * m))
@@ -59,6 +63,17 @@ def first_input(
         rows.append(terminal[0] @ gamma[-n:])
         limits.append(terminal[1] - terminal[0] @ free[-n:])
     G, h = np.vstack(rows), np.concatenate(limits)
+    if softening is not None:
+        own = terminal[1] if terminal else np.zeros(0)
+        count, sides = len(h) - 2 * horizon * m, np.zeros(len(h) - 2 * horizon * m)
+        sides[: count - len(own)], sides[count - len(own) :] = x_max, own
+        later = np.linalg.solve(H[m:, m:], H[m:, :m]) if horizon > 1 else np.zeros((0, m))
+        scale = m / np.trace(H[:m, :m] - H[:m, m:] @ later)
+        H, f = scipy.linalg.block_diag(scale * H, np.zeros((count, count))), scale * f
+        f = np.append(f, softening * u_max**2 / sides)
+        slack = np.vstack([np.zeros((2 * horizon * m, count)), -np.eye(count)])
+        G = np.block([[G, slack], [np.zeros((count, horizon * m)), -np.eye(count)]])
+        h = np.append(h, np.zeros(count))
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-12

@@ -123,6 +123,7 @@ def calls() -> list[Call]:
     two, box, pair, trial = v["plant"], v["bounds"], v["weights"], v["recording"]
     problem, about = {"problem": v["problem"]}, {"plant": two, "gain": K}
     made = {"bounds": box, "horizon": 4, "terminal_set": True, "softening": 1e6}
+    own = {**made, "terminal_set": v["terminal"], "terminal_weight": states}
     demonstrated = v["point"].recorded_plan(np.ones((3, 1)), np.ones((2, 1)))
     return [
         (impc.Plant, {"system": v["system"], "controls": ["u[0]", "u[1]"]}),
@@ -143,6 +144,7 @@ def calls() -> list[Call]:
             **about, "bounds": box, "tolerance": 1e-9, "max_steps": 500, "near": v["terminal"],
         }),
         (impc.Controller, {"plant": two, "weights": pair, **made}),
+        (impc.Controller, {"plant": two, "weights": pair, **own}),
         (impc.Controller.from_gain, {**about, **made, "metric": S, "near": v["terminal"]}),
         (impc.scenario, {"plant": two, "x0": size, "steps": 30, "disturbance": np.zeros(30)}),
         (impc.scenario, {"plant": two, "x0": size, "steps": 30, "target": {"y[0]": 1.0}}),

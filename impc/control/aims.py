@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.control.compiled_kernel import Aim
+from impc.control.constraint_rows import families
 from impc.errors import InputError
 from impc.model.bounds import bound_rows
 from impc.model.targets import PlantChange, SteadyStates, expected_disturbance, signal_rows
@@ -38,7 +39,8 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     """The targets of a scenario, and their derivatives where the directions move them."""
     plant, bounds = controller.plant, bound_rows(controller.bounds, controller.plant)
     n, m, steps, p = plant.n, plant.m, given.steps, along.count
-    count = len(bounds.b)
+    whole = families(controller)
+    count = len(whole.b)
     still = [np.zeros((0, size, p)) for size in (n, m, count, count)]
     if not given.signals and not np.any(plant.observer):
         return Aim(*(np.zeros(part.shape[:2]) for part in still), *still)
@@ -54,9 +56,12 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     z, groups = states.at(values, expected)
     # What is to come is a target, without the disturbance that is believed to last.
     alone = states.at(values, 0 * expected) if np.any(expected) else (z, groups)
-    table = np.hstack([bounds.E, bounds.F])
+    # A terminal set of the user's own is about the target: it takes nothing of it.
+    table = np.zeros((count, n + m))
+    table[: len(bounds.b)] = np.hstack([bounds.E, bounds.F])
     taken, held = alone[0] @ table.T, (z - alone[0])[:steps] @ table.T
-    if controller.terminal is not None and np.any(np.abs(z @ table.T) > _NOTHING * bounds.b):
+    invariant = controller.terminal is not None and not controller.terminal.own
+    if invariant and np.any(np.abs(z @ table.T) > _NOTHING * whole.b):
         raise InputError(
             "terminal set",
             "is that of rest at 0, and a target takes of the bounds",

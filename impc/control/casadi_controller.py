@@ -80,7 +80,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
     x = ca.SX.sym("x", controller.plant.n)
     v = ca.SX.sym("v", rows.M.shape[1])
     slack = ca.SX.sym("s", int(soft.sum()))
-    metric = scipy.linalg.block_diag(*[controller.S] * controller.horizon)
+    metric = scipy.linalg.block_diag(*controller.metrics)
     placed = np.eye(len(rows.b))[:, soft]
     cost_weight = ca.DM(rows.limit[soft])
     curvature = ca.DM(rows.limit[soft] / rows.b[soft] * (_DAQP_SLACK if solver == "daqp" else 0))
@@ -215,6 +215,6 @@ def _unroll(controller: Controller, x: Array, v: Array) -> tuple[Array, Array]:
     plan, states = np.zeros((horizon, plant.m)), np.zeros((horizon + 1, plant.n))
     states[0] = x
     for k in range(horizon):
-        plan[k] = moves[k] - controller.K @ states[k]
+        plan[k] = moves[k] - controller.gains[k] @ states[k]
         states[k + 1] = plant.A @ states[k] + plant.B @ plan[k]
     return plan, states

@@ -215,7 +215,7 @@ def _ask_solver(
             du,
             np.empty(len(rows.b)),
         )
-        w = (work.v.reshape(-1, len(u)) @ np.linalg.cholesky(controller.S)).ravel()
+        w = (work.v.reshape(-1, 1, len(u)) @ np.linalg.cholesky(controller.metrics)).ravel()
         if status <= Status.SOFTENED and np.max(np.abs(w - found.w)) <= found.agrees:
             return Status(status), weak, -1
     row = excluded_row(rows, slack)

@@ -8,6 +8,8 @@ H = E - F K and the closed loop Phi = A - BK, the row says
 Stages k < N are the bounds along the horizon. A row (c, j) of the maximal invariant set is the
 same row at the stage k = N + j, where no v is left: the terminal set needs no code of its own,
 and follows K through the same derivative. In short  T x + M v <= b  (docs/theory.md, section 3).
+The rows of a terminal set of the user's own are further bounds, E = H and F = 0, at stage N alone.
+Where each stage has its own gain, products Phi_{k-1} ... Phi_i stand in place of the powers.
 """
 
 from __future__ import annotations
@@ -20,12 +22,13 @@ import numpy as np
 from impc.arrays import Array, IntArray
 from impc.checking import checked
 from impc.errors import DataError, InputError
-from impc.model.bounds import bound_rows
+from impc.model.bounds import BoundRows, bound_rows
+from impc.model.riccati import finite_horizon_changes
 
 if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.body import Body
-    from impc.model.bounds import BoundRows
+    from impc.model.riccati import FiniteHorizonLqr
 
 
 class Rows(NamedTuple):
@@ -62,8 +65,8 @@ class Directions:
     A: Array  # Plant matrices: (n, n, p), (n, m, p), (n, d, p)
     B: Array
     E: Array
-    K: Array  # Gain (m, n, p)
-    S: Array  # Metric (m, m, p), of the scaled metric of `Controller`
+    K: Array  # Gain (m, n, p); where each stage has its own, one below the other (N m, n, p)
+    S: Array  # Metric (m, m, p), of the scaled metric of `Controller`; likewise (N m, m, p)
     bounds: Array  # Right sides b of `bound_rows` (c, p)
     C: Array  # Outputs (outputs, n, p) and the observer's rates (d, p): they move targets
     observer: Array
@@ -87,6 +90,9 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         Number of directions p.
     **given : Array
         Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
+        Of a controller with a terminal weight of its own the gains and metrics are not free: in
+        place of A, B, K and S it has the weights Q, R and P, (n, n, p), (m, m, p) and (n, n, p),
+        of which the symmetric parts count.
 
     Raises
     ------
@@ -117,6 +123,10 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
         "observer": plant.observer.shape,
         "x0": (plant.n,),
     }
+    if controller.stages is not None:
+        n, m = plant.n, plant.m
+        still = {name: np.zeros((*shapes.pop(name), count)) for name in "ABKS"}
+        shapes |= {"Q": (n, n), "R": (m, m), "P": (n, n)}
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
         if name not in shapes:
@@ -125,24 +135,46 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
             problem = f"expected {parts[name].shape}, got {values.shape}"
             raise DataError(name, problem, "give a part for each direction")
         parts[name] = np.ascontiguousarray(values).reshape(*shapes[name], count)
+    if controller.stages is not None:
+        changes = [np.moveaxis(parts.pop(name), -1, 0) for name in "QRP"]
+        parts |= still | _stage_directions(controller.stages, *changes)
     return Directions(**parts, bodies=())
+
+
+def _stage_directions(stages: FiniteHorizonLqr, *changes: Array) -> dict[str, Array]:
+    """K (N m, n, p) and S (N m, m, p) along changes of Q, R and P, each (p, ., .)."""
+    dK, dS = finite_horizon_changes(stages, *((dX + dX.swapaxes(1, 2)) / 2 for dX in changes))
+    m, trace = stages.S.shape[-1], np.trace(stages.S[0])
+    share = np.trace(dS[0], axis1=1, axis2=2)[:, None, None] / trace
+    dS = (dS - share * stages.S[:, None]) * (m / trace)  # all in the scale of the first
+    below = (np.moveaxis(part, 1, -1) for part in (dK, dS))
+    return {
+        name: np.ascontiguousarray(part.reshape(len(part) * part.shape[1], *part.shape[2:]))
+        for name, part in zip("KS", below, strict=True)
+    }
 
 
 def build_rows(controller: Controller) -> Rows:
     """Return the rows of the controller's problem."""
-    bounds = bound_rows(controller.bounds, controller.plant)
+    bounds = families(controller)
     family, stage = _pairs(controller, bounds)
-    powers = _powers(controller, bounds, int(stage.max(initial=0)))
-    M = _inputs(controller, family, stage, powers @ controller.plant.B, bounds.F)
-    m = controller.plant.m
-    factor = np.linalg.cholesky(controller.S)
-    by_stage = M.reshape(-1, m).T
-    W = np.ascontiguousarray(np.linalg.solve(factor, by_stage).T).reshape(M.shape)
-    N = np.ascontiguousarray(np.linalg.solve(controller.S, by_stage).T).reshape(M.shape)
+    if controller.stages is None:
+        powers = _powers(controller, bounds, int(stage.max(initial=0)))
+        T = powers[stage, family]
+        M = _inputs(controller, family, stage, powers @ controller.plant.B, bounds.F)
+    else:
+        none = np.zeros((0, *controller.gains.shape))
+        T, M, _, _ = _unrolled(controller, bounds, family, stage, none)
+    metrics = controller.metrics
+    by_stage = np.moveaxis(M.reshape(len(M), *metrics.shape[:2]), 0, 2)
+    W, N = (
+        np.ascontiguousarray(np.moveaxis(np.linalg.solve(part, by_stage), 2, 0)).reshape(M.shape)
+        for part in (np.linalg.cholesky(metrics), metrics)
+    )
     b = bounds.b[family]
     soft = bounds.on_state[family] | (stage >= controller.horizon)
     limit = np.where(soft, controller.penalty / b, np.inf)
-    return Rows(powers[stage, family], M, N, W, W @ W.T, b, limit, family, stage)
+    return Rows(T, M, N, W, W @ W.T, b, limit, family, stage)
 
 
 def differentiate_rows(controller: Controller, along: Directions) -> RowDirections:
@@ -151,8 +183,14 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
     With G_k = H Phi^k:  dG_{k+1} = dG_k Phi + G_k dPhi,  dPhi = dA - dB K - B dK,  dH = -F dK.
     """
     plant, K = controller.plant, controller.K
-    bounds = bound_rows(controller.bounds, plant)
+    bounds = families(controller)
     family, stage = _pairs(controller, bounds)
+    fixed = np.zeros((len(bounds.b) - len(along.bounds), along.count))
+    db = np.concatenate([along.bounds, fixed])[family]
+    if controller.stages is not None:
+        gains = np.moveaxis(along.K, -1, 0).reshape(-1, *controller.gains.shape)
+        _, _, dT, dM = _unrolled(controller, bounds, family, stage, gains)
+        return RowDirections(dT, dM, db)
     last = int(stage.max(initial=0))
     dK, dA, dB = (np.moveaxis(part, -1, 0) for part in (along.K, along.A, along.B))
     closed = plant.A - plant.B @ K
@@ -166,7 +204,18 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
     dresponse = np.moveaxis(dresponse, 1, -1)
     dM = _inputs(controller, family, stage, dresponse, np.zeros_like(dresponse[0]))
     dT = np.ascontiguousarray(np.moveaxis(dpowers[stage, :, family], 1, -1))
-    return RowDirections(dT, dM, along.bounds[family])
+    return RowDirections(dT, dM, db)
+
+
+def families(controller: Controller) -> BoundRows:
+    """The bounds of one stage, then the rows of a terminal set of the user's own."""
+    bounds, terminal = bound_rows(controller.bounds, controller.plant), controller.terminal
+    if terminal is None or not terminal.own:
+        return bounds
+    both = [bounds, terminal.rows]
+    E, F, b = (np.concatenate([getattr(one, name) for one in both]) for name in "EFb")
+    on_state = np.concatenate([one.on_state for one in both])
+    return BoundRows(E, F, b, on_state, bounds.names + terminal.rows.names)
 
 
 def _pairs(controller: Controller, bounds: BoundRows) -> tuple[IntArray, IntArray]:
@@ -175,13 +224,16 @@ def _pairs(controller: Controller, bounds: BoundRows) -> tuple[IntArray, IntArra
     A state bound at stage 0 cannot be influenced. It stays while it is hard, so that a state
     outside is reported; softened it would be a constant and is left out.
     """
-    family, stage = np.meshgrid(np.arange(len(bounds.b)), np.arange(controller.horizon))
+    terminal = controller.terminal
+    own = len(terminal.h) if terminal is not None and terminal.own else 0
+    count = len(bounds.b) - own
+    family, stage = np.meshgrid(np.arange(count), np.arange(controller.horizon))
     keep = (stage > 0) | ~bounds.on_state[family] | (controller.softening is None)
-    families, stages = [family[keep]], [stage[keep]]
-    if controller.terminal is not None:
-        families.append(np.asarray(controller.terminal.family))
-        stages.append(np.asarray(controller.terminal.step) + controller.horizon)
-    return np.concatenate(families).astype(np.int64), np.concatenate(stages).astype(np.int64)
+    which, stages = [family[keep]], [stage[keep]]
+    if terminal is not None:
+        which.append(np.asarray(terminal.family) + (count if own else 0))
+        stages.append(np.asarray(terminal.step) + controller.horizon)
+    return np.concatenate(which).astype(np.int64), np.concatenate(stages).astype(np.int64)
 
 
 def _powers(controller: Controller, bounds: BoundRows, last: int) -> Array:
@@ -193,6 +245,26 @@ def _powers(controller: Controller, bounds: BoundRows, last: int) -> Array:
     for k in range(last):
         powers[k + 1] = powers[k] @ closed
     return powers
+
+
+def _unrolled(
+    controller: Controller, bounds: BoundRows, family: IntArray, stage: IntArray, dK: Array
+) -> tuple[Array, Array, Array, Array]:
+    """T, M and along dK (p, N, m, n) their derivatives, back through x+ = (A - B K_k) x + B v."""
+    A, B, gains = controller.plant.A, controller.plant.B, controller.gains
+    N, m, _ = gains.shape
+    F, last = bounds.F[family], np.minimum(stage, N - 1)
+    T = bounds.E[family] - (F[:, None] @ gains[last])[:, 0]  # at stage N is no input, and F = 0
+    dT = -(F[:, None] @ dK[:, last])[:, :, 0]
+    M, dM = np.zeros((len(T), N, m)), np.zeros((*dT.shape[:2], N, m))
+    for k in reversed(range(N)):
+        now, later = stage == k, stage > k
+        closed = A - B @ gains[k]
+        M[now, k], M[later, k], dM[:, later, k] = F[now], T[later] @ B, dT[:, later] @ B
+        dT[:, later] = dT[:, later] @ closed - T[later] @ (B @ dK[:, k])
+        T[later] = T[later] @ closed
+    dT, dM = (np.ascontiguousarray(np.moveaxis(part, 0, -1)) for part in (dT, dM))
+    return T, M.reshape(len(T), -1), dT, dM.reshape(len(T), N * m, len(dK))
 
 
 def _inputs(

@@ -6,6 +6,7 @@ With P from the Riccati equation, the cost of (3.1) along any input sequence is
 
 (docs/theory.md, section 2, has the proof), so a controller is its gain K, its metric S up to
 scale, its bounds, its horizon and its terminal set. The weights are one way to name K and S.
+With a terminal weight of the user's own the same holds with a gain and a metric for each stage.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from impc.checking import Value, checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.named_solver import COMPILED, require_solver
 from impc.control.simulation import Status, excluded_bound, scenario
-from impc.control.terminal_set import maximal_invariant_set
+from impc.control.terminal_set import maximal_invariant_set, own_terminal_set
 from impc.errors import InputError
 from impc.model.continuous_gain import held_gain
-from impc.model.riccati import solve_lqr, stabilises
+from impc.model.riccati import solve_finite_horizon, solve_lqr, stabilises, terminal_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from impc.control.terminal_set import TerminalSet
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
+    from impc.model.riccati import FiniteHorizonLqr
     from impc.model.weights import Weights
 
 #: Samples; the rows of a horizon take memory in its square, 0.4 GB of these for two bounds.
@@ -56,20 +58,25 @@ class Controller(Value):
     bounds : Bounds
     horizon : int
         N >= 1, in samples.
-    terminal_set : bool
+    terminal_set : bool, pair of array_like, or TerminalSet
         Whether x_N must lie in the maximal invariant set of the regulator under the bounds, as in
-        the dissertation.
+        the dissertation; or the set that it must lie in, {x : H x <= h} as a pair (H, h) of shapes
+        (r, n) and (r,), h > 0. Where it is not invariant, a later sample may have no answer.
     softening, solver : optional
         See the attributes.
+    terminal_weight : array_like, optional
+        P (n, n) of the cost x_N'P x_N, positive semidefinite, or 0 for no such cost. By default
+        that of the Riccati equation, whose gain has the maximal invariant set: with another give
+        ``terminal_set=False`` or a set of your own.
 
     Attributes
     ----------
     plant : Plant
         Discrete.
     K : Array
-        Gain (m, n); u_k = -K x_k + v_k.
+        Gain (m, n); u_k = -K x_k + v_k. The first of them where there is one for each stage.
     S : Array
-        Metric (m, m), scaled to a mean diagonal of 1: its scale has no effect.
+        Metric (m, m), scaled to a mean diagonal of 1: its scale has no effect. Likewise the first.
     bounds : Bounds
     horizon : int
         N >= 1, in samples.
@@ -83,12 +90,15 @@ class Controller(Value):
     solver : str
         Which method finds the input where the gain breaks a bound: "compiled", the package's own,
         or one of CasADi's by its name (`impc.control.named_solver.SOLVERS`).
+    stages : FiniteHorizonLqr or None
+        Weights, gains and metrics of all stages, where the terminal weight is the user's own.
 
     Raises
     ------
     PlantError, WeightsError, InputError
-        When the plant is continuous, no stabilising Riccati solution exists, or the horizon is
-        not a positive whole number, or there is no such solver.
+        When the plant is continuous, no stabilising Riccati solution exists, the horizon is not a
+        positive whole number, a terminal weight is not semidefinite, a terminal set does not have
+        the origin inside, or there is no such solver.
 
     Examples
     --------
@@ -115,6 +125,7 @@ class Controller(Value):
     terminal: TerminalSet | None
     softening: float | None
     solver: str
+    stages: FiniteHorizonLqr | None = None
 
     @checked(horizon=(1, LONGEST_HORIZON))
     def __init__(
@@ -124,22 +135,43 @@ class Controller(Value):
         bounds: Bounds,
         horizon: int,
         *,
-        terminal_set: bool = True,
+        terminal_set: bool | TerminalSet | tuple[ArrayLike, ArrayLike] = True,
         softening: float | None = None,
         solver: str = COMPILED,
+        terminal_weight: ArrayLike | None = None,
     ) -> None:
-        solution = solve_lqr(plant.require_discrete(), weights)
+        plant.require_discrete()
+        stages = None
+        if terminal_weight is None:
+            solution = solve_lqr(plant, weights)
+            K, S = solution.K, solution.S
+        elif terminal_set is True:
+            problem = "True is the invariant set of the Riccati gain, not of this terminal weight"
+            raise InputError("terminal_set", problem, "give False, or a set of your own")
+        else:
+            P = terminal_matrix(plant, terminal_weight)
+            stages = solve_finite_horizon(plant, weights, P, horizon)
+            K, S = stages.K[0], stages.S[0]
         made = Controller.from_gain(
             plant,
-            solution.K,
+            K,
             bounds,
             horizon,
-            metric=solution.S,
+            metric=S,
             terminal_set=terminal_set,
             softening=softening,
             solver=solver,
         )
-        self._fill(**vars(made))
+        self._fill(**vars(made) | {"stages": stages})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        plant, made = self.plant, self.stages
+        if made is not None:
+            same = (made.plant.A, plant.A), (made.plant.B, plant.B), (made.K[0], self.K)
+            if len(made.K) != self.horizon or not all(np.array_equal(*pair) for pair in same):
+                problem = "its stage gains are of another plant, gain or horizon"
+                raise InputError("Controller", problem, "make it anew from weights")
 
     @classmethod
     @checked(gain="m n", metric="m m", horizon=(1, LONGEST_HORIZON))
@@ -151,12 +183,12 @@ class Controller(Value):
         horizon: int,
         *,
         metric: ArrayLike | None = None,
-        terminal_set: bool = True,
+        terminal_set: bool | TerminalSet | tuple[ArrayLike, ArrayLike] = True,
         softening: float | None = None,
         near: TerminalSet | None = None,
         solver: str = COMPILED,
     ) -> Controller:
-        """Controller that stays near u = -Kx; with a terminal set the gain must stabilise.
+        """Controller that stays near u = -Kx; with its invariant set the gain must stabilise.
 
         Parameters
         ----------
@@ -170,7 +202,7 @@ class Controller(Value):
         metric : array_like, optional
             S (m, m), positive definite; the identity by default, which is no choice for one input.
         terminal_set, softening, solver
-            As in the constructor.
+            As in the constructor; a set of one's own is a pair of shapes (r, n) and (r,).
         near : TerminalSet, optional
             Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
 
@@ -182,7 +214,7 @@ class Controller(Value):
         """
         plant.require_discrete()
         K = finite_array("gain", gain, (plant.m, plant.n))
-        if terminal_set and not stabilises(plant, K):
+        if terminal_set is True and not stabilises(plant, K):
             raise InputError(
                 "gain", "does not stabilise the plant", "give one with |eig(A - BK)| < 1"
             )
@@ -191,6 +223,10 @@ class Controller(Value):
             raise InputError("metric", "is not positive definite", "give R + B'PB")
         if softening is not None and not 0 < softening < np.inf:
             raise InputError("softening", f"got {softening!r}", "give a positive number, or None")
+        if isinstance(terminal_set, bool):
+            terminal = maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None
+        else:
+            terminal = own_terminal_set(plant, terminal_set)
         made = object.__new__(cls)
         made._fill(
             plant=plant,
@@ -198,9 +234,10 @@ class Controller(Value):
             S=frozen(S * (plant.m / np.trace(S))),
             bounds=bounds,
             horizon=horizon,
-            terminal=maximal_invariant_set(plant, K, bounds, near=near) if terminal_set else None,
+            terminal=terminal,
             softening=softening,
             solver=require_solver(solver),
+            stages=None,
         )
         return made
 
@@ -302,6 +339,20 @@ class Controller(Value):
         x, u = np.array(run.x), np.array(run.u)
         x[end + 1 :], u[end:] = np.nan, np.nan
         return replace(run, x=x, u=u)
+
+    @property
+    def gains(self) -> Array:
+        """Gain of each stage (N, m, n)."""
+        if self.stages is not None:
+            return self.stages.K
+        return np.broadcast_to(self.K, (self.horizon, *self.K.shape))
+
+    @property
+    def metrics(self) -> Array:
+        """Metric of each stage (N, m, m), all in the scale of the first."""
+        if self.stages is not None:
+            return np.asarray(self.stages.S * (len(self.S) / np.trace(self.stages.S[0])))
+        return np.broadcast_to(self.S, (self.horizon, *self.S.shape))
 
     @property
     def penalty(self) -> float:

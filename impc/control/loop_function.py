@@ -104,6 +104,9 @@ def closed_loop_function(
     """
     if of not in ("gain", "weights"):
         raise InputError("of", f"got {of!r}", "choose gain or weights")
+    if controller.stages is not None:
+        problem = "has a terminal weight of its own, and a gain for each stage"
+        raise InputError("controller", problem, "differentiate by impc.simulate_and_differentiate")
     plant = controller.plant
     if np.any(plant.observer) or plant.ahead:
         raise InputError(
@@ -251,7 +254,8 @@ class _GainLoop:
     def _law(self, K: Array, S: Array, *others: Array) -> Controller | None:
         if not all(np.all(np.isfinite(part)) for part in (K, S, *others)):
             return None
-        given = self.controller
+        given, terminal = self.controller, self.controller.terminal
+        own = terminal is not None and terminal.own
         try:
             law = Controller.from_gain(
                 given.plant,
@@ -259,7 +263,7 @@ class _GainLoop:
                 given.bounds,
                 given.horizon,
                 metric=(S + S.T) / 2,
-                terminal_set=given.terminal is not None,
+                terminal_set=terminal if terminal and own else terminal is not None,
                 softening=given.softening,
                 near=self.near,
                 solver=given.solver,

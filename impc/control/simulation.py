@@ -16,9 +16,8 @@ import numpy as np
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
 from impc.control import compiled_kernel
-from impc.control.constraint_rows import build_rows
+from impc.control.constraint_rows import build_rows, families
 from impc.errors import DataError, InfeasibleError, SolverError
-from impc.model.bounds import bound_rows
 from impc.model.foresight import physical_disturbances, with_steps
 from impc.model.targets import reference
 
@@ -266,7 +265,7 @@ def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str,
     if row < 0:
         return "the bounds", remedy
     rows = build_rows(controller)
-    name = bound_rows(controller.bounds, controller.plant).names[rows.family[row]]
+    name = families(controller).names[rows.family[row]]
     stage = int(rows.stage[row])
     if stage < controller.horizon:
         return f"the bound {name} {stage} samples ahead", remedy

@@ -76,6 +76,9 @@ class TerminalSet(Value):
     bases : mapping of int to IntArray
         How the linear programs ended, for ``near=``: bases (c, q) by step, and at 0 those of the
         last pruning.
+    own : bool
+        Whether it is a set that a user gave: ``rows`` are then its own and ``gain`` is zero, for
+        nothing says that it is invariant.
 
     Examples
     --------
@@ -98,6 +101,7 @@ class TerminalSet(Value):
     F: Array
     rows: BoundRows
     bases: Mapping[int, IntArray] = field(repr=False, compare=False)
+    own: bool = False
 
     def contains(self, x: ArrayLike) -> bool:
         """Whether the state `x` (n,) is in the set, within its tolerance of each bound."""
@@ -224,6 +228,20 @@ def maximal_invariant_set(
         rows=rows,
         bases=bases,
     )
+
+
+def own_terminal_set(plant: Plant, given: TerminalSet | tuple[ArrayLike, ArrayLike]) -> TerminalSet:
+    """The set {x : H x <= h} that a user gives as a pair (H, h); of another set its rows."""
+    pair = (given.H, given.h) if isinstance(given, TerminalSet) else given
+    H = finite_array("terminal_set: H", pair[0], (None, plant.n))
+    h = finite_array("terminal_set: h", pair[1], (len(H),))
+    if np.any(h <= 0):
+        problem = f"leaves no room about the origin: its least entry is {h.min():g}"
+        raise InputError("terminal_set: h", problem, "give H x <= h with h > 0")
+    names = tuple(f"H[{row}] x <= {bound:g}" for row, bound in enumerate(h))
+    rows = BoundRows(H, np.zeros((len(h), plant.m)), h, np.ones(len(h), dtype=bool), names)
+    every, gain = np.arange(len(h)), np.zeros((plant.m, plant.n))
+    return TerminalSet(H, h, every, 0 * every, 0, 1e-9, gain, plant.A, rows, {}, own=True)
 
 
 def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: int) -> None:

@@ -79,7 +79,8 @@ class Goodness:
     white: bool
     softened: int  # How many samples exceed a soft bound or the terminal set, and of how many
     samples: int
-    rank: int  # Directions of the gain that the recordings identify
+    # Directions of the gain (of the weights, where the terminal weight is given) identified
+    rank: int
     unconfirmed: bool = (
         False  # Whether the best of several searches was alone: the others ended at more
     )
@@ -180,7 +181,14 @@ class Estimate(Frozen):
                 f"{found.softened} of {found.samples} samples of its simulation exceed a state "
                 "bound or the terminal set, which the search had softened."
             )
-        if found.rank < self.K.size:
+        if self.problem.terminal_weight is not None:
+            count = 0 if self.cost_weights is None else len(self.cost_weights)
+            doubts.append(
+                "The horizon ends in a terminal weight of your own: K is the first of its gains, "
+                "and the weights are identified otherwise than by one gain. The recordings "
+                f"identify {found.rank} of their {count} directions."
+            )
+        elif found.rank < self.K.size:
             doubts.append(
                 f"The recordings identify {found.rank} of the {self.K.size} directions of the gain."
             )
@@ -261,12 +269,12 @@ class Estimate(Frozen):
         SolverError
             When the method ended without a gain.
         """
-        return controller_for(self.problem, self.gain, self.metric)
+        return controller_for(self.problem, self.gain, self.metric, weights=self.weights)
 
     @cached_property
     def simulations(self) -> tuple[Simulation, ...]:
         """The recorded trials under this controller, one each."""
-        return tuple(simulated(self.problem, self.gain, self.metric))
+        return tuple(simulated(self.problem, self.gain, self.metric, self.weights))
 
     @property
     def time(self) -> tuple[Array, ...]:
@@ -396,9 +404,11 @@ def simulated_estimate(
     settled: bool = True,
     unconfirmed: bool = False,
     cost_weights: Array | None = None,
+    rank: int | None = None,
 ) -> Estimate:
-    """What a method found, simulated; the last arguments are fields of `Estimate`."""
-    misfit, fit = goodness(problem, K, S)
+    """What a method found, simulated; the last are fields of `Estimate` and its `Goodness`."""
+    known = gain_rank(problem, K, S) if rank is None else rank
+    misfit, fit = goodness(problem, simulated(problem, K, S, weights), known)
     if weights is None:
         status = Status.GAIN_ONLY
     elif explains(problem, misfit) and not reason:
@@ -434,12 +444,10 @@ def no_estimate(method: str, problem: Problem, reason: str) -> Estimate:
     )
 
 
-def goodness(problem: Problem, gain: Array, metric: Array) -> tuple[float, Goodness]:
-    """Misfit of a gain (m, n) with a metric (m, m), and what else its simulation says."""
-    runs = simulated(problem, gain, metric)
+def goodness(problem: Problem, runs: list[Simulation], rank: int) -> tuple[float, Goodness]:
+    """Misfit of the simulated recordings, and what else they say; the rank is known."""
     status = np.concatenate([run.status for run in runs])
     softened = int(np.count_nonzero(status == SampleStatus.SOFTENED))
-    rank = gain_rank(problem, gain, metric)
     left = misfit(problem, runs)
     return left, Goodness(_is_white(problem, runs), softened, len(status), rank)
 

@@ -29,7 +29,7 @@ from impc.inverse.coordinates import Coordinates, Point, descend
 from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.least_squares import Stop
 from impc.inverse.prediction import command_sizes, correction
-from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.problem import EXPLAINED, recorded_size, require_riccati
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.riccati import solve_lqr, stabilises
@@ -92,6 +92,7 @@ class GainFit(Frozen):
 @checked
 def fit_gain(problem: Problem) -> GainFit:
     """Fit K, and S for several inputs, with initial states and parameters that are not known."""
+    require_riccati(problem)
     count = problem.recorded_numbers
     few, wanted = count <= FEW, _SURE if count <= _HANDFUL else _AGREE
     found: list[GainFit] = []

@@ -32,9 +32,11 @@ from impc.inverse.gain_search import refine_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
 from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of, with_fitted_starts
+from impc.inverse.problem import require_riccati
 from impc.inverse.proximal_search import auxiliary_weights
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.structured_fit import fit_structured
+from impc.inverse.weight_fit import fit_weights
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr, stabilises
 from impc.model.weights import Weights
@@ -399,9 +401,16 @@ def fit(
            [0., 1.]])
     """
     chosen, first = method_named(method), start
+    if chosen.name != "inverse_mpc":
+        require_riccati(problem)
     if chosen.name == "inverse_mpc" or not isinstance(first, Estimate):
         started = time.perf_counter()
-        first = fit_controller(*_begun(problem, start))
+        if problem.terminal_weight is None:
+            first = fit_controller(*_begun(problem, start))
+        elif start is None:
+            first = fit_weights(problem)
+        else:
+            raise InputError("start", "has no use beside a terminal_weight", "leave it out")
         first = replace(first, seconds=time.perf_counter() - started)
         _LOG.info("%s", first)
     if chosen.name == "inverse_mpc":

@@ -26,6 +26,7 @@ from impc.errors import DataError, InputError, SolverError, WeightsError
 from impc.model.bounds import Bounds
 from impc.model.foresight import physical_states
 from impc.model.plant_family import plant_at
+from impc.model.riccati import terminal_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
     from impc.model.structure import Structure
+    from impc.model.weights import Weights
 
 #: Misfit, of the recorded outputs, up to which they are explained.
 EXPLAINED = 1e-9
@@ -57,7 +59,8 @@ class Problem(Value):
     horizon : int
         N, in samples.
     recordings : sequence of Recording
-    terminal_set, softening, unknown_start, family, structure, feedback_states, solver
+    terminal_set, softening, unknown_start, family, structure, feedback_states, solver, \
+    terminal_weight
         See the attributes.
     output_scale : array_like, optional
         (p,), positive; by default the root-mean-square of each output over all recordings, so
@@ -103,6 +106,10 @@ class Problem(Value):
     solver : str
         What solves the controller's quadratic programs in every simulation of a search, see
         `Controller`.
+    terminal_weight : Array or None
+        P (n, n) of the cost x_N'P x_N in the scale in which R[0, 0] = 1, given as 0 for no such
+        cost; None for that of the Riccati equation. With a P `impc.fit` searches the weights
+        themselves, by "inverse_mpc" alone; what assumes one gain and one metric refuses it.
 
     Raises
     ------
@@ -127,6 +134,7 @@ class Problem(Value):
         "output_scale": "p",
         "command_scale": "m",
         "logarithms": "*",
+        "terminal_weight": "n n",
     }
 
     plant: Plant
@@ -144,6 +152,7 @@ class Problem(Value):
     structure: Structure | None
     feedback_states: tuple[str, ...]
     solver: str
+    terminal_weight: Array | None = None
 
     @checked(horizon=(1, LONGEST_HORIZON), output_scale="p", command_scale="m")
     def __init__(
@@ -163,8 +172,12 @@ class Problem(Value):
         structure: Structure | None = None,
         feedback_states: Sequence[str] = (),
         solver: str = COMPILED,
+        terminal_weight: ArrayLike | None = None,
     ) -> None:
         plant.require_discrete()
+        if terminal_weight is not None and (terminal_set or family is not None):
+            problem = "goes neither with terminal_set=True nor with a family of plants"
+            raise InputError("terminal_weight", problem, "leave one out")
         if not recordings:
             raise DataError("recordings", "there are none", "give at least one trial")
         outputs = [trial.outputs for trial in recordings]
@@ -175,6 +188,7 @@ class Problem(Value):
                 known = ", ".join(plant.outputs)
                 raise InputError("offsets", f"there is no output {name!r}", f"choose of {known}")
         aimed = np.any(plant.observer) or any(trial.signals for trial in recordings)
+        P = None if terminal_weight is None else terminal_matrix(plant, terminal_weight)
         self._fill(
             plant=plant,
             bounds=bounds,
@@ -193,6 +207,7 @@ class Problem(Value):
             structure=structure,
             feedback_states=tuple(feedback_states),
             solver=require_solver(solver),
+            terminal_weight=P,
         )
 
     def without_bounds(self) -> Problem:
@@ -311,9 +326,16 @@ def missed(problem: Problem, trial: Recording, run: Simulation) -> Array:
 
 
 def controller_for(
-    problem: Problem, gain: Array, metric: Array, near: TerminalSet | None = None
+    problem: Problem,
+    gain: Array,
+    metric: Array,
+    near: TerminalSet | None = None,
+    weights: Weights | None = None,
 ) -> Controller:
-    """Return the controller of the problem with that `gain` (m, n) and `metric` (m, m)."""
+    """Return the controller of a `gain` (m, n) and `metric` (m, m), or beside a P of `weights`."""
+    if problem.terminal_weight is not None and weights is not None:
+        return weights_controller(problem, weights)
+    require_riccati(problem)
     return Controller.from_gain(
         problem.plant,
         gain,
@@ -325,6 +347,30 @@ def controller_for(
         near=near,
         solver=problem.solver,
     )
+
+
+def weights_controller(problem: Problem, weights: Weights, *, hard: bool = False) -> Controller:
+    """Return the controller of the problem with these weights, its rows soft or `hard`."""
+    return Controller(
+        problem.plant,
+        weights,
+        problem.bounds,
+        problem.horizon,
+        terminal_set=bool(problem.terminal_set),
+        softening=None if hard else problem.softening,
+        solver=problem.solver,
+        terminal_weight=problem.terminal_weight,
+    )
+
+
+def require_riccati(problem: Problem) -> None:
+    """Refuse a terminal weight of the user's own where one gain and metric have to be all."""
+    if problem.terminal_weight is not None:
+        raise InputError(
+            "terminal_weight",
+            "of your own gives each stage a gain, and this needs one gain for all",
+            "use impc.fit(problem), or leave the terminal weight out",
+        )
 
 
 def scenarios(problem: Problem) -> list[Scenario]:
@@ -401,9 +447,11 @@ def typical_output(problem: Problem) -> float:
     return recorded_size(problem) / float(np.sqrt(problem.recorded_numbers)) or 1.0
 
 
-def simulated(problem: Problem, gain: Array, metric: Array) -> list[Simulation]:
+def simulated(
+    problem: Problem, gain: Array, metric: Array, weights: Weights | None = None
+) -> list[Simulation]:
     """Every recording under the controller of a `gain` (m, n) and a `metric` (m, m)."""
-    controller = controller_for(problem, gain, metric)
+    controller = controller_for(problem, gain, metric, weights=weights)
     return [simulate(controller, drive) for drive in scenarios(problem)]
 
 

@@ -17,7 +17,6 @@ from impc.arrays import Array, frozen
 from impc.checking import checked, replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import Directions, directions
-from impc.control.controller import Controller
 from impc.control.simulation import Status
 from impc.errors import ImpcError
 from impc.inverse.problem import (
@@ -26,7 +25,9 @@ from impc.inverse.problem import (
     missed,
     modelled,
     recorded,
+    require_riccati,
     scenarios,
+    weights_controller,
 )
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
@@ -35,6 +36,7 @@ from impc.model.riccati import stabilises
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from impc.control.controller import Controller
     from impc.control.simulation import Scenario, Sensitivity, Simulation
     from impc.control.terminal_set import TerminalSet
     from impc.inverse.prediction import Correction
@@ -89,6 +91,7 @@ def evaluate(
     diverges, gives a large finite residual and its reason, so that a search can step back. With a
     `correction` every gain can be evaluated, and no parameters may be searched.
     """
+    require_riccati(problem)
     plant = problem.plant
     m, n = plant.m, plant.n
     refused = _refused(problem, gain, correction)
@@ -373,14 +376,7 @@ def scaled_changes(metric: Array, changes: Array) -> Array:
 @checked
 def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set."""
-    controller = Controller(
-        problem.plant,
-        weights,
-        problem.bounds,
-        problem.horizon,
-        terminal_set=bool(problem.terminal_set),
-        solver=problem.solver,
-    )
+    controller = weights_controller(problem, weights, hard=True)
     return [simulate(controller, drive) for drive in scenarios(problem)]
 
 

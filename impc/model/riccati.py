@@ -9,6 +9,9 @@ At the optimum the Riccati equation is stationary in K, so its differential keep
 
 A row of dK/d(Q, R) is obtained by the adjoint of this pair: one Lyapunov equation for each entry
 of K, instead of one for each entry of Q.
+
+With another terminal weight a horizon has a gain for each stage, by the same equations backwards:
+P_k from P_{k+1}, and dP_k from dP_{k+1}.
 """
 
 from __future__ import annotations
@@ -19,13 +22,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, Frozen, frozen, symmetric_matrix
 from impc.checking import checked
 from impc.errors import InputError, WeightsError
+from impc.model.weights import require_semidefinite
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from impc.model.plant import Plant
     from impc.model.weights import Weights
+
+# Least eigenvalue of a metric, of the largest, with which its inverse has no digit left.
+_SINGULAR = 1e-14
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,17 @@ class LqrSolution(Frozen):
     K: Array  # Gain (m, n) of u = -Kx
     S: Array  # Metric (m, m) in which the constrained controller stays near the gain: R + B'PB
     F: Array  # Closed loop A - BK, (n, n)
+
+
+@dataclass(frozen=True)
+class FiniteHorizonLqr(Frozen):
+    """The regulator of a horizon that ends in a terminal weight: a gain for each stage."""
+
+    plant: Plant
+    weights: Weights
+    P: Array  # Cost to go from each stage (N + 1, n, n); the last is the terminal weight
+    K: Array  # Gains (N, m, n)
+    S: Array  # Metrics R + B'P_{k+1}B (N, m, m)
 
 
 @dataclass(frozen=True)
@@ -75,12 +95,7 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     >>> found.K.round(4)
     array([[ 1.4938, -0.8811]])
     """
-    if weights.Q.shape != (plant.n, plant.n) or weights.R.shape != (plant.m, plant.m):
-        raise InputError(
-            "Q, R",
-            f"have shapes {weights.Q.shape} and {weights.R.shape}",
-            f"the plant needs {(plant.n, plant.n)} and {(plant.m, plant.m)}",
-        )
+    _require_sizes(plant, weights)
     solver = (
         scipy.linalg.solve_discrete_are if plant.discrete else scipy.linalg.solve_continuous_are
     )
@@ -99,6 +114,55 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     if not is_stable(F, discrete=plant.discrete):
         raise _no_solution("the closed loop that came out is not stable")
     return LqrSolution(plant, weights, frozen(P), frozen(K), frozen(S), frozen(F))
+
+
+def _require_sizes(plant: Plant, weights: Weights) -> None:
+    if weights.Q.shape != (plant.n, plant.n) or weights.R.shape != (plant.m, plant.m):
+        raise InputError(
+            "Q, R",
+            f"have shapes {weights.Q.shape} and {weights.R.shape}",
+            f"the plant needs {(plant.n, plant.n)} and {(plant.m, plant.m)}",
+        )
+
+
+def terminal_matrix(plant: Plant, given: ArrayLike) -> Array:
+    """The terminal weight P (n, n) of what a user gives: a matrix, or 0 for none."""
+    none = np.ndim(given) == 0 and np.all(np.asarray(given) == 0)
+    P = symmetric_matrix("terminal_weight", np.zeros(2 * (plant.n,)) if none else given, plant.n)
+    require_semidefinite("terminal_weight", P)
+    return P
+
+
+def solve_finite_horizon(
+    plant: Plant, weights: Weights, terminal: Array, horizon: int
+) -> FiniteHorizonLqr:
+    """The Riccati difference recursion back from a `terminal` weight (n, n) at stage N."""
+    _require_sizes(plant, weights)
+    A, B, P, K, S = plant.A, plant.B, [terminal], [], []
+    for _ in range(horizon):
+        S.append(weights.R + B.T @ P[-1] @ B)
+        eigenvalues = np.linalg.eigvalsh(S[-1])
+        if not eigenvalues[0] > _SINGULAR * eigenvalues[-1]:
+            problem = "have a stage metric R + B'PB that is singular in double precision"
+            raise WeightsError("Q, R", problem, "weigh the inputs more alike")
+        K.append(np.linalg.solve(S[-1], B.T @ P[-1] @ A))
+        F = A - B @ K[-1]
+        before = F.T @ P[-1] @ F + weights.Q + K[-1].T @ weights.R @ K[-1]
+        P.append((before + before.T) / 2)
+    return FiniteHorizonLqr(plant, weights, *(frozen(part[::-1]) for part in (P, K, S)))
+
+
+def finite_horizon_changes(
+    found: FiniteHorizonLqr, dQ: Array, dR: Array, dP: Array
+) -> tuple[Array, Array]:
+    """Change of gains (N, k, m, n) and metrics (N, k, m, m) along k changes of Q, R and last P."""
+    A, B, dK, dS = found.plant.A, found.plant.B, [], []
+    for K, S in zip(found.K[::-1], found.S[::-1], strict=True):
+        F = A - B @ K
+        dS.append(dR + B.T @ dP @ B)
+        dK.append(np.linalg.solve(S, B.T @ dP @ F - dR @ K))
+        dP = F.T @ dP @ F + dQ + K.T @ dR @ K
+    return np.array(dK[::-1]), np.array(dS[::-1])
 
 
 @checked(F="n n")

@@ -63,13 +63,8 @@ class Weights(Value):
     @checked
     def __init__(self, Q: ArrayLike, R: ArrayLike) -> None:
         q, r = symmetric_matrix("Q", Q), symmetric_matrix("R", R)
-        q_eigenvalues, r_eigenvalues = np.linalg.eigvalsh(q), np.linalg.eigvalsh(r)
-        if q_eigenvalues[0] < -1e-9 * max(q_eigenvalues[-1], 1e-300):
-            raise WeightsError(
-                "Q",
-                f"is not positive semidefinite: its least eigenvalue is {q_eigenvalues[0]:.4g}",
-                "give Q = LL'",
-            )
+        require_semidefinite("Q", q)
+        r_eigenvalues = np.linalg.eigvalsh(r)
         if r_eigenvalues[0] <= 0:
             raise WeightsError(
                 "R",
@@ -82,6 +77,14 @@ class Weights(Value):
     def block(self) -> Array:
         """The block-diagonal matrix blkdiag(Q, R), (n + m, n + m)."""
         return np.asarray(scipy.linalg.block_diag(self.Q, self.R))
+
+
+def require_semidefinite(name: str, matrix: Array) -> None:
+    """Require that no eigenvalue of a matrix (n, n) is negative but for rounding."""
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    if eigenvalues[0] < -1e-9 * max(eigenvalues[-1], 1e-300):
+        problem = f"is not positive semidefinite: its least eigenvalue is {eigenvalues[0]:.4g}"
+        raise WeightsError(name, problem, f"give {name} = LL'")
 
 
 @checked

@@ -12,6 +12,7 @@ from impc.checking import checked
 from impc.errors import ImpcError, InputError
 from impc.inverse.coordinates import Point
 from impc.inverse.gain_search import regulators
+from impc.inverse.problem import require_riccati
 from impc.output_feedback.observer import LEVELS
 from impc.output_feedback.prior import Place, Prior
 from impc.output_feedback.search import climb
@@ -161,6 +162,7 @@ def fit_output_feedback(
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
     problem = found.problem
     _require_plain(problem)
+    require_riccati(problem)
     shortest = min(trial.samples for trial in problem.recordings)
     if counted >= shortest:
         left = f"got {counted}, and the shortest trial has {shortest} samples"

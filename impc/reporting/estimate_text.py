@@ -35,7 +35,9 @@ def summary(estimate: Estimate) -> str:
     lines.append("VAF, %:     " + ", ".join(f"{name} {value:.4g}" for name, value in shares))
     said = (estimate.status.sentence, estimate.reason, *estimate.doubts)
     lines += [text for text in said if text]  # before the numbers that they are about
-    lines += ["-" * _WIDTH, estimate.intervals().round(6).to_string(), "-" * _WIDTH]
+    staged = estimate.problem.terminal_weight is not None
+    table = gain_table(plant, estimate.gain) if staged else estimate.intervals()
+    lines += ["-" * _WIDTH, table.round(6).to_string(), "-" * _WIDTH]
     if estimate.weights is not None:
         parts = (("Q", estimate.weights.Q), ("R", estimate.weights.R))
         for name, matrix in parts:
@@ -43,7 +45,8 @@ def summary(estimate: Estimate) -> str:
             small = len(matrix) <= _SMALL
             text = text.replace("\n", "\n    ") if small else f"{matrix.shape}, see .weights"
             lines.append(f"{name} = {text}")
-        lines.append("The intervals are of the gain by itself; .K is the gain of these weights.")
+        told = "The intervals are of the gain by itself; .K is the gain of these weights."
+        lines += [] if staged else [told]
     return "\n".join(lines)
 
 

@@ -1,0 +1,135 @@
+"""The weights of a horizon that ends in a terminal weight of the user's own.
+
+Its controller has a gain and a metric for each stage (docs/theory.md, section 2), so no single gain
+stands between recordings and weights: least squares go over the unknowns of a structure, by default
+all of Q and R, and over initial states that are not known. How much of the weights is identified is
+not known beforehand: it is the rank of the derivative at the answer.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from impc.arrays import Array
+from impc.checking import replace
+from impc.control.closed_loop import prepare_loop, run_loop
+from impc.control.constraint_rows import directions
+from impc.errors import ImpcError, SolverError
+from impc.inverse.estimates import determined, simulated_estimate
+from impc.inverse.gain_search import regulators
+from impc.inverse.problem import explains, scenarios, typical_output, weights_controller
+from impc.inverse.structured_fit import bryson_cost_weights
+from impc.model.structure import Structure
+
+if TYPE_CHECKING:
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
+
+# Random starts about each of Bryson's, their standard deviation, and from how many it is searched.
+_DRAWN, _SPREAD, _SEARCHED = 3, 1.0, 6
+# Residual, over typical outputs, of what is not reached; squared misfits that are one, of each.
+_NOT_REACHED, _SAME = 1e3, 1e-3
+
+
+def fit_weights(problem: Problem) -> Estimate:
+    """Fit the weights beside a terminal weight of the user's own, from several starts."""
+    structure = problem.structure or Structure(problem.plant, "full", "full")
+    posed = replace(problem, terminal_set=False, structure=structure)
+    loose, first = replace(posed, terminal_weight=None), regulators(problem)[0]
+    ladder = np.array(bryson_cost_weights(loose, structure, np.array(first.K), np.array(first.S)))
+    drawn = np.random.default_rng(0).normal(scale=_SPREAD, size=(_DRAWN, *ladder.shape))
+    x0 = posed.starts.ravel() if posed.unknown_start else np.zeros(0)
+    starts = [np.concatenate([z, x0]) for z in (*ladder, *np.concatenate(ladder + drawn))]
+    sizes = [float(np.linalg.norm(_evaluated(posed, structure, y)[0])) for y in starts]
+    spent, ends = 0, []
+    for index in np.argsort(sizes)[:_SEARCHED]:
+        ends.append(_searched(posed, structure, starts[index]))
+        spent += ends[-1].nfev
+        if explains(posed, float(np.linalg.norm(ends[-1].fun))):
+            break
+    best = min(ends, key=lambda end: float(end.cost))
+    others = [end.cost > (1 + _SAME) * best.cost for end in ends if end is not best]
+    z, found = _parted(posed, best.x)
+    weights = structure.weights(z)
+    law = weights_controller(found, weights)
+    shared, own = np.split(_evaluated(posed, structure, best.x)[1], [len(z)], axis=1)
+    left = shared - own @ np.linalg.lstsq(own, shared)[0] if own.size else shared
+    values = np.asarray(np.linalg.svd(left, compute_uv=False))
+    estimate = simulated_estimate(
+        "inverse_mpc",
+        found,
+        np.array(law.K),
+        np.array(law.S),
+        noise=float(np.linalg.norm(best.fun)),
+        weights=weights,
+        evaluations=spent,
+        settled=bool(best.success),
+        unconfirmed=bool(others) and all(others),
+        cost_weights=z,
+        rank=int(np.count_nonzero(determined(found, values))),
+    )
+    estimate = replace(estimate, weights=weights)  # in the scale of the terminal weight
+    if not all(run.complete for run in estimate.simulations):
+        raise SolverError("weights", "none can be simulated on the recordings", "check the plant")
+    return estimate
+
+
+def _parted(problem: Problem, y: Array) -> tuple[Array, Problem]:
+    """Unknowns of the structure, and the problem at the initial states, of all unknowns y."""
+    if not problem.unknown_start:
+        return y, problem
+    z, starts = np.split(y, [len(y) - problem.starts.size])
+    return z, problem.at(starts.reshape(problem.starts.shape), np.array(problem.logarithms))
+
+
+def _evaluated(problem: Problem, structure: Structure, y: Array) -> tuple[Array, Array]:
+    """Residual (r,) and its derivative along the weights and the initial states (r, len(y))."""
+    z, there = _parted(problem, y)
+    plant, q, far = problem.plant, len(z), _NOT_REACHED * typical_output(problem)
+    count = q + (plant.n if problem.unknown_start else 0)
+    try:
+        law = weights_controller(there, structure.weights(z))
+    except ImpcError:  # no controller in double precision: a search steps back
+        rows = problem.recorded_numbers
+        return np.full(rows, far), np.zeros((rows, len(y)))
+    dQ, dR = (
+        np.pad(np.moveaxis(part, 0, -1), ((0, 0), (0, 0), (0, count - q)))
+        for part in structure.changes(z)
+    )
+    along = directions(law, count, Q=dQ, R=dR, x0=np.eye(plant.n, count, q))
+    prepared = prepare_loop(law, along)
+    errors, slopes, C = [], [], plant.C / problem.output_scale[:, None]
+    for trial, drive in zip(there.recordings, scenarios(there), strict=True):
+        run, moved = run_loop(prepared, drive, proved=False)
+        error = run.x @ C.T - trial.outputs / problem.output_scale
+        if not run.complete:
+            error[run.reached + 1 :] = far
+        errors.append(error.ravel())
+        slopes.append((C @ moved.x).reshape(-1, count))
+    apart = scipy.linalg.block_diag(*(slope[:, q:] for slope in slopes))
+    return np.concatenate(errors), np.hstack([np.concatenate(slopes)[:, :q], apart])
+
+
+def _searched(
+    problem: Problem, structure: Structure, begin: Array
+) -> scipy.optimize.OptimizeResult:
+    """One search by scipy's trust region."""
+
+    @functools.lru_cache(maxsize=1)  # both are asked for one by one
+    def at(y: tuple[float, ...]) -> tuple[Array, Array]:
+        return _evaluated(problem, structure, np.array(y))
+
+    def residual(y: Array) -> Array:
+        return at(tuple(y))[0]
+
+    def derivative(y: Array) -> Array:
+        return at(tuple(y))[1]
+
+    return scipy.optimize.least_squares(
+        residual, begin, derivative, x_scale="jac", ftol=1e-10, xtol=1e-12, gtol=None, max_nfev=200
+    )
