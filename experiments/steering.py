@@ -1,0 +1,155 @@
+"""People who steer a cursor against a known push: offset-free inverse MPC and delayed PI feedback.
+
+    python -m experiments.steering folder [trials]
+
+The folder has prepared trials of Yamagami, Howell, Roth and Burden (CPHS 2018), <person>_<plant>_
+<trial>.csv with columns time (s), y, slider, push at 60 Hz; the recordings are public and not part
+of the project. The plant y' = u + d (fo) or y'' = u + d - y' (so) is exact, and so is the record
+of the slider. The hand answers its command after a delay and a lag, which are fitted together with
+the rate at which the person learns the push. Fitted to the trials with phases `p`, each is
+simulated on those with phases `m`, from its first second on.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import control
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+import impc
+from impc.arrays import Array
+from impc.assess.variance_accounted_for import left_out_vaf
+from plants.actuation import pade_delay
+
+RATE, SETTLE, HORIZON = 60.0, 1.0, 20
+
+
+def hand_and_cursor(values: Array, order: int) -> impc.Plant:
+    """Cursor, hand and delay (Pade, order 2), for delay (s), lag (s) and rate of learning (1/s)."""
+    delay, lag, learning = values
+    late = pade_delay(delay, 2)
+    a, b, c, d = (np.asarray(late.A), np.asarray(late.B), np.asarray(late.C), np.asarray(late.D))
+    n = order + 3
+    A, B = np.zeros((n, n)), np.zeros((n, 2))
+    A[0, 1] = 1.0  # y' = hand + push, or y' = v with v' = hand + push - v
+    B[order - 1, 1] = 1.0
+    if order == 2:
+        A[1, 1], A[1, 2] = -1.0, 1.0
+    A[order, order], A[order, order + 1 :] = -1 / lag, np.ravel(c) / lag
+    B[order, 0], A[order + 1 :, order + 1 :] = d.item() / lag, a
+    B[order + 1 :, 0] = np.ravel(b)
+    whole = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, n + 2))]]) / RATE)
+    C = np.eye(n)[[0, order]]
+    system = control.ss(
+        *(whole[:n, :n], whole[:n, n:], C, 0, 1 / RATE),
+        states=[*["y", "rate"][:order], "hand", "late 1", "late 2"],
+        inputs=["command", "push"],
+        outputs=["y", "slider"],
+    )
+    return impc.with_observer(impc.Plant(system, controls=["command"]), learning)
+
+
+def trials_of(folder: Path, person: str, kind: str, phase: str) -> list[Array]:
+    """Columns time, y, slider, push of every trial."""
+    files = sorted(folder.glob(f"{person}_{kind}_*{phase}.csv"))
+    return [np.loadtxt(file, delimiter=",", skiprows=1) for file in files]
+
+
+def vaf(recorded: Array, simulated: Array) -> float:
+    """Variance accounted for after the settling time, %."""
+    first = round(SETTLE * RATE)
+    return float(impc.vaf(recorded[first:, None], simulated[first:, None])[0])
+
+
+def delayed_feedback(gains: Array, delay: int, trial: Array, order: int) -> Array:
+    """The cursor (samples,) under u = -kp y - ki (integral of y), `delay` samples late."""
+    e, h = np.exp(-1 / RATE), 1 / RATE
+    y, v, total = np.zeros(len(trial)), 0.0, 0.0
+    y[0] = trial[0, 1]
+    for t in range(len(trial) - 1):
+        seen = y[t - delay] if t >= delay else 0.0
+        total += seen * h
+        push = -gains[0] * seen - gains[1] * total + trial[t, 3]
+        if order == 1:
+            y[t + 1] = y[t] + h * push
+        else:
+            y[t + 1] = y[t] + (1 - e) * v + (h - (1 - e)) * push
+            v = e * v + (1 - e) * push
+        if not abs(y[t + 1]) < 1e3:
+            y[t + 1 :] = 1e3
+            break
+    return y
+
+
+def fit_delayed(train: list[Array], order: int) -> tuple[Array, int]:
+    """The two gains and the delay of least squares."""
+    best: tuple[float, Array, int] = (np.inf, np.zeros(2), 0)
+    for delay in range(2, 31, 2):
+
+        def missed(gains: Array, delay: int = delay) -> float:
+            return sum(
+                float(np.sum((delayed_feedback(gains, delay, one, order) - one[:, 1]) ** 2))
+                for one in train
+            )
+
+        found = scipy.optimize.minimize(
+            missed, [1.0, 0.3], method="Nelder-Mead", options={"maxfev": 60}
+        )
+        if found.fun < best[0]:
+            best = (float(found.fun), found.x, delay)
+    return best[1], best[2]
+
+
+def compare(
+    folder: Path, person: str, kind: str, most: int, report: Callable[[str], None] = print
+) -> None:
+    """Print both VAF on the trials that were left out, and what was fitted."""
+    order = 1 if kind == "fo" else 2
+    train, test = (trials_of(folder, person, kind, phase)[:most] for phase in "pm")
+    gains, delay = fit_delayed(train, order)
+    plain = np.mean([vaf(one[:, 1], delayed_feedback(gains, delay, one, order)) for one in test])
+    nominal = [0.25, 0.08, 1.0]
+    family = impc.PlantFamily(
+        lambda values: hand_and_cursor(values, order), ["delay", "lag", "learning"], nominal
+    )
+    plant = hand_and_cursor(np.array(nominal), order)
+    bounds = impc.Bounds(plant)
+
+    def recording(one: Array) -> impc.Recording:
+        return impc.Recording(plant, one[:, 1:3], one[:, 3])
+
+    problem = impc.Problem(
+        plant, bounds, HORIZON, [recording(one) for one in train], family=family, terminal_set=False
+    )
+    found = impc.fit(problem)
+    held_out = np.array([left_out_vaf(found, recording(one), SETTLE).vaf for one in test])
+    rows = found.intervals().loc[list(family.names), ["value", "low", "high"]].to_numpy()
+    fitted = ", ".join(
+        f"{name} {value:.3g} ({low:.3g} to {high:.3g})"
+        for name, (value, low, high) in zip(family.names, rows, strict=True)
+    )
+    report(
+        f"{person} {kind}: cursor, held out: inverse MPC {np.nanmean(held_out[:, 0]):.1f} %, "
+        f"delayed PI {plain:.1f} %; slider {np.nanmean(held_out[:, 1]):.1f} %; "
+        f"fitted to: {found.vaf.round(1)}; {found.status.value}; {fitted}"
+    )
+    report(
+        f"    K {np.round(found.gain, 2).tolist()}, PI {gains.round(2)}, {delay / RATE:.2f} s late"
+    )
+    report(f"    {' '.join(found.doubts)}")
+
+
+def main(folder: Path, most: int) -> None:
+    """Both people, both plants."""
+    for person in sorted({file.name.split("_")[0] for file in folder.glob("*_fo_*.csv")}):
+        for kind in ("fo", "so"):
+            compare(folder, person, kind, most)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 5)
