@@ -26,7 +26,7 @@ from impc.arrays import Array
 from impc.assess.variance_accounted_for import left_out_vaf
 from plants.actuation import pade_delay
 
-RATE, SETTLE, HORIZON = 60.0, 1.0, 20
+RATE, SETTLE, HORIZON, FAR = 60.0, 1.0, 20, 1e3
 
 
 def hand_and_cursor(values: Array, order: int) -> impc.Plant:
@@ -54,10 +54,11 @@ def hand_and_cursor(values: Array, order: int) -> impc.Plant:
     return impc.with_observer(impc.Plant(system, controls=["command"]), learning)
 
 
-def trials_of(folder: Path, person: str, kind: str, phase: str) -> list[Array]:
-    """Columns time, y, slider, push of every trial."""
-    files = sorted(folder.glob(f"{person}_{kind}_*{phase}.csv"))
-    return [np.loadtxt(file, delimiter=",", skiprows=1) for file in files]
+def trials_of(folder: Path, person: str, kind: str, phase: str, most: int) -> Array:
+    """Columns time, y, slider, push of every trial (samples, trials, 4)."""
+    files = sorted(folder.glob(f"{person}_{kind}_*{phase}.csv"))[:most]
+    read = [np.loadtxt(file, delimiter=",", skiprows=1) for file in files]
+    return np.stack([one[: min(map(len, read))] for one in read], axis=1)
 
 
 def vaf(recorded: Array, simulated: Array) -> float:
@@ -66,35 +67,36 @@ def vaf(recorded: Array, simulated: Array) -> float:
     return float(impc.vaf(recorded[first:, None], simulated[first:, None])[0])
 
 
-def delayed_feedback(gains: Array, delay: int, trial: Array, order: int) -> Array:
-    """The cursor (samples,) under u = -kp y - ki (integral of y), `delay` samples late."""
+def delayed_feedback(gains: Array, delay: int, trials: Array, order: int) -> Array:
+    """Cursors (samples, k) of k trials under u = -kp y - ki (integral of y), `delay` samples late.
+
+    `trials` (samples, k, 4).
+    """
     e, h = np.exp(-1 / RATE), 1 / RATE
-    y, v, total = np.zeros(len(trial)), 0.0, 0.0
-    y[0] = trial[0, 1]
-    for t in range(len(trial) - 1):
-        seen = y[t - delay] if t >= delay else 0.0
-        total += seen * h
-        push = -gains[0] * seen - gains[1] * total + trial[t, 3]
+    y = np.zeros(trials.shape[:2])
+    v, total = np.zeros(y.shape[1]), np.zeros(y.shape[1])
+    y[0] = trials[0, :, 1]
+    for t in range(len(y) - 1):
+        seen = y[t - delay] if t >= delay else 0 * v
+        total = total + seen * h
+        push = -gains[0] * seen - gains[1] * total + trials[t, :, 3]
         if order == 1:
             y[t + 1] = y[t] + h * push
         else:
             y[t + 1] = y[t] + (1 - e) * v + (h - (1 - e)) * push
             v = e * v + (1 - e) * push
-        if not abs(y[t + 1]) < 1e3:
-            y[t + 1 :] = 1e3
-            break
+        y[t + 1] = np.clip(y[t + 1], -FAR, FAR)  # it runs away: no number grows without end
     return y
 
 
-def fit_delayed(train: list[Array], order: int) -> tuple[Array, int]:
+def fit_delayed(train: Array, order: int) -> tuple[Array, int]:
     """The two gains and the delay of least squares."""
     best: tuple[float, Array, int] = (np.inf, np.zeros(2), 0)
     for delay in range(2, 31, 2):
 
         def missed(gains: Array, delay: int = delay) -> float:
-            return sum(
-                float(np.sum((delayed_feedback(gains, delay, one, order) - one[:, 1]) ** 2))
-                for one in train
+            return float(
+                np.sum((delayed_feedback(gains, delay, train, order) - train[..., 1]) ** 2)
             )
 
         found = scipy.optimize.minimize(
@@ -110,9 +112,10 @@ def compare(
 ) -> None:
     """Print both VAF on the trials that were left out, and what was fitted."""
     order = 1 if kind == "fo" else 2
-    train, test = (trials_of(folder, person, kind, phase)[:most] for phase in "pm")
+    train, test = (trials_of(folder, person, kind, phase, most) for phase in "pm")
     gains, delay = fit_delayed(train, order)
-    plain = np.mean([vaf(one[:, 1], delayed_feedback(gains, delay, one, order)) for one in test])
+    simulated = delayed_feedback(gains, delay, test, order)
+    plain = np.mean([vaf(y, own) for y, own in zip(test[..., 1].T, simulated.T, strict=True)])
     nominal = [0.25, 0.08, 1.0]
     family = impc.PlantFamily(
         lambda values: hand_and_cursor(values, order), ["delay", "lag", "learning"], nominal
@@ -124,10 +127,17 @@ def compare(
         return impc.Recording(plant, one[:, 1:3], one[:, 3])
 
     problem = impc.Problem(
-        plant, bounds, HORIZON, [recording(one) for one in train], family=family, terminal_set=False
+        plant,
+        bounds,
+        HORIZON,
+        [recording(one) for one in np.swapaxes(train, 0, 1)],
+        family=family,
+        terminal_set=False,
     )
     found = impc.fit(problem)
-    held_out = np.array([left_out_vaf(found, recording(one), SETTLE).vaf for one in test])
+    held_out = np.array(
+        [left_out_vaf(found, recording(one), SETTLE).vaf for one in np.swapaxes(test, 0, 1)]
+    )
     rows = found.intervals().loc[list(family.names), ["value", "low", "high"]].to_numpy()
     fitted = ", ".join(
         f"{name} {value:.3g} ({low:.3g} to {high:.3g})"

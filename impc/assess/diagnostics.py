@@ -62,7 +62,9 @@ def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> Residu
     residuals = [-part[:, :p] * problem.output_scale for part in by_trial(problem, found.residual)]
     structure = residual_structure(problem, gain, found)
     # Nothing but rounding is left of an exact fit: neither test has anything to say.
-    loop = None if structure is None else loop_noise(problem.plant, gain, residuals)
+    # Of residuals with gaps the spectrum is another.
+    gaps = any(np.isnan(trial.outputs).any() for trial in problem.recordings)
+    loop = None if structure is None or gaps else loop_noise(problem.plant, gain, residuals)
     return ResidualDiagnostics(loop, structure)
 
 

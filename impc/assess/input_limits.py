@@ -25,13 +25,12 @@ from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
 from impc.assess.printed_gain import LEVEL
 from impc.checking import replace
-from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.gain_search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import controller_for, scenarios, simulated
-from impc.inverse.residuals import evaluate
+from impc.inverse.problem import controller_for, simulated
+from impc.inverse.residuals import evaluate, residual_along
 from impc.model.bounds import Bounds, bound_rows
 
 if TYPE_CHECKING:
@@ -265,11 +264,7 @@ def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control
     of_input = np.isclose(np.abs(rows.b), limit) & ~np.any(rows.E, axis=1)
     moves = np.abs(rows.F[:, control]) * of_input
     along = directions(controller, 1, bounds=moves[:, None])
-    seen = [
-        simulate_and_differentiate(controller, drive, along)[1].x[..., 0] @ problem.plant.C.T
-        for drive in scenarios(problem)
-    ]
-    return np.concatenate([(part / problem.output_scale).ravel() for part in seen])
+    return residual_along(problem, controller, along)[:, 0]
 
 
 def _crossing(

@@ -15,7 +15,12 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.checking import checked, replace
-from impc.control.closed_loop import prepare_loop, run_loop, simulate
+from impc.control.closed_loop import (
+    prepare_loop,
+    run_loop,
+    simulate,
+    simulate_and_differentiate,
+)
 from impc.control.constraint_rows import Directions, directions
 from impc.control.simulation import Status
 from impc.errors import ImpcError
@@ -303,18 +308,36 @@ def _slope(
 ) -> Array:
     """Derivative of `_Seen.off` (samples q, count), with the outputs' rows and offsets."""
     plant, p = problem.plant, len(problem.plant.outputs)
-    slope = np.zeros((trial.samples, len(problem.measured), layout.count))
-    slope[:, :p] = (seen.weighting @ plant.C) @ moved.x
+    slope = _moved(problem, trial, moved, seen.weighting)
     if differential is not None:
         on_outputs = np.tensordot(run.x, differential.C, ((1,), (1,)))  # (samples, p, k)
         slope[:, :p, layout.parameters] += on_outputs / problem.output_scale[:, None]
     for place, name in enumerate(problem.offsets):
         column = layout.own.start + problem.searched_states + place
         slope[:, :p, column] += seen.weighting[:, plant.outputs.index(name)]
-    if slope.shape[1] > p:
-        slope[:-1, p:] = moved.u / problem.command_scale[:, None]
     slope[np.isnan(recorded(problem, trial))] = 0.0
     return slope.reshape(-1, layout.count)
+
+
+def _moved(problem: Problem, trial: Recording, moved: Sensitivity, weighting: Array) -> Array:
+    """Outputs and commands over their scales, as a simulation moves them (samples, q, k)."""
+    p = len(weighting)
+    slope = np.zeros((trial.samples, len(problem.measured), moved.x.shape[2]))
+    slope[:, :p] = (weighting @ problem.plant.C) @ moved.x
+    if slope.shape[1] > p:
+        slope[:-1, p:] = moved.u / problem.command_scale[:, None]
+    return slope
+
+
+def residual_along(problem: Problem, controller: Controller, along: Directions) -> Array:
+    """Derivative of the residual (r, k) along directions of the controller."""
+    parts, weighting = [], np.diag(1 / problem.output_scale)
+    for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
+        _, moved = simulate_and_differentiate(controller, drive, along)
+        slope = _moved(problem, trial, moved, weighting)
+        slope[np.isnan(recorded(problem, trial))] = 0.0
+        parts.append(slope.reshape(-1, along.count))
+    return np.concatenate(parts)
 
 
 def _symmetric(columns: Array, m: int) -> Array:
