@@ -401,7 +401,10 @@ def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array
 
 
 def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
-    """Whether recordings of all states are exact: what inputs cannot do is rounding."""
+    """Whether recordings of all states are exact: what inputs cannot do is rounding.
+
+    So is what the first of them differs by from the `x0` of its trial.
+    """
     rank, states = int(np.linalg.matrix_rank(plant.B)), recorded_states(plant, recordings)
     if states is None or rank == plant.n:
         return False
@@ -409,7 +412,11 @@ def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
     missed, size = 0.0, 0.0
     for x, trial in zip(states, recordings, strict=True):
         rest = x[1:] - x[:-1] @ plant.A.T - trial.disturbance[:-1] @ plant.E.T
-        missed, size = missed + float(np.sum((rest @ left) ** 2)), size + float(np.sum(x**2))
+        begun = float(np.sum((x[0] - trial.x0 - np.linalg.solve(plant.C, trial.offset)) ** 2))
+        missed, size = (
+            missed + begun + float(np.sum((rest @ left) ** 2)),
+            size + float(np.sum(x**2)),
+        )
     return missed <= _EXACT**2 * size
 
 

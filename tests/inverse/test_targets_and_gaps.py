@@ -16,6 +16,7 @@ from impc.inverse.explaining_weights import metric_family
 from impc.inverse.residuals import evaluate, residual_only
 from impc.model.plant import Plant
 from impc.model.structure import Structure
+from tests.control.hanging_body import pendulum
 
 STEPS, HORIZON = 80, 6
 TRUE = np.diag([4.0, 0.3])
@@ -172,6 +173,25 @@ def test_slopes_with_gaps_offsets_and_commands_are_differences() -> None:
         for sign in (1, -1)
     ]
     assert found.own[:, 2] == pytest.approx((ends[0] - ends[1]) / 2, abs=1e-9)
+
+
+def test_a_nonlinear_body_is_regulated_to_its_target() -> None:
+    plant = impc.with_observer(pendulum(), 2.0)
+    bounds = impc.Bounds(plant, u_min=-3, u_max=3)
+    law = impc.Controller(plant, impc.Weights(TRUE, 1), bounds, HORIZON, terminal_set=False)
+    drive = {"angle": 0.5 * steps(1)}
+    run = law.simulate([0.3, 0.0], disturbance=0.3 * WIND, target=drive)
+    trial = impc.Recording(plant, run.x[:, :1], 0.3 * WIND, target=drive, commands=run.u)
+    found = impc.fit(impc.Problem(plant, bounds, HORIZON, [trial]))
+    assert found.gain == pytest.approx(np.array(law.K), abs=1e-6)
+
+
+def test_a_start_that_exact_states_contradict_is_searched() -> None:
+    law, run = recorded(cart(), 9.0, {"x": steps(1)}, WIND, impc.Weights(TRUE, 1))
+    trial = impc.Recording(cart(), run.x, WIND, [0.0, 0.0], target={"x": steps(1)})
+    problem = impc.Problem(cart(), law.bounds, HORIZON, [trial])
+    assert problem.unknown_start
+    assert impc.fit(problem).explained
 
 
 def test_the_metric_of_two_inputs_is_found_from_targets() -> None:
