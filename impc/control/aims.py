@@ -4,7 +4,7 @@
 
 The target (x_s, u_s) is that of the sample; the controller plans as if it stayed, or, where the
 plant knows it some samples ahead (`with_preview`), with the targets to come. Bounds are those of
-the deviations (docs/theory.md, section 9).
+the deviations (docs/theory.md, section 7).
 """
 
 from __future__ import annotations

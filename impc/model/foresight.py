@@ -8,7 +8,7 @@ targets, which are states of their own, known one sample later than the one befo
     e+ = A e + B (u - u_s) - M D_0,    D_j+ = D_{j+1},    x_s = M r
 
 so that the gain on them is the feedforward of the linear quadratic regulator (docs/theory.md,
-section 9).
+section 7).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ r are targets of the signals H x, d a lasting disturbance. D spans what neither 
 targets determine, so that there the smallest of all targets is taken. Where a disturbance leaves no
 rest within the bounds they are left out: the controller then stays at its limit. With the active
 bounds at hand z_s solves one linear system, whose derivative is that of the target (docs/theory.md,
-section 9).
+section 7).
 """
 
 from __future__ import annotations

@@ -141,6 +141,35 @@ def test_preview_moves_before_the_target_does() -> None:
     assert physical_states(known) == plant.n
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_preview_identifies_more_of_q(seed: int) -> None:
+    """Gains on increments to come, and the rank of all gains in Q: docs/theory.md, section 7."""
+    rng = np.random.default_rng(seed)
+    plant = random_plant(rng, 3, 1, 1.05)
+    Q = random_weights(rng, 3)
+
+    def gain(Q: Array, ahead: int) -> Array:
+        known = impc.with_preview(plant, plant.states[:1], ahead) if ahead else plant
+        whole = np.zeros((known.n, known.n))
+        whole[:3, :3] = Q
+        return np.asarray(impc.solve_lqr(known, impc.Weights(whole, 1)).K)
+
+    alone = impc.solve_lqr(plant, impc.Weights(Q, 1))
+    F, M = plant.A - plant.B @ alone.K, impc.steady_state(plant, {plant.states[0]: 1.0})[0]
+    ahead = [
+        np.linalg.solve(alone.S, plant.B.T @ np.linalg.matrix_power(F.T, j) @ alone.P @ M)
+        for j in range(4)
+    ]
+    assert gain(Q, 4)[0] == pytest.approx(np.r_[alone.K[0], -np.ravel(ahead)], rel=1e-8)
+    for samples, rank in ((0, 3), (1, 3), (2, 4), (3, 5), (5, 5)):
+        slopes = []
+        for i, j in zip(*np.triu_indices(3), strict=True):
+            step = 1e-4 * (np.eye(3)[[i]].T @ np.eye(3)[[j]] + np.eye(3)[[j]].T @ np.eye(3)[[i]])
+            slopes.append(np.ravel(gain(Q + step, samples) - gain(Q - step, samples)) / 2e-4)
+        sizes = np.linalg.svd(np.array(slopes), compute_uv=False)
+        assert np.count_nonzero(sizes > 1e-6 * sizes[0]) == rank
+
+
 def test_a_rest_is_one_and_reaches_its_target() -> None:
     plant, _, _, _, _, _ = a_loop(3)
     x, u = impc.steady_state(plant, {plant.states[0]: 0.4}, disturbance=[0.2])
