@@ -1,6 +1,6 @@
 """
 Which parameters can be identified: a model from another field
-========================================================
+==============================================================
 
 Any function from parameters and an input to outputs will do. Here a drug in the blood, from dose
 to concentration; the time is in hours.

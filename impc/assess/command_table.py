@@ -24,9 +24,9 @@ def command_regression(estimate: Estimate) -> pd.DataFrame:
     """Gain by regression of recorded commands on the states, with 95 % intervals, beside a fit's.
 
     Only samples count at which the fitted controller meets no bound within its horizon. The
-    intervals are for noise of the commands of any colour; noise in the states makes this gain too
-    small, which is no error of a fit. Where the two differ by much, one of their assumptions fails:
-    recorder noise in the states for this one, a noise-free command for the fit.
+    intervals are for recording noise of the commands of any colour, and for noise of the person
+    that is white: the states follow any other. Noise in recorded states makes this gain too small.
+    Where the two differ by much, an assumption of one fails (docs/fitting.md).
 
     Parameters
     ----------

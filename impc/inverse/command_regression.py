@@ -4,9 +4,9 @@
 
 x_t are the recorded states, where the outputs have them all, or those of the plant driven by the
 recorded commands, which are then taken for exact; its start is fitted to the outputs. Nothing is
-simulated in a loop, so that noise of the person, which the loop answers, is no error of this gain;
-an error of x_t is. At which samples no bound within the horizon is met, the controller that was
-fitted says.
+simulated in a loop, so that white noise of the person, which the loop answers, is no error of this
+gain; coloured noise is, which the states follow, and an error of x_t. At which samples no bound
+within the horizon is met, the controller that was fitted says.
 """
 
 from __future__ import annotations

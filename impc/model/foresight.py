@@ -36,8 +36,9 @@ def with_observer(plant: Plant, rate: ArrayLike) -> Plant:
     """The same plant, whose controller counters disturbances that last.
 
     The controller learns each disturbance d at a `rate`, dh' = rate (d - dh), as an observer does
-    that sees the state, and regulates to where the plant rests under dh: an offset-free controller.
-    In a `PlantFamily` the rate is a parameter like any other, which a fit finds.
+    that sees the state, and regulates to where the plant rests under dh: without an offset of the
+    signals that have a target; where none has, to the rest that is nearest to 0. In a
+    `PlantFamily` the rate is a parameter like any other, which a fit finds.
 
     Parameters
     ----------

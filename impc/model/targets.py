@@ -191,6 +191,10 @@ class SteadyStates:
         drest = np.concatenate([along.A, along.B], axis=1)
         dwide = np.zeros((*self.wide.shape, p))
         dwide[: self.count, : self.n] = along.H
+        # The basis of what is free turns with the plant: dD' = -N^+ dN D', N = [A - I, B; H, 0].
+        free, kept = self.wide[self.count :], np.vstack([self.rest, self.wide[: self.count]])
+        dkept = np.concatenate([drest, dwide[: self.count]])
+        dwide[self.count :] = -np.einsum("jr,rip,ki->kjp", np.linalg.pinv(kept), dkept, free)
         for active, places in groups:
             solved = self._solve(active, values[places], pushes[places])
             z, lam = solved[:, :width], solved[:, width : width + self.n]

@@ -92,10 +92,15 @@ def test_inputs_are_those_of_a_program_about_the_target(seed: int, ahead: int, r
     assert np.count_nonzero(run.status == 1) > 0
 
 
+@pytest.mark.parametrize("named", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_slopes_of_targets_are_differences(seed: int) -> None:
-    """Along plant, gain, observer's rate and bounds, with saturated samples and targets."""
+def test_slopes_of_targets_are_differences(seed: int, named: bool) -> None:
+    """Along plant, gain and observer's rate, with saturated samples; also where no signal is named.
+
+    Then the rest is the smallest, and what it may move along turns with the plant.
+    """
     plant, _, known, weights, target, push = a_loop(seed, rate=0.7)
+    target = target if named else {}
     bounds = impc.Bounds(known, u_min=-0.3, u_max=0.3)
     law = impc.Controller(known, weights, bounds, 4, terminal_set=False)
     drive = impc.scenario(known, np.ones(plant.n), disturbance=push, target=target)
