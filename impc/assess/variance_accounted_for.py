@@ -153,13 +153,15 @@ class HeldOut(Frozen):
 def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
     """VAF of a trial under the controller that was found without it."""
     gain, metric = np.array(other.gain), np.array(other.metric)
-    alone = replace(other.problem.with_nuisance_fixed(), recordings=(trial,))
+    fixed = other.problem.with_nuisance_fixed()
+    alone = replace(fixed, recordings=(trial,), offsets=other.problem.offsets)
     first = round(settle / alone.plant.dt)
     started = alone
     if other.problem.unknown_start:
         started = with_fitted_starts(alone, gain, metric, max(first, alone.plant.n))
     run = simulate(controller_for(started, gain, metric), scenarios(started)[0])
-    recorded, simulated = trial.without_offset[first:], (run.x @ started.plant.C.T)[first:]
+    recorded = started.recordings[0].without_offset[first:]
+    simulated = (run.x @ started.plant.C.T)[first:]
     if not run.complete:
         nothing = frozen(np.full(recorded.shape[1], np.nan))
         return HeldOut(nothing, nothing)

@@ -181,7 +181,7 @@ def reliability_command(
 
 def _trials_of(units: Sequence[Unit], configuration: Configuration, source: PlantSource) -> Trials:
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
-    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.files.reading import read_recordings, require_whole  # noqa: PLC0415
     from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
@@ -189,5 +189,6 @@ def _trials_of(units: Sequence[Unit], configuration: Configuration, source: Plan
     plant = make_plant(source, recorded)
     for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
         found = read_recordings(unit.files, configuration, plant)
+        require_whole(found, "reliability")
         cells[unit.subject, unit.visit, unit.condition] = found
     return Trials(tuple(plant.outputs), 1 / plant.dt, cells)

@@ -8,7 +8,7 @@ import click
 
 from impc.checking import replace
 from impc.cli.console import print_files, progress
-from impc.cli.options import out_option, solver_option, subject_arguments, yes_option
+from impc.cli.options import out_option, subject_arguments
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 @click.command("fit")
 @subject_arguments("What the columns mean, and settings; `impc inspect FILE` writes one.")
 @out_option("fit", "report.html, result.json, tables and the figures")
-@solver_option
-@yes_option
 def command(
     files: tuple[Path, ...],
     plant_name: str,
@@ -142,8 +140,6 @@ def _print(result: FitResult) -> None:
 @click.command("compare")
 @subject_arguments("What the columns mean, and settings, as for `impc fit`.")
 @out_option("compare", "report.html, result.json, tables and the figure")
-@solver_option
-@yes_option
 def compare_command(
     files: tuple[Path, ...],
     plant_name: str,

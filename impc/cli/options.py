@@ -81,7 +81,7 @@ def _command_name(context: click.Context) -> str:
 
 
 def subject_arguments(config: str) -> Callable[[F], F]:
-    """FILES, --plant and --config of one subject; `config` is the help of the last."""
+    """FILES, --plant and --config of one subject, of the help `config`; --solver and --yes."""
     options = (
         click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path)),
         click.option(
@@ -92,6 +92,8 @@ def subject_arguments(config: str) -> Callable[[F], F]:
             "space.",
         ),
         click.option("--config", required=True, type=click.Path(path_type=Path), help=config),
+        solver_option,
+        yes_option,
     )
     return lambda command: functools.reduce(lambda found, one: one(found), options[::-1], command)
 

@@ -93,8 +93,7 @@ def _person(
 
     from impc.control.controller import Controller  # noqa: PLC0415
     from impc.errors import InputError  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant, plant_family_of  # noqa: PLC0415
-    from impc.studies.fit.asked import fit_bounds, moving_body  # noqa: PLC0415
+    from impc.studies.fit.asked import asked_plant, fit_bounds  # noqa: PLC0415
     from impc.studies.plan.designs import Person  # noqa: PLC0415
     from impc.studies.plan.settings import (  # noqa: PLC0415
         assumed_cost_weights,
@@ -103,8 +102,7 @@ def _person(
     )
 
     recorded = tuple(settings.perturbed or configuration.recorded)
-    family = plant_family_of(source, recorded, fit.free)
-    plant, family = moving_body(make_plant(source, recorded), family, fit)
+    plant, family = asked_plant(source, recorded, fit)
     if not plant.disturbances:
         known = ", ".join(plant.controls)
         raise InputError("[plan] perturbed", "names no input of the plant", f"known: {known}")

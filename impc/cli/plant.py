@@ -98,8 +98,8 @@ def read_subject(
     from impc.control.named_solver import require_solver  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.digests import gather_inputs  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant, plant_family_of  # noqa: PLC0415
     from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.studies.fit.asked import asked_plant  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
     from impc.studies.fit.subject import fit_problem  # noqa: PLC0415
 
@@ -108,9 +108,7 @@ def read_subject(
     if solver is not None:
         settings = replace(settings, solver=require_solver(solver))
     source = find_plant(plant_name, configuration.plant)
-    recorded = configuration.recorded
-    plant = make_plant(source, recorded)
-    family = plant_family_of(source, recorded, settings.free)
+    plant, family = asked_plant(source, configuration.recorded, settings, configuration.aimed)
     recordings = read_recordings(files, configuration, plant)
     inputs = gather_inputs(files, config, source.name, source.arguments)
     names = tuple(path.name for path in files)

@@ -32,6 +32,7 @@ _LONGER, _STILL, _EPISODES = 4, 10, 20
 # A jump is so many times the usual step, and is no accident when it leads to one value so often.
 _JUMP, _AGAIN = 6, 3
 _BALANCED = 0.05  # share of a trial before a fall
+_MISSING = 0.5  # share of an output or a command that may be missing
 # Largest deviations of an angle, rad: more than half a turn is no posture; 0.2 deg is the size of
 # 11.5 deg that were recorded in rad and called deg.
 _TURN, _WIDE, _TINY = np.pi, 1.0, np.deg2rad(0.2)
@@ -111,8 +112,22 @@ def comparable_rates(subject: str, period: float, dt: float) -> None:
         )
 
 
-def missing(channel: Channel, fill_gaps: float) -> str:
-    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged."""
+def gaps(channel: Channel, fill_gaps: float) -> BoolArray:
+    """Missing samples in stretches longer than `fill_gaps`, in s, or at an end (samples,)."""
+    lost = ~np.isfinite(channel.values)
+    kept = np.flatnonzero(~lost)
+    after = np.searchsorted(kept, np.arange(len(lost)))
+    inside = lost & (after > 0) & (after < len(kept))
+    stretch = channel.time[kept[after[inside]]] - channel.time[kept[after[inside] - 1]]
+    lost[inside] = stretch > fill_gaps * (1 + 1e-9)
+    return lost
+
+
+def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str:
+    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged.
+
+    `keep` says whether longer gaps count as not measured; None where they cannot.
+    """
     finite = np.isfinite(channel.values)
     lost = np.flatnonzero(~finite)
     if len(lost) == 0:
@@ -122,7 +137,15 @@ def missing(channel: Channel, fill_gaps: float) -> str:
         f"{len(lost)} of {len(finite)} samples are missing or not finite, the first "
         f"{channel.at(lost[0])}"
     )
+    if keep and (left := gaps(channel, fill_gaps)).any():
+        share = float(np.mean(left))
+        if share > _MISSING:
+            remedy = "leave the trial out: at most half of a signal may be missing"
+            raise DataError(channel.name, f"{found}: {share:.0%} of them", remedy)
+        filled = "; the others filled by interpolation" if left.sum() < len(lost) else ""
+        return f"{channel.name}: {found}; {100 * share:.2g} % count as not measured{filled}"
     remedy = "cut with recording.start and stop, or repair the file"
+    remedy += ", or write recording.keep_gaps = true" if keep is False else ""
     if len(kept) == 0 or not finite[0] or not finite[-1]:
         raise DataError(channel.name, f"{found}, at an end of the recording", remedy)
     times = channel.time[kept]

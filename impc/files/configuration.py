@@ -59,6 +59,8 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pattern: str | None = None
     # Seconds; the longest gap that may be filled by interpolation. 0 fills none.
     fill_gaps: Annotated[float, msgspec.Meta(ge=0, le=_MOST)] = 0.0
+    # Whether longer gaps of outputs and commands count as not measured
+    keep_gaps: bool = False
     # Seconds on the file's clock, which begins at 0 where there is only a rate
     start: Finite | None = None
     stop: Finite | None = None
@@ -79,6 +81,8 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shift: int | Finite = 0
     # Whether it is a command of the subject that was recorded, and not a disturbance
     command: bool = False
+    # What an output is regulated to: a column, or one value; unit, offset and sign are the signal's
+    target: str | Finite | None = None
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,6 +109,11 @@ class Configuration(msgspec.Struct, frozen=True):
     def recorded(self) -> tuple[str, ...]:
         """The signals that are no commands: what is recorded of the plant."""
         return tuple(name for name, entry in self.signals.items() if not entry.command)
+
+    @property
+    def aimed(self) -> tuple[str, ...]:
+        """The signals with a target."""
+        return tuple(name for name, entry in self.signals.items() if entry.target is not None)
 
 
 @checked

@@ -19,8 +19,16 @@ from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest
 from impc.files.formats import read_table
-from impc.files.resampling import held_means, instants, resampled_samples, same_rate, shifted
+from impc.files.resampling import (
+    held_means,
+    held_values,
+    instants,
+    resampled_samples,
+    same_rate,
+    shifted,
+)
 from impc.files.units import si_unit
+from impc.model.foresight import physical_disturbances, physical_states
 from impc.model.plant import UNKNOWN
 from impc.model.recordings import Label, Recording
 
@@ -38,6 +46,8 @@ if TYPE_CHECKING:
 _OFFSET, _DRIFT = 0.12, 0.25
 # Samples for each state of the plant below which nothing can be fitted.
 _SAMPLES_A_STATE = 5
+# Share of a resampled value that missing samples may be, beyond which it is missing itself.
+_LOST = 0.05
 
 
 @checked
@@ -51,8 +61,8 @@ def read_recordings(
     paths : sequence of Path
         One file a trial.
     configuration : Configuration
-        Names a column for each output of the plant, and for the disturbances that were recorded;
-        the others are zero.
+        Names a column for each output of the plant, for its target, and for the disturbances and
+        commands that were recorded; other disturbances are zero.
     plant : Plant
         Discrete; gives the names and the rate.
 
@@ -129,30 +139,15 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     clock = read_clock(table, entry)
     checks.comparable_rates(table.source, clock.period, plant.dt)
     samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
-    checks.too_few(table.source, samples, _SAMPLES_A_STATE * plant.n)
+    checks.too_few(table.source, samples, _SAMPLES_A_STATE * physical_states(plant))
     findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
     findings += [clock.note] if clock.note else []
-    acting = [name for name in plant.disturbances if name in configuration.signals]
-    findings += [
-        f"{table.source}: {name} is a command; the fit does not use its recording"
-        for name in plant.controls
-        if name in configuration.signals
-    ]
-    even: dict[str, Array] = {}
-    for name in (*plant.outputs, *acting):
-        channel = channel_of(table, clock, name, configuration.signals[name])
-        response = name in plant.outputs
-        findings += _checked(table, channel, configuration.signals[name], entry, response)
-        even[name] = on_even_instants(clock, channel.values * channel.unit.factor)
-    even = shifted(even, _shifts(table.source, clock, configuration, even))
-    series = {
-        name: (instants if name in plant.outputs else held_means)(values, clock.period, plant.dt)
-        for name, values in even.items()
-    }
+    series, lost, targets, found = _clocked(table, clock, configuration, plant)
+    findings += found
     samples = len(series[plant.outputs[0]])
     findings += _slower(table.source, clock, plant)
-    findings += _departing(table.source, series, configuration, plant)
-    disturbance = np.zeros((samples, len(plant.disturbances)))
+    findings += _departing(table.source, series, targets, configuration, plant)
+    disturbance = np.zeros((samples, physical_disturbances(plant)))
     for index, name in enumerate(plant.disturbances):
         if name in series:
             disturbance[:, index] = series[name]
@@ -160,9 +155,86 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     outputs = np.column_stack([series[name] for name in plant.outputs])
     if clock.even and same_rate(len(clock.time), clock.period, plant.dt):
         findings += _later(table.source, outputs, series, plant)
+    for name, share in lost.items():
+        series[name] = np.where(np.abs(share) > _LOST, np.nan, series[name])
+    controls, nothing = plant.commands or plant.controls, np.full(samples, np.nan)
+    commands = np.column_stack([series.get(name, nothing) for name in controls])
+    if plant.commands:  # its controls are their changes
+        commands = np.diff(commands, axis=0, prepend=np.nan)
     return Recording(
-        plant, outputs, disturbance, np.zeros(plant.n), label=label, findings=tuple(findings)
+        plant,
+        np.column_stack([series[name] for name in plant.outputs]),
+        disturbance,
+        np.zeros(plant.n),
+        target=targets,
+        commands=commands if any(name in series for name in controls) else None,
+        label=label,
+        findings=tuple(findings),
     )
+
+
+def _clocked(
+    table: Table, clock: Clock, configuration: Configuration, plant: Plant
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], list[str]]:
+    """Every signal, where it is missing, and every target, on the plant's clock; and findings."""
+    recorded, signals, findings = configuration.recording, configuration.signals, list[str]()
+    acting = [name for name in plant.disturbances if name in signals]
+    commands = [name for name in plant.commands or plant.controls if name in signals]
+    even: dict[tuple[str, str], Array] = {}  # by signal and what it is: "", "lost" or "target"
+    for name in (*plant.outputs, *acting, *commands):
+        channel = channel_of(table, clock, name, signals[name])
+        response, keep = name in plant.outputs, None if name in acting else recorded.keep_gaps
+        findings += _checked(table, channel, signals[name], recorded, response, keep)
+        values = on_even_instants(clock, channel.values * channel.unit.factor)
+        if keep and (gaps := checks.gaps(channel, recorded.fill_gaps)).any():
+            known = np.isfinite(values)  # all but the ends, which are held
+            values = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+            even[name, "lost"] = np.zeros(len(values))
+            even[name, "lost"][clock.steps] = gaps
+        even[name, ""] = values
+        if isinstance(signals[name].target, str):
+            even[name, "target"], found = _target(table, clock, name, configuration)
+            findings += found
+    shifts = _shifts(table.source, clock, configuration, (name for name, _ in even))
+    even = shifted(even, {key: 0.0 if key[1] == "target" else shifts[key[0]] for key in even})
+    clocked: dict[str, dict[str, Array]] = {"": {}, "lost": {}, "target": {}}
+    for (name, kind), values in even.items():
+        resample = instants if name in plant.outputs else held_means
+        resample = held_values if kind == "target" else resample
+        clocked[kind][name] = resample(values, clock.period, plant.dt)
+    targets = clocked["target"]
+    samples = len(clocked[""][plant.outputs[0]])
+    for name in configuration.aimed:
+        at = signals[name].target
+        if isinstance(at, float | int):
+            size = signals[name].sign * si_unit(signals[name].unit).factor
+            targets[name] = np.full(samples, size * (at - signals[name].offset))
+    return clocked[""], clocked["lost"], targets, findings
+
+
+def _target(
+    table: Table, clock: Clock, name: str, configuration: Configuration
+) -> tuple[Array, list[str]]:
+    """The target of a signal at even instants, the last that was recorded, and what was found."""
+    entry = configuration.signals[name]
+    channel = channel_of(table, clock, name, entry, "target")
+    found = [
+        checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
+        checks.measurable(channel),
+        checks.missing(channel, configuration.recording.fill_gaps),
+    ]
+    finite = np.isfinite(channel.values)
+    instant = np.arange(clock.steps[-1] + 1)
+    places = np.searchsorted(clock.steps[finite], instant, side="right") - 1
+    values = channel.unit.factor * channel.values[finite][places]
+    return values, [finding for finding in found if finding]
+
+
+def require_whole(recordings: Sequence[Recording], command: str) -> None:
+    """Refuse missing samples where a `command` cannot do without them."""
+    if any(np.isnan(trial.outputs).any() for trial in recordings):
+        problem = f"leaves gaps, and impc {command} needs every sample"
+        raise InputError("recording.keep_gaps", problem, "take it out, or allow fill_gaps")
 
 
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
@@ -176,7 +248,7 @@ def disturbances_of(table: Table, configuration: Configuration, plant: Plant) ->
         signal = configuration.signals[name]
         require_kind(name, signal.unit, plant.unit(name))
         channel = channel_of(table, clock, name, signal)
-        _checked(table, channel, signal, entry, response=False)
+        _checked(table, channel, signal, entry, response=False, keep=None)
         even = on_even_instants(clock, channel.values * channel.unit.factor)
         shift = _shifts(table.source, clock, configuration, [name])
         columns.append(held_means(shifted({name: even}, shift)[name], clock.period, plant.dt))
@@ -201,11 +273,18 @@ def _shifts(
 
 
 def _departing(
-    source: str, series: dict[str, Array], configuration: Configuration, plant: Plant
+    source: str,
+    series: dict[str, Array],
+    targets: dict[str, Array],
+    configuration: Configuration,
+    plant: Plant,
 ) -> list[str]:
     """Offsets and drifts that are large compared with the motion."""
-    found = []
+    found: list[str] = []
+    if any(np.ptp(values) == 0 for values in targets.values()):
+        return found  # what stays away from zero does so by intent
     acting = [series[name] for name in plant.disturbances if name in series]
+    acting += targets.values()
     for name in plant.outputs:
         entry = configuration.signals[name]
         values = series[name] / (si_unit(entry.unit).factor * entry.sign)
@@ -242,7 +321,11 @@ def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) 
 
 def _require_names(configuration: Configuration, plant: Plant) -> None:
     for name, entry in configuration.signals.items():
-        known = plant.controls if entry.command else (*plant.outputs, *plant.disturbances)
+        controls = plant.commands or plant.controls
+        known = controls if entry.command else (*plant.outputs, *plant.disturbances)
+        if entry.target is not None and name not in plant.outputs:
+            remedy = f"give it to one of {', '.join(plant.outputs)}"
+            raise InputError(f"signals.{name}.target", "is for outputs alone", remedy)
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean {near[0]}?" if near else f"the plant has {', '.join(known)}"
@@ -332,9 +415,11 @@ def label_of(source: str, entry: RecordingTable) -> Label:
     )
 
 
-def channel_of(table: Table, clock: Clock, name: str, entry: SignalTable) -> checks.Channel:
-    """The column of the signal `name`, in its own unit, after offset and sign."""
-    column, values = column_of(table, entry.column, f"signals.{name}.column")
+def channel_of(
+    table: Table, clock: Clock, name: str, entry: SignalTable, key: str = "column"
+) -> checks.Channel:
+    """The column of the signal `name`, or of its target, in its own unit, after offset and sign."""
+    column, values = column_of(table, getattr(entry, key), f"signals.{name}.{key}")
     # Beyond the largest number, or a NaN that signals: not finite, and said below.
     with np.errstate(over="ignore", invalid="ignore"):
         used = entry.sign * (values[clock.rows] - entry.offset)
@@ -347,12 +432,13 @@ def _checked(
     entry: SignalTable,
     recorded: RecordingTable,
     response: bool,
+    keep: bool | None,
 ) -> list[str]:
     """Every check of one channel, those first whose fault would explain the others."""
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
-        checks.missing(channel, recorded.fill_gaps),
+        checks.missing(channel, recorded.fill_gaps, keep),
         checks.constant(channel),
         checks.degrees_for_radians(channel) if response else "",
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),

@@ -14,7 +14,7 @@ the first and behind the last sample x is continued by its point reflection 2 x_
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import scipy.signal
@@ -32,6 +32,7 @@ _PASS = 0.8
 # Rates are the same when the clocks differ by less than this part of a sample at the end.
 _SAME = 0.05
 _CHUNK = 2_000_000  # numbers in memory at a time: 16 MB
+Key = TypeVar("Key")
 
 
 def same_rate(samples: int, period: float, dt: float) -> bool:
@@ -39,7 +40,7 @@ def same_rate(samples: int, period: float, dt: float) -> bool:
     return samples * abs(period - dt) <= _SAME * dt
 
 
-def shifted(series: Mapping[str, Array], samples: Mapping[str, float]) -> dict[str, Array]:
+def shifted(series: Mapping[Key, Array], samples: Mapping[Key, float]) -> dict[Key, Array]:
     """The `series` (samples,), each moved later by so many `samples`, where all have values (any,).
 
     A part of a sample is interpolated linearly.
@@ -104,6 +105,14 @@ def held_means(values: Array, period: float, dt: float) -> Array:
     slope = held[whole + 1] - held[whole]
     integral = areas[whole] + held[whole] * part + slope * part**2 / 2
     return np.asarray(np.diff(integral) * period / dt)
+
+
+def held_values(values: Array, period: float, dt: float) -> Array:
+    """The last of the `values` (samples,), every `period` s, before or at k dt (resampled,)."""
+    if same_rate(len(values), period, dt):
+        return values
+    instant = np.arange(resampled_samples(len(values), period, dt)) * dt / period
+    return np.asarray(values[np.floor(instant + 1e-6).astype(np.int64)])
 
 
 def _half_width(period: float, dt: float) -> float:

@@ -187,7 +187,7 @@ class Problem(Value):
             if name not in plant.outputs:
                 known = ", ".join(plant.outputs)
                 raise InputError("offsets", f"there is no output {name!r}", f"choose of {known}")
-        aimed = np.any(plant.observer) or any(trial.signals for trial in recordings)
+        aimed = aims(plant, recordings)
         P = None if terminal_weight is None else terminal_matrix(plant, terminal_weight)
         self._fill(
             plant=plant,
@@ -285,6 +285,11 @@ class Problem(Value):
     def recorded_numbers(self) -> int:
         """How many numbers were recorded in all trials; missing ones do not count."""
         return sum(int(np.isfinite(recorded(self, trial)).sum()) for trial in self.recordings)
+
+
+def aims(plant: Plant, recordings: Sequence[Recording]) -> bool:
+    """Whether the controller regulates to more than rest, so that it has no terminal set."""
+    return bool(np.any(plant.observer)) or any(trial.signals for trial in recordings)
 
 
 def _scale(name: str, given: ArrayLike | None, parts: Sequence[Array], size: int) -> Array:

@@ -141,9 +141,13 @@ def require_signals(configuration: Configuration, problem: OptimalControlProblem
     require_known("signals.{}".format, configuration.signals, known, "is no signal of the problem")
     for name, entry in configuration.signals.items():
         require_filled_in(name, entry)
-        if entry.shift:
-            unused = "is not used by an optimal control problem"
-            raise InputError(f"signals.{name}.shift", unused, "shift the column in the file")
+        for key, given, remedy in (
+            ("shift", entry.shift != 0, "shift the column in the file"),
+            ("target", entry.target is not None, "make it a disturbance that the cost knows"),
+        ):
+            if given:
+                unused = "is not used by an optimal control problem"
+                raise InputError(f"signals.{name}.{key}", unused, remedy)
         require_kind(name, entry.unit, problem.units.get(name, UNKNOWN))
     for name in problem.disturbance_names:
         if name not in configuration.signals:

@@ -66,8 +66,9 @@ def methods_chart(problem: Problem, fits: Sequence[MethodFit], trial: int) -> di
     plant, given = problem.plant, problem.recordings[trial]
     stride = -(-given.samples // _SAMPLES)
     runs = [until_its_end(plant, fit.runs[trial]) for fit in drawn]
-    outputs = [given.outputs, *(y for y, _ in runs)]
-    commands = [np.full((given.samples, plant.m), np.nan), *(u for _, u in runs)]
+    outputs = [given.without_offset, *(y for y, _ in runs)]
+    unknown = np.full((given.samples, plant.m), np.nan)
+    commands = [given.commands if len(given.commands) else unknown, *(u for _, u in runs)]
     return {
         "title": f"Recorded, and simulated by {len(drawn)} methods",
         "label": "time (s)",

@@ -94,7 +94,7 @@ def trajectory_table(
         trial = problem.recordings[index]
         steps = trial.samples
         parts = [np.full((steps, 1), index + 1.0), plant.dt * np.arange(steps)[:, None]]
-        parts += [np.asarray(trial.outputs), np.asarray(trial.disturbance)]
+        parts += [np.asarray(trial.without_offset), np.asarray(trial.disturbance)]
         for each in runs.values():
             parts += until_its_end(plant, each[index])
         blocks.append(np.hstack(parts))

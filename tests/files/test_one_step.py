@@ -200,8 +200,9 @@ def test_other_trials_of_a_unit_are_read(tmp_path: Path) -> None:
 def test_a_recorded_command_is_no_disturbance(tmp_path: Path) -> None:
     angle, push = balanced(1)
     command = '[signals.finger]\ncolumn = "tap"\nunit = "1"\ncommand = true\n[signals.push]'
-    trial, findings = read(tmp_path, angle, push, ("[signals.push]", command))
+    trial, _ = read(tmp_path, angle, push, ("[signals.push]", command))
     assert trial.disturbance.shape == (SAMPLES, 1)
-    assert findings[0].endswith("finger is a command; the fit does not use its recording")
+    assert trial.commands.shape == (SAMPLES, 1)
+    assert np.isfinite(trial.commands[:-1]).all()
     with pytest.raises(InputError, match=r"signals.angle: is no command of the plant"):
         read(tmp_path, angle, push, ("# limit = 20.0", "command = true"))

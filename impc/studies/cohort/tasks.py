@@ -26,7 +26,7 @@ from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
 from impc.checking import replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.files.digests import content_digest, digest, source_digest, versions
-from impc.files.plant_sources import make_plant, plant_family_of, plant_source
+from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured_fit import fit_structured
@@ -34,7 +34,7 @@ from impc.model.plant import weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_words
 from impc.studies.effort import Effort, fit_effort
-from impc.studies.fit.asked import fit_structures
+from impc.studies.fit.asked import asked_plant, fit_structures
 from impc.studies.fit.gain_findings import number_units
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
@@ -121,7 +121,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     """One bootstrap replicate of a fitted unit, by its number `index`; `fit` is its content."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
-    here = problem.at(np.array(fit["starts"]), np.array(fit["logarithms"]))
+    here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "offsets")))
     model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
     found = replicate(model, index, settings.seed, DRAWS[settings.bootstrap])
     return _finished({"K": found.K, "parameters": found.parameters}, started)
@@ -147,11 +147,10 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
             "has other recordings, another plant or other versions than this command",
             "give all machines the same, and start the workers again",
         )
-    recorded = task.configuration.recorded
-    plant = make_plant(source, recorded)
-    family = plant_family_of(source, recorded, settings.free)
+    configuration = task.configuration
+    plant, family = asked_plant(source, configuration.recorded, settings, configuration.aimed)
     paths = [Path(name) for name in task.files]
-    (first, *others), fallen = read_unit(paths, task.configuration, plant)
+    (first, *others), fallen = read_unit(paths, configuration, plant)
     left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
     recordings = (replace(first, findings=(*first.findings, *left)), *others)
     return fit_problem(plant, recordings, settings, family), settings
@@ -221,6 +220,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "parameters": dict(zip(names, estimate.parameters, strict=True)),
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
+        "offsets": estimate.problem.shifts,
         "findings": [trial.findings for trial in problem.recordings],
         # Of the first trial, a few hundred points.
         "trajectory": {

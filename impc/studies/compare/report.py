@@ -9,6 +9,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from impc.assess.assessments import ASSESSMENTS
+from impc.checking import replace
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
 from impc.reporting.document import Lines, Report, Section, Terms, Verdict
@@ -64,6 +65,8 @@ def compare_report(
     """Page, result.json, tables and the figures."""
     subject = str(problem.recordings[0].label.subject) or "a subject"
     methods = [METHODS[item.name] for item in compared]
+    found = compared[-1].estimate.problem.recordings  # with their offsets
+    problem = replace(problem, recordings=found)
     with journal_style():
         curves = methods_chart(problem, _by_score(compared), 0)
         figures = drawn(

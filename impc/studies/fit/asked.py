@@ -1,4 +1,4 @@
-"""What the settings of a fit ask for of plant and recordings: bounds, structures."""
+"""What the settings of a fit ask for of plant and recordings: controller, bounds, structures."""
 
 from __future__ import annotations
 
@@ -9,15 +9,20 @@ import numpy as np
 import scipy.signal
 
 from impc.errors import InputError
+from impc.files.configuration import require_known
+from impc.files.plant_sources import make_plant, plant_family_of
 from impc.model.bounds import Bounds
+from impc.model.foresight import with_observer, with_preview
+from impc.model.plant_family import PlantFamily
+from impc.model.rates import with_rates
 from impc.model.structure import Structure
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
+    from impc.files.plant_sources import PlantSource
     from impc.model.plant import Plant
-    from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
     from impc.studies.fit.settings import FitSettings
 
@@ -51,6 +56,81 @@ def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]
     return tuple(found)
 
 
+#: The setting of that name, and how the rates of an observer are called where they are fitted.
+OBSERVER = "observer_rate"
+
+
+def asked_plant(
+    source: PlantSource, recorded: Sequence[str], settings: FitSettings, aimed: Sequence[str] = ()
+) -> tuple[Plant, PlantFamily | None]:
+    """The plant of a source and its family, with what the settings say of the controller.
+
+    Inputs that are `recorded` are disturbances; signals that are `aimed` have a target.
+    """
+    plain, rates = make_plant(source, recorded), _observer_rates(settings)
+    plant = _dressed(plain, settings, aimed, rates)
+    if not settings.free:
+        return plant, None
+    learned = [name for name in settings.free if name in rates]
+    own = [name for name in settings.free if name not in rates]
+    for name in own:
+        if name.partition(".")[0] == OBSERVER:
+            raise InputError(f"[fit] free {name}", "has no nominal value", f"give {name} in [fit]")
+    family = plant_family_of(source, recorded, own)
+
+    def make(values: Array) -> Plant:
+        bare = plain if family is None else family.make(values[: len(own)])
+        moved = dict(zip(learned, map(float, values[len(own) :]), strict=True))
+        return _dressed(bare, settings, aimed, rates | moved)
+
+    nominal = [] if family is None else family.nominal.tolist()
+    return plant, PlantFamily(make, [*own, *learned], nominal + [rates[name] for name in learned])
+
+
+def _observer_rates(settings: FitSettings) -> dict[str, float]:
+    """The rates of the observer by the names that they have where they are fitted."""
+    given = settings.observer_rate
+    if isinstance(given, dict):
+        return {f"{OBSERVER}.{name}": rate for name, rate in given.items()}
+    return {} if given is None else {OBSERVER: given}
+
+
+def _dressed(
+    plant: Plant, settings: FitSettings, aimed: Sequence[str], rates: Mapping[str, float]
+) -> Plant:
+    """The plant with changes of commands, then an observer with these rates, then a preview."""
+    plant = plant.linear() if settings.body == "linear" else plant
+    if settings.rates:
+        plant = with_rates(plant)
+    if rates:
+        names = [f"{OBSERVER}.{name}" for name in plant.disturbances]
+        unknown = [name for name in rates if name not in (OBSERVER, *names)]
+        if unknown:
+            has = ", ".join(plant.disturbances) or "none"
+            raise InputError(f"[fit] {unknown[0]}", "is of no disturbance", f"the plant has {has}")
+        if not names:
+            remedy = "take the line out, or give [signals.NAME] of a disturbance"
+            raise InputError(f"[fit] {OBSERVER}", "has no disturbance to learn", remedy)
+        plant = with_observer(plant, [rates.get(OBSERVER, rates.get(name, 0.0)) for name in names])
+    aimed = [name for name in aimed if name in plant.outputs]
+    if settings.preview and not aimed:
+        remedy = "write target in the [signals.NAME] of an output"
+        raise InputError("[fit] preview", "has no target to be known ahead", remedy)
+    return with_preview(plant, aimed, settings.preview) if settings.preview else plant
+
+
+def require_dressed(plant: Plant, settings: FitSettings) -> None:
+    """Refuse a plant of the caller's own that has not what the settings say of it."""
+    for name, asked, there, function in (
+        ("rates", settings.rates, plant.commands, "with_rates"),
+        (OBSERVER, settings.observer_rate, np.any(plant.observer), "with_observer"),
+        ("preview", settings.preview, plant.ahead, "with_preview"),
+    ):
+        if asked and not there:
+            remedy = f"give impc.{function}(plant), and recordings of it"
+            raise InputError(f"[fit] {name}", "is set, and the plant is without", remedy)
+
+
 def moving_body(
     plant: Plant, family: PlantFamily | None, settings: FitSettings
 ) -> tuple[Plant, PlantFamily | None]:
@@ -77,6 +157,12 @@ def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recordi
         raise InputError(
             "[fit] u_max", f"has {len(u_max)} numbers", f"give one, or {plant.m}, one an input"
         )
+    if settings.rates:  # the commands are states, and the controls their changes
+        limits = settings.rates if isinstance(settings.rates, dict) else {}
+        require_known("[fit] rates {}".format, limits, plant.commands, "is no command")
+        if u_max is not None:
+            x_max[np.isin(plant.states, plant.commands)] = u_max
+        u_max = np.array([limits.get(name, np.inf) for name in plant.commands])
     u_min = None if u_max is None else -u_max
     return Bounds(plant, x_min=-x_max, x_max=x_max, u_min=u_min, u_max=u_max)
 
@@ -86,7 +172,7 @@ def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[R
         raise InputError(f"[fit] bounded_states {name}", f"got {word!r}", 'give a number or "data"')
     if name in plant.outputs:
         column = plant.outputs.index(name)
-        return max(float(np.max(np.abs(trial.outputs[:, column]))) for trial in recordings)
+        return max(float(np.nanmax(np.abs(trial.outputs[:, column]))) for trial in recordings)
     base = name.removesuffix("_rate")
     if base != name and base in plant.outputs:
         column = plant.outputs.index(base)
@@ -100,6 +186,6 @@ def _largest_rate(values: Array, dt: float) -> float:
     window = max(5, 2 * round(_RATE_WINDOW / dt / 2) + 1)
     if len(values) < window:
         raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
-    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt)
+    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt, mode="nearest")
     half = window // 2  # at the ends the parabola is one-sided
-    return float(np.max(np.abs(rate[half:-half])))
+    return float(np.nanmax(np.abs(rate[half:-half])))

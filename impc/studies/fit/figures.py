@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.inverse.methods import METHODS
+from impc.model.foresight import physical_disturbances
 from impc.reporting.shown_units import axis_label, shown_unit
 from impc.reporting.style import (
     BLUE,
@@ -65,9 +66,11 @@ def fit_figures(result: FitResult) -> dict[str, bytes]:
 def trajectory_figure(result: FitResult, index: int) -> Figure:
     """Outputs, command and disturbance of a trial, recorded and simulated."""
     plant = result.fitted.problem.plant
-    trial, run = result.given.recordings[index], result.inverse_mpc.runs[index]
+    trial, run = result.fitted.problem.recordings[index], result.inverse_mpc.runs[index]
     time = np.arange(trial.samples) * plant.dt
-    rows = len(plant.outputs) + plant.m + (1 if np.any(trial.disturbance) else 0)
+    drives = plant.disturbances[: physical_disturbances(plant)]
+    pushes = trial.disturbance[:, : len(drives)]
+    rows = len(plant.outputs) + plant.m + (1 if np.any(pushes) else 0)
     figure = new_figure(DOUBLE_COLUMN, 0.5 + 1.15 * rows)
     axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
     for column, name in enumerate(plant.outputs):
@@ -81,6 +84,9 @@ def trajectory_figure(result: FitResult, index: int) -> Figure:
             label="recorded",
             rasterized=True,
         )
+        if name in trial.signals:
+            target = factor * trial.target[:, trial.signals.index(name)]
+            ax.plot(time, target, "k--", linewidth=0.6, drawstyle="steps-post", label="target")
         simulated = run.x @ plant.C.T
         ax.plot(
             time,
@@ -93,12 +99,12 @@ def trajectory_figure(result: FitResult, index: int) -> Figure:
         ax.set_ylabel(axis_label(plant, name))
     for column in range(plant.m):
         _command(axes[len(plant.outputs) + column], result, index, column)
-    if np.any(trial.disturbance):
+    if np.any(pushes):
         ax = axes[-1]
-        ax.plot(time, trial.disturbance, color=INK, linewidth=0.8, drawstyle="steps-post")
-        ax.set_ylabel(", ".join(axis_label(plant, name) for name in plant.disturbances))
+        ax.plot(time, pushes, color=INK, linewidth=0.8, drawstyle="steps-post")
+        ax.set_ylabel(", ".join(axis_label(plant, name) for name in drives))
     axes[0].set_title(trial_name(result, index), loc="right")
-    axes[0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
+    axes[0].legend(loc="upper left", ncols=3, bbox_to_anchor=(0, 1.28))
     axes[-1].set_xlabel("time (s)")
     axes[-1].set_xlim(0, time[-1])
     return figure
@@ -124,22 +130,26 @@ def _command(ax: Axes, result: FitResult, index: int, column: int) -> None:
                 linewidth=0,
                 step="post",
             )
+    commands = result.given.recordings[index].commands[: len(u), column]
+    if len(commands):
+        ax.plot(time, commands, color=_SOFT, linewidth=1.6, drawstyle="steps-post")
     ax.plot(time, u, color=BLUE, linewidth=0.9, drawstyle="steps-post")
     ax.set_ylabel(axis_label(result.given.plant, name))
 
 
 def _residuals(result: FitResult) -> Figure:
     plant = result.fitted.problem.plant
-    count, p = min(len(result.given.recordings), MOST_TRIALS), len(plant.outputs)
+    trials, p = result.fitted.problem.recordings, len(plant.outputs)
+    count = min(len(trials), MOST_TRIALS)
     figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
     axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
     for column, name in enumerate(plant.outputs):
         factor, unit = shown_unit(plant, name)
         series = [
             factor * (trial.without_offset - run.x @ plant.C.T)[:, column]
-            for trial, run in zip(result.given.recordings, result.inverse_mpc.runs, strict=True)
+            for trial, run in zip(trials, result.inverse_mpc.runs, strict=True)
         ]
-        offset = 6 * max(float(np.std(part)) for part in series)
+        offset = 6 * max(float(np.nanstd(part)) for part in series)
         for index, part in enumerate(series[:MOST_TRIALS]):
             axes[column, 0].plot(
                 np.arange(len(part)) * plant.dt,
@@ -164,7 +174,7 @@ def _autocorrelation(ax: Axes, series: list[Array], dt: float) -> None:
     lags = min(round(_LAGS / dt), min(len(part) for part in series) // 4)
     styles = ("-", "--", ":", "-.")
     for index, part in enumerate(series):
-        centred = part - np.mean(part)
+        centred = np.nan_to_num(part - np.nanmean(part))
         power = float(centred @ centred) or 1.0
         values = [float(centred[k:] @ centred[: len(centred) - k]) / power for k in range(1, lags)]
         ax.plot(
@@ -226,7 +236,7 @@ def _methods(result: FitResult) -> Figure:
     plant = result.fitted.problem.plant
     shown = {item.name: item for item in result.methods if item.name in _METHOD_LINES and item.runs}
     index, first = _most_telling(result)
-    trial = result.given.recordings[index]
+    trial = result.fitted.problem.recordings[index]
     window = slice(first, min(first + round(_WINDOW / plant.dt), trial.samples - 1))
     time = np.arange(window.start, window.stop) * plant.dt
     figure = new_figure(DOUBLE_COLUMN, 3.4)
@@ -245,7 +255,7 @@ def _methods(result: FitResult) -> Figure:
     for limit in (result.given.bounds.u_min[0], result.given.bounds.u_max[0]):
         if np.isfinite(limit):
             below.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
-    reach = 1.6 * float(np.max(np.abs(recorded)))
+    reach = 1.6 * float(np.nanmax(np.abs(recorded), initial=0.0)) or 1.0
     above.set_ylim(-reach, reach)
     above.set_ylabel(axis_label(plant, plant.outputs[0]))
     below.set_ylabel(axis_label(plant, plant.controls[0]))

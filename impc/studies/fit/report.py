@@ -24,6 +24,8 @@
     person                                   of [fit.observer]: K, levels with intervals, models
                                              with log_likelihood and aic, whiteness, errors ahead
     identifiability                          rank, free, chosen, singular_values
+    aim                                      targets, samples that they are known ahead, rates (1/s)
+                                             of lasting disturbances, offsets (SI), commands
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           as in every result (docs/results.md)
     findings.<name>                          severity, sentences and table of each of the page
@@ -43,6 +45,7 @@ from markupsafe import Markup
 
 from impc.assess.intent_statements import dominant_sentence
 from impc.control.named_solver import described
+from impc.inverse.problem import aims
 from impc.reporting.document import (
     Block,
     Details,
@@ -57,6 +60,7 @@ from impc.reporting.document import (
 from impc.reporting.finding import Chart, Picture
 from impc.reporting.shown_units import body_sentence, signal_words
 from impc.studies.charts import methods_chart
+from impc.studies.fit.aim import aim_data
 from impc.studies.fit.figures import fit_figures
 from impc.studies.fit.gain_findings import (
     direction_finding,
@@ -72,6 +76,8 @@ from impc.studies.fit.trial_findings import (
     RESIDUALS,
     agreement_finding,
     check_finding,
+    command_findings,
+    offset_findings,
     residual_findings,
     trajectory_finding,
 )
@@ -161,6 +167,7 @@ def _gain(result: FitResult) -> list[Block]:
         return [verdict(result)]
     limits = limit_findings(result)
     found = [gain_finding(result), *parameter_findings(result), direction_finding(result)]
+    found += [*offset_findings(result), *command_findings(result)]
     return [*found, *([Heading("Limit and horizon")] if limits else []), *limits]
 
 
@@ -177,12 +184,12 @@ def _trajectories(result: FitResult) -> list[Block]:
             f"Recorded and simulated outputs, command and disturbance over time, "
             f"{trial_name(result, index)}",
             f"{trial_name(result, index)}. Grey: recorded. Dashed: simulated from the disturbance "
-            "alone. Dotted lines: bound of the command; shaded: where it is at the bound.",
+            "and targets alone. Dotted: bound of the command; shaded: where it is at the bound.",
         )
         for index in shown
     ]
     others = [Details("The other trials", pictures[1:])] if len(pictures) > 1 else []
-    data = methods_chart(result.given, result.methods[::-1], shown[0])
+    data = methods_chart(result.fitted.problem, result.methods[::-1], shown[0])
     return [*blocks, Chart(pictures[0], data), *others]
 
 
@@ -220,6 +227,9 @@ def _terminal_set(result: FitResult) -> str:
     changed = result.terminal_set_difference
     within = bool(result.fitted.problem.terminal_set)
     present = "without" if within else "with"
+    problem = result.fitted.problem
+    if aims(problem.plant, problem.recordings):
+        return "The fitted controller has no terminal set: what it regulates to moves."
     if np.isnan(changed):
         effect = "does not reach the end of every trial"
     else:
@@ -244,6 +254,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
         "trials": [_trial(result, index) for index in range(len(result.trials))],
         "methods": methods_data(result.methods),
         "structures": structure_data(result),
+        "aim": aim_data(result),
         "person": None if result.person is None else result.person.data(),
         "plant": {
             "name": provenance.plant_name,
@@ -339,6 +350,7 @@ def _trial(result: FitResult, index: int) -> dict[str, Any]:
     return {
         **asdict(trial.label),
         "samples": trial.samples,
+        "missing": int(np.isnan(trial.outputs).any(axis=1).sum()),
         "findings": trial.findings,
         "vaf": found.vaf,
         "centred_vaf": found.centred_vaf,

@@ -14,6 +14,8 @@ from impc.control.simulation import Status
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from impc.arrays import Array
     from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
@@ -88,6 +90,8 @@ class FitResult:
     # Those that were asked for, that of [fit.structure] first
     structures: tuple[StructureFit, ...] = ()
     person: PersonReport | None = None  # Of [fit.observer]; None where none was asked for
+    # The gain by regression on recorded commands (`command_regression`); None where there are none
+    commands: pd.DataFrame | None = None
 
     @property
     def person_sentences(self) -> tuple[str, ...]:

@@ -38,6 +38,7 @@ _PAGES = {"fit": "docs/fitting.md", "plan": "docs/planning.md", "select": "docs/
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
 Length = Annotated[int, Meta(ge=1, le=5000)]  # Of a horizon, in samples
+Rate = Annotated[float, Meta(ge=0)]  # 1/s
 T = TypeVar("T")
 
 
@@ -88,7 +89,18 @@ class FitSettings:
         Whether the controller ends in its maximal invariant set. "auto" takes what explains the
         recordings better: without it, unless that leaves more than white noise.
     free : list of str
-        Physical parameters of the plant that are fitted with the gain (3.19).
+        Physical parameters of the plant that are fitted with the gain (3.19), and
+        "observer_rate", or "observer_rate.<disturbance>", where that is given.
+    rates : bool or dict of str to float
+        Whether the controls are changes of the commands (`with_rates`); limits of the change per
+        sample by the name of a command, in its unit. `u_max` stays the limit of the commands.
+    observer_rate : float or dict of str to float or None
+        Rate at which the controller learns disturbances that last (`with_observer`), 1/s, of all
+        or by name; infinite where it knows them. None: it takes none for lasting.
+    preview : int
+        Samples that all targets are known ahead (`with_preview`).
+    offsets : list of str
+        Outputs with an offset that is not known, one a trial (`Problem.offsets`).
     feedback_states : list of str
         States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits; it is left
         out when there are none.
@@ -142,6 +154,10 @@ class FitSettings:
     margin: Annotated[float, Meta(ge=1, le=1000)] = 1.2
     terminal_set: bool | Literal["auto"] = "auto"
     free: list[str] = field(default_factory=list)
+    rates: bool | dict[str, Annotated[float, Meta(gt=0)]] = False
+    observer_rate: Rate | dict[str, Rate] | None = None
+    preview: Annotated[int, Meta(ge=0, le=1000)] = 0
+    offsets: list[str] = field(default_factory=list)
     feedback_states: list[str] = field(default_factory=list)
     settle: Annotated[float, Meta(ge=0, le=1_000_000)] = 1.0
     held_out: bool = True
@@ -216,7 +232,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
 
 
 def _require_distinct(settings: FitSettings) -> None:
-    for name in ("free", "feedback_states", "profiles", "horizons", "methods"):
+    for name in ("free", "offsets", "feedback_states", "profiles", "horizons", "methods"):
         given = getattr(settings, name)
         twice = [item for index, item in enumerate(given) if item in given[:index]]
         if twice:

@@ -19,10 +19,8 @@ from tqdm.auto import tqdm
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
 from impc.assess.assessments import evaluate_method
-from impc.assess.diagnostics import (
-    ResidualDiagnostics,
-    residual_diagnostics,
-)
+from impc.assess.command_table import command_regression
+from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics
 from impc.assess.input_limits import at_another_limit
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
@@ -37,9 +35,16 @@ from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import Problem, simulated
+from impc.inverse.problem import Problem, aims, simulated
 from impc.inverse.structured_fit import fit_structured
-from impc.studies.fit.asked import fit_bounds, fit_structures, moving_body, output_feedback
+from impc.model.foresight import physical_states
+from impc.studies.fit.asked import (
+    fit_bounds,
+    fit_structures,
+    moving_body,
+    output_feedback,
+    require_dressed,
+)
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings, ObserverSettings
 from impc.studies.pool import threads
@@ -47,6 +52,8 @@ from impc.studies.pool import threads
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from concurrent.futures import Future, ThreadPoolExecutor
+
+    import pandas as pd
 
     from impc.assess.all_intervals import Attempt, Uncertainty
     from impc.assess.assessments import MethodFit
@@ -61,7 +68,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
-    from impc.model.riccati import LqrSolution
     from impc.output_feedback.page import PersonReport
 
 _THREADS = 2
@@ -129,18 +135,19 @@ def fit_problem(
     if not recordings:
         raise DataError("recordings", "there are none", "give at least one trial")
     outputs = np.concatenate([trial.outputs for trial in recordings])
-    scale = np.sqrt(np.mean(outputs**2, axis=0))
+    scale = np.sqrt(np.nanmean(outputs**2, axis=0))
     for name, size in zip(plant.outputs, scale, strict=True):
         if size == 0:
             raise DataError(f"output {name}", "is zero in every trial", "check its column")
     shortest = min(trial.samples for trial in recordings)
-    least = round(settings.settle / plant.dt) + plant.n
+    least = round(settings.settle / plant.dt) + physical_states(plant)
     if shortest <= least:
         raise DataError(
             "recordings",
             f"the shortest has {shortest} samples, {least} serve to find where it starts",
             "give longer ones, or lower [fit] settle",
         )
+    require_dressed(plant, settings)
     plant, family = moving_body(plant, family, settings)
     return Problem(
         plant,
@@ -149,6 +156,7 @@ def fit_problem(
         tuple(_first_guess(plant, trial) for trial in recordings),
         terminal_set=None if settings.terminal_set == "auto" else settings.terminal_set,
         output_scale=scale,
+        offsets=settings.offsets,
         unknown_start=True,
         family=family,
         structure=next(iter(fit_structures(plant, settings)), None),
@@ -213,10 +221,8 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         """The set of weights with the gain, or why nothing may be said of it."""
         if not usable or test.rejected:
             return None, test.sentence if usable else _UNUSABLE
-        draws: tuple[LqrSolution, ...] = ()
-        if settings.intent_draws:
-            drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
-            draws = attempt("drawn gains", drawn, ())
+        drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
+        draws = attempt("drawn gains", drawn, ()) if settings.intent_draws else ()
         return weights_summary_or_reason(plant, K, metrics, sizes, draws)
 
     methods, held_out, weights_found = _beside_it(
@@ -249,7 +255,15 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         failures,
         structures,
         attempt("subject with sensory noise", person, None),
+        attempt("regression of commands", functools.partial(_regressed, fitted), None),
     )
+
+
+def _regressed(fitted: Estimate) -> pd.DataFrame | None:
+    """The gain by regression, where commands were recorded; of changes the first is not known."""
+    problem = fitted.problem
+    recorded = any(len(trial.commands) for trial in problem.recordings)
+    return command_regression(fitted) if recorded and not problem.plant.commands else None
 
 
 def _estimates(
@@ -381,7 +395,7 @@ def _first_guess(plant: Plant, trial: Recording) -> Recording:
     """Where the search for x0 starts: at rest, or in the first output when nothing drives it."""
     if np.any(trial.disturbance) or np.any(trial.x0):
         return trial
-    return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ trial.outputs[0]))
+    return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ np.nan_to_num(trial.outputs[0])))
 
 
 def _leaves_out(trials: int, settings: FitSettings) -> bool:
@@ -436,6 +450,8 @@ def state_sizes(runs: tuple[Simulation, ...]) -> Array:
 def _terminal_set_difference(fitted: MethodFit) -> float:
     """Largest change of a scaled output where the terminal set is added, or taken away."""
     found = fitted.estimate
+    if aims(found.problem.plant, found.problem.recordings):
+        return float("nan")
     problem = replace(found.problem, terminal_set=not found.problem.terminal_set)
     pair = [fitted.runs, simulated(problem, found.gain, found.metric)]
     if not all(run.complete for runs in pair for run in runs):

@@ -1,4 +1,4 @@
-"""What a fit says of each trial: agreement, residuals, checks of the recording, curves."""
+"""What a fit says of each trial: agreement, offsets, commands, residuals, checks, curves."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import numpy as np
 import pandas as pd
 
 from impc.reporting.finding import Finding, Picture, Severity
+from impc.reporting.shown_units import shown_unit
+from impc.studies.fit.aim import aim_data
+from impc.studies.fit.gain_findings import number_name
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.methods_table import trajectory_table
 
@@ -39,6 +42,39 @@ def agreement_finding(result: FitResult) -> Finding:
         "residual is white; a small one says that something regular is left.",
         digits=5,
     )
+
+
+def offset_findings(result: FitResult) -> list[Finding]:
+    """What the outputs of each trial have too much, where that was asked for."""
+    plant, offsets = result.fitted.problem.plant, aim_data(result)["offsets"]
+    rows = [
+        (trial_name(result, index), name, shown_unit(plant, name)[1],
+         shown_unit(plant, name)[0] * value)
+        for name, values in offsets.items()
+        for index, value in enumerate(values)
+    ]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["trial", "output", "unit", "offset"])
+    caption = "What the recorded outputs have too much, found with the gain."
+    return [Finding("offsets", table, caption)] if rows else []
+
+
+def command_findings(result: FitResult) -> list[Finding]:
+    """The gain by regression on recorded commands beside that of the fit, where there are any."""
+    if result.commands is None:
+        return []
+    table = result.commands.reset_index(names="number")
+    table["number"] = [number_name(result.given.plant, name) for name in table["number"]]
+    inside = table["fitted"].between(table["low"], table["high"])
+    said = (
+        f"{inside.sum()} of the {len(table)} entries of the fitted gain lie inside the 95 % "
+        "intervals of a regression of the recorded commands on the states."
+    )
+    caption = (
+        "The regression takes samples without a bound. Noise in the states makes its gain too "
+        "small, noise of the command inside the loop makes that of the fit wrong: where the two "
+        "differ by much, one of the two is there."
+    )
+    return [Finding("command_regression", table, caption, [said])]
 
 
 def residual_findings(result: FitResult) -> list[Finding]:
@@ -86,7 +122,7 @@ def check_finding(result: FitResult) -> Finding:
 def trajectory_finding(result: FitResult) -> Finding:
     """A row a sample of the trials that the page draws: recorded and simulated."""
     runs = {"simulated": result.inverse_mpc.runs}
-    table = trajectory_table(result.given, shown_trials(result), runs)
+    table = trajectory_table(result.fitted.problem, shown_trials(result), runs)
     drives = list(result.given.plant.disturbances)
     others = [name for name in table.columns if name not in drives]
     return Finding("trajectories", table[[*others, *drives]])

@@ -9,6 +9,7 @@ import numpy as np
 from impc.assess.covariance import IDENTIFIED
 from impc.assess.intent_statements import dominant_sentence
 from impc.reporting.rendering import number
+from impc.studies.fit.aim import aim_sentences
 from impc.studies.fit.result import LITTLE, trial_name
 from impc.studies.fit.structure_words import structure_sentences
 
@@ -112,6 +113,7 @@ def abstract(result: FitResult) -> tuple[str, ...]:
     """Three to five plain sentences with numbers."""
     return (
         _what_was_done(result),
+        *aim_sentences(result),
         _agreement(result),
         *_at_the_bound(result),
         *((_gain(result), _weights(result)) if result.usable else ()),
@@ -123,9 +125,13 @@ def _what_was_done(result: FitResult) -> str:
     plant, horizon = problem.plant, problem.horizon
     trials = result.given.recordings
     seconds = sum(trial.samples for trial in trials) * plant.dt
+    bounds = result.given.bounds
+    most_of = dict(zip(plant.states, bounds.x_max, strict=True))
+    most_of = {name: most_of[name] for name in plant.commands}
+    most_of |= zip(plant.controls, bounds.u_max, strict=True)
     limits = [
         f"{number(float(most))} {plant.unit(name)} of {_named(plant, name)}"
-        for name, most in zip(plant.controls, result.given.bounds.u_max, strict=True)
+        for name, most in most_of.items()
         if np.isfinite(most)
     ]
     bounded = f"limited to {' and '.join(limits)}" if limits else "without a limit"

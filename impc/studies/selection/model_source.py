@@ -27,7 +27,7 @@ import numpy as np
 from impc.errors import InputError
 from impc.files.digests import digest, source_digest, versions
 from impc.files.plant_sources import import_function, users_code
-from impc.files.reading import read_recordings
+from impc.files.reading import read_recordings, require_whole
 from impc.model.plant import Plant
 from impc.studies.cache import from_json
 from impc.studies.pool import Task, run
@@ -92,6 +92,7 @@ def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tupl
     found: dict[tuple[str, str], tuple[Trial, ...]] = {}
     for unit in study.units:
         trials = read_recordings(unit.files, study.configuration, plant)
+        require_whole(trials, "select")
         key = (unit.subject, unit.visit)
         found[key] = found.get(key, ()) + tuple(
             Trial(item.disturbance, item.outputs) for item in trials

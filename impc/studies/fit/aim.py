@@ -1,0 +1,66 @@
+"""What a fitted controller regulates to, and what of its recordings is fitted beside outputs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.model.foresight import physical_disturbances
+from impc.reporting.rendering import number
+from impc.reporting.shown_units import shown_unit
+from impc.studies.fit.asked import OBSERVER
+
+if TYPE_CHECKING:
+    from impc.studies.fit.result import FitResult
+
+
+def aim_data(result: FitResult) -> dict[str, Any]:
+    """`aim` of result.json: targets, rates (1/s) of lasting disturbances, offsets, commands."""
+    problem = result.fitted.problem
+    plant, trials = problem.plant, problem.recordings
+    count = physical_disturbances(plant)
+    learned = zip(plant.disturbances[:count], plant.observer[:count], strict=True)
+    controls = plant.commands or plant.controls
+    recorded = [np.any(np.isfinite(trial.commands), axis=0) for trial in trials]
+    return {
+        "targets": tuple(dict.fromkeys(name for trial in trials for name in trial.signals)),
+        "ahead": plant.ahead,
+        "observer_rate": {name: float(rate) for name, rate in learned if rate > 0},
+        "offsets": {
+            name: [float(trial.offset[plant.outputs.index(name)]) for trial in trials]
+            for name in problem.offsets
+        },
+        "commands": tuple(np.array(controls)[np.any(recorded, axis=0)].tolist()),
+    }
+
+
+def aim_sentences(result: FitResult) -> list[str]:
+    """That in a sentence, where the controller does not just regulate to rest."""
+    aim, plant = aim_data(result), result.fitted.problem.plant
+    said = []
+    if aim["targets"]:
+        ahead = f", known {plant.ahead * plant.dt:.3g} s ahead" if plant.ahead else ""
+        said.append(f"it regulates to the target of {' and '.join(aim['targets'])}{ahead}")
+    for name, rate in aim["observer_rate"].items():
+        how = "knows it at once"
+        if np.isfinite(rate):
+            fitted = (result.preferred.get(key) for key in (f"{OBSERVER}.{name}", OBSERVER))
+            interval = next((item for item in fitted if item is not None), None)
+            between = (
+                f" (fitted, 95 %: {number(interval.low, 3)} to {number(interval.high, 3)})"
+                if interval is not None
+                else ""
+            )
+            how = f"learns it at {number(rate, 3)} 1/s{between}"
+        said.append(f"it takes {name} for lasting and {how}")
+    for name, values in aim["offsets"].items():
+        factor, unit = shown_unit(plant, name)
+        low, high = factor * min(values), factor * max(values)
+        said.append(
+            f"{name} has an offset in each trial, {number(low, 3)} to {number(high, 3)} {unit}"
+        )
+    if aim["commands"]:
+        said.append(f"recorded commands ({', '.join(aim['commands'])}) count beside the outputs")
+    text = "; ".join(said)
+    return [f"{text[0].upper()}{text[1:]}."] if said else []
