@@ -18,7 +18,6 @@ from impc.assess.input_limits import input_limit
 from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals
 from impc.assess.profiles import profile_likelihood, require_numbers
 from impc.assess.resampling import (
-    DRAWS,
     bootstrap_intervals,
     bootstrap_model,
     replicate,
@@ -46,10 +45,6 @@ class Asked(Protocol):
     @property
     def replicates(self) -> int:
         """Number of bootstrap replicates; 0 for none."""
-
-    @property
-    def bootstrap(self) -> str:
-        """How residuals are drawn: a key of `DRAWS`."""
 
     @property
     def seed(self) -> int:
@@ -109,10 +104,7 @@ def assess(
     attempt: Attempt,
 ) -> Uncertainty:
     """Run what the settings ask for."""
-    intervals = [
-        *covariance_intervals(estimate, estimate.covariance, "sandwich"),
-        *covariance_intervals(estimate, estimate.white, "cramer-rao"),
-    ]
+    intervals = list(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     require_numbers(estimate, settings.profiles)
     for name in settings.profiles:
         stage = f"profile of {name}"
@@ -149,12 +141,11 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    draw = DRAWS[settings.bootstrap]
     model = bootstrap_model(estimate.problem, np.array(estimate.K), np.array(estimate.S))
     found = []
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
-        compute = functools.partial(replicate, model, index, settings.seed, draw)
+        compute = functools.partial(replicate, model, index, settings.seed)
         found.append(remember(name, compute))
         done(name)
-    return bootstrap_intervals(estimate, found, settings.bootstrap, LEVEL)
+    return bootstrap_intervals(estimate, found, "block", LEVEL)

@@ -128,7 +128,7 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     if n == 1:  # one state has one direction
         return 0.0, found.least.weights
     D = np.diag(np.asarray(sizes, dtype=np.float64))
-    centre = _dominant(D @ found.least.weights.Q @ D)
+    centre = dominant_direction(D @ found.least.weights.Q @ D)
     largest = np.argsort(-np.diag(D @ found.least.weights.Q @ D))[:2]
     starts = [found.least.weights.block]
     directions = np.zeros((len(largest), *found.first.shape))
@@ -138,7 +138,7 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     best_angle, best = 0.0, found.least.weights.block
     for start in starts:
         X = _frank_wolfe(found, D, centre, start)
-        angle = _angle(centre, _dominant(D @ X[:n, :n] @ D))
+        angle = angle_between(centre, dominant_direction(D @ X[:n, :n] @ D))
         if angle > best_angle:
             best_angle, best = angle, X
     return best_angle, type(found.least.weights)(best[:n, :n], best[n:, n:])
@@ -151,12 +151,12 @@ def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Ar
         gradient = np.zeros_like(X)
         gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
         end = linear_maxima(found, gradient[None])[0].weights.block
-        shares = np.linspace(0.0, 1.0, 21)
-        angles = [_angle(centre, _dominant(D @ (X + s * (end - X))[:n, :n] @ D)) for s in shares]
-        step = shares[int(np.argmax(angles))]
-        if step == 0:
+        segment = [X + share * (end - X) for share in np.linspace(0.0, 1.0, 21)]
+        angles = [angle_between(centre, dominant_direction(D @ Y[:n, :n] @ D)) for Y in segment]
+        best = int(np.argmax(angles))
+        if best == 0:
             break
-        X = X + step * (end - X)
+        X = segment[best]
     return X
 
 
@@ -172,11 +172,13 @@ def _turning(Q: Array, centre: Array) -> Array:
     return np.asarray((gradient + gradient.T) / 2)
 
 
-def _dominant(Q: Array) -> Array:
+def dominant_direction(Q: Array) -> Array:
+    """The eigenvector (n,) of the largest eigenvalue of a symmetric matrix (n, n)."""
     return np.asarray(np.linalg.eigh((Q + Q.T) / 2)[1][:, -1])
 
 
-def _angle(one: Array, other: Array) -> float:
+def angle_between(one: Array, other: Array) -> float:
+    """Angle between two directions (n,) of either sign, degrees."""
     return float(np.degrees(np.arccos(min(1.0, abs(float(one @ other))))))
 
 
@@ -311,8 +313,5 @@ def _reading(rule: str, weights: Weights, before: list[Reading]) -> Reading:
     values, vectors = np.linalg.eigh(scaled.Q)
     largest = np.argmax(np.abs(vectors), axis=0)
     vectors = vectors * np.sign(vectors[largest, np.arange(len(values))])
-    angle = 0.0
-    if before:
-        cosine = min(1.0, abs(float(before[0].dominant @ vectors[:, -1])))
-        angle = float(np.degrees(np.arccos(cosine)))
+    angle = angle_between(before[0].dominant, vectors[:, -1]) if before else 0.0
     return Reading(rule, scaled, condition_number(scaled), frozen(values), frozen(vectors), angle)

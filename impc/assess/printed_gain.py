@@ -28,7 +28,6 @@ import scipy.special
 
 from impc.arrays import Array, frozen
 from impc.assess.covariance import GainCovariance, gain_covariance
-from impc.assess.long_run_covariance import white_noise
 from impc.checking import replace
 from impc.inverse.coordinates import Coordinates, descend
 from impc.inverse.least_squares import Stop
@@ -80,7 +79,6 @@ class GainEstimate(IdentifiedGain):
 
     linear: GainCovariance  # To first order
     covariance: GainCovariance  # For noise of the colour that the residuals show, with curvature
-    white: GainCovariance  # As if the residuals were white
 
 
 def gain_estimate(fitted: Estimate) -> GainEstimate:
@@ -92,7 +90,6 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
         here.misfit,
         here.linear,
         gain_covariance(*at, curvature=True, evaluation=here.evaluation),
-        gain_covariance(*at, white_noise, curvature=True, evaluation=here.evaluation),
     )
 
 
@@ -165,8 +162,8 @@ class Interval:
     """One interval."""
 
     name: str  # K.<control>.<state>, the name of a parameter, or u_max.<control>
-    # sandwich: normal, for the colour that the residuals show; cramer-rao: as if they were white,
-    # too narrow where they are not; block, model: of a bootstrap; profile: see `profiles`
+    # sandwich: normal, for the colour that the residuals show; block: of a bootstrap; profile: see
+    # `profiles`
     method: str
     level: float  # Between 0 and 1, 0.95 for 95 %
     value: float | None  # The estimate; None when nothing determines it

@@ -28,6 +28,8 @@ import scipy.optimize
 import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.covariance import gain_covariance
+from impc.assess.long_run_covariance import white_noise
 from impc.assess.printed_gain import LEVEL, Interval, entry_names
 from impc.errors import InputError
 from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates
@@ -220,7 +222,9 @@ def _functional(
 
 def _spread(estimate: GainEstimate, name: str) -> tuple[float, float]:
     """Deviation in units of the offset, and the factor f of the residuals' colour."""
-    coloured, white = estimate.covariance, estimate.white
+    coloured = estimate.covariance
+    at = estimate.problem, np.array(estimate.K), np.array(estimate.S)
+    white = gain_covariance(*at, white_noise, curvature=True)
     entries = entry_names(estimate.problem.plant)
     if name in entries:
         index = entries.index(name)

@@ -1,12 +1,9 @@
 """Bootstrap of a fitted controller: simulate, add residuals drawn again, fit again.
 
-The disturbance is known and the same in every replicate; only the residuals are drawn.
-
-    moving blocks   blocks of the residuals of all trials, laid end to end (Künsch 1989); their
-                    length is that of Politis and White (2004) for a first-order process,
-                    (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest of the outputs
-    model           an autoregression for each output by Burg's method, its order by AIC; the rows
-                    of its innovations drawn one by one, so that outputs keep their correlation
+The disturbance is known and the same in every replicate; only the residuals are drawn, in blocks of
+the residuals of all trials, laid end to end (Künsch 1989). The length of a block is that of Politis
+and White (2004) for a first-order process, (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest of the
+outputs.
 
 Replicate k draws from the k-th child of the seed: the same numbers in any order, on any machine.
 Its search begins at the estimate and moves the gain alone (`identified_gain`): fitting weights anew
@@ -15,12 +12,10 @@ would take most of its time, and their gain is not what is printed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.printed_gain import Interval, entry_names, identified_gain
@@ -32,12 +27,6 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
     from impc.inverse.problem import Problem
-
-#: Draws residuals again: (residuals (samples, p) of each trial, generator) -> as many.
-Draw = Callable[[list[Array], np.random.Generator], list[Array]]
-
-_HIGHEST_ORDER = 12
-_BEFORE = 500
 
 
 @dataclass(frozen=True)
@@ -66,13 +55,13 @@ def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapMo
     return BootstrapModel(problem, frozen(gain), frozen(metric), measured)
 
 
-def replicate(model: BootstrapModel, index: int, seed: int, resample: Draw) -> Replicate:
+def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
     """One replicate, by its number."""
     recordings = model.problem.recordings
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     pairs = list(zip(recordings, model.measured, strict=True))
     residuals = [np.nan_to_num(recorded(model.problem, one) - values) for one, values in pairs]
-    drawn, p = resample(residuals, rng), len(model.problem.plant.outputs)
+    drawn, p = block_residuals(residuals, rng), len(model.problem.plant.outputs)
     trials = []
     for (trial, values), noise in zip(pairs, drawn, strict=True):
         new = values + noise + 0 * recorded(model.problem, trial)  # what is missing stays so
@@ -105,10 +94,7 @@ def bootstrap_intervals(
 
 
 def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """A `Draw` in moving blocks: `residuals` (samples, p) of each trial to as many, (samples, p).
-
-    `rng` is what is drawn from.
-    """
+    """Draw as many `residuals` (samples, p) of each trial again, in moving blocks."""
     centred = [part - np.mean(part, axis=0) for part in residuals]
     length = block_length(residuals)
     drawn = []
@@ -130,50 +116,3 @@ def block_length(residuals: list[Array]) -> int:
     total = sum(map(len, residuals))
     best = np.max(np.cbrt(6 * root**2 / (1 - root**2) ** 2 * total))
     return int(np.clip(np.ceil(best), 1, min(map(len, residuals))))
-
-
-def model_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """A `Draw` by autoregressions: `residuals` (samples, p) of each trial to as many, (samples, p).
-
-    They are fitted to all trials; `rng` is what is drawn from.
-    """
-    centred = [part - np.mean(part, axis=0) for part in residuals]
-    outputs = centred[0].shape[1]
-    models = [_autoregression([part[:, output] for part in centred]) for output in range(outputs)]
-    longest = max(map(len, models))
-    innovations = np.concatenate(
-        [
-            np.column_stack(
-                [scipy.signal.lfilter(model, [1.0], part[:, i]) for i, model in enumerate(models)]
-            )[longest - 1 :]
-            for part in centred
-        ]
-    )
-    drawn = []
-    for part in centred:
-        rows = innovations[rng.integers(len(innovations), size=len(part) + _BEFORE)]
-        columns = [
-            scipy.signal.lfilter([1.0], model, rows[:, i])[_BEFORE:]
-            for i, model in enumerate(models)
-        ]
-        drawn.append(np.column_stack(columns))
-    return drawn
-
-
-#: By the word that `bootstrap` of [fit] gives.
-DRAWS: dict[str, Draw] = {"block": block_residuals, "model": model_residuals}
-
-
-def _autoregression(parts: list[Array]) -> Array:
-    """1, -a_1, ..., -a_r: Burg's on the trials end to end, its order by AIC."""
-    # Imported here: it takes half a second, and only this needs it.
-    from statsmodels.regression.linear_model import burg  # noqa: PLC0415
-
-    joined = np.concatenate(parts)
-    best, chosen = np.inf, np.array([1.0])
-    for order in range(1, _HIGHEST_ORDER + 1):
-        coefficients, variance = burg(joined, order, demean=False)
-        criterion = len(joined) * np.log(variance) + 2 * order
-        if criterion < best:
-            best, chosen = criterion, np.append(1.0, -coefficients)
-    return np.asarray(chosen)

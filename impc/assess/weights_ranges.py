@@ -13,7 +13,13 @@ import numpy as np
 
 from impc.assess.bounded_weights import entry_ranges, weights_set
 from impc.assess.intent_draws import set_of_gain, weights_over_gains, with_confidence
-from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
+from impc.assess.intent_statements import (
+    angle_between,
+    dominant_direction,
+    order_statements,
+    sense_statements,
+    widest_dominant_angle,
+)
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
 
@@ -118,17 +124,13 @@ def weights_summary_or_reason(
 def _angle_of_gain(found: WeightsSet, sets: tuple[DrawnSet, ...], sizes: Array) -> float:
     if not sets:
         return float("nan")
-    own, widest = _dominant(found.least.weights, sizes), 0.0
-    for one in sets:
-        # Without a least conditioned member the direction is anywhere.
-        cosine = 0.0 if one.least is None else abs(float(own @ _dominant(one.least, sizes)))
-        widest = max(widest, float(np.degrees(np.arccos(min(1.0, cosine)))))
-    return widest
-
-
-def _dominant(weights: Weights, sizes: Array) -> Array:
     D = np.diag(np.asarray(sizes))
-    return np.asarray(np.linalg.eigh(D @ weights.Q @ D)[1][:, -1])
+    own = dominant_direction(D @ found.least.weights.Q @ D)
+    # Without a least conditioned member the direction is anywhere.
+    return max(
+        90.0 if one.least is None else angle_between(own, dominant_direction(D @ one.least.Q @ D))
+        for one in sets
+    )
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:

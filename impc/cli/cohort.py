@@ -152,7 +152,7 @@ def reliability_command(
 
     The study file is that of `impc cohort`.
     """
-    from impc.files.digests import study_inputs  # noqa: PLC0415
+    from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
@@ -166,7 +166,9 @@ def reliability_command(
     source = named_plant(study_file, study, plant_name, allowed)
     units = [replace(unit, files=unit.files[-last:]) for unit in study.units]
     trials = _trials_of(units, study.configuration, source)
-    inputs = study_inputs(units, study_file, "plant", source.name, source.arguments)
+    inputs = gather_inputs(
+        {unit.name: unit.files for unit in units}, study_file, source.name, source.arguments
+    )
     result = analyse(trials)
     line = f"impc reliability {study_file.name} --plant {source.name} --last {last}"
     with angles_in(study.configuration.report.angles):

@@ -92,7 +92,7 @@ def read_model_study(
     path: Path, given: str | None, allowed: bool
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
     """The study at `path`, its model, all recordings, and the digests of these."""
-    from impc.files.digests import study_inputs  # noqa: PLC0415
+    from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
     from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -104,7 +104,8 @@ def read_model_study(
     arguments: dict[str, Any] = dict(study.configuration.model)
     source = model_source(name, arguments)
     recorded = read_trials(study, source)
-    return study, source, recorded, study_inputs(study.units, path, "model", name, arguments)
+    files = {unit.name: unit.files for unit in study.units}
+    return study, source, recorded, gather_inputs(files, path, name, arguments, "model")
 
 
 @click.command("key-parameters")

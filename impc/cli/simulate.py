@@ -31,15 +31,7 @@ if TYPE_CHECKING:
     from impc.output_feedback.observer import Observer
     from impc.studies.simulated_people import SubjectTrial
 
-_ENDINGS = {
-    "csv": ".csv",
-    "tsv": ".tsv",
-    "xlsx": ".xlsx",
-    "mat": ".mat",
-    "tdms": ".tdms",
-    "c3d": ".c3d",
-}
-_FORMATS = (*_ENDINGS, "mat73")
+_FORMATS = ("csv", "tsv", "xlsx", "mat", "tdms", "c3d")
 # What a plain installation cannot write.
 _LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
 _RATE = 1000.0
@@ -106,7 +98,7 @@ def command() -> None:
 @click.option(
     "--formats",
     show_default="all that are installed",
-    help="Which of csv, tsv, xlsx, mat, mat73, tdms and c3d, with commas between.",
+    help="Which of csv, tsv, xlsx, mat, tdms and c3d, with commas between.",
 )
 def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
     """A person on a seat that tilts sideways, holding it by a constrained controller.
@@ -135,9 +127,8 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
         click.echo(f"trial {number}: at the torque limit for {share:.1f} % of the time{fell}")
     print_files(out, written)
     # Of several formats the first: the trials are the same in all.
-    ending = "_v73.mat" if wanted[0] == "mat73" else _ENDINGS[wanted[0]]
     fit = "impc fit {} --plant seated-balance --config {}"
-    print_next(fit, out, f"trial_*{ending}", "subject.toml")
+    print_next(fit, out, f"trial_*.{wanted[0]}", "subject.toml")
 
 
 def _wanted(formats: str | None) -> tuple[str, ...]:
@@ -213,17 +204,9 @@ def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str,
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import encode_table  # noqa: PLC0415
-    from impc.files.matlab73 import matlab73_bytes  # noqa: PLC0415
 
     table = seat_table(name, np.degrees(trial.outputs), trial.disturbance[:, 0], _RATE)
-    files = {
-        f"{name}{ending}": encode_table(ending, table)
-        for key, ending in _ENDINGS.items()
-        if key in wanted
-    }
-    if "mat73" in wanted:
-        files[f"{name}_v73.mat"] = matlab73_bytes(table)
-    return files
+    return {f"{name}.{ending}": encode_table(f".{ending}", table) for ending in wanted}
 
 
 def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
@@ -249,7 +232,7 @@ def _configuration(person: dict[str, Any], given: dict[str, Any]) -> str:
 [recording]
 time = "time"
 subject = "simulated"
-pattern = "trial_(?P<trial>[0-9]+)(_v73)?"
+pattern = "trial_(?P<trial>[0-9]+)"
 
 {SIGNALS.replace("LIMIT", _STOP)}
 [plant]

@@ -21,7 +21,7 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -199,42 +199,21 @@ class Inputs:
 
 
 def gather_inputs(
-    files: Sequence[Path], configuration: Path, name: str, arguments: Mapping[str, Any]
+    recordings: Sequence[Path] | Mapping[str, Sequence[Path]],
+    configuration: Path,
+    name: str,
+    arguments: Mapping[str, Any],
+    kind: str = "plant",
 ) -> Inputs:
-    """Digests of the recordings `files`, of the `configuration` and of a plant as they are now.
+    """Digests of the `recordings`, of the `configuration` and of a plant or model as they are now.
 
-    The plant is a file or an import path, the `name`, imported already, with its `arguments`.
+    The recordings are files, or those of each unit of a study. The plant is a file or an import
+    path, the `name`, imported already, with its `arguments`; `kind` is "plant" or "model".
     """
-    recordings = tuple(content_digest(path) for path in files)
-    return Inputs(
-        recordings, content_digest(configuration), _code(name, arguments), digest(versions())
-    )
-
-
-class Recorded(Protocol):
-    """What is read here of a unit of a study."""
-
-    @property
-    def name(self) -> str:
-        """Of the unit."""
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """Its recordings."""
-
-
-def study_inputs(
-    units: Sequence[Recorded], study: Path, kind: str, name: str, arguments: Mapping[str, Any]
-) -> Inputs:
-    """Digests of the recordings of `units`, of the `study` file and of its plant or model.
-
-    `kind` is "plant" or "model"; `name` and `arguments` are as in `gather_inputs`.
-    """
-    recordings = {unit.name: tuple(content_digest(path) for path in unit.files) for unit in units}
-    return Inputs(
-        recordings, content_digest(study), _code(name, arguments), digest(versions()), kind
-    )
-
-
-def _code(name: str, arguments: Mapping[str, Any]) -> str:
-    return digest(source_digest(name, arguments), dict(arguments))
+    contents: tuple[str, ...] | Mapping[str, tuple[str, ...]]
+    if isinstance(recordings, Mapping):
+        contents = {unit: tuple(map(content_digest, files)) for unit, files in recordings.items()}
+    else:
+        contents = tuple(map(content_digest, recordings))
+    code = digest(source_digest(name, arguments), dict(arguments))
+    return Inputs(contents, content_digest(configuration), code, digest(versions()), kind)

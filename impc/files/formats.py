@@ -15,7 +15,7 @@ from impc.files.apart import read_apart
 from impc.files.delimited import encode_delimited, read_delimited
 from impc.files.disk import LARGEST, damaged, require_readable, unwritable
 from impc.files.matlab import encode_matlab
-from impc.files.matlab73 import HDF5_SIGNATURE, matlab73_bytes
+from impc.files.matlab73 import HDF5_SIGNATURE
 from impc.files.recorders import encode_c3d, encode_tdms
 from impc.files.spreadsheet import encode_workbook
 
@@ -131,11 +131,6 @@ def write_table(path: Path | str, table: Table) -> None:
 def encode_table(ending: str, table: Table) -> bytes:
     """The bytes of a table in the format of an ending, a key of `FORMATS`; .mat is v5."""
     return FORMATS[_suffix(Path(f"table{ending}"), OutputError)].encode(table)
-
-
-def write_matlab73(path: Path, table: Table) -> None:
-    """Write the .mat file of version 7.3 at `path`, whole or not at all."""
-    _write(path, matlab73_bytes(table))
 
 
 def _suffix(path: Path, error: type[InputError | OutputError]) -> str:

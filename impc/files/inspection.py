@@ -32,9 +32,7 @@ _SLOWEST = 0.2
 _HORIZON = 20
 _INPUT = "an input: without this table, or with command = true, a command"
 # Units at the end of names, as in alpha_deg.
-_IN_NAMES = {
-    name: name for name in ("deg", "rad", "mm", "cm", "m", "N", "Nm", "V", "mV", "s", "ms")
-}
+_IN_NAMES = ("deg", "rad", "mm", "cm", "m", "N", "Nm", "V", "mV", "s", "ms")
 _ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
 
 
@@ -166,7 +164,7 @@ def _column_unit(table: Table, column: str) -> tuple[str, str]:
         return stated, "as the file says"
     last = re.split(r"[_ .]", column)[-1]
     if last != column and last in _IN_NAMES:
-        return _IN_NAMES[last], "a guess: by its name"
+        return last, "a guess: by its name"
     return FILL_IN, ""
 
 

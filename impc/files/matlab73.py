@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -10,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.matlab import AS_STRUCT, array_columns, nested_columns
+from impc.files.matlab import AS_STRUCT, array_columns
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from impc.arrays import Array
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
 
 #: First bytes of an HDF5 file.
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_USER_BLOCK = 512
 _DEPTH = 8
 _MOST = 10_000  # names in a file
 _MOST_IDENTIFIED = 256  # bytes of an attribute of MATLAB's: it has one word
@@ -51,30 +48,6 @@ def read_matlab73(path: Path, largest: int) -> Table:
     with h5py.File(path, "r") as file:
         _collect(found, "", file, 0)
     return make_table(found.source, found.columns, None, None, found.skipped)
-
-
-def matlab73_bytes(table: Table) -> bytes:
-    """The bytes of a v7.3 .mat file with one column vector for each column."""
-    import h5py  # noqa: PLC0415
-
-    content = io.BytesIO()
-    with h5py.File(content, "w", userblock_size=_USER_BLOCK) as file:
-        _write(file, nested_columns(table.source, table.columns))
-    text = b"MATLAB 7.3 MAT-file, written by impc. HDF5 schema 1.00 ."
-    header = text.ljust(116) + bytes(8) + b"\x00\x02IM"
-    return header.ljust(_USER_BLOCK, b"\0") + content.getvalue()[_USER_BLOCK:]
-
-
-def _write(group: Any, values: Mapping[str, Any]) -> None:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            made = group.create_group(name)
-            _write(made, value)
-            kind = b"struct"
-        else:
-            made = group.create_dataset(name, data=value[None, :])  # HDF5 has rows, MATLAB columns
-            kind = b"double"
-        made.attrs["MATLAB_class"] = np.bytes_(kind)
 
 
 def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:

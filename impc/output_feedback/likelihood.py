@@ -153,18 +153,9 @@ def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
         return law, Clip(used=False, low=-np.inf, high=np.inf, unit=1.0)
     of_state = np.any(bound_rows(controller.bounds, controller.plant).E, axis=1)
     kept = np.flatnonzero((rows.stage > 0) | of_state[rows.family])
-    inner = Rows(
-        rows.T[kept],
-        rows.M[kept],
-        rows.N[kept],
-        rows.W[kept],
-        np.ascontiguousarray(rows.gram[np.ix_(kept, kept)]),
-        rows.b[kept],
-        rows.limit[kept],
-        rows.family[kept],
-        rows.stage[kept],
-    )
-    others = RowDirections(moved.T[kept], moved.M[kept], moved.b[kept])
+    inner = Rows._make(part[kept] for part in rows)
+    inner = inner._replace(gram=np.ascontiguousarray(inner.gram[:, kept]))
+    others = RowDirections._make(part[kept] for part in moved)
     return (
         dataclasses.replace(law, rows=inner, row_directions=others),
         Clip(used=True, low=low, high=high, unit=min(-low, high)),

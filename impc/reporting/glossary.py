@@ -27,8 +27,6 @@ WORDS: dict[str, str] = {
     "penalise directions. It depends on units.",
     "cost weight": "An entry on the diagonal of Q or R: what the square of a state or command "
     "costs.",
-    "Cramér-Rao": "The least variance that any unbiased estimate can have, if the residuals are "
-    "white.",
     "D-optimal": "Of experiments: with the least determinant of the covariance of the cost "
     "weights, the smallest volume of uncertainty.",
     "direction of the gain": "A combination of entries of the gain. Recordings determine some "

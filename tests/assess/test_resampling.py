@@ -10,16 +10,23 @@ import scipy.signal
 
 from experiments.coverage import cart, noisy_trial
 from impc.arrays import Array
-from impc.assess.printed_gain import Interval, covariance_intervals, entry_names, gain_estimate
+from impc.assess import resampling
+from impc.assess.covariance import GainCovariance, gain_covariance
+from impc.assess.long_run_covariance import white_noise
+from impc.assess.printed_gain import (
+    GainEstimate,
+    Interval,
+    covariance_intervals,
+    entry_names,
+    gain_estimate,
+)
 from impc.assess.profiles import profile_likelihood
 from impc.assess.resampling import (
-    Draw,
     Replicate,
     block_length,
     block_residuals,
     bootstrap_intervals,
     bootstrap_model,
-    model_residuals,
     replicate,
 )
 from impc.checking import replace
@@ -47,10 +54,16 @@ def first_order(root: float, samples: int, seed: int) -> Array:
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
 
 
-def drawn(fitted: Estimate, index: int, seed: int, draw: Draw) -> Replicate:
+def drawn(fitted: Estimate, index: int, seed: int) -> Replicate:
     at = gain_estimate(fitted)
     model = bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
-    return replicate(model, index, seed, draw)
+    return replicate(model, index, seed)
+
+
+def white_covariance(estimate: GainEstimate) -> GainCovariance:
+    """As if the residuals were white."""
+    at = estimate.problem, np.array(estimate.K), np.array(estimate.S)
+    return gain_covariance(*at, white_noise, curvature=True)
 
 
 def width(found: tuple[Interval, ...]) -> Array:
@@ -65,13 +78,12 @@ def width(found: tuple[Interval, ...]) -> Array:
     indirect=True,
 )
 def test_bootstrap_agrees_with_the_sandwich(fitted: Estimate) -> None:
-    """30 replicates, seed 4: widths within a third of the sandwich's, for both ways to draw."""
+    """30 replicates, seed 4: widths within a third of the sandwich's."""
     estimate = gain_estimate(fitted)
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
-    for draw in (block_residuals, model_residuals):
-        found = [drawn(fitted, index, SEED, draw) for index in range(30)]
-        ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
-        assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
+    found = [drawn(fitted, index, SEED) for index in range(30)]
+    ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
+    assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 
 
 @pytest.mark.full
@@ -90,7 +102,7 @@ def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
     trial = noisy_trial(SEED, 0.9)
     fit = fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
     estimate = gain_estimate(fit)
-    plain = width(covariance_intervals(estimate, estimate.white, "cramer-rao"))
+    plain = width(covariance_intervals(estimate, white_covariance(estimate), "white"))
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     assert np.all(sandwich > 2 * plain)
 
@@ -114,7 +126,7 @@ def test_profile_against_brute_force(fitted: Estimate) -> None:
     best = profile.values[int(np.argmin(profile.distances))]
     least = min(squared(best, second) for second in grid)
     variance = least / sum(trial.outputs.size for trial in problem.recordings)
-    factor = max((known.covariance.entries[0, 0] / known.white.entries[0, 0]) ** 2, 1.0)
+    factor = max((known.covariance.entries[0, 0] / white_covariance(known).entries[0, 0]) ** 2, 1.0)
     assert distance == pytest.approx((held - least) / (variance * factor), rel=0.05, abs=0.05)
 
 
@@ -143,13 +155,15 @@ def test_an_unknown_name_is_told(fitted: Estimate) -> None:
 
 
 def test_a_replicate_depends_on_seed_and_number_only(fitted: Estimate) -> None:
-    alone = drawn(fitted, 3, SEED, block_residuals)
-    after = [drawn(fitted, index, SEED, block_residuals) for index in (2, 3)][1]
+    alone = drawn(fitted, 3, SEED)
+    after = [drawn(fitted, index, SEED) for index in (2, 3)][1]
     np.testing.assert_array_equal(alone.K, after.K)
-    assert not np.array_equal(drawn(fitted, 3, SEED + 1, block_residuals).K, alone.K)
+    assert not np.array_equal(drawn(fitted, 3, SEED + 1).K, alone.K)
 
 
-def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(fitted: Estimate) -> None:
+def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
+    fitted: Estimate, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Weights first, then the gain that is identified: within a hundredth of its deviation.
 
     The whole fit is given the recordings that the replicate has drawn.
@@ -161,8 +175,9 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(fitted: Estim
         kept.append(block_residuals(residuals, rng))
         return kept[-1]
 
+    monkeypatch.setattr(resampling, "block_residuals", keep)
     model = bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
-    found = replicate(model, 0, SEED, keep)
+    found = replicate(model, 0, SEED)
     trials = tuple(
         replace(trial, outputs=outputs + noise)
         for trial, outputs, noise in zip(
@@ -174,13 +189,12 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(fitted: Estim
     assert np.all(np.abs(found.K - at.K) > 0.01 * whole.covariance.entries)
 
 
-@pytest.mark.parametrize("draw", [block_residuals, model_residuals])
 @pytest.mark.parametrize("root", [0.0, 0.9])
-def test_drawn_residuals_have_the_colour_of_the_given(draw, root: float) -> None:  # type: ignore[no-untyped-def]
+def test_drawn_residuals_have_the_colour_of_the_given(root: float) -> None:
     """Variance, correlation of the outputs and of neighbours; 40 draws of 2 x 2000 samples."""
     given = [first_order(root, 2000, SEED), first_order(root, 1500, SEED + 1)]
     rng = np.random.default_rng(SEED)
-    drawn = [draw(given, rng) for _ in range(40)]
+    drawn = [block_residuals(given, rng) for _ in range(40)]
     assert [part.shape for part in drawn[0]] == [(2000, 2), (1500, 2)]
 
     def moments(trials: list[Array]) -> Array:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import c3d
-import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -18,7 +17,7 @@ from nptdms import ChannelObject, TdmsFile, TdmsWriter
 from numpy.typing import ArrayLike
 
 from impc.errors import DataError, OutputError
-from impc.files.formats import read_table, write_matlab73, write_table
+from impc.files.formats import read_table, write_table
 from impc.files.layout import split_heading
 from impc.files.table import Table, make_table
 from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat, save_mat
@@ -239,9 +238,8 @@ def test_files_that_matlab_wrote_and_cannot_be_read(name: str, phrase: str) -> N
 
 def test_the_names_of_columns_in_matlab(tmp_path: Path) -> None:
     table = make_table("trial", {"seat angle": np.arange(5.0)})
-    for write in (write_table, write_matlab73):
-        with pytest.raises(OutputError, match="cannot be the name of a variable"):
-            write(tmp_path / "trial.mat", table)
+    with pytest.raises(OutputError, match="cannot be the name of a variable"):
+        write_table(tmp_path / "trial.mat", table)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -353,13 +351,6 @@ def test_what_others_read_in_what_impc_writes(tmp_path: Path) -> None:
     write_table(tmp_path / "a.mat", table)
     five = scipy.io.loadmat(tmp_path / "a.mat", simplify_cells=True)
     np.testing.assert_array_equal(five["s"]["seat"], SEAT["seat"])
-    write_matlab73(tmp_path / "b.mat", table)
-    with h5py.File(tmp_path / "b.mat") as file:
-        assert file.userblock_size == 512
-        assert file["s"].attrs["MATLAB_class"] == b"struct"
-        assert file["s/seat"].attrs["MATLAB_class"] == b"double"
-        np.testing.assert_array_equal(file["s/seat"][0], SEAT["seat"])
-    assert_columns(read_table(tmp_path / "b.mat"), {"s.seat": SEAT["seat"], "time": SEAT["time"]})
     write_table(tmp_path / "c.tdms", table)
     channel = TdmsFile.read(tmp_path / "c.tdms")["recording"]["s.seat"]
     np.testing.assert_array_equal(channel[:], SEAT["seat"])

@@ -15,7 +15,7 @@ import numpy as np
 
 from impc.errors import ImpcError
 from impc.files.configuration import read_configuration
-from impc.files.formats import FORMATS, read_table, write_matlab73, write_table
+from impc.files.formats import FORMATS, read_table, write_table
 from impc.files.inspection import draft_configuration, summary
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
@@ -155,7 +155,7 @@ def _sound_files(folder: Path) -> dict[str, list[bytes]]:
     for packed in (False, True):
         save_mat(path, {**columns, **more}, do_compression=packed)
         found[".mat"].append(path.read_bytes())
-    write_matlab73(path, make_table("sound", {**columns, "s.a": np.arange(60.0)}))
+    hdf5_mat(path, {**columns, "s/a": np.arange(60.0)})
     found[".mat"] += [path.read_bytes()] * 2
     hdf5_mat(path, {name: np.atleast_2d(values) for name, values in columns.items()})
     found[".mat"].append(path.read_bytes())

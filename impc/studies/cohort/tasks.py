@@ -20,7 +20,7 @@ from impc.arrays import frozen
 from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent_statements import intent
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.resampling import DRAWS, bootstrap_model, replicate
+from impc.assess.resampling import bootstrap_model, replicate
 from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
 from impc.checking import replace
@@ -123,7 +123,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     problem, settings = unit_problem(task)
     here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "offsets")))
     model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
-    found = replicate(model, index, settings.seed, DRAWS[settings.bootstrap])
+    found = replicate(model, index, settings.seed)
     return _finished({"K": found.K, "parameters": found.parameters}, started)
 
 

@@ -37,7 +37,7 @@ _FIGURE = Picture(
     narrow=True,
 )
 # Columns of intervals by other methods than that of low and high.
-_OTHER = {"cramer-rao": "white", "block": "block", "model": "model", "profile": "profile"}
+_OTHER = ("block", "profile")
 
 
 def gain_finding(result: FitResult) -> Finding:
@@ -56,22 +56,22 @@ def gain_finding(result: FitResult) -> Finding:
             "identified": item.identified,
             "excludes_zero": item.excludes_zero,
         }
-        for method, column in _OTHER.items():
+        for method in _OTHER:
             other = found.get((name, method))
             if any(key == method for _, key in found):
-                row[f"{column}_low"] = np.nan if other is None else float(other.low)
-                row[f"{column}_high"] = np.nan if other is None else float(other.high)
+                row[f"{method}_low"] = np.nan if other is None else float(other.low)
+                row[f"{method}_high"] = np.nan if other is None else float(other.high)
         rows.append(row | {"gain_of_the_weights": float(of_weights.get(name, np.nan))})
     level = 100 * uncertainty.intervals[0].level if rows else 95
     return Finding(
         "gain",
         pd.DataFrame(rows),
         f"Intervals of {level:.0f} %. Low and high allow for autocorrelated residuals, as those of "
-        "people are; those that take them for white are too narrow then. An entry that is not "
-        "identified takes part in directions that hardly show in the recordings: values within its "
-        "interval cannot be distinguished, and the table of directions says which combinations "
-        "can. The gain of the reported weights follows from a rule that chose them, so it has no "
-        "interval; outside the estimate's interval these weights do not quite behave as recorded.",
+        "people are. An entry that is not identified takes part in directions that hardly show in "
+        "the recordings: values within its interval cannot be distinguished, and the table of "
+        "directions says which combinations can. The gain of the reported weights follows from a "
+        "rule that chose them, so it has no interval; outside the estimate's interval these "
+        "weights do not quite behave as recorded.",
         figure=_FIGURE,
         folded="Every number with its intervals",
     )

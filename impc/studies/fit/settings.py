@@ -111,8 +111,8 @@ class FitSettings:
         Whether each trial is predicted from the others.
     replicates : int
         Bootstrap replicates; 0 for none, else at least 20.
-    bootstrap : "block" or "model"
-        How residuals are drawn (`impc.assess.resampling`).
+    bootstrap : "block"
+        How residuals are drawn: in moving blocks (`impc.assess.resampling`).
     seed : int
         Of the bootstrap.
     profiles : list of str
@@ -162,7 +162,7 @@ class FitSettings:
     settle: Annotated[float, Meta(ge=0, le=1_000_000)] = 1.0
     held_out: bool = True
     replicates: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
-    bootstrap: Literal["block", "model"] = "block"
+    bootstrap: Literal["block"] = "block"
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     profiles: list[str] = field(default_factory=list)
     intent_draws: bool = True
@@ -214,6 +214,8 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
             raise InputError(
                 f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or take the line out"
             )
+    if table.get("bootstrap") == "model":
+        raise InputError("[fit] bootstrap", '"model" was removed', 'use "block"')
     settings = read_settings("fit", FitSettings, table)
     if 0 < settings.replicates < _FEWEST:
         raise InputError(

@@ -40,9 +40,8 @@ from impc.studies.selection.lasso import Lasso, lasso_of_size, table_c1
 from impc.studies.selection.model import Trial
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from impc.assess.resampling import Draw
     from impc.studies.selection.model import ParametricModel
     from impc.studies.selection.model_source import Runner
     from impc.studies.selection.settings import SelectSettings
@@ -189,7 +188,7 @@ class BootstrapIntervals(Frozen):
 
 
 def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """A `Draw` row by row of all trials: residuals `parts` (samples, p) of each, drawn by `rng`."""
+    """Draw residuals `parts` (samples, p) of each trial again, row by row of all trials."""
     pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
 
@@ -203,7 +202,7 @@ def bootstrap_subset(
     fit: Estimate,
     replicates: int,
     seed: int,
-    draw: Draw = draw_single,
+    draw: Callable[[list[Array], np.random.Generator], list[Array]] = draw_single,
 ) -> BootstrapIntervals:
     """Intervals of the free parameters of a fit."""
     theta = np.array(fit.theta)
