@@ -50,12 +50,13 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     width = plant.E.shape[1]  # predictions are driven by recorded outputs too
     pushes = given.disturbance[:, :width]
     expected, dexpected = expected_disturbance(plant, pushes, along.observer)
-    held = np.minimum(np.arange(len(values)), steps - 1)
-    expected, dexpected = expected[held], dexpected[held]
+    last = np.minimum(np.arange(len(values)), steps - 1)
+    expected, dexpected = expected[last], dexpected[last]
     states = SteadyStates(plant, signal_rows(plant, given.signals), controller.bounds)
     z, groups = states.at(values, expected)
     # What is to come is a target, without the disturbance that is believed to last.
-    alone = states.at(values, 0 * expected) if np.any(expected) else (z, groups)
+    lasting = bool(count and np.any(expected))
+    alone = states.at(values, 0 * expected) if lasting else (z, groups)
     # A terminal set of the user's own is about the target: it takes nothing of it.
     table = np.zeros((count, n + m))
     table[: len(bounds.b)] = np.hstack([bounds.E, bounds.F])
@@ -69,20 +70,26 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
         )
     aim = [np.ascontiguousarray(part) for part in (z[:steps, :n], z[:steps, n:], taken, held)]
     moving = (along.A, along.B, along.E[:, :width], along.C, along.observer, along.bounds)
-    if not any(np.any(part) for part in moving):
+    # Few directions move the plant: only along these are targets differentiated.
+    moved = sum(np.any(part, axis=tuple(range(part.ndim - 1))) for part in moving)
+    columns = np.flatnonzero(moved)
+    if not len(columns):
         return Aim(*aim, *still)
-    dH = [along.C[plant.outputs.index(name)] if name in plant.outputs else np.zeros((n, p))
+    A, B, E, C, _, limits = (part[..., columns] for part in moving)
+    dH = [C[plant.outputs.index(name)] if name in plant.outputs else np.zeros((n, len(columns)))
           for name in given.signals]  # fmt: skip
-    change = PlantChange(
-        along.A, along.B, along.E[:, :width], np.array(dH).reshape(-1, n, p), along.bounds
-    )
+    change = PlantChange(A, B, E, np.array(dH).reshape(-1, n, len(columns)), limits)
+    dexpected = dexpected[..., columns]
     slopes = states.slopes(values, expected, dexpected, groups, change)
     ahead = slopes
-    if np.any(expected):
+    if lasting:
         ahead = states.slopes(values, 0 * expected, 0 * dexpected, alone[1], change)
     dtaken, dheld = (
         np.tensordot(part, table, (1, 1)).transpose(0, 2, 1)
         for part in (ahead, (slopes - ahead)[:steps])
     )
-    parts = slopes[:steps, :n], slopes[:steps, n:], dtaken, dheld
-    return Aim(*aim, *(np.ascontiguousarray(part) for part in parts))
+    found = []
+    for part in (slopes[:steps, :n], slopes[:steps, n:], dtaken, dheld):
+        found.append(np.zeros((*part.shape[:2], p)))
+        found[-1][..., columns] = part
+    return Aim(*aim, *found)

@@ -166,12 +166,11 @@ class SteadyStates:
         """
         z = self._solve((), values, pushes)[:, : self.G.shape[1]]
         excess = z @ self.G.T - self.rows.b
-        groups: dict[tuple[int, ...], list[int]] = {}
-        for place in range(len(z)):
-            beyond = np.any(excess[place] > _KEPT * self.rows.b)
-            active = self._active(-excess[place]) if beyond else ()
-            groups.setdefault(active, []).append(place)
-        found = [(active, np.array(places)) for active, places in groups.items()]
+        beyond = np.any(excess > _KEPT * self.rows.b, axis=1)
+        groups: dict[tuple[int, ...], list[int]] = {(): np.flatnonzero(~beyond).tolist()}
+        for place in np.flatnonzero(beyond).tolist():
+            groups.setdefault(self._active(-excess[place]), []).append(place)
+        found = [(active, np.array(places, dtype=int)) for active, places in groups.items()]
         for active, places in found:
             if active:
                 z[places] = self._solve(active, values[places], pushes[places])[:, : z.shape[1]]
