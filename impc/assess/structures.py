@@ -155,7 +155,8 @@ def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
 
 def _left_out(problem: Problem, structure: Structure, end: Estimate, settle: float) -> list[Array]:
     """VAF of each trial under the structure fitted to the others."""
-    start, found = problem.at(end.problem.starts, end.problem.logarithms), []
+    there = end.problem
+    start, found = problem.at(there.starts, there.logarithms, there.shifts), []
     cost_weights = _moving(np.array(end.cost_weights))
     for index in range(len(problem.recordings) if len(problem.recordings) > 1 else 0):
         others = start.leaving_out(index)

@@ -426,5 +426,6 @@ def _begun(problem: Problem, start: Estimate | Weights | None) -> tuple[Problem,
         return problem, start
     there, same = start.problem, start.problem.starts.shape == problem.starts.shape
     if problem.unknown_start and same and there.logarithms.shape == problem.logarithms.shape:
-        problem = problem.at(np.array(there.starts), np.array(there.logarithms))
+        own = (np.array(part) for part in (there.starts, there.logarithms, there.shifts))
+        problem = problem.at(*own)
     return problem, start.stage_weights

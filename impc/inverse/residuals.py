@@ -307,36 +307,45 @@ def _slope(
     differential: PlantDifferential | None,
 ) -> Array:
     """Derivative of `_Seen.off` (samples q, count), with the outputs' rows and offsets."""
-    plant, p = problem.plant, len(problem.plant.outputs)
-    slope = _moved(problem, trial, moved, seen.weighting)
+    p = len(problem.plant.outputs)
+    slope = measured_slope(problem, trial, moved, layout.own.start, seen.weighting)
     if differential is not None:
         on_outputs = np.tensordot(run.x, differential.C, ((1,), (1,)))  # (samples, p, k)
         slope[:, :p, layout.parameters] += on_outputs / problem.output_scale[:, None]
-    for place, name in enumerate(problem.offsets):
-        column = layout.own.start + problem.searched_states + place
-        slope[:, :p, column] += seen.weighting[:, plant.outputs.index(name)]
-    slope[np.isnan(recorded(problem, trial))] = 0.0
+        slope[np.isnan(recorded(problem, trial))] = 0.0
     return slope.reshape(-1, layout.count)
 
 
-def _moved(problem: Problem, trial: Recording, moved: Sensitivity, weighting: Array) -> Array:
-    """Outputs and commands over their scales, as a simulation moves them (samples, q, k)."""
-    p = len(weighting)
+def measured_slope(
+    problem: Problem,
+    trial: Recording,
+    moved: Sensitivity,
+    own: int | None = None,
+    weighting: Array | None = None,
+) -> Array:
+    """Outputs and commands over their scales, as a simulation moves them (samples, q, k).
+
+    Zero where something is missing; offsets, if there are columns of a trial's `own`, behind its
+    states.
+    """
+    outputs, W = problem.plant.outputs, weighting
+    W, p = np.diag(1 / problem.output_scale) if W is None else W, len(outputs)
     slope = np.zeros((trial.samples, len(problem.measured), moved.x.shape[2]))
-    slope[:, :p] = (weighting @ problem.plant.C) @ moved.x
+    slope[:, :p] = (W @ problem.plant.C) @ moved.x
+    for place, name in enumerate(problem.offsets if own is not None else ()):
+        slope[:, :p, (own or 0) + problem.searched_states + place] += W[:, outputs.index(name)]
     if slope.shape[1] > p:
         slope[:-1, p:] = moved.u / problem.command_scale[:, None]
+    slope[np.isnan(recorded(problem, trial))] = 0.0
     return slope
 
 
 def residual_along(problem: Problem, controller: Controller, along: Directions) -> Array:
     """Derivative of the residual (r, k) along directions of the controller."""
-    parts, weighting = [], np.diag(1 / problem.output_scale)
+    parts = []
     for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
         _, moved = simulate_and_differentiate(controller, drive, along)
-        slope = _moved(problem, trial, moved, weighting)
-        slope[np.isnan(recorded(problem, trial))] = 0.0
-        parts.append(slope.reshape(-1, along.count))
+        parts.append(measured_slope(problem, trial, moved).reshape(-1, along.count))
     return np.concatenate(parts)
 
 

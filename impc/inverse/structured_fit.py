@@ -81,11 +81,12 @@ def fit_structure(
 
 def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Estimate:
     """Fit a structure from an estimate that fits, with its initial states and parameters."""
-    posed = problem.at(np.array(near.problem.starts), np.array(near.problem.logarithms))
+    own = (np.array(getattr(near.problem, name)) for name in ("starts", "logarithms", "shifts"))
+    posed = problem.at(*own)
     end = fit_structure(posed, structure, np.array(near.gain), np.array(near.metric))
     given = np.array(problem.logarithms)
     if np.any(np.abs(near.problem.logarithms - given) > _RUNAWAY):
-        there = problem.at(np.array(end.problem.starts), given)
+        there = problem.at(np.array(end.problem.starts), given, np.array(end.problem.shifts))
         with contextlib.suppress(
             WeightsError
         ):  # a cost weight of zero may leave no regulator there

@@ -2,8 +2,8 @@
 
 Its controller has a gain and a metric for each stage (docs/theory.md, section 2), so no single gain
 stands between recordings and weights: least squares go over the unknowns of a structure, by default
-all of Q and R, and over initial states that are not known. How much of the weights is identified is
-not known beforehand: it is the rank of the derivative at the answer.
+all of Q and R, and over initial states and offsets that are not known. How much of the weights is
+identified is not known beforehand: it is the rank of the derivative at the answer.
 """
 
 from __future__ import annotations
@@ -20,9 +20,17 @@ from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.errors import ImpcError, SolverError
+from impc.inverse.coordinates import with_own
 from impc.inverse.estimates import determined, simulated_estimate
 from impc.inverse.gain_search import regulators
-from impc.inverse.problem import explains, scenarios, typical_output, weights_controller
+from impc.inverse.problem import (
+    explains,
+    missed,
+    scenarios,
+    typical_output,
+    weights_controller,
+)
+from impc.inverse.residuals import measured_slope
 from impc.inverse.structured_fit import bryson_cost_weights
 from impc.model.structure import Structure
 
@@ -43,8 +51,8 @@ def fit_weights(problem: Problem) -> Estimate:
     loose, first = replace(posed, terminal_weight=None), regulators(problem)[0]
     ladder = np.array(bryson_cost_weights(loose, structure, np.array(first.K), np.array(first.S)))
     drawn = np.random.default_rng(0).normal(scale=_SPREAD, size=(_DRAWN, *ladder.shape))
-    x0 = posed.starts.ravel() if posed.unknown_start else np.zeros(0)
-    starts = [np.concatenate([z, x0]) for z in (*ladder, *np.concatenate(ladder + drawn))]
+    own = np.zeros(len(posed.recordings) * posed.own_unknowns)
+    starts = [np.concatenate([z, own]) for z in (*ladder, *np.concatenate(ladder + drawn))]
     sizes = [float(np.linalg.norm(_evaluated(posed, structure, y)[0])) for y in starts]
     spent, ends = 0, []
     for index in np.argsort(sizes)[:_SEARCHED]:
@@ -57,8 +65,8 @@ def fit_weights(problem: Problem) -> Estimate:
     z, found = _parted(posed, best.x)
     weights = structure.weights(z)
     law = weights_controller(found, weights)
-    shared, own = np.split(_evaluated(posed, structure, best.x)[1], [len(z)], axis=1)
-    left = shared - own @ np.linalg.lstsq(own, shared)[0] if own.size else shared
+    shared, apart = np.split(_evaluated(posed, structure, best.x)[1], [len(z)], axis=1)
+    left = shared - apart @ np.linalg.lstsq(apart, shared)[0] if apart.size else shared
     values = np.asarray(np.linalg.svd(left, compute_uv=False))
     estimate = simulated_estimate(
         "inverse_mpc",
@@ -80,37 +88,37 @@ def fit_weights(problem: Problem) -> Estimate:
 
 
 def _parted(problem: Problem, y: Array) -> tuple[Array, Problem]:
-    """Unknowns of the structure, and the problem at the initial states, of all unknowns y."""
-    if not problem.unknown_start:
-        return y, problem
-    z, starts = np.split(y, [len(y) - problem.starts.size])
-    return z, problem.at(starts.reshape(problem.starts.shape), np.array(problem.logarithms))
+    """Unknowns of the structure, and the problem at initial states and offsets, of all y."""
+    shape = len(problem.recordings), problem.own_unknowns
+    z, own = np.split(y, [len(y) - shape[0] * shape[1]])
+    return z, with_own(problem, own.reshape(shape))
 
 
 def _evaluated(problem: Problem, structure: Structure, y: Array) -> tuple[Array, Array]:
-    """Residual (r,) and its derivative along the weights and the initial states (r, len(y))."""
+    """Residual (r,) and its derivative along the weights and what is a trial's own (r, len(y))."""
     z, there = _parted(problem, y)
-    plant, q, far = problem.plant, len(z), _NOT_REACHED * typical_output(problem)
-    count = q + (plant.n if problem.unknown_start else 0)
+    q, far = len(z), _NOT_REACHED * typical_output(problem)
+    count, searched = q + problem.own_unknowns, problem.searched_states
     try:
         law = weights_controller(there, structure.weights(z))
     except ImpcError:  # no controller in double precision: a search steps back
-        rows = problem.recorded_numbers
+        rows = sum(problem.trial_sizes)
         return np.full(rows, far), np.zeros((rows, len(y)))
     dQ, dR = (
         np.pad(np.moveaxis(part, 0, -1), ((0, 0), (0, 0), (0, count - q)))
         for part in structure.changes(z)
     )
-    along = directions(law, count, Q=dQ, R=dR, x0=np.eye(plant.n, count, q))
-    prepared = prepare_loop(law, along)
-    errors, slopes, C = [], [], plant.C / problem.output_scale[:, None]
+    x0 = np.zeros((problem.plant.n, count))
+    x0[:searched, q : q + searched] = np.eye(searched)
+    prepared = prepare_loop(law, directions(law, count, Q=dQ, R=dR, x0=x0))
+    errors, slopes = [], []
     for trial, drive in zip(there.recordings, scenarios(there), strict=True):
         run, moved = run_loop(prepared, drive, proved=False)
-        error = run.x @ C.T - trial.outputs / problem.output_scale
+        error = missed(there, trial, run)
         if not run.complete:
             error[run.reached + 1 :] = far
         errors.append(error.ravel())
-        slopes.append((C @ moved.x).reshape(-1, count))
+        slopes.append(measured_slope(there, trial, moved, q).reshape(-1, count))
     apart = scipy.linalg.block_diag(*(slope[:, q:] for slope in slopes))
     return np.concatenate(errors), np.hstack([np.concatenate(slopes)[:, :q], apart])
 

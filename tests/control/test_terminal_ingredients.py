@@ -130,6 +130,28 @@ def test_the_riccati_weight_given_is_the_default() -> None:
     assert simulate(given, drive).u == pytest.approx(default.u, abs=1e-9)
 
 
+def test_gaps_offsets_and_commands_of_a_finite_horizon() -> None:
+    rng = np.random.default_rng(2)
+    plant = random_plant(rng, 2, 1, 1.05, d=1)
+    structure = impc.Structure(plant, "diagonal")
+    truth = structure.weights(np.array([0.5, -0.3]))
+    bounds, push = impc.Bounds(plant, u_min=-0.5, u_max=0.5), rng.normal(size=60)
+    given: dict[str, Any] = {"terminal_weight": 0}
+    law = impc.Controller(plant, truth, bounds, 4, terminal_set=False, **given)
+    target = {plant.states[0]: 0.2 * np.sign(np.sin(np.arange(61) / 9))}
+    run = law.simulate([1, -1], disturbance=push, target=target)
+    y = run.x + np.array([0.1, 0.0])
+    y[rng.random(y.shape) < 0.3] = np.nan
+    trial = impc.Recording(plant, y, push, target=target, commands=run.u)
+    problem = impc.Problem(
+        plant, bounds, 4, [trial], structure=structure, offsets=plant.outputs[:1], **given
+    )
+    found = impc.fit(problem)
+    assert found.explained
+    assert impc.weight_error(found.stage_weights, truth) < 1e-6
+    assert found.problem.shifts[0, 0] == pytest.approx(0.1, abs=1e-8)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_weights_behind_a_finite_horizon(seed: int, tmp_path: Path) -> None:
     """Of exact recordings; the rank is that of central differences."""

@@ -367,3 +367,29 @@ def test_with_a_bound_it_is_that_of_many_particles(
 ) -> None:
     who = Someone(limit=limit, horizon=1, sensory=senses, start=(0.0, 0.0))
     check_with_particles(who, 200, 100_000)
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.5])
+def test_a_target_of_a_cart_only_moves_the_origin(limit: float) -> None:
+    """A recording about a target has the likelihood of the same one about rest, with its slopes."""
+    who = Someone(limit=limit)
+    y = recorded(who, 200).outputs
+    there = recorded_about(who, 200, 0.4)
+    np.testing.assert_allclose(there, y + 0.4, atol=1e-9)
+    prepared = filter_of(who, slopes=True)
+    moved = Recording(
+        who.plant(), y + 0.4, push(200), np.add(who.start, [0.4, 0.0]), target={"x": 0.4}
+    )
+    rest, aimed = joint_likelihoods(prepared, [trial_of(who, y), moved])
+    assert np.any(rest.status > 0) == np.isfinite(limit)
+    np.testing.assert_allclose(aimed.identified, rest.identified, atol=1e-8)
+    np.testing.assert_allclose(aimed.score, rest.score, atol=1e-6)
+
+
+def recorded_about(who: Someone, samples: int, target: float) -> Array:
+    """The same noise about a target, the person having begun there."""
+    law, person, pushed = who.controller(), who.observer(), push(samples)
+    found = simulate_person(
+        law, person, pushed, recorder=who.recorder, seed=1, x0=[target, 0], target={"x": target}
+    )
+    return np.array(found.outputs)
