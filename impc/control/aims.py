@@ -9,6 +9,7 @@ the deviations (docs/theory.md, section 7).
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,15 +36,20 @@ def window(aim: Aim, first: int, steps: int) -> Aim:
     return Aim(*parts)._replace(taken=aim.taken[first : first + steps + ahead])
 
 
+@functools.lru_cache(maxsize=64)  # short simulations are made by the thousand
+def _rest(n: int, m: int, p: int) -> Aim:
+    """The aim of a controller that regulates to rest."""
+    slopes = [np.zeros((0, size, p)) for size in (n, m, 0, 0)]
+    return Aim(*(np.zeros(part.shape[:2]) for part in slopes), *slopes)
+
+
 def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     """The targets of a scenario, and their derivatives where the directions move them."""
-    plant, bounds = controller.plant, bound_rows(controller.bounds, controller.plant)
-    n, m, steps, p = plant.n, plant.m, given.steps, along.count
-    whole = families(controller)
-    count = len(whole.b)
-    still = [np.zeros((0, size, p)) for size in (n, m, count, count)]
+    plant, p = controller.plant, along.count
     if not given.signals and not np.any(plant.observer):
-        return Aim(*(np.zeros(part.shape[:2]) for part in still), *still)
+        return _rest(plant.n, plant.m, p)
+    bounds, whole = bound_rows(controller.bounds, plant), families(controller)
+    n, m, steps, count = plant.n, plant.m, given.steps, len(whole.b)
     # Beyond the last sample the last target stays: nobody recorded what came.
     places = np.minimum(np.arange(steps + plant.ahead), len(given.target) - 1)
     values = given.target[places] if given.signals else np.zeros((len(places), 0))
@@ -74,7 +80,7 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     moved = sum(np.any(part, axis=tuple(range(part.ndim - 1))) for part in moving)
     columns = np.flatnonzero(moved)
     if not len(columns):
-        return Aim(*aim, *still)
+        return Aim(*aim, *list(_rest(n, m, p))[4:])
     A, B, E, C, _, limits = (part[..., columns] for part in moving)
     dH = [C[plant.outputs.index(name)] if name in plant.outputs else np.zeros((n, len(columns)))
           for name in given.signals]  # fmt: skip

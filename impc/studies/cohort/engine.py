@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from impc.studies.pool import Pool, Result
 
 # What a replicate needs of its fit.
-_NEEDED = ("starts", "logarithms", "K", "S", "Q", "R")
+_NEEDED = ("starts", "logarithms", "offsets", "K", "S", "Q", "R")
 
 
 @dataclass(frozen=True)
