@@ -167,7 +167,9 @@ class SteadyStates:
         z = self._solve((), values, pushes)[:, : self.G.shape[1]]
         excess = z @ self.G.T - self.rows.b
         beyond = np.any(excess > _KEPT * self.rows.b, axis=1)
-        groups: dict[tuple[int, ...], list[int]] = {(): np.flatnonzero(~beyond).tolist()}
+        groups: dict[tuple[int, ...], list[int]] = {}
+        if not np.all(beyond):
+            groups[()] = np.flatnonzero(~beyond).tolist()
         for place in np.flatnonzero(beyond).tolist():
             groups.setdefault(self._active(-excess[place]), []).append(place)
         found = [(active, np.array(places, dtype=int)) for active, places in groups.items()]

@@ -136,6 +136,24 @@ def test_slopes_of_targets_are_differences(seed: int, named: bool) -> None:
     assert impc.simulate_and_differentiate(law, drive, directions(law, 0))[0].status.max() == 1
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_slopes_where_every_target_is_beyond_reach(seed: int) -> None:
+    """Along the plant's B, at rests whose commands are all at their bounds."""
+    plant, _, _, weights, target, _ = a_loop(seed)
+    bounds = impc.Bounds(plant, u_min=-1e-3, u_max=1e-3)
+    law = impc.Controller(plant, weights, bounds, 4, terminal_set=False)
+    drive = impc.scenario(plant, np.zeros(plant.n), 5, target=dict.fromkeys(target, 1.0))
+    _, slope = impc.simulate_and_differentiate(law, drive, impc.directions(law, 1, B=plant.B))
+
+    def at(step: float) -> Array:
+        there = replace(law, plant=replace(plant, B=plant.B * (1 + step)))
+        return np.array(impc.simulate_and_differentiate(there, drive, directions(there, 0))[0].x)
+
+    wanted = (at(1e-6) - at(-1e-6)) / 2e-6
+    assert np.max(np.abs(wanted)) > 0
+    assert slope.x[..., 0] == pytest.approx(wanted, abs=1e-6 * np.max(np.abs(wanted)))
+
+
 def test_preview_moves_before_the_target_does() -> None:
     plant, _, known, weights, _, _ = a_loop(0, ahead=3)
     law = impc.Controller(known, weights, impc.Bounds(known), 3, terminal_set=False)
