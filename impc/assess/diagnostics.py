@@ -63,7 +63,7 @@ def residual_diagnostics(problem: Problem, gain: Array, metric: Array) -> Residu
     structure = residual_structure(problem, gain, found)
     # Nothing but rounding is left of an exact fit: neither test has anything to say.
     # Of residuals with gaps the spectrum is another.
-    gaps = any(np.isnan(trial.outputs).any() for trial in problem.recordings)
+    gaps = any(trial.has_gaps for trial in problem.recordings)
     loop = None if structure is None or gaps else loop_noise(problem.plant, gain, residuals)
     return ResidualDiagnostics(loop, structure)
 

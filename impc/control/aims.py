@@ -17,7 +17,6 @@ import numpy as np
 from impc.control.compiled_kernel import Aim
 from impc.control.constraint_rows import families
 from impc.errors import InputError
-from impc.model.bounds import bound_rows
 from impc.model.targets import PlantChange, SteadyStates, expected_disturbance, signal_rows
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     plant, p = controller.plant, along.count
     if not given.signals and not np.any(plant.observer):
         return _rest(plant.n, plant.m, p)
-    bounds, whole = bound_rows(controller.bounds, plant), families(controller)
+    whole = families(controller)
     n, m, steps, count = plant.n, plant.m, given.steps, len(whole.b)
     # Beyond the last sample the last target stays: nobody recorded what came.
     places = np.minimum(np.arange(steps + plant.ahead), len(given.target) - 1)
@@ -65,7 +64,7 @@ def aim_of(controller: Controller, given: Scenario, along: Directions) -> Aim:
     alone = states.at(values, 0 * expected) if lasting else (z, groups)
     # A terminal set of the user's own is about the target: it takes nothing of it.
     table = np.zeros((count, n + m))
-    table[: len(bounds.b)] = np.hstack([bounds.E, bounds.F])
+    table[: len(states.G)] = states.G
     taken, held = alone[0] @ table.T, (z - alone[0])[:steps] @ table.T
     invariant = controller.terminal is not None and not controller.terminal.own
     if invariant and np.any(np.abs(z @ table.T) > _NOTHING * whole.b):

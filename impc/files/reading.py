@@ -187,7 +187,7 @@ def _clocked(
         findings += _checked(table, channel, signals[name], recorded, response, keep)
         values = on_even_instants(clock, channel.values * channel.unit.factor)
         if keep and (gaps := checks.gaps(channel, recorded.fill_gaps)).any():
-            known = np.isfinite(values)  # all but the ends, which are held
+            known = np.isfinite(values)  # the ends are held already
             values = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
             even[name, "lost"] = np.zeros(len(values))
             even[name, "lost"][clock.steps] = gaps
@@ -232,7 +232,7 @@ def _target(
 
 def require_whole(recordings: Sequence[Recording], command: str) -> None:
     """Refuse missing samples where a `command` cannot do without them."""
-    if any(np.isnan(trial.outputs).any() for trial in recordings):
+    if any(trial.has_gaps for trial in recordings):
         problem = f"leaves gaps, and impc {command} needs every sample"
         raise InputError("recording.keep_gaps", problem, "take it out, or allow fill_gaps")
 

@@ -10,9 +10,8 @@ Gain and metric are independent: where no bound is active S has no effect, and d
 No optimal regulator has a K T of norm above (tr(B'PB)/R)^(1/2), because white noise costs it
 tr(B'PB) a sample, of which R u^2 is a part.
 
-Initial states are measured in those of the trials themselves (`start_unit`), offsets in the
-size of their outputs, and a parameter in
-thirds of itself (docs/fitting.md).
+Initial states are measured in those of the trials themselves (`start_unit`), offsets in the size of
+their outputs, and a parameter in thirds of itself (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 
 from impc.arrays import Array
 from impc.inverse.least_squares import Prior, Rows, minimise, triangular_rows
@@ -130,9 +130,7 @@ class Coordinates:
         """The problem at coordinates of its other unknowns; `parameters` (k,)."""
         problem = self.problem
         moved = starts.reshape(self.trials, self.own) @ self.own_unit.T
-        there = with_own(problem, moved)
-        logarithms = problem.logarithms + PARAMETER_UNIT * parameters
-        return there.at(np.array(there.starts), logarithms)
+        return with_own(problem, moved, problem.logarithms + PARAMETER_UNIT * parameters)
 
     def at(self, z: Array) -> Compressed:
         """Residual and derivative at z (q,)."""
@@ -322,39 +320,36 @@ def _factor_changes(first: Array, lower: Array) -> Array:
     return np.array(found).reshape(-1, *first.shape)
 
 
-def with_own(problem: Problem, moved: Array) -> Problem:
-    """The problem at initial states and offsets that differ by `moved` (trials, own)."""
-    if not moved.size:
-        return problem
-    starts, shifts, size = (
-        np.array(problem.starts),
-        np.array(problem.shifts),
-        problem.searched_states,
-    )
+def with_own(problem: Problem, moved: Array, logarithms: Array | None = None) -> Problem:
+    """The problem at initial states and offsets that differ by `moved` (trials, own).
+
+    And at other `logarithms` (k,) of its parameters, where they are given.
+    """
+    starts, shifts = np.array(problem.starts), np.array(problem.shifts)
+    size = problem.searched_states
     starts[:, :size] += moved[:, :size]
-    for place, name in enumerate(problem.offsets):
-        shifts[:, problem.plant.outputs.index(name)] += moved[:, size + place]
-    return problem.at(starts, np.array(problem.logarithms), shifts)
+    shifts[:, _offset_places(problem)] += moved[:, size:]
+    return problem.at(starts, problem.logarithms if logarithms is None else logarithms, shifts)
 
 
 def own_values(problem: Problem) -> Array:
     """Initial states and offsets that are searched (trials, own)."""
-    places = [problem.plant.outputs.index(name) for name in problem.offsets]
-    return np.hstack([problem.starts[:, : problem.searched_states], problem.shifts[:, places]])
+    shifts = problem.shifts[:, _offset_places(problem)]
+    return np.hstack([problem.starts[:, : problem.searched_states], shifts])
+
+
+def _offset_places(problem: Problem) -> list[int]:
+    """Which outputs have an offset that is searched."""
+    return [problem.plant.outputs.index(name) for name in problem.offsets]
 
 
 def own_unit(problem: Problem, gain: Array) -> Array:
     """Unit of what is a trial's own (own, own): that of `start_unit`, and of the outputs."""
-    unit, size, count = np.eye(problem.own_unknowns), problem.searched_states, len(problem.offsets)
-    if size:
-        whole = start_unit(problem, gain)
-        square = size == len(whole)
-        unit[:size, :size] = (
-            whole if square else np.linalg.cholesky((whole @ whole.T)[:size, :size])
-        )
-    scales = [problem.output_scale[problem.plant.outputs.index(name)] for name in problem.offsets]
-    unit[size:, size:] = np.diag(scales) if count else unit[size:, size:]
-    return unit
+    size, shifts = problem.searched_states, np.diag(problem.output_scale[_offset_places(problem)])
+    whole = start_unit(problem, gain) if size else np.zeros((0, 0))
+    if size < len(whole):  # the other states are known
+        whole = np.asarray(np.linalg.cholesky((whole @ whole.T)[:size, :size]), dtype=np.float64)
+    return np.asarray(scipy.linalg.block_diag(whole, shifts))
 
 
 def start_unit(problem: Problem, gain: Array) -> Array:

@@ -397,7 +397,7 @@ def recorded_size(problem: Problem) -> float:
 def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array] | None:
     """States (samples, n) of each trial, where the outputs determine them."""
     C = plant.C
-    gaps = any(np.isnan(trial.outputs).any() for trial in recordings)
+    gaps = any(trial.has_gaps for trial in recordings)
     if gaps or C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
         return None
     return [
@@ -418,10 +418,8 @@ def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
     for x, trial in zip(states, recordings, strict=True):
         rest = x[1:] - x[:-1] @ plant.A.T - trial.disturbance[:-1] @ plant.E.T
         begun = float(np.sum((x[0] - trial.x0 - np.linalg.solve(plant.C, trial.offset)) ** 2))
-        missed, size = (
-            missed + begun + float(np.sum((rest @ left) ** 2)),
-            size + float(np.sum(x**2)),
-        )
+        missed += begun + float(np.sum((rest @ left) ** 2))
+        size += float(np.sum(x**2))
     return missed <= _EXACT**2 * size
 
 

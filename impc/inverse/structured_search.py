@@ -33,7 +33,7 @@ from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
 
 if TYPE_CHECKING:
     from impc.arrays import BoolArray
-    from impc.inverse.coordinates import Compressed, own_values
+    from impc.inverse.coordinates import Compressed
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
     from impc.model.structure import Structure

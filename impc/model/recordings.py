@@ -181,6 +181,11 @@ class Recording(Value):
         return np.asarray(self.outputs - self.offset)
 
     @property
+    def has_gaps(self) -> bool:
+        """Whether an output is missing at some sample."""
+        return bool(np.isnan(self.outputs).any())
+
+    @property
     def samples(self) -> int:
         """Number of samples."""
         return len(self.outputs)

@@ -197,7 +197,7 @@ def fit_output_feedback(
 
 def _require_plain(problem: Problem) -> None:
     """Refuse what the likelihood has no terms for."""
-    gaps = any(np.isnan(trial.outputs).any() for trial in problem.recordings)
+    gaps = any(trial.has_gaps for trial in problem.recordings)
     for there, what, remedy in (
         (gaps, "outputs with missing samples", "cut the trials there"),
         (bool(problem.offsets), "unknown offsets", "take them out of the recordings"),

@@ -45,8 +45,10 @@ def summary(estimate: Estimate) -> str:
             small = len(matrix) <= _SMALL
             text = text.replace("\n", "\n    ") if small else f"{matrix.shape}, see .weights"
             lines.append(f"{name} = {text}")
-        told = "The intervals are of the gain by itself; .K is the gain of these weights."
-        lines += [] if staged else [told]
+        if not staged:
+            lines.append(
+                "The intervals are of the gain by itself; .K is the gain of these weights."
+            )
     return "\n".join(lines)
 
 
