@@ -70,9 +70,9 @@ def command_findings(result: FitResult) -> list[Finding]:
         "intervals of a regression of the recorded commands on the states."
     )
     caption = (
-        "The regression takes samples without a bound. Noise in the states makes its gain too "
-        "small, noise of the command inside the loop makes that of the fit wrong: where the two "
-        "differ by much, one of the two is there."
+        "The regression takes samples without a bound. Noise in recorded states, and noise of the "
+        "subject that is not white, bias the regression; a wrong plant or bound biases the fit. "
+        "Where the two differ by much, one of these is there (docs/fitting.md)."
     )
     return [Finding("command_regression", table, caption, [said])]
 
