@@ -20,7 +20,8 @@ first (px/s). Input: command (px/s). There noise in the command is drift of the 
 a movement does.
 
 Their parameters were not measured by anybody: delay and lag are fitted, the defaults are where a
-fit starts. A bound on the command is one before delay and lag. The recordings that they were made
+fit starts. They are known to 30 ms (visual delays of tracking hands are .1 to .2 s) and 40 %
+(judgement). A bound on the command is one before delay and lag. The recordings that they were made
 for are described in docs/cursor-tracking.md.
 """
 
@@ -33,7 +34,7 @@ import numpy as np
 import scipy.linalg
 
 from plants._checks import finite_number
-from plants._units import with_units
+from plants._units import with_uncertainty, with_units
 from plants.actuation import delayed_muscle
 
 __all__ = ["cursor_plant", "pursuit_plant"]
@@ -86,7 +87,9 @@ def cursor_plant(
     stages = {name: f"stage {k} of the delay of the nerves" for k, name in enumerate(delays, 1)}
     stages["acceleration"] = "acceleration of the cursor"
     command = f"{length}/s^2", "acceleration that the person asks for"
-    return _tracking("cursor", (held[:n, :n], held[:n, n:]), sample_time, length, stages, command)
+    matrices = held[:n, :n], held[:n, n:]
+    system = _tracking("cursor", matrices, sample_time, length, stages, command)
+    return with_uncertainty(system, {"delay": delay, "lag": lag}, {"delay": 0.03, "lag": "40 %"})
 
 
 def pursuit_plant(
@@ -132,7 +135,8 @@ def pursuit_plant(
     commands = [f"command_{k}" for k in range(1, delay + 1)]
     stages = {name: f"command of the hand in {k} samples" for k, name in enumerate(commands)}
     command = f"{length}/s", "velocity that the person asks for"
-    return _tracking("pursuit", (A, B), sample_time, length, stages, command)
+    system = _tracking("pursuit", (A, B), sample_time, length, stages, command)
+    return with_uncertainty(system, {"lag": lag}, {"lag": "40 %"})
 
 
 def _tracking(

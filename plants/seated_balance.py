@@ -22,6 +22,9 @@ them, depend on the realisation of the delay; the body states, the torque and th
 
 from __future__ import annotations
 
+import functools
+from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -112,15 +115,27 @@ def continuous_seated_balance_plant(
     ValueError
         When the order is out of range.
     """
-    dynamics = nonlinear_dynamics(parameters, delay_order)
-    state = ca.SX.sym("state", dynamics.size1_in(0))
-    inputs = ca.SX.sym("input", dynamics.size1_in(1))
-    rate = dynamics(state, inputs)
-    jacobians = ca.Function(
-        "jacobians", [state, inputs], [ca.jacobian(rate, state), ca.jacobian(rate, inputs)]
-    )
-    A, B = (matrix.full() for matrix in jacobians(0, 0))
+    parameters = parameters or SeatedBalanceParameters()
+    chain = delayed_muscle(parameters.tau_d, parameters.tau_m, delay_order)
+    values = [getattr(parameters, each.name) for each in fields(parameters)]
+    by_state, by_input = (part.full() for part in _slopes_at_rest()(values))
+    n = 4 + len(chain.B)
+    A, B = np.zeros((n, n)), np.zeros((n, 2))
+    A[:4, :4], A[:4, -1], A[4:, 4:] = by_state, by_input[:, 0], chain.A
+    B[:4, 1], B[4:, 0] = by_input[:, 1], chain.B
     return _named(A, B, 0.0, "seated_balance_continuous")
+
+
+@functools.cache
+def _slopes_at_rest() -> ca.Function:
+    """All parameters, in their order -> slopes at rest of the bodies' rate by state and input."""
+    known = fields(SeatedBalanceParameters)
+    values, state, inputs = ca.SX.sym("p", len(known)), ca.SX.sym("x", 4), ca.SX.sym("u", 2)
+    named = {each.name: values[place] for place, each in enumerate(known)}
+    rate = _body_rate(SimpleNamespace(**named), state, inputs)
+    slopes = ca.jacobian(rate, ca.vertcat(state, inputs))
+    at_rest = ca.densify(ca.substitute(slopes, ca.vertcat(state, inputs), ca.DM.zeros(6)))
+    return ca.Function("slopes", [values], [at_rest[:, :4], at_rest[:, 4:]])
 
 
 def nonlinear_dynamics(
@@ -175,9 +190,12 @@ def body_dynamics(parameters: SeatedBalanceParameters | None = None) -> ca.Funct
         (state (4): angles in rad, then their rates in rad/s; input (2): lumbar torque u,
         perturbation d in Nm) -> state rate (4).
     """
-    p = parameters or SeatedBalanceParameters()
-    state = ca.SX.sym("state", 4)
-    inputs = ca.SX.sym("input", 2)
+    state, inputs = ca.SX.sym("state", 4), ca.SX.sym("input", 2)
+    rate = _body_rate(parameters or SeatedBalanceParameters(), state, inputs)
+    return ca.Function("bodies", [state, inputs], [rate], ["state", "input"], ["rate"])
+
+
+def _body_rate(p: Any, state: ca.SX, inputs: ca.SX) -> Any:
     theta1, theta2, rate1, rate2 = ca.vertsplit(state)
     u, d = inputs[0], inputs[1]
     angle = theta1 - theta2
@@ -190,9 +208,7 @@ def body_dynamics(parameters: SeatedBalanceParameters | None = None) -> ca.Funct
         gravity1 - coupling * rate2**2 - robot - lumbar + d - u,
         gravity2 + coupling * rate1**2 + lumbar + u,
     )
-    acceleration = ca.solve(_mass(p, angle), moments)
-    rate = ca.vertcat(rate1, rate2, acceleration)
-    return ca.Function("bodies", [state, inputs], [rate], ["state", "input"], ["rate"])
+    return ca.vertcat(rate1, rate2, ca.solve(_mass(p, angle), moments))
 
 
 def mass_matrix(parameters: SeatedBalanceParameters | None = None) -> ca.Function:
@@ -213,11 +229,12 @@ def mass_matrix(parameters: SeatedBalanceParameters | None = None) -> ca.Functio
     return ca.Function("mass_matrix", [angles], [matrix], ["angles"], ["M"])
 
 
-def _mass(p: SeatedBalanceParameters, angle: ca.SX) -> ca.SX:
+def _mass(p: Any, angle: ca.SX) -> ca.SX:
     lower = p.J1 + p.m1 * p.l1**2 + p.m2 * p.l12**2
     upper = p.J2 + p.m2 * p.l2**2
     shared = p.m2 * p.l12 * p.l2 * ca.cos(angle)
-    return ca.vertcat(ca.horzcat(lower, shared), ca.horzcat(shared, upper))
+    matrix: ca.SX = ca.vertcat(ca.horzcat(lower, shared), ca.horzcat(shared, upper))
+    return matrix
 
 
 def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:

@@ -14,8 +14,10 @@ from plants._checks import finite_number
 __all__ = ["Quantities", "SeatedBalanceLimits", "SeatedBalanceParameters", "quantity"]
 
 
-def quantity(default: float, unit: str, origin: str, **limit: float) -> Any:
-    """Declare a dataclass field with its unit, its origin and its limits.
+def quantity(
+    default: float, unit: str, origin: str, known: float | str = 0.0, **limit: float
+) -> Any:
+    """Declare a dataclass field with its unit, its origin, how well it is known, and its limits.
 
     Parameters
     ----------
@@ -23,14 +25,25 @@ def quantity(default: float, unit: str, origin: str, **limit: float) -> Any:
         Value when none is given.
     unit, origin : str
         Kept in the metadata of the field.
+    known : float or str
+        Standard deviation between persons of whom no more is known: in the unit, or as "5 %".
     **limit : float
         ``least``, ``above``, ``most`` of `plants._checks.finite_number`.
     """
-    return field(default=default, metadata={"unit": unit, "origin": origin, "limit": limit})
+    return field(
+        default=default, metadata={"unit": unit, "origin": origin, "known": known, "limit": limit}
+    )
 
 
 class Quantities:
     """Base of frozen dataclasses of quantities: checks every field, keeps it as a float."""
+
+    @property
+    def uncertainty(self) -> dict[str, float | str]:
+        """How well each is known that is positive and not known exactly, by name."""
+        each = fields(self)  # type: ignore[arg-type]  # as above
+        known = {one.name: one.metadata["known"] for one in each}
+        return {name: how for name, how in known.items() if how and getattr(self, name) > 0}
 
     def __post_init__(self) -> None:
         for each in fields(self):  # type: ignore[arg-type]  # the subclasses are dataclasses
@@ -48,7 +61,12 @@ class SeatedBalanceParameters(Quantities):
     (trunk above the navel, head and arms) about the lumbar joint. The defaults stand for a man of
     79.7 kg and 1.66 m; the dissertation's own values (Table 3.2) are lost. The metadata of each
     field hold its unit and its origin: *regressed* on body mass and height, *measured* by others,
-    or *chosen* here for want of a source.
+    or *chosen* here for want of a source; and its standard deviation from person to person.
+
+    Regressed inertias of limbs have a standard error of 13 to 21 % (Yeadon and Morlock 1989), of
+    the trunk less; masses by X-ray absorption differ from regressions by 3 to 10 % (Rossi 2013),
+    more in obese persons. Stiffness and delay scatter as their sources do, below. The deviations
+    of l1, c_h and tau_m are judgement: nobody has measured them.
 
     Attributes
     ----------
@@ -97,19 +115,19 @@ class SeatedBalanceParameters(Quantities):
         inertias and times are positive, stiffness, damping and gravity are not negative.
     """
 
-    m1: float = quantity(60.6, "kg", "regressed", above=0.0)
-    m2: float = quantity(39.1, "kg", "regressed", above=0.0)
-    l1: float = quantity(0.058, "m", "regressed")
-    l2: float = quantity(0.263, "m", "regressed", above=0.0)
-    l12: float = quantity(0.279, "m", "regressed", above=0.0)
-    J1: float = quantity(2.53, "kg m^2", "regressed", above=0.0)
-    J2: float = quantity(1.34, "kg m^2", "regressed", above=0.0)
-    k_h: float = quantity(30.0, "Nm/rad", "measured", least=0.0)
-    c_h: float = quantity(2.5, "Nms/rad", "chosen", least=0.0)
-    k_r: float = quantity(120.0, "Nm/rad", "chosen", least=0.0)
-    c_r: float = quantity(5.0, "Nms/rad", "chosen", least=0.0)
-    tau_d: float = quantity(0.08, "s", "chosen", above=0.0)
-    tau_m: float = quantity(0.06, "s", "chosen", above=0.0)
+    m1: float = quantity(60.6, "kg", "regressed", "3 %", above=0.0)
+    m2: float = quantity(39.1, "kg", "regressed", "4 %", above=0.0)
+    l1: float = quantity(0.058, "m", "regressed", 0.015)
+    l2: float = quantity(0.263, "m", "regressed", "5 %", above=0.0)
+    l12: float = quantity(0.279, "m", "regressed", "5 %", above=0.0)
+    J1: float = quantity(2.53, "kg m^2", "regressed", "12 %", above=0.0)
+    J2: float = quantity(1.34, "kg m^2", "regressed", "12 %", above=0.0)
+    k_h: float = quantity(30.0, "Nm/rad", "measured", "35 %", least=0.0)
+    c_h: float = quantity(2.5, "Nms/rad", "chosen", "50 %", least=0.0)
+    k_r: float = quantity(120.0, "Nm/rad", "chosen", "2 %", least=0.0)
+    c_r: float = quantity(5.0, "Nms/rad", "chosen", "5 %", least=0.0)
+    tau_d: float = quantity(0.08, "s", "chosen", 0.01, above=0.0)
+    tau_m: float = quantity(0.06, "s", "chosen", "25 %", above=0.0)
     gravity: float = quantity(9.81, "m/s^2", "chosen", least=0.0)
 
 

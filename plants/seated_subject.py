@@ -5,11 +5,12 @@ Body: `plants.anthropometry`, after de Leva 1996. Plant: `plants.seated_balance`
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import casadi as ca
 
+from plants._units import with_uncertainty
 from plants.anthropometry import Sex, from_anthropometry
 from plants.integration import runge_kutta_step, with_linear_part
 from plants.seated_balance import nonlinear_dynamics, seated_balance_plant
@@ -17,9 +18,6 @@ from plants.seated_body import seated_balance_body
 from plants.seated_parameters import SeatedBalanceParameters
 
 __all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_for"]
-
-
-from impc.checking import replace
 
 
 def seated_parameters_for(
@@ -49,6 +47,8 @@ def seated_balance_for(
 ) -> Any:
     """Return the plant of a person as a discrete control.StateSpace, with the body that moves.
 
+    Its parameters, and how well they are known, are those of `SeatedBalanceParameters`.
+
     Parameters
     ----------
     mass, height : float
@@ -69,9 +69,13 @@ def seated_balance_for(
     """
     found = seated_parameters_for(mass, height, sex, **parameters)
     system = seated_balance_plant(found, sample_time, delay_order)
-    step = seated_balance_body(found, sample_time, delay_order)
-    system.body = with_linear_part(step, system.A, system.B)
-    return system
+
+    def body() -> ca.Function:
+        step = seated_balance_body(found, sample_time, delay_order)
+        return with_linear_part(step, system.A, system.B)
+
+    system.body = body  # a twentieth of a second that the linear plant alone does not take
+    return with_uncertainty(system, asdict(found), found.uncertainty)
 
 
 def seated_balance_step_for(

@@ -12,7 +12,8 @@ Cramér-Rao bound.
 Beside the gain everything else that was fitted is unknown: initial states, physical parameters
 and, for several inputs, the metric S, which is independent of the gain. The prior of a search
 (`fit_gain`) is left out: the result says what the recordings determine, and in a direction that
-they hardly do it is wide.
+they hardly do it is wide. What has a stated uncertainty keeps its prior, as rows below those that
+were recorded, J_0 = s / deviation with white noise s of their own (docs/fitting.md).
 
 To first order a direction that is not identified has no part in those that are; to second order it
 has, and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
@@ -31,7 +32,8 @@ from impc.assess.long_run_covariance import ResidualNoise, residual_noise, sprea
 from impc.inverse.coordinates import metric_directions
 from impc.inverse.estimates import DETERMINED, determined
 from impc.inverse.least_squares import trial_span
-from impc.inverse.residuals import evaluate, residual_only, residual_or_reason
+from impc.inverse.problem import noise_of_residual
+from impc.inverse.residuals import evaluate, residual_only, residual_or_reason, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
 
 if TYPE_CHECKING:
@@ -83,6 +85,8 @@ class GainCovariance(Frozen):
     # natural size of a gain, over its deviation by those that are (m, n)
     foreign: Array
     parameters: Array  # Standard deviation of the logarithm of each physical parameter (k,)
+    # Of the variance of each entry, what each parameter with a stated uncertainty causes (m, n, k)
+    shares: Array
     noise: ResidualNoise  # The colour of the residuals
     spread: Array  # Covariance of steps along the directions with a finite deviation (k, k)
 
@@ -117,11 +121,18 @@ def gain_covariance(
     *,
     curvature: bool = False,
     evaluation: Evaluation | None = None,
+    scale: float | None = None,
 ) -> GainCovariance:
-    """Covariance of a gain fitted by least squares, and of the parameters fitted with it."""
+    """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
+
+    The `scale` is the deviation of the noise, that of the residual if omitted.
+    """
     m, n = problem.plant.m, problem.plant.n
     T, G = natural_coordinates(problem.plant, gain)
     found = evaluation or evaluate(problem, gain, metric)
+    rows = len(found.residual)
+    scale = noise_of_residual(problem, found.residual) if scale is None else scale
+    found = with_prior_rows(problem, found, scale)
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
     metric_columns = _identified_metric(found.along_metric(metric, metric_directions(metric)))
@@ -133,8 +144,9 @@ def gain_covariance(
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = determined(problem, values)
     unit = seen @ directions[usable].T / values[usable]
-    colour = noise(by_trial(problem, found.residual), rest.plus(unit))
-    spread = spread_of_sum(colour, by_trial(problem, unit / values[usable]))
+    fitted = rest.plus(unit).upper(len(problem.recordings), rows)
+    colour = noise(by_trial(problem, found.residual), fitted)
+    spread = spread_of_rows(problem, colour, unit / values[usable], scale)
     deviations = np.full(m * n, np.inf)
     deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     if curvature:
@@ -142,10 +154,14 @@ def gain_covariance(
         reach = np.minimum(deviations, 1.0)[:, None] * directions
         unidentified = reach[deviations >= IDENTIFIED]
         shifts = _shifts(problem, gain, metric, (unidentified @ in_units.T).reshape(-1, m, n))
-        shifts = shifts @ unit[:, identified] / values[identified]
+        shifts = shifts @ unit[:rows, identified] / values[identified]
         spread[np.ix_(identified, identified)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
+    known = directions[deviations < IDENTIFIED]
+    along = _span(problem, found, metric_columns).without(
+        np.hstack([on_gain @ known.T, found.dparameters])
+    )
     return GainCovariance(
         frozen(T),
         frozen(G),
@@ -154,10 +170,38 @@ def gain_covariance(
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, found.dparameters, others, colour)),
+        frozen(_parameter_deviations(problem, found.dparameters, others, colour, scale)),
+        frozen(_shares(problem, along, in_units @ known.T).reshape(m, n, -1)),
         colour,
         frozen(spread),
     )
+
+
+def spread_of_rows(problem: Problem, noise: ResidualNoise, columns: Array, scale: float) -> Array:
+    """Covariance of columns' e (k, k): noise of its colour, and white of `scale` in prior rows."""
+    below = columns[sum(problem.trial_sizes) :]
+    return spread_of_sum(noise, by_trial(problem, columns)) + scale**2 * below.T @ below
+
+
+def _shares(problem: Problem, along: Array, back: Array) -> Array:
+    """Share of each stated parameter in the variance of each entry (entries, k).
+
+    `along` (r, c) are derivatives along directions of the gain and by parameters; `back` (entries,
+    d). By how much the variance would fall, were that parameter known, all others as they are.
+    """
+    stated, d = problem.parameter_units[1], back.shape[1]
+    shares = np.zeros((len(back), np.count_nonzero(stated)))
+    if shares.size == 0:
+        return shares
+    size = np.linalg.norm(along, axis=0)
+    size[size == 0] = 1.0
+    inverse = np.linalg.pinv(np.linalg.qr(along / size, mode="r")) / size[:, None]
+    whole = inverse @ inverse.T
+    entries = np.diag(back @ whole[:d, :d] @ back.T)
+    of_parameters = np.diag(whole)[d:][stated]
+    together = (back @ whole[:d, d:][:, stated]) ** 2
+    scale = entries[:, None] * of_parameters
+    return np.asarray(np.divide(together, scale, out=shares, where=scale > 0))
 
 
 def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:
@@ -193,9 +237,9 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
 
 
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
-    """The `rows` (r, ...) of all trials as one (samples, q, ...) array a trial."""
-    q, ends = len(problem.measured), np.cumsum(problem.trial_sizes)[:-1]
-    parts = [part.reshape(-1, q, *rows.shape[1:]) for part in np.split(rows, ends)]
+    """The `rows` (r, ...) of all trials as one (samples, q, ...) array a trial; none below."""
+    q, ends = len(problem.measured), np.cumsum(problem.trial_sizes)
+    parts = [part.reshape(-1, q, *rows.shape[1:]) for part in np.split(rows, ends)[:-1]]
     return parts
 
 
@@ -208,12 +252,11 @@ def _identified_metric(alone: Array) -> Array:
 
 def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
     """What initial states and the columns `shared` can explain."""
-    sizes = problem.trial_sizes
-    return trial_span(found.own, sizes, np.hstack(shared))
+    return trial_span(found.own, problem.row_sizes, np.hstack(shared))
 
 
 def _parameter_deviations(
-    problem: Problem, own: Array, others: TrialSpan, colour: ResidualNoise
+    problem: Problem, own: Array, others: TrialSpan, colour: ResidualNoise, scale: float
 ) -> Array:
     """Standard deviations of the logarithms (derivatives `own`), all else being fitted too."""
     count = own.shape[1]
@@ -224,5 +267,5 @@ def _parameter_deviations(
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)
     along = seen @ directions.T / values**2 @ directions
-    spread = spread_of_sum(colour, by_trial(problem, along))
+    spread = spread_of_rows(problem, colour, along, scale)
     return np.sqrt(np.maximum(np.diag(spread), 0.0))

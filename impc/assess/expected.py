@@ -21,9 +21,9 @@ import numpy as np
 import scipy.special
 
 from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
-from impc.assess.covariance import GainCovariance, by_trial, gain_covariance
+from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.input_limits import on_limit
-from impc.assess.long_run_covariance import ResidualNoise, spread_of_sum
+from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
@@ -128,13 +128,13 @@ def expected_intervals(
     # In units of the noise, so that its variance is one.
     scaled = replace(problem, output_scale=size)
     unknowns = finite_array("cost_weights", cost_weights, (structure.count,))
-    at = replace(tangent(structure, scaled, unknowns), noise=1.0)
+    at = tangent(structure, scaled, unknowns, noise=1.0)
     found = weight_covariance(at, lambda _trials, _lost: coloured, lambda _trials, _lost: plain)
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     return Expectation(
         found,
         _intervals(at, found),
-        gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True),
+        gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True, scale=1.0),
         frozen(_limits(at, coloured)),
     )
 
@@ -159,10 +159,11 @@ def _limits(at: Tangent, colour: ResidualNoise) -> Array:
     for control, limit in enumerate(np.array(problem.bounds.u_max)):
         if not np.isfinite(limit):
             continue
-        column = limit * on_limit(problem, K, S, limit, control)
+        column = np.zeros(len(at.residual))
+        column[: sum(problem.trial_sizes)] = limit * on_limit(problem, K, S, limit, control)
         seen = at.without_nuisance(column[:, None], *at.gain_columns())
         size = float(seen[:, 0] @ seen[:, 0])
         if size > _UNSEEN * len(column):
-            spread = spread_of_sum(colour, by_trial(problem, seen / size))
+            spread = at.spread(colour, seen / size)
             found[control] = np.sqrt(spread[0, 0])
     return found

@@ -70,7 +70,7 @@ class IdentifiedGain:
         family = self.problem.family
         if family is None:
             return np.zeros(0)
-        return np.asarray(family.nominal * np.exp(self.problem.logarithms))
+        return family.values(np.array(self.problem.logarithms))
 
 
 @dataclass(frozen=True)
@@ -79,17 +79,23 @@ class GainEstimate(IdentifiedGain):
 
     linear: GainCovariance  # To first order
     covariance: GainCovariance  # For noise of the colour that the residuals show, with curvature
+    # The same if what has a stated uncertainty were exactly as it was found; None without any
+    exact: GainCovariance | None = None
 
 
 def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the gain behind a fit, and how far it is determined."""
     here = _search(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
-    at = here.problem, frozen(here.K), frozen(here.S)
+    problem, at = here.problem, (frozen(here.K), frozen(here.S))
+    fixed, free = problem.with_body_fixed(), ~problem.parameter_units[1]
+    alone = replace(here.evaluation, dparameters=here.evaluation.dparameters[:, free])
     return GainEstimate(
+        problem,
         *at,
         here.misfit,
         here.linear,
-        gain_covariance(*at, curvature=True, evaluation=here.evaluation),
+        gain_covariance(problem, *at, curvature=True, evaluation=here.evaluation),
+        None if fixed is problem else gain_covariance(fixed, *at, curvature=True, evaluation=alone),
     )
 
 

@@ -32,7 +32,7 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.assess.printed_gain import LEVEL, Interval, entry_names
 from impc.errors import InputError
-from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates
+from impc.inverse.coordinates import Coordinates
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -102,7 +102,10 @@ class _Search:
         self.samples = problem.recorded_numbers
         misfit = float(np.linalg.norm(self.space.at(self.space.start).residual))
         self.noise = max(misfit, 1e-12) / np.sqrt(self.samples)
-        self.pull = self.noise / _WIDTH
+        self.centre = self.space.centre
+        self.pull = np.full(len(self.centre), self.noise / _WIDTH)
+        self.stated = int(self.space.ends[2]) + np.flatnonzero(self.space.stated)
+        self.pull[self.stated] = self.noise
         self.tried: dict[float, tuple[float, Array]] = {}
         self.squared(0.0)
         self.deviation, self.factor = _spread(estimate, name)
@@ -118,18 +121,19 @@ class _Search:
 
             def residual(w: Array) -> Array:
                 z, _ = self._at(offset, w)
-                away = self.pull * (z - self.space.start)
+                away = self.pull * (z - self.centre)
                 return np.concatenate([self.space.at(z).residual, away])
 
             def derivative(w: Array) -> Array:
                 z, along = self._at(offset, w)
-                return np.vstack([self.space.at(z).jacobian @ along, self.pull * along])
+                return np.vstack([self.space.at(z).jacobian @ along, self.pull[:, None] * along])
 
             found = scipy.optimize.least_squares(
                 residual, start, jac=derivative, ftol=1e-8, max_nfev=40
             )
             z, _ = self._at(offset, found.x)
-            self.tried[offset] = (float(np.sum(self.space.at(z).residual ** 2)), z)
+            held = self.noise * (z - self.centre)[self.stated]
+            self.tried[offset] = (float(np.sum(self.space.at(z).residual ** 2) + held @ held), z)
         return self.tried[offset][0]
 
     def _at(self, offset: float, w: Array) -> tuple[Array, Array]:
@@ -211,7 +215,7 @@ def _functional(
     assert family is not None  # see `require_numbers`
     index = family.names.index(name)
     row = np.zeros(int(space.ends[-1]))
-    row[int(space.ends[2]) + index] = PARAMETER_UNIT
+    row[int(space.ends[2]) + index] = space.units[index]
     value = float(estimate.parameters[index])
 
     def parameter(z: Array) -> tuple[float, Array]:

@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
-from impc.assess.covariance import TWO_SIDED, by_trial
+from impc.assess.covariance import TWO_SIDED, by_trial, spread_of_rows
 from impc.assess.long_run_covariance import (
     ResidualNoise,
     residual_noise,
-    spread_of_sum,
     white_noise,
 )
 from impc.inverse.coordinates import metric_directions
 from impc.inverse.estimates import DETERMINED
 from impc.inverse.least_squares import trial_span
-from impc.inverse.residuals import evaluate
+from impc.inverse.problem import noise_of_residual
+from impc.inverse.residuals import evaluate, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured_search import regulator_slopes
 from impc.model.riccati import solve_lqr
@@ -78,8 +78,18 @@ class Tangent(Frozen):
 
     def span(self, *beside: Array) -> TrialSpan:
         """What initial states, parameters and columns `beside` (r, b) can make up."""
-        sizes = self.problem.trial_sizes
+        sizes = self.problem.row_sizes
         return trial_span(self.found.own, sizes, np.hstack([self.on_parameters, *beside]))
+
+    def colour(self, model: NoiseModel, fitted: TrialSpan) -> ResidualNoise:
+        """That of the residuals that a fit of all in a span leaves."""
+        rows = sum(self.problem.trial_sizes)
+        residuals = by_trial(self.problem, np.array(self.residual))
+        return model(residuals, fitted.upper(len(residuals), rows))
+
+    def spread(self, noise: ResidualNoise, columns: Array) -> Array:
+        """Covariance of columns' residual (k, k) for noise of a colour."""
+        return spread_of_rows(self.problem, noise, columns, self.noise)
 
     def gain_columns(self) -> tuple[Array, Array]:
         """Derivatives with respect to gain and metric."""
@@ -89,11 +99,19 @@ class Tangent(Frozen):
         return self.found.along_gain(T, G), on_metric
 
 
-def tangent(structure: Structure, problem: Problem, cost_weights: Array) -> Tangent:
-    """Residual and derivatives at `cost_weights` (count,) and a problem's other unknowns."""
+def tangent(
+    structure: Structure, problem: Problem, cost_weights: Array, noise: float | None = None
+) -> Tangent:
+    """Residual and derivatives at `cost_weights` (count,) and a problem's other unknowns.
+
+    The last rows are those of stated uncertainties. The `noise` is that of the residual if omitted.
+    """
     solution = solve_lqr(problem.plant, structure.weights(cost_weights))
     K, S = np.array(solution.K), np.array(solution.S)
     found = evaluate(problem, K, S)
+    size = float(np.sqrt(np.mean(found.residual**2))) if noise is None else noise
+    scale = noise_of_residual(problem, found.residual) if noise is None else noise
+    found = with_prior_rows(problem, found, scale)
     dK, dS = regulator_slopes(problem, structure, cost_weights, solution)
     seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), K.size).T
     seen += found.along_metric(S, dS)
@@ -107,7 +125,7 @@ def tangent(structure: Structure, problem: Problem, cost_weights: Array) -> Tang
         found,
         frozen(seen[:, :count]),
         frozen(found.dparameters + seen[:, count:]),
-        float(np.sqrt(np.mean(found.residual**2))),
+        size,
     )
 
 
@@ -166,12 +184,10 @@ def weight_covariance(
     seen = beside.without(at.on_cost_weights[:, moving]) @ slopes
     _, sizes, rows = np.linalg.svd(seen, full_matrices=False)
     usable = sizes > DETERMINED * np.max(sizes, initial=0.0)
-    residuals = by_trial(at.problem, np.array(at.residual))
     unit = seen @ rows[usable].T / sizes[usable]
     fitted = beside.plus(unit)
-    colour = noise(residuals, fitted)
-    along = by_trial(at.problem, unit / sizes[usable])
-    spread, plain = (spread_of_sum(kind, along) for kind in (colour, white(residuals, fitted)))
+    colour, along = at.colour(noise, fitted), unit / sizes[usable]
+    spread, plain = (at.spread(kind, along) for kind in (colour, at.colour(white, fitted)))
     deviations = np.full(len(sizes), np.inf)
     deviations[usable] = _roots(spread)
     directions = np.zeros((len(sizes), at.structure.count))

@@ -30,8 +30,8 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.covariance import IDENTIFIED, by_trial
-from impc.assess.long_run_covariance import residual_noise, spread_of_sum
+from impc.assess.covariance import IDENTIFIED
+from impc.assess.long_run_covariance import residual_noise
 from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.variance_accounted_for import (
@@ -245,8 +245,7 @@ def structure_test(at: Tangent) -> StructureTest:
     exact = EXPLAINED * recorded_size(at.problem)
     if U.shape[1] == 0 or np.linalg.norm(at.residual) <= exact:
         return StructureTest(0.0, 0, 1.0, ())
-    residuals = by_trial(at.problem, np.array(at.residual))
-    V = spread_of_sum(residual_noise(residuals, fitted), by_trial(at.problem, U))
+    V = at.spread(at.colour(residual_noise, fitted), U)
     score = U.T @ at.residual
     statistic = float(score @ np.linalg.solve(V, score))
     freedom = U.shape[1]

@@ -20,7 +20,6 @@ parameters can make up for, these to first order; `rest` is what no gain near by
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -228,12 +227,13 @@ class WeightProfiles:
     def _form(self, cost_weights: Array) -> NearFit | None:
         """The quadratic form elsewhere, in the noise of the fit; None where there is none."""
         try:
-            there = tangent(self.at.structure, self.at.problem, cost_weights)
+            at = self.at
+            there = tangent(at.structure, at.problem, cost_weights, at.noise)
         except WeightsError:
             return None
         if there.found.reason:
             return None
-        return NearFit(dataclasses.replace(there, noise=self.at.noise))
+        return NearFit(there)
 
     def _passing(
         self, form: NearFit, line: _Line, here: Array, quantile: float

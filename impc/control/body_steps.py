@@ -37,11 +37,13 @@ def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTap
     With arrays of its own each time, because trials are simulated side by side.
     """
     if body is None:
-        return BodyTape(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 0)))
+        none = np.zeros((0, 0))
+        return BodyTape(0, np.zeros(0), np.zeros(0), np.zeros(0), none, none)
     found = np.zeros(n * (1 + given))
     code = address(body, n, moving=moving)
     constants = np.array(body.constants)
-    return BodyTape(code, constants, np.zeros(given), found, found[n:].reshape(n, given))
+    slopes, beside = found[n:].reshape(n, given), np.array(body.beside, order="C")
+    return BodyTape(code, constants, np.zeros(given), found, slopes, beside)
 
 
 def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
@@ -53,11 +55,15 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
 
 
 def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
-    """What the parameters in the body add to each derivative of the next state."""
-    found = np.zeros((*x.shape, along.count))
+    """What the parameters in the body add to each derivative of the next state.
+
+    A direction without bodies nearby moves the body as it moves the matrices.
+    """
+    found = np.tensordot(x, along.A, ((1,), (1,))) + np.tensordot(u, along.B, ((1,), (1,)))
+    found += np.tensordot(d, along.E, ((1,), (1,)))
     for index, bodies in enumerate(along.bodies):
-        for factor, body in bodies:
-            found[..., index] += factor * _ahead(body, x, u, d)
+        if bodies:
+            found[..., index] = sum(factor * _ahead(body, x, u, d) for factor, body in bodies)
     return found
 
 

@@ -179,7 +179,8 @@ def run_loop(
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
     """What parameters in the body add to the derivatives, along the trajectory."""
     controller, along = prepared.controller, prepared.along
-    if not any(along.bodies):
+    moving = any(along.bodies) or np.any(along.A) or np.any(along.B) or np.any(along.E)
+    if controller.plant.body is None or not moving:
         return np.zeros((0, controller.plant.n, along.count))
     run, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
     return pushes(along, run.x[:-1], run.u, given.disturbance)

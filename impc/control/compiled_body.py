@@ -28,8 +28,9 @@ class BodyTape(NamedTuple):
     given: Buffer  # Written at every sample: state, input and disturbance (g,)
     found: Buffer  # Written by the code: the next state and behind it its slopes (n + n*g,)
     # The same numbers as `found` has there: derivatives of the next state by what is given (n, g).
-    # Zero where the code does not write.
     slopes: Buffer
+    # What moves beside it, in proportion to what is given: its slopes (n, g), or none (n, 0)
+    beside: Buffer
 
 
 @njit(cache=True)
@@ -99,7 +100,12 @@ def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
         body.given[n + i] = u[i]
     for i in range(len(disturbance)):
         body.given[n + m + i] = disturbance[i]
+    body.slopes[:] = 0.0  # the code writes those alone that may be another number
     _call(body.address, body.constants, body.given, body.found)
+    for j in range(body.beside.shape[1]):
+        for i in range(n):
+            body.found[i] += body.beside[i, j] * body.given[j]
+            body.slopes[i, j] += body.beside[i, j]
 
 
 def _called(context: Any, address: Any, constants: Any, given: Any, found: Any) -> Any:

@@ -25,12 +25,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
 from impc.model.plant import Plant
-from impc.model.plant_family import PlantFamily
+from impc.model.plant_family import DELAY, LIMIT, PlantFamily, relative_deviation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 #: Arguments of a plant that are measured of every subject.
 OWN = ("mass", "height")
+#: The table in [plant] that says how well its parameters are known, and a word in it for all.
+UNCERTAINTY, _ALL = "uncertainty", "all"
 
 
 @dataclass(frozen=True)
@@ -162,12 +164,17 @@ def _beside_the_recordings() -> Iterator[None]:
 
 
 @checked
-def make_plant(source: PlantSource, recorded: Sequence[str], **changed: Any) -> Plant:
+def make_plant(
+    source: PlantSource, recorded: Sequence[str], *, linear: bool = False, **changed: Any
+) -> Plant:
     """Make the plant; inputs that are `recorded` are disturbances, the others are controls.
 
-    Names that are no inputs are ignored; what is `changed` replaces arguments of the source.
+    Names that are no inputs are ignored; what is `changed` replaces arguments of the source. Of a
+    `linear` plant the body is not made.
     """
     name, system = f"plant {source.name}", made_by(source, **changed)
+    if linear and hasattr(system, "body"):
+        system.body = None
     if hasattr(system, "no_plant"):  # an optimal control problem
         raise PlantError(name, *system.no_plant)
     inputs = tuple(getattr(system, "input_labels", ()))
@@ -185,6 +192,7 @@ def made_by(source: PlantSource, **changed: float) -> Any:
     What is `changed` replaces arguments of the source.
     """
     arguments = {**source.arguments, **changed}
+    arguments.pop(UNCERTAINTY, None)
     for key, value in arguments.items():
         if isinstance(value, str) and value == FILL_IN:
             raise InputError(f"[plant] {key}", f"is still {FILL_IN!r}", "fill it in")
@@ -215,19 +223,48 @@ def _refused_arguments(name: str) -> Iterator[None]:
 def plant_family_of(
     source: PlantSource, recorded: Sequence[str], free: Sequence[str]
 ) -> PlantFamily | None:
-    """The plants that differ in the `free` arguments; None when none is.
+    """The plants that differ in the `free` arguments and in uncertain ones; None without any.
 
-    The names of `recorded` signals are as in `make_plant`.
+    The names of `recorded` signals are as in `make_plant`. A body that is not linear keeps, beside
+    a linear part that follows the parameters, what is not linear of it.
     """
-    if not free:
+    offered = made_by(source)
+    nominal = dict(getattr(offered, "parameters", {}))
+    stated = {
+        name: given
+        for name, given in _stated_uncertainty(source, offered).items()
+        if name not in free and relative_deviation(name, given, nominal.get(name, 1.0)) > 0
+    }
+    names = [*free, *(name for name in stated if name not in (DELAY, LIMIT))]
+    if not names and not stated:
         return None
-    nominal = [_nominal(source, name) for name in free]
+    values = [nominal[name] if name in nominal else _nominal(source, name) for name in names]
+    plain = make_plant(source, recorded)
 
-    def make(values: Array) -> Plant:
-        changed = {name: float(value) for name, value in zip(free, values, strict=True)}
-        return make_plant(source, recorded, **changed)
+    def make(given: Array) -> Plant:
+        changed = {name: float(value) for name, value in zip(names, given, strict=True)}
+        plant = make_plant(source, recorded, linear=True, **changed)
+        if plain.body is None:
+            return plant
+        moved = (plant.A - plain.A, plant.B - plain.B, plant.E - plain.E)
+        return replace(plant, body=plain.body.moved(*moved))
 
-    return PlantFamily(make, free, nominal)
+    return PlantFamily(make, names, values, stated)
+
+
+def _stated_uncertainty(source: PlantSource, offered: Any) -> dict[str, Any]:
+    """Standard deviations by name: those of the plant, and what [plant.uncertainty] says."""
+    given = source.arguments.get(UNCERTAINTY, {})
+    if not isinstance(given, dict):
+        remedy = 'write a table [plant.uncertainty], as in mass = "3 %"'
+        raise InputError(f"[plant] {UNCERTAINTY}", "is no table", remedy)
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+            raise InputError(f"[plant.{UNCERTAINTY}] {name}", f"got {value!r}", 'give "5 %"')
+    given, known = dict(given), dict(getattr(offered, UNCERTAINTY, {}))
+    if _ALL in given:
+        known = dict.fromkeys(known, given.pop(_ALL))
+    return known | given
 
 
 def _nominal(source: PlantSource, name: str) -> float:
@@ -237,7 +274,5 @@ def _nominal(source: PlantSource, name: str) -> float:
         parameter = inspect.signature(source.make).parameters.get(name)
         value = None if parameter is None else parameter.default
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(
-            f"[fit] free {name}", "has no nominal value", f"give {name} in the [plant] table"
-        )
+        raise InputError(f"parameter {name}", "has no nominal value", "give it in [plant]")
     return float(value)

@@ -11,7 +11,8 @@ No optimal regulator has a K T of norm above (tr(B'PB)/R)^(1/2), because white n
 tr(B'PB) a sample, of which R u^2 is a part.
 
 Initial states are measured in those of the trials themselves (`start_unit`), offsets in the size of
-their outputs, and a parameter in thirds of itself (docs/fitting.md).
+their outputs, a parameter that is free in thirds of itself, and one with a stated uncertainty in
+that. Of such a one the prior is about its nominal value and is never weaker (docs/fitting.md).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import scipy.linalg
 
 from impc.arrays import Array
 from impc.inverse.least_squares import Prior, Rows, minimise, triangular_rows
-from impc.inverse.problem import recorded_size, simulated
+from impc.inverse.problem import noise_of_residual, recorded_size, simulated
 from impc.inverse.residuals import evaluate, residual_or_reason, scaled_changes
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
 
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-#: A parameter's coordinate counts thirds of itself.
-PARAMETER_UNIT = 1 / 3
 _START_FLOOR = 1e-8
 # Columns below that, of the largest, are rounding.
 _EXPLAINED = 1e-12
@@ -95,6 +94,7 @@ class Coordinates:
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
         self.T, self.G = natural_coordinates(plant, gain)
         self.own_unit, self.own = own_unit(problem, gain), problem.own_unknowns
+        self.units, self.stated = problem.parameter_units
         self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
         if gains is None:
             entries = np.eye(self.m * self.n).reshape(-1, self.m, self.n)
@@ -120,6 +120,14 @@ class Coordinates:
         along = np.tensordot(self.natural(self.gains), self.natural(gain), 2)
         return np.concatenate([along, np.eye(self.m)[self.tril][1:], nuisance])
 
+    @property
+    def centre(self) -> Array:
+        """z (q,) of the prior: the origin, and nominal values where an uncertainty is stated."""
+        found = self.start.copy()
+        nominal = -self.problem.logarithms / self.units
+        found[int(self.ends[2]) :] = np.where(self.stated, nominal, 0.0)
+        return found
+
     def unpack(self, z: Array) -> Point:
         """The values at z (q,)."""
         along, factor, starts, parameters = np.split(z, self.ends[:-1])
@@ -130,7 +138,7 @@ class Coordinates:
         """The problem at coordinates of its other unknowns; `parameters` (k,)."""
         problem = self.problem
         moved = starts.reshape(self.trials, self.own) @ self.own_unit.T
-        return with_own(problem, moved, problem.logarithms + PARAMETER_UNIT * parameters)
+        return with_own(problem, moved, problem.logarithms + self.units * parameters)
 
     def at(self, z: Array) -> Compressed:
         """Residual and derivative at z (q,)."""
@@ -158,7 +166,7 @@ class Coordinates:
             mine = slice(row, row + size)
             row = mine.stop
             pulled[place : place + self.own] += change[mine] @ found.own[mine] @ self.own_unit
-        pulled[last:] += PARAMETER_UNIT * (change @ found.dparameters)
+        pulled[last:] += self.units * (change @ found.dparameters)
         return pulled
 
     def evaluated(self, z: Array, known: Evaluation | None = None) -> tuple[Evaluation, Compressed]:
@@ -182,12 +190,19 @@ class Coordinates:
         basis = left * (values > _EXPLAINED * largest)[:, None, :]
         shared = rows.shared - basis @ (np.swapaxes(basis, 1, 2) @ rows.shared)
         kept, nuisance = np.split(shared.reshape(-1, shared.shape[2]), [int(self.ends[1])], axis=1)
+        held = self.noise(z) * np.eye(len(self.stated))[self.stated]
+        kept = np.vstack([kept, np.zeros((len(held), kept.shape[1]))])
+        nuisance = np.vstack([nuisance, held])
         if nuisance.shape[1] == 0:
             return kept
         size = np.sqrt(np.sum(rows.shared[..., int(self.ends[1]) :] ** 2, axis=(0, 1)))
         rest, values, _ = np.linalg.svd(nuisance, full_matrices=False)
         rest = rest[:, values > _EXPLAINED * max(largest, np.max(size))]
         return np.asarray(kept - rest @ (rest.T @ kept))
+
+    def noise(self, z: Array) -> float:
+        """Root-mean-square of the residual at z (q,), by which a prior is weighed."""
+        return noise_of_residual(self.problem, self.at(z).residual)
 
     def natural(self, gains: Array) -> Array:
         """G^-1 K T, (..., m, n), of gains (..., m, n)."""
@@ -227,7 +242,7 @@ class Coordinates:
             row = mine.stop
             blocks = [along[mine, :first]]
             blocks += [found.own[mine] @ self.own_unit] if self.own else []
-            parameters = found.dparameters[mine] * PARAMETER_UNIT + along[mine, first:]
+            parameters = found.dparameters[mine] * self.units + along[mine, first:]
             blocks += [parameters, found.residual[mine, None]]
             triangle = triangular_rows(blocks)
             full = np.zeros((triangle.shape[1], triangle.shape[1]))
@@ -250,8 +265,10 @@ def descend(
 ) -> tuple[Array, int, bool]:
     """Least squares from z (q,) with a normal prior about the origin of the coordinates."""
     model = _Along(space, z, along)
-    centre = model.apart(space.start)
-    weights = np.broadcast_to(shared, model.columns.shape[1])
+    centre = model.apart(space.centre)
+    weights = np.array(np.broadcast_to(shared, model.columns.shape[1]), dtype=np.float64)
+    if len(weights):
+        weights[len(weights) - len(space.stated) :][space.stated] = 1.0
     prior = Prior(*centre, weights, own)
     u, v, spent, converged = minimise(model, prior, model.begin, stop)
     return model.placed(u, v), spent, converged

@@ -20,8 +20,16 @@ from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
 from impc.inverse.least_squares import trial_span
-from impc.inverse.problem import controller_for, explains, misfit, missed, recorded_size, simulated
-from impc.inverse.residuals import evaluate
+from impc.inverse.problem import (
+    controller_for,
+    explains,
+    misfit,
+    missed,
+    noise_of_residual,
+    recorded_size,
+    simulated,
+)
+from impc.inverse.residuals import evaluate, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.riccati import stabilises
 from impc.model.weights import Weights, normalised
@@ -457,11 +465,12 @@ def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
     found = evaluate(problem, gain, metric)
     if found.reason:
         return 0
+    found = with_prior_rows(problem, found, noise_of_residual(problem, found.residual))
     plant = problem.plant
     stable = stabilises(plant, gain)
     T, G = natural_coordinates(plant, gain) if stable else (np.eye(plant.n), np.eye(plant.m))
     beside = np.hstack([found.dS.reshape(len(found.residual), -1), found.dparameters])
-    left = trial_span(found.own, problem.trial_sizes, beside).without(found.along_gain(T, G))
+    left = trial_span(found.own, problem.row_sizes, beside).without(found.along_gain(T, G))
     values: Array = np.asarray(np.linalg.svd(left, compute_uv=False), dtype=np.float64)
     return int(np.count_nonzero(determined(problem, values)))
 

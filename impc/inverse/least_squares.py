@@ -264,6 +264,10 @@ class TrialSpan:
         left = _without(self.own, columns)
         return np.asarray(left - self.shared @ (self.shared.T @ left))
 
+    def upper(self, trials: int, rows: int) -> TrialSpan:
+        """The first rows alone, those of so many trials."""
+        return TrialSpan(self.own[:trials], self.shared[:rows])
+
     def plus(self, columns: Array) -> TrialSpan:
         """With orthonormal `columns` (r, k) that are orthogonal to this basis."""
         return TrialSpan(self.own, np.hstack([self.shared, columns]))

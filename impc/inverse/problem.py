@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen
+from impc.arrays import Array, BoolArray, finite_array, frozen
 from impc.checking import Value, checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import LONGEST_HORIZON, Controller
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 EXPLAINED = 1e-9
 # Of the states: noise that a laboratory would call none is above, rounding in files is below.
 _EXACT = 1e-9
+# Of the outputs: beside less noise a stated uncertainty counts as it does beside that.
+_NO_NOISE = 1e-4
 
 
 @dataclass(frozen=True, init=False)
@@ -187,6 +189,11 @@ class Problem(Value):
             if name not in plant.outputs:
                 known = ", ".join(plant.outputs)
                 raise InputError("offsets", f"there is no output {name!r}", f"choose of {known}")
+        if family is not None:
+            if plant_at(family, np.zeros(len(family.names))).states != plant.states:
+                remedy = "give family.make(family.nominal) as plant"
+                raise InputError("family", "makes a plant with other states", remedy)
+            family = family.with_limits(plant, bounds)
         aimed = aims(plant, recordings)
         P = None if terminal_weight is None else terminal_matrix(plant, terminal_weight)
         self._fill(
@@ -218,6 +225,14 @@ class Problem(Value):
         """Return the problem with its initial states, offsets and parameters as they stand."""
         return replace(self, unknown_start=False, offsets=(), family=None, logarithms=frozen([]))
 
+    def with_body_fixed(self) -> Problem:
+        """Return the problem with what has a stated uncertainty held where it stands."""
+        if self.family is None or not np.any(self.family.stated):
+            return self
+        free = ~self.family.stated
+        family = self.family.part(free, self.logarithms) if np.any(free) else None
+        return replace(self, family=family, logarithms=frozen(self.logarithms[free]))
+
     def leaving_out(self, trial: int) -> Problem:
         """Return the problem without one trial, counted from 0."""
         return replace(self, recordings=self.recordings[:trial] + self.recordings[trial + 1 :])
@@ -239,10 +254,17 @@ class Problem(Value):
             replace(trial, x0=frozen(x0), offset=frozen(offset))
             for trial, x0, offset in zip(self.recordings, starts, moved, strict=True)
         )
-        plant = self.plant
+        plant, bounds = self.plant, self.bounds
         if self.family is not None and not np.array_equal(logarithms, self.logarithms):
             plant = plant_at(self.family, logarithms)
-        return replace(self, plant=plant, recordings=recordings, logarithms=frozen(logarithms))
+            bounds = self.family.bounds_at(plant, bounds, logarithms)
+        return replace(
+            self,
+            plant=plant,
+            bounds=bounds,
+            recordings=recordings,
+            logarithms=frozen(logarithms),
+        )
 
     @property
     def starts(self) -> Array:
@@ -277,9 +299,22 @@ class Problem(Value):
         return self.searched_states + len(self.offsets)
 
     @property
+    def parameter_units(self) -> tuple[Array, BoolArray]:
+        """Unit of each parameter's logarithm in a search, and whether its uncertainty is stated."""
+        if self.family is None:
+            return np.zeros(0), np.zeros(0, bool)
+        return self.family.unit, self.family.stated
+
+    @property
     def trial_sizes(self) -> list[int]:
         """How many numbers of the residual belong to each trial."""
         return [trial.samples * len(self.measured) for trial in self.recordings]
+
+    @property
+    def row_sizes(self) -> list[int]:
+        """The same with the rows of stated uncertainties, which stand last."""
+        stated = int(np.count_nonzero(self.parameter_units[1]))
+        return self.trial_sizes + ([stated] if stated else [])
 
     @property
     def recorded_numbers(self) -> int:
@@ -450,6 +485,12 @@ def with_or_without_set(
     except (InputError, SolverError, WeightsError):  # no controller with the set comes near
         return without
     return within if within.misfit < without.misfit else without
+
+
+def noise_of_residual(problem: Problem, residual: Array) -> float:
+    """Root-mean-square of a residual (r,), at least what is no noise, by which priors count."""
+    least = _NO_NOISE * recorded_size(problem)
+    return float(max(np.linalg.norm(residual), least) / np.sqrt(problem.recorded_numbers))
 
 
 def typical_output(problem: Problem) -> float:

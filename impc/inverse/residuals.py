@@ -108,7 +108,7 @@ def evaluate(
         return unusable(problem, str(error))
     layout = _layout(problem)
     differential = _plant_differential(problem)
-    along = _all_directions(controller, layout, problem.searched_states, differential)
+    along = _all_directions(problem, controller, layout, differential)
     seen = _Seen.of(problem, correction)
     if correction is not None and seen.moves is not None:
         E = np.zeros((n, seen.moves[2].shape[1], layout.count))
@@ -137,11 +137,29 @@ def evaluate(
     )
 
 
+def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evaluation:
+    """The same with a row below for each stated uncertainty, in units of the `noise`.
+
+    So a parameter that is q off its nominal value counts q / deviation, as a residual of that many
+    deviations of the noise does. Covariances see the prior as rows that have been recorded.
+    """
+    units, stated = problem.parameter_units
+    k = int(np.count_nonzero(stated))
+    if k == 0:
+        return found
+    slopes = noise * np.diag(1 / units)[stated]
+    below = {"residual": slopes @ problem.logarithms, "dparameters": slopes}
+    for name in ("dK", "dS", "own"):
+        below[name] = np.zeros((k, *getattr(found, name).shape[1:]))
+    parts = {name: np.concatenate([getattr(found, name), part]) for name, part in below.items()}
+    return replace(found, **parts)
+
+
 def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
     """Residual of the only trial of a problem as a function of its initial state and offsets."""
     controller = controller_for(problem, gain, metric)
     layout = _layout(replace(problem, family=None, logarithms=frozen([])))
-    along = _all_directions(controller, layout, problem.searched_states, None)
+    along = _all_directions(problem, controller, layout, None)
     prepared = prepare_loop(controller, along)
     (trial,) = problem.recordings
     seen = _Seen.of(problem, None)
@@ -269,12 +287,12 @@ def _plant_differential(problem: Problem) -> PlantDifferential | None:
 
 
 def _all_directions(
+    problem: Problem,
     controller: Controller,
     layout: _Layout,
-    searched: int,
     differential: PlantDifferential | None,
 ) -> Directions:
-    m, n = controller.K.shape
+    (m, n), searched = controller.K.shape, problem.searched_states
     count = layout.count
     dK = np.zeros((m * n, count))
     dK[:, layout.gain] = np.eye(m * n)
@@ -291,6 +309,12 @@ def _all_directions(
             part = getattr(differential, name)
             given[name] = np.zeros((*part.shape[:-1], count))
             given[name][..., layout.parameters] = part
+    if differential is not None and problem.family is not None:
+        bounds = bound_rows(controller.bounds, problem.plant)
+        given["bounds"] = np.zeros((len(bounds.b), count))
+        for place, control in problem.family.limits(problem.plant):
+            of_control = (bounds.F[:, control] != 0) & ~bounds.on_state
+            given["bounds"][:, layout.parameters.start + place] = bounds.b * of_control
     along = directions(controller, count, **given)
     if differential is None:
         return along

@@ -24,7 +24,7 @@ import scipy.linalg
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.errors import WeightsError
-from impc.inverse.coordinates import PARAMETER_UNIT, Coordinates, Point, descend, own_values
+from impc.inverse.coordinates import Coordinates, Point, descend, own_values
 from impc.inverse.least_squares import Stop
 from impc.inverse.problem import recorded_size
 from impc.inverse.residuals import evaluate, scaled_changes, unusable
@@ -99,7 +99,7 @@ class WeightCoordinates(Coordinates):
         if last > first:
             away = own_values(there) - own_values(self.problem)
             z[first:last] = np.linalg.solve(self.own_unit, away.T).T.ravel()
-        z[last:] = (there.logarithms - self.problem.logarithms) / PARAMETER_UNIT
+        z[last:] = (there.logarithms - self.problem.logarithms) / self.units
         return z
 
     def unknowns(self, z: Array) -> Array:
@@ -144,7 +144,7 @@ class WeightCoordinates(Coordinates):
         dK, dS = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
         for whole, part in zip((dK, dS), slopes, strict=True):
             whole[: self.ends[0]] = part[:count][self.moving]
-            whole[self.ends[2] :] = PARAMETER_UNIT * part[count:]
+            whole[self.ends[2] :] = self.units[:, None, None] * part[count:]
         return dK, scaled_changes(here.S, dS)
 
     def deviations(self, z: Array, noise: float) -> tuple[Array, Array]:

@@ -10,13 +10,13 @@ the list.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, IntArray, frozen
-from impc.checking import Value
+from impc.checking import Value, replace
 from impc.errors import PlantError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Body(Value):
     and disturbances that are given, the rest what is computed.
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {"constants": "*"}
+    _rules: ClassVar[Mapping[str, Any]] = {"constants": "*", "beside": "* *"}
 
     # (k, 4): operation, by its place in `OPERATIONS`; slot of the answer; slots of its two
     # operands, of which one may not be used. The answer of an OUTPUT is a place among the n next
@@ -47,6 +47,12 @@ class Body(Value):
     # that is zero wherever the body is has none.
     code: IntArray
     constants: Array  # (c,)
+    # What is added to it in proportion to what is given (n, g), or nothing (n, 0)
+    beside: Array = field(default_factory=lambda: frozen(np.zeros((0, 0))))
+
+    def moved(self, A: Array, B: Array, E: Array) -> Body:
+        """The body with A x + B u + E d added to its next state."""
+        return replace(self, beside=frozen(np.hstack([A, B, E])))
 
 
 def read_body(function: Any, order: Sequence[int], n: int) -> Body:

@@ -136,6 +136,8 @@ class Plant(Value):
             )
         rest = tuple(name for name in names if name not in chosen)
         moves = getattr(system, "body", None) if body is None else body
+        if callable(moves) and not hasattr(moves, "n_in"):  # it is made where it is needed
+            moves = moves()
         order = [names.index(name) for name in (*chosen, *rest)]
         self._fill(
             A=matrices["A"],

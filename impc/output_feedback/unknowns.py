@@ -13,7 +13,6 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.control.constraint_rows import directions
 from impc.errors import SolverError
-from impc.inverse.coordinates import PARAMETER_UNIT
 from impc.inverse.problem import controller_for
 from impc.inverse.structured_search import WeightCoordinates
 from impc.model.bounds import bound_rows
@@ -157,8 +156,10 @@ class PersonCoordinates:
         if family is not None:
             differential = plant_differential(family, here.problem.logarithms)
             mine = slice(self.own - len(family.names), self.own)
-            dB = PARAMETER_UNIT * np.moveaxis(differential.B, -1, 0)
-            moved[mine] += PARAMETER_UNIT * np.moveaxis(differential.A, -1, 0) - dB @ here.K
+            dA, dB = (
+                np.moveaxis(part * space.units, -1, 0) for part in (differential.A, differential.B)
+            )
+            moved[mine] += dA - dB @ here.K
             turned[mine] = dB @ space.G @ space.G.T @ plant.B.T
         change = np.einsum("ij,kij->k", 2 * Y @ closed @ X, moved)
         change += 2 * np.einsum("ij,kij->k", Y, turned)
@@ -210,8 +211,8 @@ class PersonCoordinates:
                 for name in ("A", "B", "E"):
                     change = getattr(differential, name)
                     given[name] = np.zeros((*change.shape[:-1], count))
-                    given[name][..., mine] = PARAMETER_UNIT * change
-                dC[..., mine] = PARAMETER_UNIT * differential.C
+                    given[name][..., mine] = self.space.units * change
+                dC[..., mine] = self.space.units * differential.C
         along = directions(controller, count, **given)
         return along, NoiseDirections(dC, levels, len(moved.shared))
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.signal
 
+from impc.arrays import frozen
+from impc.checking import replace
 from impc.errors import InputError
 from impc.files.configuration import require_known
 from impc.files.plant_sources import make_plant, plant_family_of
@@ -67,24 +69,33 @@ def asked_plant(
 
     Inputs that are `recorded` are disturbances; signals that are `aimed` have a target.
     """
-    plain, rates = make_plant(source, recorded), _observer_rates(settings)
-    plant = _dressed(plain, settings, aimed, rates)
-    if not settings.free:
-        return plant, None
+    rates = _observer_rates(settings)
     learned = [name for name in settings.free if name in rates]
     own = [name for name in settings.free if name not in rates]
     for name in own:
         if name.partition(".")[0] == OBSERVER:
             raise InputError(f"[fit] free {name}", "has no nominal value", f"give {name} in [fit]")
     family = plant_family_of(source, recorded, own)
+    plain = make_plant(source, recorded) if family is None else family.make(family.nominal)
+    plant = _dressed(plain, settings, aimed, rates)
+    if family is None and not learned:
+        return plant, None
+    bare, count = (
+        family or PlantFamily(lambda _: plain, [], []),
+        len(family.names if family else ()),
+    )
 
     def make(values: Array) -> Plant:
-        bare = plain if family is None else family.make(values[: len(own)])
-        moved = dict(zip(learned, map(float, values[len(own) :]), strict=True))
-        return _dressed(bare, settings, aimed, rates | moved)
+        moved = dict(zip(learned, map(float, values[count:]), strict=True))
+        return _dressed(bare.make(values[:count]), settings, aimed, rates | moved)
 
-    nominal = [] if family is None else family.nominal.tolist()
-    return plant, PlantFamily(make, [*own, *learned], nominal + [rates[name] for name in learned])
+    return plant, replace(
+        bare,
+        make=make,
+        names=(*bare.names, *learned),
+        nominal=frozen([*bare.nominal, *(rates[name] for name in learned)]),
+        deviations=frozen([*bare.deviations, *[np.inf] * len(learned)]),
+    )
 
 
 def _observer_rates(settings: FitSettings) -> dict[str, float]:

@@ -61,7 +61,8 @@ def open_memory(
 ) -> FitMemory:
     """The memory of a command in a folder, empty when there is none for this very problem."""
     # Of a family the plant at its nominal values; its code is in `made_of` (`impc.files.digests`).
-    known = digest(replace(problem, family=None), settings, made_of, versions())
+    body = () if problem.family is None else (problem.family.names, problem.family.deviations)
+    known = digest(replace(problem, family=None), *body, settings, made_of, versions())
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 
 
