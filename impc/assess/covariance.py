@@ -239,8 +239,8 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
     """The `rows` (r, ...) of all trials as one (samples, q, ...) array a trial; none below."""
     q, ends = len(problem.measured), np.cumsum(problem.trial_sizes)
-    parts = [part.reshape(-1, q, *rows.shape[1:]) for part in np.split(rows, ends)[:-1]]
-    return parts
+    parts = np.split(rows, ends)[:-1]
+    return [part.reshape(len(part) // q, q, *rows.shape[1:]) for part in parts]
 
 
 def _identified_metric(alone: Array) -> Array:

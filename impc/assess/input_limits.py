@@ -65,33 +65,6 @@ class LimitEstimate(Frozen):
     distances: Array
 
 
-@dataclass(frozen=True)
-class OtherLimit:
-    """A fit whose limit of the command was searched too."""
-
-    given: float  # The limit as it was given, in the input's unit
-    limit: LimitEstimate
-    fitted: Estimate  # Inverse MPC at that limit
-
-    @property
-    def contradicted(self) -> bool:
-        """Whether the interval of the limit excludes the given one."""
-        return not self.limit.low <= self.given <= self.limit.high
-
-
-def at_another_limit(fitted: Estimate, known: LimitEstimate | None = None) -> OtherLimit | None:
-    """The fit with the limit of its one input free; None where none is determined."""
-    given = float(fitted.problem.bounds.u_max[0])
-    if fitted.problem.plant.m > 1 or not np.isfinite(given):
-        return None
-    limit = known or input_limit(fitted)
-    if limit.value is None:
-        return None
-    posed = with_limit(fitted.problem, limit.value)
-    # From nothing: the weights that fit best at a wrong limit are a poor start.
-    return OtherLimit(given, limit, fit_controller(posed))
-
-
 def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
     """The problem with |u_control| <= limit, or without that bound for an infinite limit."""
     bounds = problem.bounds

@@ -13,6 +13,8 @@ from impc.cli.options import out_option, subject_arguments
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from impc.inverse.problem import Problem
+    from impc.studies.fit.memory import FitMemory
     from impc.studies.fit.result import FitResult
 
 
@@ -62,8 +64,14 @@ def command(
     truth = read_truth(files, problem.plant)
     # One more: the page with its figures takes ten seconds.
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
-        stated = FitProgress(done, memory.estimate, memory.replicate, memory.part)
-        result = fit_recordings(problem, settings, stated)
+
+        def remembered(memory: FitMemory) -> FitProgress:
+            def about(further: Problem) -> FitProgress:
+                return remembered(memory.about(further))
+
+            return FitProgress(done, memory.estimate, memory.replicate, memory.part, about)
+
+        result = fit_recordings(problem, settings, remembered(memory))
         with angles_in(subject.angles):
             content = fit_report(result, subject.provenance, truth, unknown).files()
         done("page")
@@ -117,10 +125,11 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_statements import dominant_sentence  # noqa: PLC0415
     from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
+    from impc.studies.fit.trial_findings import warnings_of  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
-    stated = (*structure_sentences(result), *result.person_sentences, *result.warnings)
+    stated = (*structure_sentences(result), *result.person_sentences, *warnings_of(result))
     for line in dict.fromkeys((verdict(result), *stated)):
         click.echo(line)
     plant = result.fitted.problem.plant

@@ -299,6 +299,11 @@ class Problem(Value):
         return self.searched_states + len(self.offsets)
 
     @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Physical parameters that are fitted (k,)."""
+        return () if self.family is None else self.family.names
+
+    @property
     def parameter_units(self) -> tuple[Array, BoolArray]:
         """Unit of each parameter's logarithm in a search, and whether its uncertainty is stated."""
         if self.family is None:

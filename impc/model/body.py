@@ -52,7 +52,8 @@ class Body(Value):
 
     def moved(self, A: Array, B: Array, E: Array) -> Body:
         """The body with A x + B u + E d added to its next state."""
-        return replace(self, beside=frozen(np.hstack([A, B, E])))
+        more = np.hstack([A, B, E])
+        return replace(self, beside=frozen(more + self.beside if self.beside.size else more))
 
 
 def read_body(function: Any, order: Sequence[int], n: int) -> Body:

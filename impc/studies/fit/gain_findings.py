@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from impc.assess.covariance import IDENTIFIED
+from impc.assess.covariance import IDENTIFIED, TWO_SIDED
 from impc.assess.printed_gain import entry_names
 from impc.assess.variance_accounted_for import verdict
 from impc.files.disk import LARGEST
 from impc.model.plant import UNKNOWN, gain_unit
-from impc.reporting.finding import Finding, Picture, Severity, table_of
+from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.rendering import number
-from impc.studies.fit.verdict import direction_name, other_limit_sentence
+from impc.studies.fit.verdict import direction_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -46,6 +46,9 @@ def gain_finding(result: FitResult) -> Finding:
     of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
     found = {(item.name, item.method): item for item in uncertainty.intervals}
     units, rows = number_units(plant), []
+    alone = result.estimate.exact
+    deviations = np.zeros(0) if alone is None else np.ravel(alone.entries)
+    exact = dict(zip(entry_names(plant), deviations, strict=False))
     for name, item in result.preferred.items():
         row = {
             "number": number_name(plant, name),
@@ -56,6 +59,9 @@ def gain_finding(result: FitResult) -> Finding:
             "identified": item.identified,
             "excludes_zero": item.excludes_zero,
         }
+        if alone is not None:
+            half, middle = TWO_SIDED * exact.get(name, np.nan), (item.low + item.high) / 2
+            row |= {"exact_body_low": middle - half, "exact_body_high": middle + half}
         for method in _OTHER:
             other = found.get((name, method))
             if any(key == method for _, key in found):
@@ -69,7 +75,8 @@ def gain_finding(result: FitResult) -> Finding:
         f"Intervals of {level:.0f} %. Low and high allow for autocorrelated residuals, as those of "
         "people are. An entry that is not identified takes part in directions that hardly show in "
         "the recordings: values within its interval cannot be distinguished, and the table of "
-        "directions says which combinations can. The gain of the reported weights follows from a "
+        "directions says which combinations can. Exact body: what they would be if the body were "
+        "known exactly as it was found. The gain of the reported weights follows from a "
         "rule that chose them, so it has no interval; outside the estimate's interval these "
         "weights do not quite behave as recorded.",
         figure=_FIGURE,
@@ -120,14 +127,19 @@ def parameter_findings(result: FitResult) -> list[Finding]:
             "nominal": lambda item: float(item.nominal),
             "fitted": lambda item: float(item.value),
             "standard_error": lambda item: float(item.deviation),
+            "stated_deviation": lambda item: np.nan if item.stated is None else item.stated,
+            "moved_by_deviations": lambda item: float(item.pull),
+            "share_of_the_gains_variance_percent": lambda item: 100 * float(item.share),
             "identified": lambda item: item.determined,
         },
     )
     caption = (
-        "Physical parameters fitted with the gain, in SI units. One that is not identified, to a "
-        "factor of e at 95 %, stays near its nominal value whatever the true one is."
+        "Physical parameters fitted with the gain, in SI units. One with a stated deviation keeps "
+        "to its nominal value as far as that says; its share is by how much the variance of the "
+        "gain's entries would fall if it were measured exactly. A free one that is not identified, "
+        "to a factor of e at 95 %, stays near its nominal value whatever the true one is."
     )
-    return [Finding("parameters", table, caption)]
+    return [Finding("parameters", table, caption, folded="Physical parameters")]
 
 
 def limit_findings(result: FitResult) -> list[Finding]:
@@ -148,11 +160,6 @@ def limit_findings(result: FitResult) -> list[Finding]:
         )
         said = [f"{item.reason[0].upper()}{item.reason[1:]}." for item in limits]
         found.append(Finding("limits", table, "Limits of the command as unknowns, 95 %.", said))
-    if result.other_limit is not None:
-        contradicted = result.other_limit.contradicted
-        level = Severity.RED if contradicted else Severity.NOTE
-        said = [other_limit_sentence(result)]
-        found.append(Finding("other_limit", sentences=said, severity=level))
     if result.uncertainty.alternatives:
         first = result.uncertainty.alternatives[0]
         table = table_of(

@@ -33,6 +33,11 @@ class FitMemory(Steps):
 
     problem: Problem = field(kw_only=True)  # As it was posed
 
+    def about(self, problem: Problem) -> FitMemory:
+        """The memory of another problem of the same recordings, which has one unknown more."""
+        known = digest(self.digest, problem.parameter_names, problem.offsets)
+        return replace(self, digest=known, problem=problem)
+
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
         """The estimate of the stage `name`, as `compute` makes it."""
 

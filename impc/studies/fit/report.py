@@ -15,7 +15,9 @@
     weights_test                             whether any weights explain K: statistic, freedom,
                                              p_value, rejected, return_difference
     terminal_set, doubts                     of the fitted controller; sentences
-    horizon, bounds, other_limit             as given; the fit with the limit free, or null
+    horizon, bounds                          as given
+    lack_of_fit                              of the first fit and, where something was added, of the
+                                             last: alarm, and errors with probability and size
     failures.<stage>                         why the stage has no result
     warnings                                 sentences
     intent                                   eigenvalues (ascending), dominant, sentence, weights
@@ -80,6 +82,7 @@ from impc.studies.fit.trial_findings import (
     offset_findings,
     residual_findings,
     trajectory_finding,
+    warnings_of,
 )
 from impc.studies.fit.verdict import abstract, remarks, verdict
 from impc.studies.fit.weight_findings import reading_finding, statement_findings, weight_finding
@@ -243,7 +246,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     plant, found = result.fitted.problem.plant, result.identifiability
     return _controller(result) | {
         "estimate": _estimate(result),
-        "warnings": result.warnings,
+        "warnings": warnings_of(result),
         "intent": _intent(result),
         "identifiability": {
             "rank": found.rank,
@@ -268,7 +271,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
 
 def _controller(result: FitResult) -> dict[str, Any]:
     plant, fitted = result.fitted.problem.plant, result.fitted
-    weights, bounds, other = result.intent.reported.weights, result.given.bounds, result.other_limit
+    weights, bounds = result.intent.reported.weights, result.given.bounds
     held = np.array([item.vaf for item in result.held_out])
     left_out = np.mean(held, axis=0) if len(held) else [None] * len(plant.outputs)
     return {
@@ -289,15 +292,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "terminal_set": bool(fitted.problem.terminal_set),
         "doubts": fitted.doubts,
         "failures": dict(result.failures),
-        "other_limit": None
-        if other is None
-        else {
-            "given": other.given,
-            "limit": asdict(other.limit),
-            "K": other.fitted.gain,
-            "misfit": other.fitted.misfit,
-            "contradicted": other.contradicted,
-        },
+        "lack_of_fit": [None if one is None else asdict(one) for one in result.lack],
         "horizon": fitted.problem.horizon,
         "body": plant.moves,
         "solver": fitted.problem.solver,
@@ -334,6 +329,7 @@ def _estimate(result: FitResult) -> dict[str, Any]:
         "S": estimate.S,
         "misfit": estimate.misfit,
         "standard_errors": covariance.entries,
+        "standard_errors_exact_body": None if estimate.exact is None else estimate.exact.entries,
         "identified": covariance.individually_identified,
         "singular_values": covariance.singular_values,
         "directions": covariance.directions,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.diagnostics import residual_warnings
 from impc.assess.printed_gain import PARAMETER, entry_names
 from impc.control.simulation import Status
 from impc.model.riccati import solve_lqr
@@ -19,9 +18,9 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
-    from impc.assess.diagnostics import ResidualDiagnostics
-    from impc.assess.input_limits import OtherLimit
     from impc.assess.intent_statements import Intent
+    from impc.assess.lack_of_fit import LackOfFit
+    from impc.assess.loop_noise import LoopNoise
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
@@ -47,6 +46,18 @@ class FittedParameter:
     value: float
     # Standard deviation of the value, in its unit; infinite when nothing determines it
     deviation: float
+    stated: float | None = None  # Standard deviation that was stated, in its unit; None when free
+    share: float = 0.0  # Of the variance of the gain's entries, on average, that it causes
+
+    @property
+    def learned(self) -> float:
+        """Standard deviation after the fit over the stated one: 1 where nothing was learned."""
+        return self.deviation / self.stated if self.stated else 0.0
+
+    @property
+    def pull(self) -> float:
+        """How far it was moved, in stated deviations; NaN when it is free."""
+        return (self.value - self.nominal) / self.stated if self.stated else float("nan")
 
     @property
     def determined(self) -> bool:
@@ -77,14 +88,14 @@ class FitResult:
     held_out: tuple[HeldOut, ...]  # One a trial; empty for a single trial or when not asked for
     # Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC
     methods: tuple[MethodFit, ...]
-    diagnostics: ResidualDiagnostics  # What the residuals say against the fit
+    # The tests of the model: of the first fit and, where one unknown was added, of the last
+    lack: tuple[LackOfFit | None, ...]
+    loop: LoopNoise | None  # Whether the residuals look like noise inside the loop
     # Largest change of a scaled output when the terminal set is added (or taken away); NaN when the
     # loop with it does not reach the end
     terminal_set_difference: float
     seconds: float  # Time of the whole fit, s
     weights_test: WeightsTest  # Whether any weights explain the gain
-    # The fit with the limit of the command free, where the recordings contradict the given one
-    other_limit: OtherLimit | None = None
     # Stages that failed, and why; what they would have found is missing
     failures: Mapping[str, str] = field(default_factory=dict)
     # Those that were asked for, that of [fit.structure] first
@@ -139,11 +150,15 @@ class FitResult:
         return max(self.intent.widest_angle, over_set)
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What has to be read before any number."""
-        saturated = sum(item.saturated for item in self.trials) / len(self.trials)
-        outputs = self.fitted.problem.plant.outputs
-        return residual_warnings(self.diagnostics, outputs, saturated)
+    def alarm(self) -> bool:
+        """Whether the last fit's residuals follow what drove the recordings."""
+        last = self.lack[-1]
+        return last is not None and last.alarm
+
+    @property
+    def saturated(self) -> float:
+        """Share of the samples at which the command is at its bound."""
+        return sum(item.saturated for item in self.trials) / len(self.trials)
 
     @property
     def inverse_mpc(self) -> MethodFit:

@@ -38,8 +38,7 @@ def structure_sentences(result: FitResult) -> tuple[str, ...]:
     lines = [_verdict(found)]
     if found.estimate is None:
         return tuple(lines)
-    other = result.diagnostics.structure
-    if found.refused and other is not None and other.found:
+    if found.refused and result.alarm:
         lines.append(_OF_THE_MODEL)
     lines.append(_explains(result, found))
     if not found.refused:

@@ -20,10 +20,10 @@ from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
 from impc.assess.assessments import evaluate_method
 from impc.assess.command_table import command_regression
-from impc.assess.diagnostics import ResidualDiagnostics, residual_diagnostics
-from impc.assess.input_limits import at_another_limit
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
+from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, OFFSET, PUSH, LackOfFit, lack_of_fit
+from impc.assess.loop_noise import loop_noise_of
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out_vaf
@@ -33,6 +33,12 @@ from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
+from impc.inverse.further_unknowns import (
+    with_delay_unknown,
+    with_limit_unknown,
+    with_offsets_unknown,
+    with_strength_unknown,
+)
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, aims, simulated
@@ -55,9 +61,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from impc.assess.all_intervals import Attempt, Uncertainty
+    from impc.assess.all_intervals import Attempt
     from impc.assess.assessments import MethodFit
-    from impc.assess.input_limits import OtherLimit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
     from impc.assess.structures import StructureFit
@@ -86,6 +91,12 @@ class FitProgress:
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
     # (name of stage, compute, encode, decode) -> what an optional subpackage finds, likewise
     part: Callable[..., Any] = lambda _name, compute, _encode, _decode: compute()
+    # The same for another problem, which has one unknown more; None where nothing is remembered
+    about: Callable[[Problem], FitProgress] | None = None
+
+    def anew(self, problem: Problem) -> FitProgress:
+        """The same for another problem."""
+        return FitProgress(self.done) if self.about is None else self.about(problem)
 
 
 def stages(problem: Problem, settings: FitSettings) -> int:
@@ -202,20 +213,19 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     started = time.perf_counter()
     failures: dict[str, str] = {}
     attempt = functools.partial(_attempt, failures)
-    found = _estimates(problem, settings, progress)
+    problem, progress, fitted, estimate, lack = _first_fits(problem, progress, attempt)
+    found = _estimates(problem, fitted, settings, progress)
+    if not np.array_equal(found["inverse_mpc"].gain, fitted.gain):  # another method's was better
+        estimate = gain_estimate(found["inverse_mpc"])
     fitted = found["inverse_mpc"]
-    estimate = gain_estimate(fitted)
     known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
     plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
     own = evaluate_method(fitted, problem.bounds)
     sizes = state_sizes(own.runs)
     usable = bool(np.all(own.vaf >= LITTLE))
-    diagnostics = attempt(
-        "tests of the residuals",
-        lambda: residual_diagnostics(fitted.problem, K, np.array(fitted.metric)),
-        ResidualDiagnostics(None, None),
-    )
-    test = weights_test(fitted, estimate, contradicted=diagnostics.contradicted)
+    loop = attempt("noise inside the loop", lambda: loop_noise_of(estimate), None)
+    doubted = (lack[-1] is not None and lack[-1].alarm) or (loop is not None and loop.found)
+    test = weights_test(fitted, estimate, contradicted=doubted)
 
     def whole_set() -> tuple[WeightsSummary | None, str]:
         """The set of weights with the gain, or why nothing may be said of it."""
@@ -232,9 +242,8 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     after = progress.done, progress.replicate, attempt
     uncertainty = assess(problem, fitted, estimate, weights_found, settings, *after)
     trials = _agreements(known, methods[-1].runs, problem.bounds)
-    doubted = diagnostics.contradicted or not usable
-    free = _free_limit(fitted, trials, uncertainty, attempt, doubted=doubted)
-    person = functools.partial(_person, problem, settings, fitted, progress)
+    body_known = replace(fitted, problem=fitted.problem.with_body_fixed())
+    person = functools.partial(_person, problem, settings, body_known, progress)
     return FitResult(
         settings,
         problem,
@@ -247,11 +256,11 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         trials,
         held_out,
         methods,
-        diagnostics,
+        lack,
+        loop,
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
         test,
-        free,
         failures,
         structures,
         attempt("subject with sensory noise", person, None),
@@ -266,12 +275,42 @@ def _regressed(fitted: Estimate) -> pd.DataFrame | None:
     return command_regression(fitted) if recorded and not problem.plant.commands else None
 
 
+def _first_fits(
+    problem: Problem, progress: FitProgress, attempt: Attempt
+) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
+    """Inverse MPC, and once more with an unknown that the first fit is found to lack."""
+    lack: list[LackOfFit | None] = []
+    while True:
+        fitted = progress.estimate("inverse_mpc", functools.partial(fit, problem))
+        estimate = gain_estimate(fitted)
+        test = functools.partial(lack_of_fit, estimate)
+        lack.append(attempt("test of the model", test, None))
+        culprit = None if lack[-1] is None else lack[-1].culprit
+        further = None if culprit is None else _CURES.get(culprit.name, _no_cure)(problem)
+        if further is None or len(lack) > 1:
+            progress.done("inverse MPC")
+            return problem, progress, fitted, estimate, tuple(lack)
+        problem, progress = further, progress.anew(further)
+
+
+def _no_cure(_: Problem) -> None:
+    return None
+
+
+#: What is fitted too where the test of the model names it.
+_CURES: dict[str, Callable[[Problem], Problem | None]] = {
+    DELAY: with_delay_unknown,
+    LIMIT: with_limit_unknown,
+    LEAN: with_offsets_unknown,
+    OFFSET: with_offsets_unknown,
+    PUSH: with_strength_unknown,
+}
+
+
 def _estimates(
-    problem: Problem, settings: FitSettings, progress: FitProgress
+    problem: Problem, fitted: Estimate, settings: FitSettings, progress: FitProgress
 ) -> dict[str, Estimate]:
     """What every method finds, inverse MPC last, none beaten by another's answer."""
-    fitted = progress.estimate("inverse_mpc", functools.partial(fit, problem))
-    progress.done("inverse MPC")
     found = {
         name: progress.estimate(name, functools.partial(METHODS[name].estimate, problem, fitted))
         for name in _beside(settings)
@@ -309,24 +348,6 @@ def _beside_it(
     if held_out:
         methods[-1] = replace(own, held_out=frozen([item.vaf for item in held_out]))
     return tuple(methods), tuple(held_out), found_set
-
-
-def _free_limit(
-    fitted: Estimate,
-    trials: tuple[TrialAgreement, ...],
-    uncertainty: Uncertainty,
-    attempt: Attempt,
-    *,
-    doubted: bool,
-) -> OtherLimit | None:
-    """The fit with the limit free, where the command meets it and something speaks against it."""
-    if not any(item.saturated for item in trials) or not (doubted or uncertainty.limits):
-        return None
-    known = uncertainty.limits[0] if uncertainty.limits else None
-    found: OtherLimit | None = attempt(
-        "free limit", functools.partial(at_another_limit, fitted, known), None
-    )
-    return found
 
 
 def _predicted(other: Future[Estimate], trial: Recording, settle: float) -> HeldOut:
@@ -420,18 +441,25 @@ def _without(index: int) -> str:
 
 
 def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
-    family = estimate.problem.family
+    family, covariance = estimate.problem.family, estimate.covariance
     if family is None:
         return ()
+    at_nominal, values = family.values(np.zeros(len(family.names))), estimate.parameters
+    scale = family.nominal * np.exp(estimate.problem.logarithms)
+    shares = np.zeros(len(family.names))
+    identified = np.array(covariance.individually_identified)
+    if np.any(identified):
+        shares[family.stated] = np.mean(np.array(covariance.shares)[identified], axis=0)
     return tuple(
-        FittedParameter(name, float(nominal), float(value), float(value * deviation))
-        for name, nominal, value, deviation in zip(
-            family.names,
-            family.nominal,
-            estimate.parameters,
-            estimate.covariance.parameters,
-            strict=True,
+        FittedParameter(
+            name,
+            float(at_nominal[k]),
+            float(values[k]),
+            float(scale[k] * covariance.parameters[k]),
+            float(family.nominal[k] * family.deviations[k]) if family.stated[k] else None,
+            float(shares[k]),
         )
+        for k, name in enumerate(family.names)
     )
 
 

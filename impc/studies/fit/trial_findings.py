@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from impc.assess.loop_noise import loop_sentence
 from impc.reporting.finding import Finding, Picture, Severity
 from impc.reporting.shown_units import shown_unit
 from impc.studies.fit.aim import aim_data
+from impc.studies.fit.body_words import lack_finding
 from impc.studies.fit.gain_findings import number_name
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.methods_table import trajectory_table
@@ -79,27 +81,18 @@ def command_findings(result: FitResult) -> list[Finding]:
 
 def residual_findings(result: FitResult) -> list[Finding]:
     """Tests that speak against the model; their warnings have to be read before any number."""
-    found, rows = result.diagnostics, []
-    if found.loop is not None:
-        rows.append(("noise inside the loop", found.loop.statistic, found.loop.threshold,
-                     np.nan, float(np.max(found.loop.shares)), found.loop.found))  # fmt: skip
-    if found.structure is not None:
-        least = min(found.structure.p_linear, found.structure.p_nonlinear)
-        rows.append(("error of the model", np.nan, np.nan, least, found.structure.share,
-                     found.structure.found))  # fmt: skip
-    if not rows:
-        return []
-    heads = ["test", "statistic", "threshold", "p", "share_of_the_residual", "found"]
-    return [
-        Finding(
-            "residual_tests",
-            pd.DataFrame(rows, columns=heads),
-            "What the residuals say against the model.",
-            result.warnings,
-            severity=Severity.AMBER if result.warnings else Severity.GREEN,
-            folded="Tests of the residuals",
-        )
-    ]
+    found: list[Finding] = []
+    if result.lack[-1] is not None:
+        found.append(lack_finding(result, result.lack[-1]))
+    if result.loop is not None and result.loop.found:
+        said = [loop_sentence(result.loop, result.given.plant.outputs, result.saturated)]
+        found.append(Finding("loop_noise", sentences=said, severity=Severity.AMBER))
+    return found
+
+
+def warnings_of(result: FitResult) -> list[str]:
+    """What has to be read before any number."""
+    return [line for item in residual_findings(result) for line in item.sentences]
 
 
 RESIDUALS = Picture(

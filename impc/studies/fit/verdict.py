@@ -10,6 +10,7 @@ from impc.assess.covariance import IDENTIFIED
 from impc.assess.intent_statements import dominant_sentence
 from impc.reporting.rendering import number
 from impc.studies.fit.aim import aim_sentences
+from impc.studies.fit.body_words import body_sentences
 from impc.studies.fit.result import LITTLE, trial_name
 from impc.studies.fit.structure_words import structure_sentences
 
@@ -27,9 +28,8 @@ _NAMED = 0.15
 
 def verdict(result: FitResult) -> str:
     """The one sentence that says what may be made of the fit; what forbids most comes first."""
-    found, within = result.diagnostics, structure_sentences(result)
+    within = structure_sentences(result)
     saturated = any(item.saturated for item in result.trials)
-    other = result.other_limit
     cases = (
         (bool(within) and result.structures[0].refused, next(iter(within), "")),
         (not result.usable, _little(result)),
@@ -37,7 +37,6 @@ def verdict(result: FitResult) -> str:
             not result.fitted.converged,
             "The search ended before it converged: a longer or less noisy recording is needed.",
         ),
-        (other is not None and other.contradicted, other_limit_sentence(result)),
         (
             result.person is not None and result.person.preferred,
             "A subject with noise inside the loop explains the recordings better than noise in "
@@ -45,15 +44,15 @@ def verdict(result: FitResult) -> str:
         ),
         (result.weights_test.rejected, result.weights_test.sentence),
         (
-            saturated and found.loop is not None and found.loop.found,
+            saturated and result.loop is not None and result.loop.found,
             "The controller agrees with the recordings, but what it leaves looks like noise inside "
             "the loop: do not rely on its gain or its weights. [fit.observer] asks for a subject "
             "who senses with noise.",
         ),
         (
-            found.structure is not None and found.structure.found,
+            result.alarm,
             "The controller agrees with the recordings, but the body or the controller that moved "
-            "is not that of the model: its intervals do not hold that error.",
+            "is not that of the model: its intervals do not contain that error.",
         ),
         (
             not bounded(result),
@@ -90,30 +89,12 @@ def _little(result: FitResult) -> str:
     )
 
 
-def other_limit_sentence(result: FitResult) -> str:
-    """What the recordings say of the limit of the command, where it was set free."""
-    other, plant = result.other_limit, result.given.plant
-    if other is None or other.limit.value is None:
-        return ""
-    unit = plant.unit(plant.controls[0])
-    found, value = other.limit, other.limit.value
-    interval = f"95 %: {number(found.low, 4)} to {number(found.high, 4)}"
-    gain = np.array2string(np.array(other.fitted.gain), precision=4)
-    said = (
-        f"With the limit of the command free the recordings give {number(value, 4)} {unit} "
-        f"({interval}) for the given {number(other.given, 4)} {unit}; at that limit the misfit is "
-        f"{number(other.fitted.misfit, 3)} for {number(result.fitted.misfit, 3)}, the gain {gain}."
-    )
-    if not other.contradicted:
-        return said
-    return f"{said} The recordings contradict the given limit: fit again with u_max at that value."
-
-
 def abstract(result: FitResult) -> tuple[str, ...]:
     """Three to five plain sentences with numbers."""
     return (
         _what_was_done(result),
         *aim_sentences(result),
+        *body_sentences(result),
         _agreement(result),
         *_at_the_bound(result),
         *((_gain(result), _weights(result)) if result.usable else ()),

@@ -1,0 +1,307 @@
+"""Whether the residuals of a fit follow what drove it, and which error of the model explains that.
+
+Noise knows nothing of the perturbation. Where the body or its controller is another than the fit's,
+a part of the residuals lies along the derivative of the outputs with respect to that error. Each
+error that was not fitted is a group of such columns c (r, d), made by a forcing f_t that goes
+through the local loop, x the fit's own trajectory and G_t the local gain of the controller,
+
+    dx_{t+1} = (A_t + B_t G_t) dx_t + f_t,      c_t = C dx_t:
+
+    delay               f = -B (u_t - u_{t-1}), a command that arrives one sample late
+    limit               the derivative with respect to the limit of the command
+    lean                f = B in one trial, a constant push that the person gives or takes
+    offset              c = 1 in one output and trial
+    perturbation        f = E d_t, its size or the inertia that it moves
+    stiffness           f = E y_t and E (y_t - y_{t-1}), stiffness and damping where it acts
+    further mode        f = E d_{t-l}, answers that come later than the model's
+    nonlinear body      f = (B, E) (y^2, y^3)
+
+The test is made at the fit with its prior, so that a stated uncertainty explains what it can. All
+rows are whitened by the residuals' autoregression of order one, and M is what gain, metric, initial
+states and parameters cannot make up for. With U an orthonormal basis of M c, e the residual and V
+the long-run covariance of U'e (`long_run_covariance`), T = (U'e)' V^-1 (U'e) is chi-squared with d
+degrees of freedom where the model holds; F's distribution with as many independent samples as the
+colour leaves takes its place. Holm's correction holds the level over all groups
+(docs/fitting.md has level and power).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+import scipy.stats
+
+from impc.arrays import Array, Frozen, IntArray
+from impc.assess.covariance import by_trial, spread_of_rows
+from impc.assess.long_run_covariance import residual_noise
+from impc.assess.several_tests import holm
+from impc.checking import replace
+from impc.control.body_steps import slopes_along
+from impc.control.closed_loop import prepare_loop, run_loop
+from impc.control.constraint_rows import directions
+from impc.inverse.coordinates import metric_directions
+from impc.inverse.least_squares import trial_span
+from impc.inverse.problem import controller_for, drive_of, noise_of_residual
+from impc.inverse.residuals import evaluate, residual_along, with_prior_rows
+from impc.inverse.solution_set import natural_coordinates
+from impc.model.bounds import bound_rows
+
+if TYPE_CHECKING:
+    from impc.assess.printed_gain import IdentifiedGain
+    from impc.control.controller import Controller
+    from impc.control.simulation import Simulation
+    from impc.inverse.problem import Problem
+    from impc.inverse.residuals import Evaluation
+    from impc.model.recordings import Recording
+
+#: Probability of any alarm where the model holds.
+LEVEL = 0.05
+DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
+PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
+MODE, NONLINEAR = "a further mode", "a nonlinear body"
+# Samples, in shares of the shortest trial, at which an answer may come later.
+_LATER = (0.005, 0.01, 0.02, 0.04)
+# Of a column: less that the fit cannot make up for is nothing to test.
+_LEFT = 1e-3
+# Residuals below this share of the outputs are rounding; fewer samples are no test.
+_EXACT, _FEWEST = 1e-7, 100
+
+
+@dataclass(frozen=True)
+class ModelError(Frozen):
+    """One kind of error of the model, and what the residuals say of it."""
+
+    name: str
+    probability: float  # Of as much where the model holds
+    evidence: float  # Minus its logarithm
+    # How large the error is that explains it, with its standard deviation, in samples of delay or
+    # shares of a limit or perturbation; NaN for a group of several columns
+    size: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class LackOfFit(Frozen):
+    """The test of every kind of error."""
+
+    errors: tuple[ModelError, ...]  # Those that can be tested, the most probable culprit first
+    alarm: bool  # Whether any is found at 5 %, all together
+    untestable: tuple[str, ...]  # Kinds that the fit makes up for, whatever their size
+
+    @property
+    def culprit(self) -> ModelError | None:
+        """The error that explains most, where there is an alarm."""
+        return self.errors[0] if self.alarm else None
+
+
+def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
+    """Test the model of a fit; None where there is too little to test, or an exact fit."""
+    problem, K, S = estimate.problem, np.array(estimate.K), np.array(estimate.S)
+    found = evaluate(problem, K, S)
+    samples = sum(trial.samples for trial in problem.recordings)
+    size = np.linalg.norm(found.residual) / np.sqrt(problem.recorded_numbers)
+    if found.reason or samples < _FEWEST or size <= _EXACT or _has_gaps(problem):
+        return None
+    groups = {name: columns for name, columns in _columns(problem, K, S) if columns.shape[1]}
+    widths = [columns.shape[1] for columns in groups.values()]
+    tested = _Tested(problem, found, K, S, np.hstack(list(groups.values())))
+    parts = np.split(np.arange(sum(widths)), np.cumsum(widths)[:-1])
+    results = {name: tested.of(name, part) for name, part in zip(groups, parts, strict=True)}
+    errors = sorted(
+        (item for item in results.values() if item is not None), key=lambda item: -item.evidence
+    )
+    corrected = holm(np.array([item.probability for item in errors]))
+    alarm = bool(np.any(np.array(corrected) <= LEVEL))
+    return LackOfFit(
+        tuple(errors), alarm, tuple(name for name, item in results.items() if item is None)
+    )
+
+
+def _has_gaps(problem: Problem) -> bool:
+    return any(trial.has_gaps for trial in problem.recordings)
+
+
+class _Tested:
+    """Whitened columns without what the fit makes up for, and the noise of the rest."""
+
+    def __init__(
+        self, problem: Problem, found: Evaluation, K: Array, S: Array, columns: Array
+    ) -> None:
+        self.problem, trials = problem, len(problem.recordings)
+        found, self.root = _whitened(problem, found)
+        columns = _white_rows(problem, columns, self.root)
+        self.scale, rows = noise_of_residual(problem, found.residual), len(found.residual)
+        found = with_prior_rows(problem, found, self.scale)
+        below = np.zeros((len(found.residual) - rows, columns.shape[1]))
+        T, G = natural_coordinates(problem.plant, K)
+        shared = [found.along_gain(T, G), found.along_metric(S, metric_directions(S))]
+        sizes = problem.row_sizes
+        fitted = trial_span(found.own, sizes, np.hstack([*shared, found.dparameters]))
+        whole = np.vstack([columns, below])
+        self.seen = fitted.without(whole)
+        self.whole = np.linalg.norm(whole, axis=0)
+        self.residual = fitted.without(found.residual[:, None])[:, 0]
+        basis = self._basis(np.arange(columns.shape[1]))
+        left = self.residual - basis @ (basis.T @ self.residual)
+        everything = fitted.plus(basis).upper(trials, rows)
+        self.noise = residual_noise(by_trial(problem, left), everything)
+
+    def _basis(self, part: IntArray) -> Array:
+        """Orthonormal basis of what some columns have that the fit cannot make up for."""
+        size = np.linalg.norm(self.seen[:, part], axis=0)
+        usable = part[size > _LEFT * self.whole[part]]
+        scaled = self.seen[:, usable] / np.linalg.norm(self.seen[:, usable], axis=0)
+        if scaled.shape[1] == 0:
+            return np.zeros((len(self.seen), 0))
+        left, values, _ = np.linalg.svd(scaled, full_matrices=False)
+        return np.asarray(left[:, values > _LEFT])
+
+    def of(self, name: str, part: IntArray) -> ModelError | None:
+        """The test of one group of columns."""
+        U = self._basis(part)
+        d = U.shape[1]
+        if d == 0:
+            return None
+        V = spread_of_rows(self.problem, self.noise, U, self.scale)
+        score = U.T @ self.residual
+        statistic = float(score @ np.linalg.solve(V, score))
+        free = self._independent() - d + 1
+        scaled = statistic * free / ((free + d - 1) * d)
+        evidence = -float(scipy.stats.f.logsf(scaled, d, free))
+        size = deviation = np.nan
+        if len(part) == 1:
+            length = float(np.linalg.norm(self.seen[:, part[0]]))
+            side = np.sign(float(U[:, 0] @ self.seen[:, part[0]]))
+            size, deviation = -side * float(score[0]) / length, float(np.sqrt(V[0, 0])) / length
+        return ModelError(name, float(np.exp(-evidence)), evidence, size, deviation)
+
+    def _independent(self) -> float:
+        """How many independent samples are as good as those that were recorded."""
+        slow = float(np.max(np.clip(self.root, 0.0, None)))
+        samples = sum(trial.samples for trial in self.problem.recordings)
+        return max(samples * (1 - slow) / (1 + slow), 10.0)
+
+
+def _whitened(problem: Problem, found: Evaluation) -> tuple[Evaluation, Array]:
+    """The same in rows whose noise is white, and the roots of their autoregression (p,)."""
+    root = np.array(residual_noise(by_trial(problem, found.residual)).root)
+    names = ("residual", "dK", "dS", "own", "dparameters")
+    parts = {name: _white_rows(problem, getattr(found, name), root) for name in names}
+    return replace(found, **parts), root
+
+
+def _white_rows(problem: Problem, rows: Array, root: Array) -> Array:
+    """x_t - a x_{t-1} of each trial and output; the first as its variance asks."""
+    parts = []
+    for part in by_trial(problem, rows):
+        a = root.reshape(-1, *[1] * (part.ndim - 2))
+        white = np.array(part)
+        white[1:] -= a * part[:-1]
+        white[0] *= np.sqrt(1 - a**2)
+        parts.append(white.reshape(-1, *rows.shape[1:]))
+    return np.concatenate(parts)
+
+
+def _columns(problem: Problem, K: Array, S: Array) -> list[tuple[str, Array]]:
+    """Derivatives of the residual along each kind of error, by name."""
+    controller = controller_for(problem, K, S)
+    prepared = prepare_loop(
+        controller, directions(controller, problem.plant.n, x0=np.eye(len(K.T)))
+    )
+    forced: dict[str, list[Array]] = {}
+    for trial in problem.recordings:
+        run, moved = run_loop(prepared, drive_of(trial, trial.x0), local=True, proved=False)
+        for name, columns in _forced(problem, trial, run, moved.u).items():
+            forced.setdefault(name, []).append(columns)
+    leans = forced.pop(LEAN)
+    found = [(name, np.concatenate(parts)) for name, parts in forced.items()]
+    found.append((LEAN, scipy.linalg.block_diag(*leans)))
+    fitted = problem.parameter_names
+    if not any(name.startswith("u_max") for name in fitted):
+        found.append((LIMIT, _along_limits(problem, controller)))
+    if len(problem.offsets) < len(problem.plant.outputs):
+        found.append((OFFSET, _offsets(problem)))
+    return found
+
+
+def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -> dict[str, Array]:
+    """Those that a forcing makes, in one trial (rows, d); `local` (steps, m, n) are G_t."""
+    plant, u, d = problem.plant, np.array(run.u), np.array(trial.disturbance[: len(run.u)])
+    y = run.x[:-1] @ plant.C.T
+    y = y / np.maximum(np.sqrt(np.mean(y**2, axis=0)), 1e-300)
+    A, B, E = slopes_along(plant, run.x[:-1], run.u, d)
+    late = u - np.vstack([u[:1], u[:-1]])
+    steps = [max(1, round(share * trial.samples)) for share in _LATER]
+    forces = {
+        DELAY: [-_through(B, np.eye(plant.m)[k] * late) for k in range(plant.m)],
+        LEAN: [_through(B, column) for column in _single(np.ones_like(u))],
+        PUSH: [_through(E, column) for column in _single(d)],
+        STIFFNESS: [
+            _through(E, column)
+            for signal in (y, np.diff(y, axis=0, prepend=y[:1]))
+            for column in _crossed(signal, d.shape[1])
+        ],
+        MODE: [_through(E, _later(column, step)) for step in steps for column in _single(d)],
+        NONLINEAR: [
+            _through(slopes, column)
+            for slopes, width in ((B, plant.m), (E, d.shape[1]))
+            for power in (y**2, y**3)
+            for column in _crossed(power, width)
+        ],
+    }
+    every = np.stack([force for part in forces.values() for force in part], axis=2)
+    closed, dx = A + B @ local, np.zeros((trial.samples, plant.n, every.shape[2]))
+    for t in range(len(u)):
+        dx[t + 1] = closed[t] @ dx[t] + every[t]
+    seen = plant.C @ dx / problem.output_scale[:, None]
+    rows = np.zeros((trial.samples, len(problem.measured), every.shape[2]))
+    rows[:, : len(plant.outputs)] = seen
+    flat = rows.reshape(-1, every.shape[2])
+    ends = np.cumsum([len(part) for part in forces.values()])[:-1]
+    return dict(zip(forces, np.split(flat, ends, axis=1), strict=True))
+
+
+def _through(slopes: Array, column: Array) -> Array:
+    """A forcing (steps, n) by a signal (steps, inputs) through slopes (steps, n, inputs)."""
+    return np.asarray(np.einsum("tni,ti->tn", slopes, column))
+
+
+def _single(signals: Array) -> list[Array]:
+    """Each signal (steps, i) by itself, the others zero."""
+    return [signals * unit for unit in np.eye(signals.shape[1])]
+
+
+def _crossed(signals: Array, inputs: int) -> list[Array]:
+    """Each signal (steps, k) at each input alone (steps, inputs)."""
+    return [signals[:, [k]] * unit for k in range(signals.shape[1]) for unit in np.eye(inputs)]
+
+
+def _later(signal: Array, steps: int) -> Array:
+    return np.vstack([np.zeros((steps, signal.shape[1])), signal[:-steps]])
+
+
+def _along_limits(problem: Problem, controller: Controller) -> Array:
+    """Derivatives by the logarithm of the limit of each control that has one (r, k)."""
+    rows = bound_rows(controller.bounds, problem.plant)
+    moves = [rows.b * ((rows.F[:, k] != 0) & ~rows.on_state) for k in range(problem.plant.m)]
+    moves = [column for column in moves if np.any(column)]
+    if not moves:
+        return np.zeros((sum(problem.trial_sizes), 0))
+    along = directions(controller, len(moves), bounds=np.stack(moves, axis=1))
+    return residual_along(problem, controller, along)
+
+
+def _offsets(problem: Problem) -> Array:
+    """One in each output of each trial that is not fitted anyway (r, k)."""
+    names = problem.plant.outputs
+    places = [k for k, name in enumerate(names) if name not in problem.offsets]
+    parts, count = [], len(problem.recordings)
+    for index, trial in enumerate(problem.recordings):
+        rows = np.zeros((trial.samples, len(problem.measured), count, len(places)))
+        for column, place in enumerate(places):
+            rows[:, place, index, column] = 1 / problem.output_scale[place]
+        parts.append(rows.reshape(-1, count * len(places)))
+    return np.concatenate(parts)

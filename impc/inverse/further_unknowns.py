@@ -1,0 +1,119 @@
+"""One unknown more in a problem: what a test of its fit says that the model lacks.
+
+Each is fitted about what the model says, with a standard deviation that is wide beside what the
+recordings will say of it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, frozen
+from impc.checking import replace
+from impc.model.plant_family import DELAY, PlantFamily, with_late_commands
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
+
+#: The size of a perturbation, relative to what was recorded, as a parameter.
+STRENGTH = "perturbation"
+# Deviations: of the limit, of that size, and of the delay in samples.
+_LIMIT, _STRENGTH, _DELAY = 0.3, 0.3, 1.0
+
+
+def with_limit_unknown(problem: Problem) -> Problem | None:
+    """The limits of the controls among the parameters; None where they cannot be."""
+    bounds = problem.bounds
+    if np.any(bounds.u_max != -bounds.u_min) or problem.plant.commands:
+        return None
+    family = replace(_family(problem), limit_deviation=_LIMIT).with_limits(problem.plant, bounds)
+    return _posed(problem, family)
+
+
+def with_delay_unknown(problem: Problem) -> Problem | None:
+    """A delay of the commands among the parameters; None for a plant that cannot have one here."""
+    plant, m = problem.plant, problem.plant.m
+    dressed = plant.ahead or plant.commands or np.any(plant.observer) or DELAY in _names(problem)
+    if plant.body is not None or dressed or problem.terminal_weight is not None:
+        return None
+    dt = plant.dt
+
+    def late(one: Plant, value: float) -> Plant:
+        return with_late_commands(one, value / dt - 1)
+
+    family = _widened(_family(problem), DELAY, dt, _DELAY, late)
+    none, far = np.zeros(m), np.full(m, np.inf)
+    bounds = replace(
+        problem.bounds,
+        x_min=frozen(np.append(problem.bounds.x_min, -far)),
+        x_max=frozen(np.append(problem.bounds.x_max, far)),
+    )
+    trials = [replace(trial, x0=frozen(np.append(trial.x0, none))) for trial in problem.recordings]
+    structure = problem.structure
+    if structure is not None:
+        wider = np.hstack([structure.features, np.zeros((len(structure.features), m))])
+        structure = replace(structure, features=frozen(wider))
+    parts = {"bounds": bounds, "recordings": tuple(trials), "structure": structure}
+    return _posed(problem, family, **parts)
+
+
+def with_offsets_unknown(problem: Problem) -> Problem | None:
+    """An offset of every output in every trial."""
+    return replace(problem, offsets=problem.plant.outputs)
+
+
+def with_strength_unknown(problem: Problem) -> Problem | None:
+    """The size of the disturbances, one factor for all, among the parameters."""
+    if problem.plant.ahead or STRENGTH in _names(problem):
+        return None
+
+    def stronger(plant: Plant, factor: float) -> Plant:
+        E = factor * plant.E
+        body = plant.body and plant.body.moved(0 * plant.A, 0 * plant.B, E - plant.E)
+        return replace(plant, E=frozen(E), body=body)
+
+    return _posed(problem, _widened(_family(problem), STRENGTH, 1.0, _STRENGTH, stronger))
+
+
+def _names(problem: Problem) -> tuple[str, ...]:
+    return problem.parameter_names
+
+
+def _family(problem: Problem) -> PlantFamily:
+    return problem.family or PlantFamily(lambda _: problem.plant, [], [])
+
+
+def _widened(
+    family: PlantFamily,
+    name: str,
+    nominal: float,
+    deviation: float,
+    change: Callable[[Plant, float], Plant],
+) -> PlantFamily:
+    """The family with one parameter more, which changes its plants."""
+    make = family.make
+    return replace(
+        family,
+        make=lambda values: change(make(values[:-1]), float(values[-1])),
+        names=(*family.names, name),
+        nominal=frozen([*family.nominal, nominal]),
+        deviations=frozen([*family.deviations, deviation]),
+    )
+
+
+def _posed(problem: Problem, family: PlantFamily, **parts: object) -> Problem:
+    """The problem with a wider family, its further parameters at their nominal values."""
+    more = np.zeros(len(family.names) - len(problem.logarithms))
+    logarithms = np.append(problem.logarithms, more)
+    plant: Plant = family.make(_values(family, logarithms))
+    known = {"family": family, "plant": plant, "logarithms": frozen(logarithms)}
+    return replace(problem, **known, **parts)
+
+
+def _values(family: PlantFamily, logarithms: Array) -> Array:
+    return family.nominal * np.exp(logarithms)

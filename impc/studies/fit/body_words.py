@@ -1,0 +1,135 @@
+"""What a fit says of the body: how well it is known, and whether the recordings contradict it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, MODE, NONLINEAR, OFFSET, PUSH, STIFFNESS
+from impc.reporting.finding import Finding, Severity, table_of
+from impc.reporting.rendering import number
+
+if TYPE_CHECKING:
+    from impc.assess.lack_of_fit import LackOfFit, ModelError
+    from impc.studies.fit.result import FitResult
+
+# Of a stated deviation: what is known no better after the fit is not identified by it.
+_AS_BEFORE = 0.9
+# Of the variance of the gain: a smaller share of a parameter is not named.
+_NAMED = 0.05
+
+_KINDS = {
+    DELAY: "a delay of the command",
+    LIMIT: "another limit of the command",
+    LEAN: "a lean, a constant push in each trial",
+    OFFSET: "an offset of the recorded outputs",
+    PUSH: "another size of the perturbation, or another inertia",
+    STIFFNESS: "another stiffness or damping where the perturbation acts",
+    MODE: "a further mode of the body",
+    NONLINEAR: "a body that is not linear, or is otherwise",
+}
+
+
+def body_sentences(result: FitResult) -> tuple[str, ...]:
+    """How well the body is known, and what that makes of the intervals."""
+    stated = [item for item in result.parameters if item.stated is not None]
+    if not stated:
+        return (
+            "The body was taken as exact: the intervals on this page contain noise, and not what "
+            "is uncertain of masses, lengths, delay and limit ([plant.uncertainty] states it).",
+        )
+    wider = _wider(result)
+    parts = sorted(stated, key=lambda item: -item.share)
+    named = [f"{item.name} {100 * item.share:.0f} %" for item in parts if item.share > _NAMED]
+    found_as_before = [item.name for item in stated if item.learned > _AS_BEFORE]
+    said = [
+        f"The body is not known exactly: {len(stated)} of its parameters were fitted within their "
+        f"stated uncertainty, and the intervals contain it{wider}."
+    ]
+    if named:
+        said.append(f"Of the variance of the gain come from {', '.join(named)}.")
+    if found_as_before:
+        said.append(
+            f"These recordings say nothing of {', '.join(found_as_before)}: a gain makes up for "
+            "them. They cannot be tested here, only measured."
+        )
+    return tuple(said)
+
+
+def _wider(result: FitResult) -> str:
+    """How much wider the intervals are than for an exact body."""
+    found, exact = result.estimate.covariance, result.estimate.exact
+    identified = np.array(found.individually_identified)
+    if exact is None or not np.any(identified):
+        return ""
+    ratio = (np.array(found.entries) / np.array(exact.entries))[identified]
+    return f", {number(float(np.median(ratio)), 2)} times as wide as for an exact body"
+
+
+def error_words(result: FitResult, error: ModelError) -> str:
+    """An error of the model, with its size where it has one."""
+    plant, size, deviation = result.given.plant, error.size, error.deviation
+    words = _KINDS[error.name]
+    if not np.isfinite(size):
+        return words
+    if error.name == DELAY:
+        return f"{words} of {1e3 * plant.dt * size:.0f} ± {1e3 * plant.dt * deviation:.0f} ms"
+    return f"{words}, by {100 * size:+.1f} ± {100 * deviation:.1f} %"
+
+
+def added_sentence(result: FitResult) -> str:
+    """What was fitted too because a first fit lacked it; empty where nothing was."""
+    added = [found.culprit for found in result.lack[:-1] if found is not None]
+    if not added or added[0] is None:
+        return ""
+    return (
+        f"A first fit left what {error_words(result, added[0])} explains "
+        f"({_probability(added[0])}). It was fitted too: all numbers are of that fit."
+    )
+
+
+def lack_sentence(result: FitResult) -> str:
+    """The warning that the model does not fit, with the most probable reason; or nothing."""
+    culprit = None if result.lack[-1] is None else result.lack[-1].culprit
+    if culprit is None:
+        return ""
+    return (
+        "Warning: a part of what the fit leaves follows the perturbation, as noise does not. "
+        f"{error_words(result, culprit).capitalize()} explains most of it "
+        f"({_probability(culprit)}). The intervals on this page do not contain this error."
+    )
+
+
+def _probability(error: ModelError) -> str:
+    return "p < 0.0001" if error.probability < 1e-4 else f"p = {error.probability:.4f}"
+
+
+def lack_finding(result: FitResult, found: LackOfFit) -> Finding:
+    """Every error of the model that was tested."""
+    table = table_of(
+        found.errors,
+        {
+            "error": lambda item: item.name,
+            "p": lambda item: float(item.probability),
+            "size": lambda item: float(item.size),
+            "standard_error": lambda item: float(item.deviation),
+        },
+    )
+    added, warned = added_sentence(result), lack_sentence(result)
+    untestable = ", ".join(_KINDS[name] for name in found.untestable)
+    caption = (
+        "Each is an error of the model that would move the outputs as the residuals do; p is of as "
+        "much where the model holds, each test by itself. Sizes: delay in samples, limit and "
+        "perturbation as shares."
+    )
+    if untestable:
+        caption += f" The fit makes up for {untestable}, whatever the size."
+    return Finding(
+        "residual_tests",
+        table,
+        caption,
+        [line for line in (added, warned) if line],
+        severity=Severity.AMBER if warned else Severity.GREEN,
+        folded="Tests of the model",
+    )
