@@ -3,53 +3,88 @@
     python -m experiments.uncertain_body coverage cart 60 99 0.0    persons, VAF, correlation
     python -m experiments.uncertain_body coverage seat 20 99 0.0
     python -m experiments.uncertain_body test none 100 99 0.9       error, persons, VAF, correlation
+    python -m experiments.uncertain_body summary FILE...            of the lines of these
 
 Every person has a body drawn from the stated uncertainty and weights drawn about typical ones, and
 is fitted as a user would: from nothing, with the nominal body. One line of JSON a person. Errors of
 `test` are none, plant (3 % of both coefficients), delay (one sample), limit (5 %) and lean (a
-constant push of 2 % of the limit, 1 degree of a cart that falls like a person on the seat).
+constant push of .04 of the limit, what 1 degree is to a cart that falls as a seated person does).
 """
 
 from __future__ import annotations
 
+import collections
 import json
 import sys
 import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import control
 import numpy as np
 import scipy.linalg
 import scipy.signal
+from scipy.stats import beta
 
 import impc
+from impc.arrays import Array
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
+from impc.inverse.problem import Problem
 
 DT, HORIZON, SAMPLES, LIMIT, KNOWN = 0.05, 10, 400, 0.55, 0.03
+Rng = np.random.Generator
 
 
-def cart(factors=(1.0, 1.0), outputs=1):
+class Person(NamedTuple):
+    """The problem that the recordings of a person pose, and the truth."""
+
+    problem: Problem
+    gain: Array
+    truth: Array  # Factors of the parameters of the body (k,)
+
+
+def cart(factors: Sequence[float] = (1.0, 1.0), outputs: int = 1) -> impc.Plant:
     """A cart that falls: its two coefficients are uncertain."""
     A = np.array([[0.0, 1.0], [1.2 * factors[0], -0.3 * factors[1]]])
     B = np.array([[0.0, 0.0], [1.0, 1.0]])
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, 4))]]) * DT)
-    names = {"states": ["pos", "vel"], "inputs": ["u", "push"], "outputs": ["pos", "vel"][:outputs]}
-    system = control.ss(held[:2, :2], held[:2, 2:], np.eye(outputs, 2), 0, DT, **names)
-    return impc.Plant(system, ["u"])
+    names: Any = {"states": ["pos", "vel"], "inputs": ["u", "push"], "outputs": ["pos", "vel"]}
+    names["outputs"] = names["outputs"][:outputs]
+    return impc.Plant(
+        control.ss(held[:2, :2], held[:2, 2:], np.eye(outputs, 2), 0, DT, **names), ["u"]
+    )
 
 
-def noise(rng, samples, p, root):
+def noise(rng: Rng, samples: int, p: int, root: float) -> Array:
     """Stationary first-order noise of variance one (samples, p)."""
     white = rng.standard_normal((samples + 200, p))
-    return scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[200:]
+    found = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
+    return np.asarray(found[200:])
 
 
-def recorded(rng, nominal, true, weights, limit, pushes, vaf, root, late=0, lean=0.0):
-    """Recordings of a person on the true plant; None of one who falls."""
-    law = impc.Controller(
-        true, weights, impc.Bounds(true, u_min=-limit, u_max=limit), HORIZON, terminal_set=False
-    )
+def moved(law: impc.Controller, push: Array, late: int) -> Array:
+    """Outputs of a law that answers the state of `late` samples ago; NaN where it falls."""
+    plant = law.plant
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not late:
+            return np.asarray(law.simulate(np.zeros(plant.n), disturbance=push).x[:-1] @ plant.C.T)
+        x = [np.zeros(plant.n)] * (late + 1)
+        for value in push[:-1]:
+            u = law.simulate(x[-1 - late], steps=1).u[0]
+            x.append(plant.A @ x[-1] + plant.B @ u + plant.E @ np.array([value]))
+            if not np.all(np.abs(x[-1]) < 20):
+                return np.full((1, 1), np.nan)
+    return np.array(x[late:]) @ plant.C.T
+
+
+def recorded(
+    rng: Rng, nominal: impc.Plant, law: impc.Controller, pushes: Sequence[Array], vaf: float,
+    root: float, late: int = 0, lean: float = 0.0,
+) -> list[impc.Recording] | None:  # fmt: skip
+    """Recordings of a law; None of one that falls."""
     trials, share = [], np.sqrt((100 - vaf) / vaf)
     for push in pushes:
         outputs = moved(law, push + lean, late)
@@ -60,71 +95,62 @@ def recorded(rng, nominal, true, weights, limit, pushes, vaf, root, late=0, lean
     return trials
 
 
-def moved(law, push, late):
-    """Outputs of a law that answers the state of `late` samples ago."""
-    plant = law.plant
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        if not late:
-            return law.simulate(np.zeros(plant.n), disturbance=push).x[:-1] @ plant.C.T
-        x = [np.zeros(plant.n)] * (late + 1)
-        for value in push[:-1]:
-            u = law.simulate(x[-1 - late], steps=1).u[0]
-            x.append(plant.A @ x[-1] + plant.B @ u + plant.E @ [value])
-            if not np.all(np.abs(x[-1]) < 20):
-                return np.full((1, 1), np.nan)
-    return np.array(x[late:]) @ plant.C.T
+def _law(plant: impc.Plant, weights: impc.Weights, limit: float, N: int) -> impc.Controller:
+    bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
+    return impc.Controller(plant, weights, bounds, N, terminal_set=False)
 
 
-def cart_person(seed, vaf, root, error="none", drawn=True):
-    """One cart and its recordings: problem, true gain, or None."""
+def cart_person(
+    seed: int, vaf: float, root: float, error: str = "none", *, stated: bool = True
+) -> Person | None:
+    """One cart and its recordings."""
     rng = np.random.default_rng([seed, int(vaf), int(10 * root)])
     outputs = 1 + seed % 2
-    factors = np.exp(KNOWN * rng.standard_normal(2)) if drawn else np.ones(2)
+    factors = np.exp(KNOWN * rng.standard_normal(2)) if stated else np.ones(2)
     if error == "plant":
         factors = 1 + 0.03 * rng.choice([-1, 1], 2)
-    true, nominal = cart(factors, outputs), cart(outputs=outputs)
+    true, nominal = cart(factors.tolist(), outputs), cart(outputs=outputs)
     weights = impc.Weights(np.diag([4.0, 1.0] * np.exp(rng.uniform(-0.7, 0.7, 2))), 1)
     pushes = [0.4 * np.repeat(rng.choice([-1.0, 0, 1], SAMPLES // 16), 16) for _ in range(2)]
-    limit = LIMIT * (1.05 if error == "limit" else 1.0)
+    law = _law(true, weights, LIMIT * (1.05 if error == "limit" else 1.0), HORIZON)
     late, lean = int(error == "delay"), 0.02 * (error == "lean")
-    trials = recorded(rng, nominal, true, weights, limit, pushes, vaf, root, late, lean)
+    trials = recorded(rng, nominal, law, pushes, vaf, root, late, lean)
     if trials is None:
         return None
-    known = {"fall": f"{100 * KNOWN} %", "damp": f"{100 * KNOWN} %"}
-    family = impc.PlantFamily(
-        lambda values: cart(values, outputs), ["fall", "damp"], [1, 1], known if drawn else None
-    )
+    known = dict.fromkeys(("fall", "damp"), f"{100 * KNOWN} %")
+    family = impc.PlantFamily(lambda v: cart(v.tolist(), outputs), list(known), [1, 1], known)
     bounds = impc.Bounds(nominal, u_min=-LIMIT, u_max=LIMIT)
-    posed = family if drawn else None
-    problem = impc.Problem(nominal, bounds, HORIZON, trials, unknown_start=True, family=posed)
-    return problem, np.array(impc.solve_lqr(true, weights).K), factors
+    problem = Problem(
+        nominal, bounds, HORIZON, trials, unknown_start=True, family=family if stated else None
+    )
+    return Person(problem, np.array(impc.solve_lqr(true, weights).K), factors)
 
 
-def seat_person(seed, vaf, root, error="none", drawn=True):
-    """One person on the seat with the linear body: problem, true gain, or None."""
+def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Person | None:
+    """One person on the seat with the linear body; the errors are those of no test."""
     rng = np.random.default_rng([seed, int(vaf), int(10 * root), 1])
-    family = plant_family_of(plant_source("plants:seated_balance_for", {}), ["perturbation"], [])
-    family = family.linear()
-    logarithms = family.deviations * rng.standard_normal(len(family.names)) * drawn
-    true, nominal = family.make(family.nominal * np.exp(logarithms)), family.make(family.nominal)
+    found = plant_family_of(plant_source("plants:seated_balance_for", {}), ["perturbation"], [])
+    assert found is not None
+    family = found.linear()
+    factors = np.exp(family.deviations * rng.standard_normal(len(family.names)))
+    true, nominal = family.make(family.nominal * factors), family.make(family.nominal)
     costs = np.log([6e3, 9e3, 6e2, 4e2]) + rng.uniform(-0.7, 0.7, 4)
     weights = impc.Structure(nominal, list(nominal.states[:4])).weights(costs)
     pushes = [5 * np.repeat(rng.choice([-1.0, 0, 1], 120), 25) for _ in range(3)]
-    trials = recorded(rng, nominal, true, weights, 70.0, pushes, vaf, root)
+    trials = recorded(rng, nominal, _law(true, weights, 70.0, 20), pushes, vaf, root)
     if trials is None or max(np.max(np.abs(trial.outputs)) for trial in trials) > 0.6:
         return None
     bounds = impc.Bounds(nominal, u_min=-70.0, u_max=70.0)
-    problem = impc.Problem(nominal, bounds, 20, trials, unknown_start=True, family=family)
-    return problem, np.array(impc.solve_lqr(true, weights).K), np.exp(logarithms)
+    problem = Problem(nominal, bounds, 20, trials, unknown_start=True, family=family)
+    return Person(problem, np.array(impc.solve_lqr(true, weights).K), factors)
 
 
-def covered(person):
-    """Whether each interval of an identified entry holds, with and without the uncertainty."""
+def covered(person: Person) -> dict[str, Any]:
+    """Deviations of identified entries from the truth, with and without the uncertainty."""
     problem, truth, _ = person
-    found = impc.fit(problem)
-    both, exact = {}, impc.fit(problem.with_body_fixed())
-    for name, estimate in (("stated", gain_estimate(found)), ("exact", gain_estimate(exact))):
+    both = {}
+    for name, posed in (("stated", problem), ("exact", problem.with_body_fixed())):
+        estimate = gain_estimate(impc.fit(posed))
         deviation, value = np.array(estimate.covariance.entries), np.array(estimate.K)
         identified = np.array(estimate.covariance.individually_identified)
         both[name] = {
@@ -135,21 +161,62 @@ def covered(person):
     return both
 
 
-def tested(person):
-    """The test of lack of fit: alarm, culprit, sizes."""
-    found = lack_of_fit(gain_estimate(impc.fit(person[0])))
-    return {
-        "alarm": found.alarm,
-        "errors": [[e.name, e.probability, e.size, e.deviation] for e in found.errors],
-    }
+def tested(person: Person) -> dict[str, Any]:
+    """The test of lack of fit: alarm, errors with probability and size."""
+    found = lack_of_fit(gain_estimate(impc.fit(person.problem)))
+    assert found is not None
+    errors = [[one.name, one.probability, one.size, one.deviation] for one in found.errors]
+    return {"alarm": found.alarm, "errors": errors}
 
 
-def main(kind, what, count, vaf, root, first="0", drawn="1"):
-    """Print one line a person."""
-    made = seat_person if what == "seat" else cart_person
+def summary(path: str) -> str:
+    """The rates of a file of lines, with intervals of 95 %; coverage is clustered by person."""
+    with open(path, encoding="utf-8") as file:
+        rows = [row for row in map(json.loads, file) if "failed" not in row]
+    if "alarm" in rows[0]:
+        alarms = [row["errors"][0][0] for row in rows if row["alarm"]]
+        low, high = _interval(len(alarms), len(rows))
+        named = dict(collections.Counter(alarms))
+        return f"{len(alarms)} of {len(rows)} ({low:.0f} to {high:.0f} %): {named}"
+    said = []
+    for kind in ("stated", "exact"):
+        inside = [np.abs(row[kind]["z"]) < 1.96 for row in rows if row[kind]["z"]]
+        rates, counts = (
+            np.array([np.mean(one) for one in inside]),
+            np.array([len(one) for one in inside]),
+        )
+        rate = float(counts @ rates / counts.sum())
+        spread = np.sqrt(np.sum((counts * (rates - rate)) ** 2)) / counts.sum()
+        width, error = (
+            np.median(np.concatenate([row[kind][name] for row in rows]))
+            for name in ("width", "error")
+        )
+        said.append(
+            f"{kind} {100 * rate:.0f} ± {196 * spread:.0f} % of {counts.sum()} entries, "
+            f"deviation {100 * width:.2g} %, error {100 * error:.2g} %"
+        )
+    return f"{len(rows)} persons: {'; '.join(said)}"
+
+
+def _interval(k: int, n: int) -> tuple[float, float]:
+    """Clopper's and Pearson's interval of a rate, %."""
+    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
+    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
+    return 100 * float(low), 100 * float(high)
+
+
+def main(kind: str, *given: str) -> None:
+    """Print one line a person, or a summary."""
+    if kind == "summary":
+        for path in given:
+            print(path, summary(path))
+        return
+    what, count, vaf, root = given[:4]
+    first = int(given[4]) if len(given) > 4 else 0
+    make: Callable[..., Person | None] = seat_person if what == "seat" else cart_person
     error = "none" if kind == "coverage" else what
-    for seed in range(int(first), int(first) + int(count)):
-        person = made(seed, float(vaf), float(root), error, drawn == "1")
+    for seed in range(first, first + int(count)):
+        person = make(seed, float(vaf), float(root), error)
         if person is None:
             continue
         try:

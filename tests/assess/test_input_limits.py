@@ -8,12 +8,11 @@ import pytest
 from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.simulated_subjects import noisy_recordings
-from impc.assess.input_limits import LimitEstimate, at_another_limit, input_limit, with_limit
+from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
 from impc.control.closed_loop import simulate
 from impc.control.simulation import scenario
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
@@ -87,28 +86,3 @@ def test_with_limit_changes_one_input_only() -> None:
     assert np.isinf(with_limit(fitted.problem, np.inf).bounds.u_min[0])
     with pytest.raises(InputError, match="control"):
         input_limit(fitted, 1)
-
-
-@pytest.mark.slow
-def test_a_fit_at_a_wrong_limit_is_made_again_at_the_right_one() -> None:
-    """Half of the true limit: the profile excludes it, and its ends lie on the quantile."""
-    whole = noisy_trial(SEED, 0.0)
-    trial = Recording(cart(), whole.outputs[:400], whole.disturbance[:400])
-    wrong = fitted_cart(trial, 0.6)
-    found = at_another_limit(wrong)
-    assert found is not None
-    assert found.contradicted
-    assert found.given == 0.6
-    assert found.limit.low < 1.0 < found.limit.high
-    assert found.fitted.misfit < wrong.misfit
-    limit, best = found.limit, found.fitted
-    for end in (limit.low, limit.high):
-        there = refine_gain(with_limit(best.problem, end), best.gain, best.metric, prior=1.0)
-        nearest = int(np.argmin(np.abs(limit.limits - end)))
-        assert limit.distances[nearest] == pytest.approx(limit.quantile, rel=0.1)
-        white = trial.outputs.size * ((there.misfit / best.noise) ** 2 - 1)
-        assert white >= 0.9 * limit.quantile
-
-
-def test_no_limit_gives_no_other() -> None:
-    assert at_another_limit(fitted_cart(gentle_trial(), None)) is None

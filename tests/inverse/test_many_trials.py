@@ -9,17 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-import impc.assess.diagnostics
 from experiments.coverage import cart
 from impc.assess.covariance import gain_covariance
-from impc.assess.diagnostics import residual_structure
-from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.inverse.gain_search import refine_gain
 from impc.inverse.problem import Problem
-from impc.inverse.residuals import evaluate
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.studies.fit.result import shown_trials
@@ -73,29 +69,13 @@ def peak_of(work: Callable[[], object]) -> int:
 WORK: dict[str, Callable[[Problem], object]] = {
     "search": lambda problem: refine_gain(problem, GAIN, np.eye(1), max_evaluations=3, prior=2.0),
     "covariance": lambda problem: gain_covariance(problem, GAIN, np.eye(1)),
-    "structure": lambda problem: residual_structure(
-        problem, GAIN, evaluate(problem, GAIN, np.eye(1))
-    ),
 }
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", WORK)
-def test_memory_grows_as_the_trials_do(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_grows_as_the_trials_do(name: str) -> None:
     """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""
-    monkeypatch.setattr(impc.assess.diagnostics, "_LAGS", 2)
-    monkeypatch.setattr(impc.assess.diagnostics, "_SHIFTS", 3)
     few, many = (starts_unknown(count) for count in (60, 180))
     WORK[name](few)  # what is compiled and kept once does not count
     assert peak_of(lambda: WORK[name](many)) < 4.5 * peak_of(lambda: WORK[name](few))
-
-
-def test_of_very_many_samples_some_trials_are_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = starts_unknown(9)
-    found = evaluate(problem, GAIN, np.eye(1))
-    monkeypatch.setattr(impc.assess.diagnostics, "_LAGS", 2)
-    monkeypatch.setattr(impc.assess.diagnostics, "_MOST", 200)
-    some = replace(problem, recordings=problem.recordings[::3])
-    expected = residual_structure(some, GAIN, evaluate(some, GAIN, np.eye(1)))
-    assert expected is not None
-    assert residual_structure(problem, GAIN, found) == expected

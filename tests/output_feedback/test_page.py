@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from impc.arrays import frozen
-from impc.assess.diagnostics import ResidualDiagnostics
-from impc.assess.loop_noise import LoopNoise
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.simulation import Status
@@ -188,9 +186,8 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
 def test_the_page_says_by_which_gain_to_go() -> None:
     """By that of the person, where least squares leaves noise inside the loop."""
     result = fitted()
-    loop = LoopNoise(np.array([0.5]), 50.0, 9.0, 0.0)
     held = tuple(replace(item, saturated=0.2) for item in result.trials)
-    result = replace(result, diagnostics=ResidualDiagnostics(loop, None), trials=held)
+    result = replace(result, lack=(None,), trials=held)
     report = result.person
     assert report is not None
     assert report.fit is not None

@@ -27,7 +27,7 @@ _KINDS = {
     PUSH: "another size of the perturbation, or another inertia",
     STIFFNESS: "another stiffness or damping where the perturbation acts",
     MODE: "a further mode of the body",
-    NONLINEAR: "a body that is not linear, or is otherwise",
+    NONLINEAR: "a body that is not linear, or noise that the person answers at the limit",
 }
 
 
@@ -94,10 +94,15 @@ def lack_sentence(result: FitResult) -> str:
     culprit = None if result.lack[-1] is None else result.lack[-1].culprit
     if culprit is None:
         return ""
+    noise = (
+        " Noise that enters the loop and is answered at the limit does the same; [fit.observer] "
+        "asks for a subject with such noise."
+    )
     return (
         "Warning: a part of what the fit leaves follows the perturbation, as noise does not. "
         f"{error_words(result, culprit).capitalize()} explains most of it "
         f"({_probability(culprit)}). The intervals on this page do not contain this error."
+        f"{noise if result.saturated > 0 and culprit.name in (LEAN, NONLINEAR) else ''}"
     )
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
     from impc.assess.intent_statements import Intent
     from impc.assess.lack_of_fit import LackOfFit
-    from impc.assess.loop_noise import LoopNoise
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
@@ -90,7 +89,6 @@ class FitResult:
     methods: tuple[MethodFit, ...]
     # The tests of the model: of the first fit and, where one unknown was added, of the last
     lack: tuple[LackOfFit | None, ...]
-    loop: LoopNoise | None  # Whether the residuals look like noise inside the loop
     # Largest change of a scaled output when the terminal set is added (or taken away); NaN when the
     # loop with it does not reach the end
     terminal_set_difference: float

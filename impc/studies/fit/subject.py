@@ -23,7 +23,6 @@ from impc.assess.command_table import command_regression
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
 from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, OFFSET, PUSH, LackOfFit, lack_of_fit
-from impc.assess.loop_noise import loop_noise_of
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out_vaf
@@ -223,8 +222,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     own = evaluate_method(fitted, problem.bounds)
     sizes = state_sizes(own.runs)
     usable = bool(np.all(own.vaf >= LITTLE))
-    loop = attempt("noise inside the loop", lambda: loop_noise_of(estimate), None)
-    doubted = (lack[-1] is not None and lack[-1].alarm) or (loop is not None and loop.found)
+    doubted = lack[-1] is not None and lack[-1].alarm
     test = weights_test(fitted, estimate, contradicted=doubted)
 
     def whole_set() -> tuple[WeightsSummary | None, str]:
@@ -257,7 +255,6 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         held_out,
         methods,
         lack,
-        loop,
         _terminal_set_difference(methods[-1]),
         time.perf_counter() - started,
         test,

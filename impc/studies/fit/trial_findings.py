@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from impc.assess.loop_noise import loop_sentence
-from impc.reporting.finding import Finding, Picture, Severity
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.shown_units import shown_unit
 from impc.studies.fit.aim import aim_data
 from impc.studies.fit.body_words import lack_finding
@@ -81,13 +80,8 @@ def command_findings(result: FitResult) -> list[Finding]:
 
 def residual_findings(result: FitResult) -> list[Finding]:
     """Tests that speak against the model; their warnings have to be read before any number."""
-    found: list[Finding] = []
-    if result.lack[-1] is not None:
-        found.append(lack_finding(result, result.lack[-1]))
-    if result.loop is not None and result.loop.found:
-        said = [loop_sentence(result.loop, result.given.plant.outputs, result.saturated)]
-        found.append(Finding("loop_noise", sentences=said, severity=Severity.AMBER))
-    return found
+    last = result.lack[-1]
+    return [] if last is None else [lack_finding(result, last)]
 
 
 def warnings_of(result: FitResult) -> list[str]:

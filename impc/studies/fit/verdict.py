@@ -29,7 +29,6 @@ _NAMED = 0.15
 def verdict(result: FitResult) -> str:
     """The one sentence that says what may be made of the fit; what forbids most comes first."""
     within = structure_sentences(result)
-    saturated = any(item.saturated for item in result.trials)
     cases = (
         (bool(within) and result.structures[0].refused, next(iter(within), "")),
         (not result.usable, _little(result)),
@@ -44,15 +43,10 @@ def verdict(result: FitResult) -> str:
         ),
         (result.weights_test.rejected, result.weights_test.sentence),
         (
-            saturated and result.loop is not None and result.loop.found,
-            "The controller agrees with the recordings, but what it leaves looks like noise inside "
-            "the loop: do not rely on its gain or its weights. [fit.observer] asks for a subject "
-            "who senses with noise.",
-        ),
-        (
             result.alarm,
             "The controller agrees with the recordings, but the body or the controller that moved "
-            "is not that of the model: its intervals do not contain that error.",
+            "is not that of the model, or noise entered the loop at its limit: do not rely on its "
+            "gain, its weights or their intervals.",
         ),
         (
             not bounded(result),

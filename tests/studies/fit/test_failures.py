@@ -66,16 +66,16 @@ def test_no_weights_is_said_before_any_weights() -> None:
 
 
 def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawn gains, residual tests and drifts of the horizon fail: the gain is reported."""
+    """Drawn gains, the test of the model and drifts of the horizon fail: the gain is reported."""
 
     def fails(*_: Any, **__: Any) -> Any:
         raise SolverError("stage", "did not end", "try another")
 
     whole = fitted()
-    for name in ("drawn_gains", "residual_diagnostics"):
+    for name in ("drawn_gains", "lack_of_fit"):
         monkeypatch.setattr(subject, name, fails)
     result = fitted()
-    assert set(result.failures) == {"drawn gains", "tests of the residuals"}
+    assert set(result.failures) == {"drawn gains", "test of the model"}
     said = remarks(result)
     for stage in result.failures:
         assert sum(stage in sentence and "did not end" in sentence for sentence in said) == 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.printed_intervals import carts, with_noise
+from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import InputError
@@ -88,12 +89,10 @@ def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
 def test_a_refusal_may_be_the_fault_of_the_model() -> None:
     result = fitted(0.5)
     assert not any("not be the structure's fault" in line for line in structure_sentences(result))
-    error = result.diagnostics.structure
-    assert error is not None
-    wrong = replace(result.diagnostics, structure=replace(error, p_linear=0.001, share=0.1))
-    lines = structure_sentences(replace(result, diagnostics=wrong))
+    wrong = (LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=()),)
+    lines = structure_sentences(replace(result, lack=wrong))
     assert lines[1].endswith("the refusal may not be the structure's fault.")
-    whole = replace(fitted(0.0), diagnostics=wrong)
+    whole = replace(fitted(0.0), lack=wrong)
     assert not any("not be the structure's fault" in line for line in structure_sentences(whole))
 
 

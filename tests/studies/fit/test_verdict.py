@@ -9,8 +9,7 @@ import control
 import numpy as np
 import pytest
 
-from impc.assess.diagnostics import ResidualDiagnostics, ResidualStructure
-from impc.assess.loop_noise import LoopNoise
+from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.files.plant_sources import plant_source
@@ -20,10 +19,12 @@ from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.reporting.shown_units import angles_in, signal_words
 from impc.studies.charts import methods_chart, weights_chart
+from impc.studies.fit.body_words import added_sentence
 from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.trial_findings import warnings_of
 from impc.studies.fit.verdict import abstract, missing, verdict
 
 if TYPE_CHECKING:
@@ -59,46 +60,40 @@ def fitted(limit: float) -> FitResult:
     return result
 
 
-def loop(found: bool) -> LoopNoise:
-    return LoopNoise(np.array([0.5]), 50.0 if found else 0.0, 9.0, 0.0)
-
-
 def test_a_fit_that_nothing_speaks_against() -> None:
-    result = replace(fitted(1.0), diagnostics=ResidualDiagnostics(None, None))
+    result = replace(fitted(1.0), lack=(None,))
     assert verdict(result).startswith("Inverse MPC explains the recordings inside the bound")
     lines = abstract(result)
-    assert 3 <= len(lines) <= 5
+    assert 3 <= len(lines) <= 6
     assert (
         "looks 0.5 s ahead (5 samples), limited to 1 m/s^2 of pull (pull of the rope)" in lines[0]
     )
-    assert f"{result.inverse_mpc.vaf[0]:.2f} % of place (place of the cart) (VAF)" in lines[1]
+    assert f"{result.inverse_mpc.vaf[0]:.2f} % of place (place of the cart) (VAF)" in lines[2]
     share = 100 * result.trials[0].saturated
     assert share > 5
-    assert f"at its bound for {share:.1f} % of the time" in lines[2]
+    assert f"at its bound for {share:.1f} % of the time" in lines[3]
     assert signal_words(result.given.plant) == (
         ("place", "Place of the cart, in m."), ("pull", "Pull of the rope, in m/s^2.")
     )  # fmt: skip
 
 
-def test_noise_in_the_loop_and_another_body_are_said_first() -> None:
+def test_an_error_of_the_model_is_said_first() -> None:
     plain = fitted(1.0)
-    structure = ResidualStructure(1e-4, 1e-4, 0.3)
-    inside = replace(plain, diagnostics=ResidualDiagnostics(loop(True), structure))
-    said = verdict(inside)
-    assert "noise inside the loop: do not rely on its gain" in said
-    assert said.endswith("its weights. [fit.observer] asks for a subject who senses with noise.")
-    other = replace(plain, diagnostics=ResidualDiagnostics(loop(False), structure))
+    alarm = LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=())
+    other = replace(plain, lack=(alarm,))
     assert "is not that of the model" in verdict(other)
+    (said,) = warnings_of(other)
+    assert "A delay of the command of 100 ± 10 ms explains most of it (p < 0.0001)" in said
+    assert added_sentence(replace(other, lack=(alarm, None))).startswith("A first fit left what")
 
 
 @pytest.mark.full
 def test_no_limit_and_a_limit_that_is_not_reached() -> None:
-    clear = ResidualDiagnostics(None, None)
     assert "No limit of the command or of a state was given" in verdict(
-        replace(fitted(np.inf), diagnostics=clear)
+        replace(fitted(np.inf), lack=(None,))
     )
     assert "without a limit" in abstract(fitted(np.inf))[0]
-    assert "No bound is ever active" in verdict(replace(fitted(50.0), diagnostics=clear))
+    assert "No bound is ever active" in verdict(replace(fitted(50.0), lack=(None,)))
 
 
 def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
@@ -184,7 +179,7 @@ def test_bars_are_the_intervals() -> None:
 
 @pytest.mark.parametrize("vaf", [40.0, 60.0])
 def test_little_is_called_little(vaf: float) -> None:
-    plain = replace(fitted(1.0), diagnostics=ResidualDiagnostics(None, None))
+    plain = replace(fitted(1.0), lack=(None,))
     poor = replace(plain.inverse_mpc, vaf=np.array([vaf]))
     result = replace(plain, methods=(*plain.methods[:-1], poor))
     assert verdict(result).startswith("The fitted controller explains less than half") == (vaf < 50)
