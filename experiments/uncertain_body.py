@@ -27,6 +27,7 @@ import scipy.signal
 from scipy.stats import beta
 
 import impc
+import plants
 from impc.arrays import Array
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
@@ -127,20 +128,26 @@ def cart_person(
 
 
 def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Person | None:
-    """One person on the seat with the linear body; the errors are those of no test."""
+    """One person on the linear seat, at the limit of 6 Nm for part of the time; never an error."""
     rng = np.random.default_rng([seed, int(vaf), int(10 * root), 1])
     found = plant_family_of(plant_source("plants:seated_balance_for", {}), ["perturbation"], [])
-    assert found is not None
+    assert found is not None and error == "none"
     family = found.linear()
     factors = np.exp(family.deviations * rng.standard_normal(len(family.names)))
     true, nominal = family.make(family.nominal * factors), family.make(family.nominal)
-    costs = np.log([6e3, 9e3, 6e2, 4e2]) + rng.uniform(-0.7, 0.7, 4)
-    weights = impc.Structure(nominal, list(nominal.states[:4])).weights(costs)
-    pushes = [5 * np.repeat(rng.choice([-1.0, 0, 1], 120), 25) for _ in range(3)]
-    trials = recorded(rng, nominal, _law(true, weights, 70.0, 20), pushes, vaf, root)
-    if trials is None or max(np.max(np.abs(trial.outputs)) for trial in trials) > 0.6:
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    Q = 1e-2 * np.eye(true.n)
+    Q[:4, :4] = np.exp(rng.uniform(-0.7, 0.7)) * 6e5 * np.outer(v, v) / (v @ v)
+    Q[:4, :4] += np.diag([2e4, 2e4, 500.0, 500.0] * np.exp(rng.uniform(-0.7, 0.7, 4)))
+    weights, limit = impc.Weights(Q, 1), 6.0
+    pushes = [
+        plants.ternary_torque(duration=30.0, rate=100.0, seed=int(rng.integers(1_000_000)))
+        for _ in range(3)
+    ]
+    trials = recorded(rng, nominal, _law(true, weights, limit, 20), pushes, vaf, root)
+    if trials is None or max(np.max(np.abs(trial.outputs)) for trial in trials) > 0.4:
         return None
-    bounds = impc.Bounds(nominal, u_min=-70.0, u_max=70.0)
+    bounds = impc.Bounds(nominal, u_min=-limit, u_max=limit)
     problem = Problem(nominal, bounds, 20, trials, unknown_start=True, family=family)
     return Person(problem, np.array(impc.solve_lqr(true, weights).K), factors)
 

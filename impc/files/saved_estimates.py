@@ -181,6 +181,8 @@ def _fields(value: Any) -> dict[str, Any]:
 
 def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | None) -> Problem:
     saved, names = kept["plant"], kept["family"]
+    if family is not None and family.limit_deviation:
+        family = _with_limits(family, kept)
     if names and (family is None or list(family.names) != names):
         raise InputError("family", f"of {', '.join(names)} is needed", "give load(..., family=...)")
     if family is not None and names:
@@ -209,6 +211,15 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
         },
     )
     return found
+
+
+def _with_limits(family: PlantFamily, kept: dict[str, Any]) -> PlantFamily:
+    """The family with the limits of the controls among its parameters, at what was given."""
+    plant, count = family.make(family.nominal), len(family.names)
+    wider = family.with_limits(plant, Bounds(plant, **kept["bounds"]))
+    nominal = np.array(wider.nominal)
+    nominal[count:] /= np.exp(np.array(kept["logarithms"], dtype=float)[count:])
+    return replace(wider, nominal=frozen(nominal))
 
 
 def _require_names(plant: Plant) -> None:

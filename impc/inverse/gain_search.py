@@ -58,6 +58,8 @@ _WEAK = 1e-3
 # Evaluations of predictions and simulations, and nats per recorded number at which each ends: a
 # squared misfit that falls by less than that share of itself; and nats at which it ends at last.
 _PREDICTED, _SIMULATED, _ROUGH, _FINE, _NATS = 25, 80, 1e-3, 1e-6, 1e-3
+# Where a stated uncertainty leaves gain and body to make up for each other: a fifth of a deviation.
+_RIDGE = 0.05
 # Misfit of rounding, of the recorded outputs.
 _ROUNDING = 1e-13
 # Factor by which each step back is shorter.
@@ -141,7 +143,8 @@ def refine_gain(
         raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
     space = Coordinates(problem, gain, metric)
     stop = _stop(problem, _FINE, max_evaluations)
-    stop = replace(stop, nats=min(stop.nats, _NATS))
+    uncertain = bool(np.any(problem.parameter_units[1]))
+    stop = replace(stop, nats=_RIDGE if uncertain else min(stop.nats, _NATS))
     z, spent, _ = descend(space, space.start, stop, shared=prior, own=prior)
     return _gain_fit(space, z, spent)
 

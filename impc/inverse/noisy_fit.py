@@ -84,17 +84,6 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     return with_or_without_set(problem, fit, settled)
 
 
-def _with_body(problem: Problem, known: GainFit) -> GainFit:
-    """The gain of an exact body fitted again together with what is uncertain of the body."""
-    there, logarithms = known.problem, np.zeros(len(problem.logarithms))
-    logarithms[~problem.parameter_units[1]] = there.logarithms
-    moved = problem.at(np.array(there.starts), logarithms, np.array(there.shifts))
-    moved = replace(moved, terminal_set=there.terminal_set)
-    found = refine_gain(moved, np.array(known.K), np.array(known.S), prior=1.0)
-    evaluations = known.evaluations + found.evaluations
-    return replace(found, evaluations=evaluations, unconfirmed=known.unconfirmed)
-
-
 def _set_may_matter(found: Estimate) -> bool:
     """Whether the controller found would do otherwise, had it to end in its terminal set.
 
@@ -116,10 +105,7 @@ def _set_may_matter(found: Estimate) -> bool:
 
 def _fitted(problem: Problem, start: Weights | None) -> Estimate:
     """The same where it is known whether the controller ends in its terminal set."""
-    known = problem.with_body_fixed()
-    free = fit_gain(known) if start is None else free_gain(known, start)
-    if known is not problem and not free.explained:
-        free = _with_body(problem, free)
+    free = fit_gain(problem) if start is None else free_gain(problem, start)
     if free.explained:  # otherwise no weights can have it: the direct form says which come near
         behind = weights_behind(free)
         nearly = behind.misfit <= _NEARLY * recorded_size(problem)

@@ -20,6 +20,7 @@
                                              last: alarm, and errors with probability and size
     failures.<stage>                         why the stage has no result
     warnings                                 sentences
+    ceiling                                  VAF that repeats with the perturbation, low, high, %
     intent                                   eigenvalues (ascending), dominant, sentence, weights
                                              of every rule
     structures                               weights and gain of each that was named
@@ -265,6 +266,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
             **{name: getattr(plant, name) for name in ("A", "B", "E", "C", "dt")},
         },
         "settings": plain_settings(result.settings),
+        "ceiling": None if result.ceiling is None else asdict(result.ceiling),
         "seconds": result.seconds,
     }
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
+    from impc.assess.ceiling import Ceiling
     from impc.assess.intent_statements import Intent
     from impc.assess.lack_of_fit import LackOfFit
     from impc.assess.printed_gain import GainEstimate, Interval
@@ -99,6 +100,8 @@ class FitResult:
     # Those that were asked for, that of [fit.structure] first
     structures: tuple[StructureFit, ...] = ()
     person: PersonReport | None = None  # Of [fit.observer]; None where none was asked for
+    # The part of the outputs that repeats with the perturbation; None where it does not repeat
+    ceiling: Ceiling | None = None
     # The gain by regression on recorded commands (`command_regression`); None where there are none
     commands: pd.DataFrame | None = None
 

@@ -19,6 +19,7 @@ from tqdm.auto import tqdm
 from impc.arrays import Array, frozen
 from impc.assess.all_intervals import assess, count_stages
 from impc.assess.assessments import evaluate_method
+from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
@@ -261,6 +262,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         failures,
         structures,
         attempt("subject with sensory noise", person, None),
+        ceiling(problem, settings.settle),
         attempt("regression of commands", functools.partial(_regressed, fitted), None),
     )
 

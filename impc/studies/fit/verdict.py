@@ -135,7 +135,24 @@ def _agreement(result: FitResult) -> str:
             f"; in trials that the fit has not seen, for "
             f"{' and '.join(f'{value:.2f} %' for value in held)}"
         )
-    return f"{text}."
+    return f"{text}.{_ceiling(result)}"
+
+
+def _ceiling(result: FitResult) -> str:
+    """What any controller without noise can explain, where the perturbation repeats."""
+    found = result.ceiling
+    if found is None:
+        return ""
+    parts = [
+        f"{value:.1f} % ({low:.1f} to {high:.1f}) of {name}"
+        for name, value, low, high in zip(
+            result.given.plant.outputs, found.vaf, found.low, found.high, strict=True
+        )
+    ]
+    return (
+        f" Of the movement {' and '.join(parts)} repeats with the perturbation: no controller "
+        f"without noise of its own explains more ({found.repetitions} repetitions)."
+    )
 
 
 def _at_the_bound(result: FitResult) -> list[str]:
