@@ -198,10 +198,7 @@ def _intervals(at: Tangent, found: WeightCovariance) -> tuple[WeightInterval, ..
 
 
 def _limits(at: Tangent, colour: ResidualNoise) -> Array:
-    """Deviations of the logarithms, everything else being fitted, the gain without a structure.
-
-    As the recordings identify a limit, without what is stated of it.
-    """
+    """Deviations of the logarithms without their own prior, all else and a free gain fitted."""
     problem, found = at.problem, np.full(at.problem.plant.m, np.inf)
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     for control, limit in enumerate(np.array(problem.bounds.u_max)):

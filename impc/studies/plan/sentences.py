@@ -60,7 +60,7 @@ def plan_sentences(plan: Plan) -> tuple[str, ...]:
         *_body(plan),
         _limits(plan),
         _how_it_goes(plan, best),
-        *_groups(plan),
+        _groups(plan),
         *_seen(plan),
         "Computed for the presumed person, who senses without error, and for noise in the recorder "
         "alone: noise in the loop, or a body farther from the plant than stated, makes all worse.",
@@ -140,26 +140,19 @@ def _how_it_goes(plan: Plan, best: Outcome) -> str:
     )
 
 
-def _groups(plan: Plan) -> tuple[str, ...]:
-    found = [item for item in plan.groups if math.isfinite(item.needed)]
-    lost = [item.feature for item in plan.groups if not math.isfinite(item.needed)]
-    never = f"No size of group shows a difference in the cost weight of {', '.join(lost)}."
-    if not found:
-        return (never,) if lost else ()
+def _groups(plan: Plan) -> str:
     settings = plan.settings
-    least = min(found, key=lambda item: item.needed)
-    most = max(found, key=lambda item: item.needed)
-    text = (
-        f"A difference of {settings.difference:g} % between two groups, whose persons differ by "
-        f"{settings.between:g} % themselves, shows with a probability of 80 % from "
-        f"{least.needed:.0f} persons a group on"
+    needed = ", ".join(
+        f"{item.feature} {item.needed:.0f}"
+        if math.isfinite(item.needed)
+        else f"{item.feature} (no number is enough)"
+        for item in plan.groups
     )
-    if most.needed == least.needed:
-        said = f"{text} in the cost weight of {', '.join(item.feature for item in found)}."
-    else:
-        other = f"from {most.needed:.0f} on in that of {most.feature}"
-        said = f"{text} in the cost weight of {least.feature}, {other}."
-    return (said, never) if lost else (said,)
+    return (
+        f"To see a difference of {settings.difference:g} % between two groups, whose persons "
+        f"differ by {settings.between:g} % themselves, with a probability of 80 %, each group "
+        f"needs so many persons, by cost weight: {needed}."
+    )
 
 
 def _seen(plan: Plan) -> tuple[str, ...]:

@@ -138,7 +138,7 @@ def test_who_is_compared_by_a_weight_without_an_end_is_told_so() -> None:
     plan = make_plan(noisy, replace(SETTINGS, amplitude=[0.4], dwell=[1.0]), perturbation)
     assert np.isinf([item.needed for item in plan.groups]).all()
     said = " ".join(plan_sentences(plan))
-    assert "No size of group shows a difference in the cost weight of x[0], x[1]." in said
+    assert "x[0] (no number is enough), x[1] (no number is enough)." in said
 
 
 def test_fits_are_of_bodies_as_uncertain_as_stated() -> None:
