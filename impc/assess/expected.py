@@ -9,7 +9,8 @@ from the truth gives the ends of profiles:
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),      m(v*) = 0
 
 which is the profile of the recordings on average, up to the count of what is fitted
-(docs/planning.md).
+(docs/planning.md). What has a stated uncertainty keeps it, as a prior in both; deviations for a
+body that is known better, or for less noise, follow from the same derivatives.
 """
 
 from __future__ import annotations
@@ -40,6 +41,19 @@ if TYPE_CHECKING:
 _LARGEST_ROOT = 0.999
 # Of all outputs: a limit that moves them by less is never met.
 _UNSEEN = 1e-12
+# Of the noise, what is left of it by ten times as many trials, and by more than will ever be made.
+_TENFOLD, _NO_NOISE = 10**-0.5, 1e-2
+
+
+@dataclass(frozen=True)
+class BodyShare(Frozen):
+    """What the stated uncertainty of the body adds to the deviations of unknowns (count,)."""
+
+    exact: Array  # The deviations, were all that is stated known exactly
+    tenfold: Array  # With ten times as many trials
+    floor: Array  # With ten thousand times as many: what no number of trials removes
+    names: tuple[str, ...]  # Parameters with a stated uncertainty (k,)
+    measured: Array  # Were one of them known exactly, all others as stated (k, count)
 
 
 @dataclass(frozen=True)
@@ -54,11 +68,18 @@ class Expectation(Frozen):
     # Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
     # infinite where it is never met, or the input has none
     limits: Array
+    body: BodyShare | None  # None where no uncertainty is stated
 
     @property
     def deviations(self) -> Array:
         """Standard deviation of each unknown of the structure (count,), to first order."""
         return np.asarray(self.cost_weights.each)
+
+    def narrower(self, deviations: Array) -> Array:
+        """Share by which other deviations (..., count) are less; 0 where there is none to begin."""
+        planned, other = np.broadcast_arrays(self.deviations, deviations)
+        kept = np.ones(other.shape)
+        return np.asarray(1 - np.divide(other, planned, out=kept, where=np.isfinite(planned)))
 
     @property
     def log_determinant(self) -> float:
@@ -136,6 +157,30 @@ def expected_intervals(
         _intervals(at, found),
         gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True, scale=1.0),
         frozen(_limits(at, coloured)),
+        _body_share(at, coloured),
+    )
+
+
+def _body_share(at: Tangent, colour: ResidualNoise) -> BodyShare | None:
+    names, stated = at.problem.parameter_names, at.problem.parameter_units[1]
+    places = [int(place) for place in np.flatnonzero(stated)]
+    if not places:
+        return None
+
+    def each(*known: int, noise: float = 1.0) -> Array:
+        slopes = np.delete(np.array(at.on_parameters), known, axis=1)
+        # The rows of a prior are in units of the noise.
+        slopes[sum(at.problem.trial_sizes) :] *= noise
+        less = replace(at, on_parameters=frozen(slopes))
+        found = weight_covariance(less, lambda *_: colour, lambda *_: colour)
+        return noise * np.asarray(found.each)
+
+    return BodyShare(
+        frozen(each(*places)),
+        frozen(each(noise=_TENFOLD)),
+        frozen(each(noise=_NO_NOISE)),
+        tuple(names[place] for place in places),
+        frozen([each(place) for place in places]),
     )
 
 
@@ -153,7 +198,7 @@ def _intervals(at: Tangent, found: WeightCovariance) -> tuple[WeightInterval, ..
 
 
 def _limits(at: Tangent, colour: ResidualNoise) -> Array:
-    """Deviations of the logarithms, everything else being fitted, the gain without a structure."""
+    """Deviations of the logarithms without their own prior, all else and a free gain fitted."""
     problem, found = at.problem, np.full(at.problem.plant.m, np.inf)
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     for control, limit in enumerate(np.array(problem.bounds.u_max)):
@@ -161,7 +206,10 @@ def _limits(at: Tangent, colour: ResidualNoise) -> Array:
             continue
         column = np.zeros(len(at.residual))
         column[: sum(problem.trial_sizes)] = limit * on_limit(problem, K, S, limit, control)
-        seen = at.without_nuisance(column[:, None], *at.gain_columns())
+        family = problem.family
+        own = [k for k, of in family.limits(problem.plant) if of == control] if family else []
+        rest = frozen(np.delete(np.array(at.on_parameters), own, axis=1))
+        seen = replace(at, on_parameters=rest).without_nuisance(column[:, None], *at.gain_columns())
         size = float(seen[:, 0] @ seen[:, 0])
         if size > _UNSEEN * len(column):
             spread = at.spread(colour, seen / size)

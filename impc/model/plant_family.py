@@ -164,12 +164,12 @@ class PlantFamily(Value):
 
     def part(self, chosen: BoolArray, logarithms: Array) -> PlantFamily:
         """The `chosen` parameters alone (k,), the others held at `logarithms` (k,)."""
-        whole = self.nominal * np.exp(logarithms)
+        whole, made = self.nominal * np.exp(logarithms), self.make
 
         def make(values: Array) -> Plant:
             moved = np.array(whole)
             moved[chosen] = values
-            return self.make(moved)
+            return made(moved)
 
         return replace(
             self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
 import scipy.linalg
@@ -17,6 +18,7 @@ from impc.errors import InputError
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
 
@@ -127,6 +129,62 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
     assert large.deviations == pytest.approx(10 * small.deviations, rel=1e-9)
     wanted = 1.959964 * np.outer(small.deviations, [-1.0, 1.0])
     np.testing.assert_allclose(ends(small), wanted, rtol=0.02)
+
+
+def known_to(uncertainty: dict[str, float | str]) -> Expectation:
+    """The cart whose force for a command, and its rate of falling, are known so well."""
+
+    def made(values: Array) -> Plant:
+        force, fall = values
+        system = control.ss(
+            [[0, 1], [fall, -0.3]], [[0, 0], [force, 1]], [[1, 0]], 0,
+            inputs=["force1", "push1"], outputs=["position1"],
+        )  # fmt: skip
+        return Plant(control.c2d(system, 0.1), ["force1"])
+
+    family = PlantFamily(made, ["force", "fall"], [1.0, 0.3], uncertainty)
+    problem = replace(cart_problem(), family=None)
+    bounds, trials = problem.bounds, problem.recordings
+    return expected_intervals(
+        Problem(
+            problem.plant, bounds, 8, trials,
+            terminal_set=False, unknown_start=True, structure=problem.structure, family=family,
+        ),
+        COST_WEIGHTS,
+        NOISE,
+    )  # fmt: skip
+
+
+STATED: dict[str, float | str] = {"force": "5 %", "fall": 0.06, "u_max": "5 %"}
+
+
+def test_an_exact_body_and_one_that_is_measured_are_those_of_their_own_problems() -> None:
+    found, exact = known_to(STATED), expected_intervals(cart_problem(), COST_WEIGHTS, NOISE)
+    assert exact.body is None
+    assert found.body is not None
+    assert found.body.names == ("force", "fall", "u_max.force1")
+    assert found.body.exact == pytest.approx(exact.deviations, rel=1e-6)
+    for name, measured in zip(STATED, found.body.measured, strict=True):
+        other = known_to(STATED | {name: 0.0})
+        assert measured == pytest.approx(other.deviations, rel=1e-6)
+        fall = 1 - other.deviations / found.deviations
+        assert found.narrower(found.body.measured)[list(STATED).index(name)] == pytest.approx(fall)
+    # What recordings say of the limit leaves out what is stated of it.
+    assert found.limits == pytest.approx(known_to(STATED | {"u_max": 0.0}).limits, rel=1e-6)
+
+
+def test_no_number_of_trials_tells_a_weak_force_from_a_weak_person() -> None:
+    """Half the force, commands, and limits doubled, and a quarter of both cost weights: the same.
+
+    So they are known to 2 sqrt(1 / (1 / .05^2 + 1 / .05^2)) and no better.
+    """
+    body = known_to(STATED).body
+    assert body is not None
+    assert body.floor == pytest.approx(np.full(2, 2 * 0.05 / np.sqrt(2)), rel=0.01)
+    # By the limit, which is known here, the recordings tell the force.
+    other = known_to({"force": "5 %"})
+    assert other.body is not None
+    assert np.all(other.body.floor < 0.05 * other.deviations)
 
 
 def test_what_cannot_be_meant_is_refused() -> None:

@@ -72,14 +72,35 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
     errors = table["theta1_standard_error"]
     kept = found["findings"]["experiments"]["table"]["theta1_standard_error"]
     assert kept == pytest.approx(list(errors))
-    # Twice the torque in a body that nothing stops: half the standard error.
-    assert errors[1] == pytest.approx(errors[0] / 2, rel=1e-6)
+    # Twice the torque halves what noise adds, and not what is uncertain of the body.
+    assert errors[0] / 2 < errors[1] < errors[0]
+    weights = pd.read_csv(folder / "out" / "cost_weights.csv")
+    assert np.all(weights["with_an_exact_body"] < weights["standard_error_of_the_logarithm"])
+    body = pd.read_csv(folder / "out" / "body.csv").set_index("parameter")
+    assert body.loc["tau_m", "stated_percent"] == pytest.approx(25)
+    assert found["findings"]["body"]["table"]["theta1_narrower_percent"] == pytest.approx(
+        list(body["theta1_narrower_percent"])
+    )
+    assert "Measuring " in " ".join(found["sentences"])
     text = html.unescape(re.sub("<[^>]*>", "", page))  # words link to what they mean
     for sentence in found["sentences"]:
         assert sentence in text
     assert read_result(folder / "out").content["best"] == found["best"]
     for name in ("cost_weights", "experiments"):
         assert (folder / "out" / f"{name}.png").stat().st_size > 10_000
+
+
+EXACT = PLAN.replace("[fit]", "[plant.uncertainty]\nall = 0\n\n[fit]", 1)
+
+
+def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
+    done = planned(tmp_path, EXACT)
+    assert done.exit_code == 0, done.output
+    assert "The body is taken as exact" in done.output
+    # Twice the torque in a body that nothing stops: half the standard error.
+    errors = pd.read_csv(tmp_path / "out" / "experiments.csv")["theta1_standard_error"]
+    assert errors[1] == pytest.approx(errors[0] / 2, rel=1e-6)
+    assert not (tmp_path / "out" / "body.csv").exists()
 
 
 def test_an_interval_without_an_upper_end_is_infinite_not_a_large_number(tmp_path: Path) -> None:

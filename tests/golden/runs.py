@@ -22,7 +22,7 @@ import impc
 from experiments.benchmarks.workloads import seat
 from experiments.peer_systems import SYSTEMS
 from impc.cli.main import main
-from tests.cli.test_plan import PLAN
+from tests.cli.test_plan import EXACT
 from tests.studies.cohort.carts import write_study
 from tests.studies.selection.test_methods import MINE, blood_study
 from tests.support import saturated_problem
@@ -141,7 +141,7 @@ def _cohort(folder: Path) -> Numbers:
 
 
 def _plan(folder: Path) -> Numbers:
-    (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
+    (folder / "plan.toml").write_text(EXACT, encoding="utf-8")
     found = _typed(folder, "plan", str(folder / "plan.toml"), "--plant", "seated-balance")
     table = pd.read_csv(folder / "out/experiments.csv")
     ending = "_standard_error"

@@ -105,12 +105,11 @@ def _best(plan: Plan) -> list[Finding]:
     if expected is None:
         return []
     plant, truth, fits = person.controller.plant, np.array(person.controller.K), plan.simulated
-    count = len(person.structure.unknowns)
-    known = fits is not None and len(fits.cost_weights) > 0
-    scatter = spread(fits.cost_weights) if fits is not None and known else np.full(count, np.nan)
+    names, some = person.structure.unknowns, fits is not None and len(fits.cost_weights) > 0
+    scatter = spread(fits.cost_weights) if fits and some else np.full(len(names), np.nan)
     cost_weights = pd.DataFrame(
         {
-            "cost_weight_of": person.structure.unknowns,
+            "cost_weight_of": names,
             "presumed": np.exp(person.cost_weights),
             "low": [math.exp(item.low) for item in expected.intervals],
             "high": [math.exp(item.high) for item in expected.intervals],
@@ -118,6 +117,26 @@ def _best(plan: Plan) -> list[Finding]:
             "in_simulated_fits": scatter,
         }
     )
+    with_one = "Cost weights, with one for the first command, 95 %."
+    body, known, problem = expected.body, [], plan.best.problem
+    if body is not None and problem is not None:
+        cost_weights["with_an_exact_body"] = np.array(body.exact)
+        cost_weights["with_ten_times_the_trials"] = np.array(body.tenfold)
+        cost_weights["with_any_number_of_trials"] = np.array(body.floor)
+        with_one += (
+            " The last three are standard errors too: if all parameters of the body were known "
+            "exactly, and with more trials of a body that is known as stated."
+        )
+        shares = 100 * expected.narrower(body.measured)
+        by = pd.DataFrame(shares, columns=[f"{name}_narrower_percent" for name in names])
+        by.insert(0, "parameter", body.names)
+        units, stated = problem.parameter_units
+        by.insert(1, "stated_percent", 100 * units[stated])
+        of_body = (
+            "By how much the interval of each cost weight would be narrower if this parameter of "
+            "the body were known exactly, and the others as stated; to first order."
+        )
+        known = [Finding("body", by, of_body, digits=2)]
     places = [(control, state) for control in plant.controls for state in plant.states]
     gains = pd.DataFrame(
         {
@@ -128,7 +147,6 @@ def _best(plan: Plan) -> list[Finding]:
             "identified": np.ravel(expected.gain.individually_identified),
         }
     )
-    with_one = "Cost weights, with one for the first command, 95 %."
     along = int(np.count_nonzero(expected.gain.identified))
     caption = (
         f"Gains fitted without a structure: {along} of {truth.size} directions would be identified "
@@ -136,6 +154,7 @@ def _best(plan: Plan) -> list[Finding]:
     )
     return [
         Finding("cost_weights", cost_weights, with_one, digits=3),
+        *known,
         Finding("gain", gains, caption, digits=3),
     ]
 
@@ -151,7 +170,8 @@ def _groups(plan: Plan) -> Finding:
              "persons_a_group_for_80_percent"]  # fmt: skip
     caption = (
         f"Two groups whose cost weight differs by {settings.difference:g} %, t-test of the "
-        f"logarithms at 5 %; persons within a group differ by {settings.between:g} %."
+        f"logarithms at 5 %; persons within a group differ by {settings.between:g} %, "
+        "and estimates as the intervals above are wide."
     )
     return Finding("groups", pd.DataFrame(rows, columns=heads), caption, digits=3)
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Wider than this, from end to end of an interval, a cost weight is not called identified.
 _WIDE = math.log(100)
+# So many parameters of the body are named; a smaller share of a width is no floor.
+_NAMED, _FLOOR = 3, 0.1
 # Nearer to one on both sides, an interval is printed in percent.
 _NARROW = 1.5
 
@@ -55,12 +57,13 @@ def plan_sentences(plan: Plan) -> tuple[str, ...]:
     return (
         f"{which}, {settings.trials} {trials} of {length}: {design_name(plan, best.design)}.",
         _cost_weights(plan),
+        *_body(plan),
         _limits(plan),
         _how_it_goes(plan, best),
-        *_groups(plan),
+        _groups(plan),
         *_seen(plan),
-        "Reckoned for the presumed person, who senses without error, and for noise in the recorder "
-        "alone: noise that goes round the loop, or a body unlike the plant, makes all of it worse.",
+        "Computed for the presumed person, who senses without error, and for noise in the recorder "
+        "alone: noise in the loop, or a body farther from the plant than stated, makes all worse.",
     )
 
 
@@ -75,6 +78,40 @@ def _cost_weights(plan: Plan) -> str:
         f"Beside the presumed cost weight, an interval of 95 % would be for {'; for '.join(parts)}."
     )
     return f"{text} That says next to nothing of {', '.join(wide)}." if wide else text
+
+
+def _body(plan: Plan) -> tuple[str, ...]:
+    """What comes from the body, and what would help: to measure it, or to record more."""
+    expected = plan.best.expected
+    if expected is None:
+        return ()
+    if expected.body is None:
+        return (
+            "The body is taken as exact: these intervals contain noise, and not what is uncertain "
+            "of masses, lengths, delay, and limit ([plant.uncertainty] states it).",
+        )
+    body, names = expected.body, plan.person.structure.unknowns
+    known = np.isfinite(expected.deviations)
+    if not np.any(known):
+        return ("It contains the stated uncertainty of the body.",)
+    exact, tenfold, *measured = (
+        100 * float(np.mean(expected.narrower(one)[known]))
+        for one in (body.exact, body.tenfold, *body.measured)
+    )
+    best = sorted(zip(measured, body.names, strict=True), reverse=True)[:_NAMED]
+    (most, first), *others = [(f"{share:.0f} %", name) for share, name in best]
+    also = "".join(f", {name} by {share}" for share, name in others if share != "0 %")
+    least = np.where(known, expected.narrower(body.floor), 1.0)
+    worst = int(np.argmin(least))
+    trials = f"Ten times as many trials would narrow them by {tenfold:.0f} % on average"
+    if least[worst] < 1 - _FLOOR:
+        most_by = f"{100 * least[worst]:.0f} %"
+        trials += f"; no number of them narrows that of {names[worst]} by more than {most_by}"
+    return (
+        "These intervals contain the stated uncertainty of the body; if it were known exactly, "
+        f"they would be {exact:.0f} % narrower on average.",
+        f"Measuring {first} exactly would narrow them by {most}{also}. {trials}.",
+    )
 
 
 def _limits(plan: Plan) -> str:
@@ -103,22 +140,19 @@ def _how_it_goes(plan: Plan, best: Outcome) -> str:
     )
 
 
-def _groups(plan: Plan) -> tuple[str, ...]:
-    found = [item for item in plan.groups if math.isfinite(item.needed)]
-    if not found:
-        return ()
+def _groups(plan: Plan) -> str:
     settings = plan.settings
-    least = min(found, key=lambda item: item.needed)
-    most = max(found, key=lambda item: item.needed)
-    text = (
-        f"A difference of {settings.difference:g} % between two groups, whose persons differ by "
-        f"{settings.between:g} % themselves, shows with a probability of 80 % from "
-        f"{least.needed:.0f} persons a group on"
+    needed = ", ".join(
+        f"{item.feature} {item.needed:.0f}"
+        if math.isfinite(item.needed)
+        else f"{item.feature} (no number is enough)"
+        for item in plan.groups
     )
-    if most.needed == least.needed:
-        return (f"{text} in any of these cost weights.",)
-    other = f"from {most.needed:.0f} on in that of {most.feature}"
-    return (f"{text} in the cost weight of {least.feature}, {other}.",)
+    return (
+        f"To see a difference of {settings.difference:g} % between two groups, whose persons "
+        f"differ by {settings.between:g} % themselves, with a probability of 80 %, each group "
+        f"needs so many persons, by cost weight: {needed}."
+    )
 
 
 def _seen(plan: Plan) -> tuple[str, ...]:

@@ -18,9 +18,13 @@ import scipy.optimize
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import identified_gain
 from impc.checking import replace
-from impc.errors import ImpcError
+from impc.control.closed_loop import simulate
+from impc.control.controller import Controller
+from impc.errors import ImpcError, SolverError
+from impc.inverse.problem import scenarios
 from impc.inverse.structured_fit import structured_estimate
 from impc.inverse.structured_search import search_from
 from impc.studies.effort import SECONDS_A_SAMPLE, Effort
@@ -44,7 +48,8 @@ class GroupPower(Frozen):
     """Whether two groups can be distinguished by one cost weight."""
 
     feature: str  # Whose cost weight
-    # Of the logarithm of an estimate within a group: of persons and of the estimate
+    # Of the logarithm of an estimate within a group: of persons and of the estimate, by its
+    # interval; infinite where that has no end
     deviation: float
     powers: Array  # How often a t-test at 5 % sees the difference, for each size of group (g,)
     needed: float  # Persons in each group for 80 %; infinite beyond a million
@@ -104,8 +109,8 @@ def group_powers(
 
     test, apart = TTestIndPower(), math.log1p(settings.difference / 100)
     found = []
-    for name, own in zip(person.structure.unknowns, outcome.expected.deviations, strict=True):
-        deviation = math.hypot(float(own), settings.between / 100)
+    for name, own in zip(person.structure.unknowns, outcome.expected.intervals, strict=True):
+        deviation = math.hypot((own.high - own.low) / (2 * TWO_SIDED), settings.between / 100)
         if not math.isfinite(deviation) or deviation == 0:
             nothing = frozen(np.full(len(settings.groups), _SIZE))
             found.append(GroupPower(name, deviation, nothing, math.inf))
@@ -154,7 +159,7 @@ class SimulatedFits(Frozen):
 
     cost_weights: Array  # Unknowns (fits, count); minus infinity for a cost weight of zero
     gains: Array  # Gain without a structure, as it is printed with intervals (fits, m, n)
-    failed: int  # Fits that ended without an answer
+    failed: int  # Fits that ended without an answer, and bodies that fell
 
     def inside(self, expected: Expectation) -> Array:
         """Share of the fits whose unknowns lie in the expected intervals (count,)."""
@@ -193,8 +198,8 @@ def simulated_fits(
     truth = np.array(person.cost_weights)
 
     def fit(number: int) -> OneFit:
-        noisy = _measured(person, problem, np.random.default_rng([seed, number]))
         try:
+            noisy = _measured(person, problem, np.random.default_rng([seed, number]))
             end = search_from(noisy, person.structure, truth)
             fitted = structured_estimate(noisy, person.structure, end)
             gain = identified_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
@@ -215,10 +220,23 @@ def simulated_fits(
 
 
 def _measured(person: Person, problem: Problem, rng: np.random.Generator) -> Problem:
-    trials = [
-        replace(trial, outputs=trial.outputs + recorded_noise(person, trial.samples, rng))
-        for trial in problem.recordings
-    ]
+    """Recordings of the presumed weights in a body drawn from what is stated of it."""
+    units, stated = problem.parameter_units
+    body = np.where(stated, units, 0.0) * rng.standard_normal(len(units))
+    drawn, trials = problem.at(problem.starts, body), []
+    law = Controller(
+        drawn.plant,
+        person.structure.weights(person.cost_weights),
+        drawn.bounds,
+        drawn.horizon,
+        terminal_set=bool(drawn.terminal_set),
+    )
+    for trial, drive in zip(problem.recordings, scenarios(drawn), strict=True):
+        run = simulate(law, drive)
+        if not run.complete:
+            raise SolverError("simulation", "the person falls", "lower amplitude")
+        noise = recorded_noise(person, trial.samples, rng)
+        trials.append(replace(trial, outputs=run.x @ drawn.plant.C.T + noise))
     return replace(problem, recordings=trials, output_scale=person.deviation)
 
 

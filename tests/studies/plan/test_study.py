@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import control
 import numpy as np
 import pytest
 import scipy.stats
@@ -14,9 +15,12 @@ from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import InputError, SolverError
 from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily
 from impc.model.structure import Structure
 from impc.studies.fit.settings import FitSettings, StructureSettings
 from impc.studies.plan.designs import Design, Person, try_design
+from impc.studies.plan.sentences import plan_sentences
 from impc.studies.plan.settings import (
     PlanSettings,
     assumed_cost_weights,
@@ -86,8 +90,9 @@ def test_a_stop_that_is_passed_is_a_fall() -> None:
 def test_power_is_that_of_the_noncentral_t() -> None:
     plan = make_plan(person(), replace(SETTINGS, amplitude=[0.8], dwell=[2.0]), perturbation)
     assert plan.best.expected is not None
-    for item, own in zip(plan.groups, plan.best.expected.deviations, strict=True):
-        size, deviation = 10, math.hypot(float(own), 0.3)
+    for item, own in zip(plan.groups, plan.best.expected.intervals, strict=True):
+        # An interval of 95 % is 3.92 deviations wide.
+        size, deviation = 10, math.hypot((own.high - own.low) / 3.919928, 0.3)
         assert item.deviation == pytest.approx(deviation)
         away = math.log(1.5) / deviation * math.sqrt(size / 2)
         edge = float(scipy.stats.t.ppf(0.975, 2 * size - 2))
@@ -95,6 +100,59 @@ def test_power_is_that_of_the_noncentral_t() -> None:
             -edge, 2 * size - 2, away
         )
         assert item.powers[0] == pytest.approx(power, rel=1e-6)
+
+
+def loosely_known(stated: str = "20 %") -> Person:
+    """The same cart, its force for a command and its limit not known exactly."""
+
+    def made(values: Array) -> Plant:
+        system = control.ss(
+            [[0, 1], [0.3, -0.3]], [[0, 0], [values[0], 1]], [[1, 0]], 0,
+            inputs=["force1", "push1"], outputs=["position1"],
+        )  # fmt: skip
+        return Plant(control.c2d(system, 0.1), ["force1"])
+
+    family = PlantFamily(made, ["force"], [1.0], {"force": stated, "u_max": stated})
+    return replace(person(), family=family)
+
+
+def test_a_body_that_is_loosely_known_needs_more_persons_and_is_worth_measuring() -> None:
+    one = replace(SETTINGS, amplitude=[0.8], dwell=[2.0])
+    exact, loose = (make_plan(who, one, perturbation) for who in (person(), loosely_known()))
+    for known, other in zip(exact.groups, loose.groups, strict=True):
+        assert other.needed > known.needed
+        assert other.deviation > known.deviation
+    said = " ".join(plan_sentences(exact))
+    assert "The body is taken as exact" in said
+    assert "Measuring" not in said
+    said = " ".join(plan_sentences(loose))
+    assert "contain the stated uncertainty of the body" in said
+    assert (
+        "Measuring force exactly would narrow them by" in said or "Measuring u_max.force1" in said
+    )
+    assert "no number of them narrows that of x[" in said
+
+
+def test_who_is_compared_by_a_weight_without_an_end_is_told_so() -> None:
+    noisy = replace(person(), deviation=np.array([30.0]))
+    plan = make_plan(noisy, replace(SETTINGS, amplitude=[0.4], dwell=[1.0]), perturbation)
+    assert np.isinf([item.needed for item in plan.groups]).all()
+    said = " ".join(plan_sentences(plan))
+    assert "x[0] (no number is enough), x[1] (no number is enough)." in said
+
+
+def test_fits_are_of_bodies_as_uncertain_as_stated() -> None:
+    """Twenty fits, with little noise: of the plant's own body they would hardly scatter."""
+    someone = replace(loosely_known("5 %"), deviation=np.array([3e-3]))
+    found = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
+    assert found.expected is not None
+    assert found.problem is not None
+    fits = simulated_fits(someone, found.problem, 20, 1)
+    assert fits.failed == 0
+    assert found.expected.body is not None
+    assert np.all(found.expected.body.exact < 0.3 * found.expected.deviations)
+    ratios = np.std(fits.cost_weights, axis=0) / found.expected.deviations
+    assert np.all((ratios > 0.65) & (ratios < 1.35)), ratios
 
 
 def test_fits_scatter_as_foreseen() -> None:
