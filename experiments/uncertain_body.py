@@ -131,7 +131,8 @@ def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Pers
     """One person on the linear seat, at the limit of 6 Nm for part of the time; never an error."""
     rng = np.random.default_rng([seed, int(vaf), int(10 * root), 1])
     found = plant_family_of(plant_source("plants:seated_balance_for", {}), ["perturbation"], [])
-    assert found is not None and error == "none"
+    assert found is not None
+    assert error == "none"
     family = found.linear()
     factors = np.exp(family.deviations * rng.standard_normal(len(family.names)))
     true, nominal = family.make(family.nominal * factors), family.make(family.nominal)

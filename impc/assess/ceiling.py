@@ -6,7 +6,7 @@ the variance of what differs between them, and the ceiling of the VAF (3.24) is
 
     1 - s^2 / mean y^2,      s^2 = sum_rt (y_rt - mean_r y_rt)^2 / (n (R - 1)).
 
-The interval is that of the jackknife over pieces of time, whose errors are taken as independent.
+The interval follows from how s^2 scatters over pieces of time, which are taken as independent.
 """
 
 from __future__ import annotations
@@ -54,11 +54,10 @@ def ceiling(problem: Problem, settle: float) -> Ceiling | None:
     pieces = [part for group in groups for part in _sums(group)]
     if len(pieces) < _FEWEST:
         return None
-    table = np.stack(pieces)  # (pieces, 2, p): what differs, and all
-    whole = _share(table.sum(axis=0))
-    count = len(table)
-    others = np.stack([_share(table.sum(axis=0) - piece) for piece in table])
-    error = np.sqrt((count - 1) / count * np.sum((others - others.mean(axis=0)) ** 2, axis=0))
+    noise, every = np.swapaxes(np.stack(pieces), 0, 1)  # (pieces, p) each
+    total = np.maximum(every.sum(axis=0), 1e-300)
+    whole = np.asarray(100 * (1 - noise.sum(axis=0) / total))
+    error = 100 * np.sqrt(len(noise)) * np.std(noise, axis=0, ddof=1) / total
     low, high = (np.clip(whole + side * error, -np.inf, 100.0) for side in (-TWO_SIDED, TWO_SIDED))
     repetitions = sum(len(group) for group in groups)
     return Ceiling(frozen(whole), frozen(low), frozen(high), repetitions)
@@ -111,7 +110,7 @@ def _period(disturbance: Array) -> int | None:
 
 
 def _sums(group: list[Array]) -> list[Array]:
-    """Mean squares of what differs and of all, per repetition, in pieces of time (2, p) each."""
+    """Squares of what differs, as noise, and of all, summed in pieces of time (2, p) each."""
     outputs = np.stack(group)
     apart = outputs - outputs.mean(axis=0)
     count = int(np.clip(outputs.shape[1] // _SHORTEST, 1, _PIECES))
@@ -122,7 +121,3 @@ def _sums(group: list[Array]) -> list[Array]:
         noise = np.sum(differs**2, axis=(0, 1)) * len(group) / (len(group) - 1)
         found.append(np.stack([noise, np.sum(whole**2, axis=(0, 1))]))
     return found
-
-
-def _share(sums: Array) -> Array:
-    return np.asarray(100 * (1 - sums[0] / np.maximum(sums[1], 1e-300)))
