@@ -67,12 +67,9 @@ def main() -> None:
         for stated in _STATED:
             both = np.concatenate([item[stated] for item in found])
             widths = ", ".join(f"{100 * one:.0f}" for one in np.median(both[..., 1], axis=0))
-            inside, of = int(both[..., 0].sum()), both[..., 0].size
-            narrow = both[both[..., 1] < 1]
-            print(
-                f"  {stated:24} {inside:3} of {of} inside, {int(narrow[:, 0].sum())} of {len(narrow)} "
-                f"without whole ranges; median widths {widths} % of the range"
-            )
+            narrow = both[both[..., 1] < 1 - 1e-9, 0]
+            print(f"  {stated:23} inside {both[..., 0].sum():.0f} of {both[..., 0].size}, without")
+            print(f"    whole ranges {narrow.sum():.0f} of {narrow.size}; median widths {widths} %")
 
 
 if __name__ == "__main__":
