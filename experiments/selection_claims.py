@@ -9,6 +9,7 @@ of table 4.3 for the widths of its intervals. The dissertation's numbers are of 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,7 +19,13 @@ import numpy as np
 import plants
 from impc.studies.selection.analysis import bootstrap_subset
 from impc.studies.selection.estimation import estimate, free_indices
-from impc.studies.selection.fisher import fisher_information, largest_subsets, sweep
+from impc.studies.selection.fisher import (
+    Selection,
+    fisher_information,
+    largest_subsets,
+    subset_variances,
+    sweep,
+)
 from impc.studies.selection.lasso import lasso_of_size, table_c1
 from impc.studies.selection.model import Trial
 from impc.studies.selection.model_source import model_source
@@ -32,6 +39,7 @@ __all__ = [
     "FIM_SUBSET",
     "Width",
     "bootstrap_widths",
+    "exhaustive",
     "mean_subject",
     "nominal_information",
     "reduced_widths",
@@ -128,6 +136,17 @@ def reduced_widths(replicates: int) -> dict[str, Array]:
         widths = bootstrap_subset(model, trials, fit, replicates, 0).width
         found[label] = widths[[free.index(index) for index in shown]]
     return found
+
+
+def exhaustive(F: Array, bound: float, least: int = 2) -> Selection:
+    """`largest_subsets` of one information (k, k), by trying every subset."""
+    for size in range(len(F), least - 1, -1):
+        subsets = list(itertools.combinations(range(len(F)), size))
+        tried = zip(subsets, subset_variances([F], subsets).tolist(), strict=True)
+        found = sorted((item for item in tried if item[1] <= bound), key=lambda item: item[1])
+        if found:
+            return Selection(bound, *zip(*found, strict=True))
+    return Selection(bound, (), ())
 
 
 def _print_reduction(replicates: int) -> None:

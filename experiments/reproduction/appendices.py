@@ -10,10 +10,10 @@ import numpy as np
 
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees
-from experiments.selection_claims import FIM_SUBSET, mean_subject
+from experiments.selection_claims import FIM_SUBSET, exhaustive, mean_subject
 from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
-from impc.studies.selection.fisher import exhaustive, fisher_information, largest_subsets
+from impc.studies.selection.fisher import fisher_information, largest_subsets
 from impc.studies.selection.lasso import lasso_of_size
 from impc.studies.selection.linear import Discrete, sampled
 from impc.studies.selection.model import Trial, normalised, sensitivity
@@ -151,7 +151,7 @@ def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]
 def _selection(information: Information) -> list[Entry]:
     F = information.F
     started = time.perf_counter()
-    all_of_them = exhaustive([F], 0.05)
+    all_of_them = exhaustive(F, 0.05)
     seconds = time.perf_counter() - started
     grown = largest_subsets([F], 0.05)
     same = set(all_of_them.subsets) == set(grown.subsets)
@@ -169,7 +169,7 @@ def _selection(information: Information) -> list[Entry]:
             "Most parameters such that the reciprocal condition number is above machine epsilon and"
             " the largest variance at most v; all 4083 subsets are tried.",
             (
-                "impc.studies.selection.fisher:exhaustive",
+                "experiments.selection_claims:exhaustive",
                 "impc.studies.selection.fisher:largest_subsets",
             ),
             f"All subsets in {1000 * seconds:.0f} ms: {len(all_of_them.subsets)} of size"

@@ -41,7 +41,7 @@ def command(
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.effort import select_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.selection.analysis import select_study  # noqa: PLC0415
-    from impc.studies.selection.report import selection_report  # noqa: PLC0415
+    from impc.studies.selection.report import read_truths, selection_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
@@ -52,11 +52,15 @@ def command(
         require_consent(effort.shared(len(named), threads), yes, FEWER_STARTS)
         found = select_study(named, settings, run)
     line = f"impc select {study_file.name} --model {source.name}"
-    written = write_files(out, selection_report(source.model, found, line, inputs).files())
+    truths = read_truths(study_file.absolute().parent, source.model)
+    page = selection_report(source.model, found, line, inputs, truths)
+    written = write_files(out, page.files())
     kept_results(out).forget()
     names = source.model.names
     click.echo(f"information: {', '.join(names[index] for index in found.free)}")
     click.echo(f"LASSO:       {', '.join(names[index] for index in found.lasso)}")
+    if page.data["truth"]:
+        click.echo(page.data["truth"])
     print_files(out, written)
 
 

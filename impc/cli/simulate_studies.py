@@ -196,11 +196,14 @@ def head_tracking(out: Path, **given: Any) -> None:
                 return theta
 
     truth: dict[str, Any] = {}
+    recordings: dict[str, Any] = {}
     for name in numbered(given["subjects"]):
         own = drawn(typical, _SPREAD)
         truth[name] = dict(zip(model.names, own.tolist(), strict=True))
         for visit in range(1, given["visits"] + 1):
             theta = drawn(own, _VISIT) if given["visits"] > 1 else own
+            here = dict(zip(model.names, theta.tolist(), strict=True))
+            recordings[f"{name} visit {visit}"] = here
             vaf = float(np.clip(rng.normal(*_VAF), 60, 95)) / 100
             files = {}
             for run in range(1, given["trials"] + 1):
@@ -218,7 +221,8 @@ def head_tracking(out: Path, **given: Any) -> None:
                 files[f"{stem}.csv"] = encode_table(".csv", table)
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
     study = _HEAD_STUDY.replace("AXIS", given["axis"])
-    write_study(out, "select", study, {"settings": given, "subjects": truth})
+    found = {"settings": given, "subjects": truth, "recordings": recordings}
+    write_study(out, "select", study, found)
 
 
 _HEAD_STUDY = """\

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from impc.errors import DataError, ImpcError, OutputError, brief
 
@@ -122,3 +123,12 @@ def flush_folder(folder: Path) -> None:
         os.fsync(number)
     finally:
         os.close(number)
+
+
+def truth_beside(folder: Path) -> Any:
+    """The truth.json of a `folder`, that of simulated recordings; {} where none can be read."""
+    path = folder / "truth.json"
+    try:
+        return json.loads(path.read_text("utf-8")) if path.stat().st_size <= LARGEST else {}
+    except (OSError, ValueError):
+        return {}

@@ -83,7 +83,7 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
 def select_evaluations(settings: SelectSettings) -> int:
     """Of the model with its derivative, for one subject of `impc select`."""
     table = _TABLE if settings.nelder_mead else 0
-    return _START * settings.starts + _REFIT * settings.replicates + _LASSO + table
+    return _START * (settings.starts + 1) + _REFIT * settings.replicates + _LASSO + table
 
 
 def key_evaluations(settings: SelectSettings, most: int = 20) -> int:

@@ -174,7 +174,8 @@ def _selection(folder: Path) -> Numbers:
     study = blood_study(folder, 3, 1)
     found = _typed(folder, "select", str(study), *MINE, "--workers", "1")
     table = pd.read_csv(folder / "out/intervals.csv")
-    intervals = table.sort_values("subject", kind="stable")[["value", "low", "high"]].to_numpy()
+    exact = [f"others_exact_{name}" for name in ("value", "low", "high")]
+    intervals = table.sort_values("subject", kind="stable")[exact].to_numpy()
     widths = np.ptp(intervals, axis=1, keepdims=True)
     return {
         "selected": found["selected"],

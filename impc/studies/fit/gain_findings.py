@@ -5,7 +5,6 @@ And of simulated recordings the true gain, from truth.json beside them.
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +13,7 @@ import pandas as pd
 from impc.assess.covariance import IDENTIFIED, TWO_SIDED
 from impc.assess.printed_gain import entry_names
 from impc.assess.variance_accounted_for import verdict
-from impc.files.disk import LARGEST
+from impc.files.disk import truth_beside
 from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.rendering import number
@@ -204,13 +203,10 @@ def number_units(plant: Plant) -> dict[str, str]:
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
     """The gain of the truth.json that lies beside recordings. Returns (m, n)."""
     folders = {path.absolute().parent for path in recordings}
-    path = folders.pop() / "truth.json" if len(folders) == 1 else None
-    if path is None or not path.is_file() or path.stat().st_size > LARGEST:
-        return None
+    said = truth_beside(folders.pop()) if len(folders) == 1 else {}
     try:
-        identified = json.loads(path.read_text(encoding="utf-8"))
-        states, gain = tuple(identified["states"]), np.array(identified["K"], dtype=np.float64)
-    except (OSError, ValueError, KeyError, TypeError):  # a file of somebody else's
+        states, gain = tuple(said["states"]), np.array(said["K"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError):  # none, or a file of somebody else's
         return None
     return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
 

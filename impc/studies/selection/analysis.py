@@ -22,10 +22,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen, percentiles
+from impc.assess.long_run_covariance import residual_noise, white_noise
 from impc.assess.resampling import block_residuals
 from impc.errors import DataError
 from impc.studies.pool import threads
-from impc.studies.selection.estimation import Estimate, estimate, multi_start, residuals
+from impc.studies.selection.estimation import (
+    Estimate,
+    PriorFit,
+    estimate,
+    estimate_with_prior,
+    multi_start,
+    residuals,
+)
 from impc.studies.selection.fisher import (
     Information,
     NullDirection,
@@ -60,6 +68,7 @@ class StudySelection:
     # The subset that is refitted: the best of the worst case at the bound, or at the first bound of
     # the sweep that has one; failing that the most frequent of the subjects'
     free: tuple[int, ...]
+    bound: float  # The largest variance that it keeps
     chosen: Mapping[str, Chosen]  # Subject -> refit of that subset, intervals, LASSO
     lasso: tuple[int, ...]  # What the LASSO selects most often
     # "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects
@@ -77,7 +86,7 @@ def select_study(
     informations = [np.asarray(item.information.F) for item in nominal.values()]
     worst = sweep(informations, settings.bounds, settings.least)
     at_bound = largest_subsets(informations, settings.bound, settings.least)
-    free = _free(at_bound, worst, nominal)
+    bound, free = _free(at_bound, worst, nominal)
     largest = (
         set(largest_subsets([F], settings.bound, settings.least).subsets) for F in informations
     )
@@ -94,6 +103,7 @@ def select_study(
         worst,
         tuple(sorted(set.intersection(*largest))),
         free,
+        bound,
         chosen,
         Counter(item.lasso.selected for item in chosen.values()).most_common(1)[0][0],
         seconds,
@@ -102,18 +112,18 @@ def select_study(
 
 def _free(
     at_bound: Selection, worst: tuple[Selection, ...], nominal: Mapping[str, Nominal]
-) -> tuple[int, ...]:
+) -> tuple[float, tuple[int, ...]]:
+    """The subset that is refitted, and its bound."""
     for selection in (at_bound, *worst):
         if selection.subsets:
-            return selection.subsets[0]
-    counted = Counter(
-        subset for item in nominal.values() for first in item.sweep[:1] for subset in first.subsets
-    )
+            return selection.bound, selection.subsets[0]
+    first = [item.sweep[0] for item in nominal.values()]
+    counted = Counter(subset for selection in first for subset in selection.subsets)
     if not counted:
         raise DataError(
             "selection", "no subset is feasible at any bound", "raise [select] bound or lower least"
         )
-    return counted.most_common(1)[0][0]
+    return first[0].bound, counted.most_common(1)[0][0]
 
 
 @dataclass(frozen=True)
@@ -132,8 +142,9 @@ class Nominal:
 class Chosen:
     """The chosen parameters of one subject, and what the LASSO would have chosen."""
 
-    refit: Estimate  # Others at typical values
-    intervals: BootstrapIntervals
+    refit: Estimate  # Others exactly at typical values
+    exact: BootstrapIntervals  # Of that
+    known: PriorFit  # Others as they are known: typical, give or take their deviations
     lasso: Lasso
     nelder_mead: Lasso | None  # Table C.1, when asked for
     seconds_lasso: float  # Time of each, s
@@ -161,15 +172,15 @@ def fit_chosen(
 ) -> Chosen:
     """Fit chosen parameters, with intervals; and select by LASSO for comparison."""
     refit = estimate(model, trials, chosen, np.array(model.typical))
-    intervals = bootstrap_subset(
-        model, trials, refit, settings.replicates, settings.seed, _DRAW[settings.draw]
-    )
+    draw, noise_of = _DRAW[settings.draw]
+    exact = bootstrap_subset(model, trials, refit, settings.replicates, settings.seed, draw)
+    known = estimate_with_prior(model, trials, chosen, np.array(refit.theta), noise_of)
     started = time.perf_counter()
     lasso = lasso_of_size(model, trials, settings.size)
     between = time.perf_counter()
     nelder_mead = table_c1(model, trials, settings.size) if settings.nelder_mead else None
     ended = time.perf_counter()
-    return Chosen(refit, intervals, lasso, nelder_mead, between - started, ended - between)
+    return Chosen(refit, exact, known, lasso, nelder_mead, between - started, ended - between)
 
 
 @dataclass(frozen=True)
@@ -193,7 +204,8 @@ def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
 
 
-_DRAW = {"single": draw_single, "block": block_residuals}
+# What residuals are taken for: draws of the bootstrap, and the noise beside a prior.
+_DRAW = {"single": (draw_single, white_noise), "block": (block_residuals, residual_noise)}
 
 
 def bootstrap_subset(

@@ -2,6 +2,15 @@
 
 Parameters are normalised; those that are not free stay where they are given. Search by a bounded
 trust region with the model's Jacobian, from one start or several.
+
+A parameter that is not free is not known either: it is typical, give or take the deviation d
+between people. With that as its prior it is fitted beside the free ones (maximum a posteriori),
+
+    minimise  |e|^2 / s^2 + sum_q ((t_q - typical_q) / d_q)^2
+    cov(t) = H^-1 (cov(J'e) / s^4 + P) H^-1,    H = J'J / s^2 + P,    P = diag(1 / d^2)
+
+where s^2 is the mean variance of the residuals e along the columns of J: for white residuals that
+of each, for coloured ones their long-run variance.
 """
 
 from __future__ import annotations
@@ -13,14 +22,23 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array, Frozen, IntArray, frozen
+from impc.assess.covariance import TWO_SIDED
+from impc.assess.long_run_covariance import spread_of_sum
 from impc.assess.variance_accounted_for import vaf as share_explained
 from impc.errors import DataError, InputError
-from impc.studies.selection.model import normalised, physical, sensitivity
+from impc.inverse.least_squares import TrialSpan
+from impc.studies.selection.model import normalised, physical, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from impc.assess.long_run_covariance import ResidualNoise
     from impc.studies.selection.model import ParametricModel, Trial
+
+# Fits with the prior, each with the noise that the one before leaves: it changes by less than 1 %.
+_ROUNDS = 3
+# Precision of a free parameter in the covariance: one without any effect is not determined.
+_FREE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -29,9 +47,8 @@ class Estimate(Frozen):
 
     theta: Array  # All parameters (k,), in their units
     free: tuple[int, ...]  # Which of them were fitted
-    misfit: float  # Sum of squares
+    misfit: float  # Sum of squares, those of a prior included
     vaf: Array  # (4.4) over all trials (p,), %
-    evaluations: int  # Of the residual
     at_bound: tuple[int, ...]  # Free parameters that end on a bound
 
 
@@ -43,15 +60,34 @@ def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...
     return tuple(model.names.index(name) for name in names)
 
 
+@dataclass(frozen=True)
+class PriorFit(Frozen):
+    """A fit of free parameters beside uncertain ones, and 95 % intervals of the free ones."""
+
+    fit: Estimate  # Free parameters first, then the uncertain ones
+    value: Array  # Free parameters (free,), in their units
+    low: Array  # Ends of the intervals, at most the bounds
+    high: Array
+    variance: Array  # In normalised units (free,)
+
+
 def estimate(
-    model: ParametricModel, trials: Sequence[Trial], free: Sequence[int], start: Array
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    free: Sequence[int],
+    start: Array,
+    pull: Array | None = None,
 ) -> Estimate:
-    """Fit the free parameters to all trials at once; `start` (k,)."""
+    """Fit the free parameters to all trials at once; `start` (k,).
+
+    `pull` (free,) weighs their distances from typical values, in normalised units, as residuals.
+    """
     if not trials:
         raise DataError("trials", "there are none", "give at least one")
     chosen: IntArray = np.asarray(free, dtype=np.int64)
     base = normalised(model, np.asarray(start, dtype=np.float64))
-    residual, derivative = _evaluation(model, trials, base, chosen)
+    weights = np.zeros(len(chosen)) if pull is None else pull
+    residual, derivative = _evaluation(model, trials, base, chosen, weights)
     begin = np.clip(base[chosen], -1 + 1e-9, 1 - 1e-9)
     if not np.all(np.isfinite(residual(begin))):
         raise DataError("model", "is not finite at the start", "start elsewhere")
@@ -64,7 +100,7 @@ def estimate(
     theta = physical(model, full)
     stuck = tuple(chosen[np.abs(found.x) > 1 - 1e-6].tolist())
     vaf, misfit = frozen(pooled_vaf(model, theta, trials)), 2 * float(found.cost)
-    return Estimate(frozen(theta), tuple(chosen.tolist()), misfit, vaf, int(found.nfev), stuck)
+    return Estimate(frozen(theta), tuple(chosen.tolist()), misfit, vaf, stuck)
 
 
 def multi_start(
@@ -88,6 +124,49 @@ def multi_start(
     return tuple(sorted(found, key=lambda item: item.misfit))
 
 
+def estimate_with_prior(
+    model: ParametricModel,
+    trials: Sequence[Trial],
+    free: Sequence[int],
+    start: Array,
+    noise_of: Callable[[list[Array], TrialSpan], ResidualNoise],
+) -> PriorFit:
+    """Fit the free parameters, the others uncertain by their deviations; `start` (k,)."""
+
+    def noise_along(at: Array) -> tuple[Array, Array]:
+        """R of J = U R, the Jacobian, and the covariance of U'e."""
+        errors, J = stacked(model, at, trials, along)
+        U, R = np.linalg.qr(J)
+        span = TrialSpan(tuple(np.zeros((part.size, 0)) for part in errors), U)
+        parts = np.split(U, np.cumsum([part.size for part in errors])[:-1])
+        columns = [part.reshape(*own.shape, -1) for part, own in zip(parts, errors, strict=True)]
+        return R, spread_of_sum(noise_of(errors, span), columns)
+
+    stated = np.asarray(model.deviation / model.gain)
+    uncertain = [index for index in range(model.size) if index not in free and stated[index] > 0]
+    along: IntArray = np.array([*free, *uncertain], dtype=np.int64)
+    precision = np.concatenate([np.zeros(len(free)), stated[uncertain] ** -2.0])
+    theta = np.asarray(start)
+    for _ in range(_ROUNDS):
+        _, spread = noise_along(theta)
+        pull = np.sqrt(np.trace(spread) / len(along) * precision)
+        fit = estimate(model, trials, [*free, *uncertain], theta, pull)
+        theta = np.array(fit.theta)
+    R, spread = noise_along(theta)
+    s2, P = np.trace(spread) / len(along), np.diag(np.maximum(precision, _FREE))
+    inverse = np.linalg.inv(R.T @ R / s2 + P)
+    covariance = inverse @ (R.T @ spread @ R / s2**2 + P) @ inverse
+    variance = np.diag(covariance)[: len(free)]
+    value, least, most, gain = (
+        np.asarray(item)[along[: len(free)]] for item in (theta, model.low, model.high, model.gain)
+    )
+    low, high = (
+        frozen(np.clip(value + side * gain * np.sqrt(variance), least, most))
+        for side in (-TWO_SIDED, TWO_SIDED)
+    )
+    return PriorFit(fit, frozen(value), low, high, frozen(variance))
+
+
 def residuals(model: ParametricModel, theta: Array, trials: Sequence[Trial]) -> list[Array]:
     """Outputs recorded minus simulated at theta (k,): (samples, p) for each trial."""
     return [np.asarray(item.outputs - model.simulate(theta, item.input)) for item in trials]
@@ -101,22 +180,21 @@ def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) ->
 
 
 def _evaluation(
-    model: ParametricModel, trials: Sequence[Trial], base: Array, chosen: IntArray
+    model: ParametricModel, trials: Sequence[Trial], base: Array, chosen: IntArray, pull: Array
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Residual and Jacobian of the chosen parameters; the last point is not computed twice."""
     last: tuple[bytes, Array, Array] | None = None
+    typical = normalised(model, np.asarray(model.typical))[chosen]
+    held = pull > 0
 
     def evaluated(t: Array) -> tuple[Array, Array]:
         nonlocal last
         if last is None or last[0] != t.tobytes():
             full = base.copy()
             full[chosen] = t
-            theta, residuals, slopes = physical(model, full), [], []
-            for trial in trials:
-                outputs, derivative = sensitivity(model, theta, trial.input, chosen)
-                residuals.append((outputs - trial.outputs).ravel())
-                slopes.append(derivative.reshape(-1, len(chosen)))
-            last = (t.tobytes(), np.concatenate(residuals), np.concatenate(slopes))
+            errors, slopes = stacked(model, physical(model, full), trials, chosen)
+            rows = [(pull * (t - typical))[held], *(part.ravel() for part in errors)]
+            last = t.tobytes(), np.concatenate(rows), np.vstack([np.diag(pull)[held], slopes])
         return last[1], last[2]
 
     return lambda t: evaluated(t)[0], lambda t: evaluated(t)[1]

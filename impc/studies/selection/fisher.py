@@ -27,7 +27,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.errors import InputError
-from impc.studies.selection.model import sensitivity
+from impc.studies.selection.model import stacked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -43,10 +43,8 @@ class Information(Frozen):
     """Information of all trials together."""
 
     F: Array  # (k, k), in normalised units
-    singular_values: Array  # Of the stacked sensitivity over sigma (k,), largest first
-    directions: Array  # Right singular vectors, one a row (k, k), in normalised units
-    # The same for sensitivities with respect to the logarithms of the parameters, singular value
-    # and direction side by side (k, 1 + k). A direction there is a scaling.
+    # Singular values, largest first, of the stacked sensitivity by the logarithms of the parameters
+    # over sigma, and right singular vectors, side by side (k, 1 + k). A direction is a scaling.
     relative: Array
     variance: float  # sigma^2 of the residual
     rank: int  # Of the relative sensitivities: singular values above 1e-6 of the largest
@@ -56,7 +54,6 @@ class Information(Frozen):
 class NullDirection:
     """A combination of parameters that the outputs do not see."""
 
-    singular_value: float  # Relative to the largest
     # Parameter -> its part in the direction of relative changes, largest first
     shares: dict[str, float]
     sentence: str  # The same in words
@@ -66,21 +63,15 @@ def fisher_information(
     model: ParametricModel, theta: Array, trials: Sequence[Trial], variance: float | None = None
 ) -> Information:
     """Information at a point; `theta` (k,)."""
-    rows, squares = [], 0.0
-    for trial in trials:
-        outputs, derivative = sensitivity(model, theta, trial.input)
-        rows.append(derivative.reshape(-1, model.size))
-        squares += float(np.sum((trial.outputs - outputs) ** 2))
-    table = np.concatenate(rows)
+    errors, table = stacked(model, theta, trials)
+    squares = sum(float(np.sum(part**2)) for part in errors)
     sigma2 = squares / (len(table) - model.size) if variance is None else variance
     sigma = np.sqrt(max(sigma2, 1e-300))
-    _, values, directions = np.linalg.svd(table / sigma, full_matrices=False)
     in_logarithms = table / model.gain * theta
     _, logarithmic, relative = np.linalg.svd(in_logarithms / sigma, full_matrices=False)
     rank = int(np.count_nonzero(logarithmic > _RANK * logarithmic[0]))
     both = np.column_stack([logarithmic, relative])
-    F, singular = table.T @ table / sigma2, frozen(values)
-    return Information(frozen(F), singular, frozen(directions), frozen(both), float(sigma2), rank)
+    return Information(frozen(table.T @ table / sigma2), frozen(both), float(sigma2), rank)
 
 
 def common_scaling(model: ParametricModel, found: Information, names: Sequence[str]) -> float:
@@ -119,7 +110,7 @@ def null_directions(model: ParametricModel, found: Information) -> tuple[NullDir
             f"changing {parts} (relative changes) together changes the outputs by {seen:.0e} of "
             "what the best seen direction does"
         )
-        nulls.append(NullDirection(seen, shares, sentence))
+        nulls.append(NullDirection(shares, sentence))
     return tuple(nulls)
 
 
@@ -201,19 +192,6 @@ def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, 
             parts = ((*subset[:place], *subset[place + 1 :], index) for place in range(len(subset)))
             if all(part in among for part in parts):
                 yield (*subset, index)
-
-
-def exhaustive(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
-    """`largest_subsets` by trying every subset of up to twenty; informations (k, k)."""
-    count = len(informations[0])
-    if count > 20:
-        raise InputError("parameters", f"are {count}", "use `largest_subsets`")
-    for size in range(count, least - 1, -1):
-        subsets = list(itertools.combinations(range(count), size))
-        found = _feasible(informations, subsets, bound)
-        if found:
-            return _selected(bound, found)
-    return _selected(bound, [])
 
 
 def sweep(

@@ -30,9 +30,9 @@ def key_report(
     """Page, result.json, table and figure of `impc key-parameters`, with `command` and `inputs`."""
     chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
     findings = [
-        f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters are "
-        f"estimated well enough for every subject and visit (variance at most "
-        f"{found.selection.bound:g}).",
+        f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters have "
+        f"variances of at most {found.selection.bound:g} for every subject and visit, if the other "
+        "parameters are exactly typical; so does every fit of a subset assume.",
         "A subset is kept when it also explains the recordings and is reliable between visits.",
     ]
     caption = (

@@ -20,8 +20,8 @@ import scipy.linalg
 import scipy.optimize
 
 from impc.arrays import Array, Frozen, frozen
-from impc.studies.selection.estimation import Estimate, estimate
-from impc.studies.selection.model import normalised, physical, sensitivity
+from impc.studies.selection.estimation import Estimate, estimate, residuals
+from impc.studies.selection.model import normalised, physical, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +42,6 @@ class Lasso(Frozen):
     selected: tuple[int, ...]  # Those away from their typical values
     refit: Estimate | None  # Of the selected ones; None when none is
     objective: float  # (C.5) at t
-    solves: int  # Problems (C.5) that were solved
 
 
 def proximal_lasso(
@@ -94,7 +93,7 @@ def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -
             break
     if best is None:
         best = (high, *proximal_lasso(model, trials, high))
-    return _finished(model, trials, *best, solves)
+    return _finished(model, trials, *best)
 
 
 def table_c1(
@@ -126,7 +125,7 @@ def table_c1(
         if before and direction != before:
             factor = float(np.sqrt(factor))
         weight, before = weight * factor**direction, direction
-    return _finished(model, trials, weight, np.asarray(t), float(found.fun), number, _THRESHOLD)
+    return _finished(model, trials, weight, np.asarray(t), float(found.fun), _THRESHOLD)
 
 
 def _finished(
@@ -135,14 +134,13 @@ def _finished(
     weight: float,
     t: Array,
     objective: float,
-    solves: int,
     threshold: float = 0.0,
 ) -> Lasso:
     chosen = _selected(model, t, threshold)
     start = np.array(model.typical)
     start[list(chosen)] = physical(model, t)[list(chosen)]
     refit = estimate(model, trials, chosen, start) if chosen else None
-    return Lasso(weight, frozen(t), chosen, refit, objective, solves)
+    return Lasso(weight, frozen(t), chosen, refit, objective)
 
 
 def _selected(model: ParametricModel, t: Array, threshold: float = 0.0) -> tuple[int, ...]:
@@ -151,24 +149,16 @@ def _selected(model: ParametricModel, t: Array, threshold: float = 0.0) -> tuple
 
 
 def _mean_square(model: ParametricModel, trials: Sequence[Trial], t: Array) -> float:
-    theta, total, count = physical(model, t), 0.0, 0
-    for trial in trials:
-        error = model.simulate(theta, trial.input) - trial.outputs
-        total, count = total + float(np.sum(error**2)), count + error.size
-    return total / count if np.isfinite(total) else np.inf
+    errors = np.concatenate(residuals(model, physical(model, t), trials))
+    mean = float(np.mean(errors**2))
+    return mean if np.isfinite(mean) else np.inf
 
 
 def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tuple[Array, Array]:
     """H and g of the mean square about t: g'd + d'Hd/2."""
-    theta, count = physical(model, t), 0
-    H, g = np.zeros((model.size, model.size)), np.zeros(model.size)
-    for trial in trials:
-        outputs, derivative = sensitivity(model, theta, trial.input)
-        J = derivative.reshape(-1, model.size)
-        H += J.T @ J
-        g += J.T @ (outputs - trial.outputs).ravel()
-        count += len(J)
-    return 2 * H / count, 2 * g / count
+    errors, J = stacked(model, physical(model, t), trials)
+    error = np.concatenate([part.ravel() for part in errors])
+    return 2 * J.T @ J / len(J), 2 * J.T @ error / len(J)
 
 
 def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> Array:

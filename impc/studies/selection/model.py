@@ -4,6 +4,9 @@ Parameters are normalised to [-1, 1] between their bounds (4.2),
 
     t_i = (theta_i - o_i) / g_i,    o_i = (max + min) / 2,   g_i = (max - min) / 2.
 
+People differ in each by a standard deviation that the model states; without one it is a quarter of
+the range, d = 0.5 in t.
+
 A model may bring its own Jacobian (`impc.studies.selection.linear` makes exact ones for linear
 systems); otherwise central differences of 1e-4 in normalised units are taken, good to about 1e-6.
 """
@@ -40,6 +43,7 @@ class ParametricModel(Frozen):
     low: Array  # Bounds and typical values (k,), in the parameters' units
     high: Array
     typical: Array
+    deviation: Array  # Standard deviation of each between people (k,)
     pathways: tuple[str, ...]  # What each belongs to, its unit, and what it is in words (k,)
     units: tuple[str, ...]
     # (theta (k,), input (samples, d)) -> outputs (samples, p)
@@ -85,11 +89,15 @@ def parametric_model(
     pathways: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
     meanings: Sequence[str] | None = None,
+    deviation: Sequence[float] | None = None,
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None,
 ) -> ParametricModel:
-    """Check and freeze a model; `low, high, typical` (k,)."""
+    """Check and freeze a model; `low, high, typical, deviation` (k,)."""
     count = len(names)
-    for name, values in (("low", low), ("high", high), ("typical", typical)):
+    spread = [(most - least) / 4 for least, most in zip(low, high, strict=False)]
+    spread = spread if deviation is None else [float(value) for value in deviation]
+    sized = {"low": low, "high": high, "typical": typical, "deviation": spread}
+    for name, values in sized.items():
         if len(values) != count:
             raise InputError(name, f"has {len(values)} values", f"give {count}, one a parameter")
     for name, least, most, value in zip(names, low, high, typical, strict=True):
@@ -99,12 +107,15 @@ def parametric_model(
             raise InputError(
                 f"parameter {name}", f"typical value {value:g} lies outside its range", "widen it"
             )
+    for name, value in zip(names, spread, strict=True):
+        if not 0 <= value < np.inf:
+            raise InputError(f"parameter {name}", f"deviation {value:g}", "give 0 or more")
     groups, measured, words = (
         ("",) * count if given is None else tuple(given) for given in (pathways, units, meanings)
     )
     return ParametricModel(
-        tuple(names), frozen(low), frozen(high), frozen(typical), groups, measured, simulate,
-        jacobian, words,
+        tuple(names), frozen(low), frozen(high), frozen(typical), frozen(spread), groups,
+        measured, simulate, jacobian, words,
     )  # fmt: skip
 
 
@@ -133,3 +144,12 @@ def sensitivity(
         above, below = (model.simulate(physical(model, t + end), given) for end in (step, -step))
         columns.append((above - below) / (2 * _STEP))
     return outputs, np.stack(columns, axis=-1)
+
+
+def stacked(
+    model: ParametricModel, theta: Array, trials: Sequence[Trial], free: IntArray | None = None
+) -> tuple[list[Array], Array]:
+    """Simulated minus recorded outputs (samples, p) of each trial, and the Jacobian of all."""
+    pairs = [sensitivity(model, theta, trial.input, free) for trial in trials]
+    errors = [outputs - trial.outputs for trial, (outputs, _) in zip(trials, pairs, strict=True)]
+    return errors, np.concatenate([part.reshape(-1, part.shape[-1]) for _, part in pairs])

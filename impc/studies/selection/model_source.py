@@ -4,6 +4,7 @@ The function named returns a mapping (or a `ParametricModel`):
 
     names, low, high, typical       of the parameters
     pathways, units, meanings       optional
+    deviation                       optional: standard deviation between people, of each parameter
     inputs, outputs, rate           signals of a recording by name, samples per second
     simulate                        (theta, input (samples, d)) -> outputs (samples, p), or
     matrices                        a CasADi function theta -> A, B, C, continuous: its
@@ -75,7 +76,7 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
     if "matrices" in returned:
         simulate, jacobian = linear_functions(returned["matrices"], 1 / rate)
     names, low, high, typical = (returned[key] for key in _NEEDED[:4])
-    said = {key: returned.get(key) for key in ("pathways", "units", "meanings")}
+    said = {key: returned.get(key) for key in ("pathways", "units", "meanings", "deviation")}
     model = parametric_model(names, low, high, typical, simulate, jacobian=jacobian, **said)
     return ModelSource(
         name, dict(arguments), model, tuple(returned["inputs"]), tuple(returned["outputs"]), rate

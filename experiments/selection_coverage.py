@@ -1,0 +1,76 @@
+"""Share of true values inside the intervals of a selection, on simulated people.
+
+    python -m experiments.selection_coverage --people 10 --seeds 0 1
+
+People of `impc simulate head-tracking`, who differ in all twelve parameters by a factor of e^0.25.
+Some parameters are fitted; the others are taken as exactly typical, or as typical give or take the
+deviation between people that the model states, or a quarter of their range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner
+
+from impc.assess.long_run_covariance import white_noise
+from impc.cli.main import main as impc
+from impc.cli.select import read_model_study
+from impc.studies.selection.estimation import estimate, estimate_with_prior, free_indices
+from impc.studies.selection.report import read_truths
+
+__all__ = ["coverage"]
+
+#: What `impc select` chooses of the people of seed 0, and the five of the dissertation.
+_SUBSETS = (("Kccr", "tau", "tauMS1"), ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1"))
+_STATED = ("exactly typical", "stated deviations", "a quarter of the range")
+
+
+def coverage(people: int, seed: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """For each of `_STATED`: inside, and width in ranges, (people, parameters, 2)."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "data"
+        given = ["--subjects", str(people), "--seed", str(seed), "--out", str(folder)]
+        done = CliRunner().invoke(impc, ["simulate", "head-tracking", *given])
+        assert done.exit_code == 0, done.output
+        _, source, recorded, _ = read_model_study(folder / "study.toml", None, False)
+        truths = read_truths(folder, source.model)
+    model = source.model
+    free = free_indices(model, names)
+    deviations = (np.zeros(model.size), model.deviation, model.gain / 2)
+    rows: dict[str, list[np.ndarray]] = {stated: [] for stated in _STATED}
+    for key, trials in recorded.items():
+        theta = truths[" visit ".join(key)][list(free)]
+        start = np.array(estimate(model, trials, free, np.array(model.typical)).theta)
+        for stated, deviation in zip(_STATED, deviations, strict=True):
+            other = replace(model, deviation=deviation)
+            found = estimate_with_prior(other, trials, free, start, white_noise)
+            inside = (found.low <= theta) & (theta <= found.high)
+            width = (found.high - found.low) / (2 * model.gain[list(free)])
+            rows[stated].append(np.column_stack([inside, width]))
+    return {stated: np.array(found) for stated, found in rows.items()}
+
+
+def main() -> None:
+    """Print the share inside, and the median width of each parameter."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--people", type=int, default=10)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    given = parser.parse_args()
+    for names in _SUBSETS:
+        print(f"\n{', '.join(names)}: {given.people} people of each of seeds {given.seeds}")
+        found = [coverage(given.people, seed, names) for seed in given.seeds]
+        for stated in _STATED:
+            both = np.concatenate([item[stated] for item in found])
+            widths = ", ".join(f"{100 * one:.0f}" for one in np.median(both[..., 1], axis=0))
+            narrow = both[both[..., 1] < 1 - 1e-9, 0]
+            print(f"  {stated:23} inside {both[..., 0].sum():.0f} of {both[..., 0].size}, without")
+            print(f"    whole ranges {narrow.sum():.0f} of {narrow.size}; median widths {widths} %")
+
+
+if __name__ == "__main__":
+    main()

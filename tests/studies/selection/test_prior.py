@@ -1,0 +1,154 @@
+"""Intervals of chosen parameters, the others uncertain: coverage, closed form, bounds, truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from impc.arrays import Array
+from impc.assess.long_run_covariance import residual_noise, white_noise
+from impc.cli.main import main
+from impc.errors import InputError
+from impc.studies.selection.estimation import PriorFit, estimate, estimate_with_prior
+from impc.studies.selection.model import ParametricModel, Trial, parametric_model
+from impc.studies.selection.report import _note, read_truths
+from tests.studies.selection.test_methods import MINE, blood_study
+
+RANGE, NOISE, SAMPLES = 10.0, 0.5, 150
+DEVIATION = np.array([1.0, 0.8, 0.5])
+
+
+def line(deviation: Array, width: float = RANGE) -> ParametricModel:
+    """y = u1 a + u2 b + u3 c, with c beside a."""
+
+    def simulate(p: Array, u: Array) -> Array:
+        return np.asarray(u @ p)[:, None]
+
+    ends = [-width] * 3, [width] * 3, [0.0] * 3
+    return parametric_model(["a", "b", "c"], *ends, simulate, deviation=list(deviation))
+
+
+def person(rng: np.random.Generator, root: float = 0.0) -> tuple[Array, Trial]:
+    """A person drawn from the deviations; inputs alike, so that fixing b and c biases a."""
+    theta = DEVIATION * rng.standard_normal(3)
+    u = rng.standard_normal((SAMPLES, 3)) @ np.array([[1, 0.8, 0.7], [0, 0.6, 0], [0, 0, 0.7]])
+    noise = np.zeros(SAMPLES)
+    for k in range(SAMPLES):
+        noise[k] = root * noise[k - 1] + np.sqrt(1 - root**2) * rng.standard_normal()
+    return theta, Trial(u, (u @ theta + NOISE * noise)[:, None])
+
+
+def test_it_is_the_posterior_of_a_linear_model() -> None:
+    """Closed form: flat prior of a, normal ones of b and c, noise as the residuals have it."""
+    _, trial = person(np.random.default_rng(1))
+    found = estimate_with_prior(line(DEVIATION), [trial], (0,), np.zeros(3), white_noise)
+    left = trial.outputs[:, 0] - trial.input @ found.fit.theta
+    s2 = left @ left / (SAMPLES - 3)
+    P = np.diag([0, *DEVIATION[1:] ** -2.0])
+    H = trial.input.T @ trial.input / s2 + P
+    mean = np.linalg.solve(H, trial.input.T @ trial.outputs[:, 0] / s2)
+    half = 1.959964 * np.sqrt(np.linalg.inv(H)[0, 0])
+    np.testing.assert_allclose(found.fit.theta, mean, atol=0.02 * half)
+    np.testing.assert_allclose([found.low[0], found.high[0]], [mean[0] - half, mean[0] + half],
+                               atol=0.03 * half)  # fmt: skip
+
+
+@pytest.mark.parametrize(("root", "noise_of"), [(0.0, white_noise), (0.7, residual_noise)])
+def test_intervals_of_people_hold_the_truth(root: float, noise_of: object) -> None:
+    """Seed 2, 100 people: 95 % within three standard errors; exactly typical others hold few."""
+    rng = np.random.default_rng(2)
+    inside = {True: 0, False: 0}
+    for _ in range(100):
+        theta, trial = person(rng, root)
+        for known in inside:
+            model = line(DEVIATION * known)
+            found = estimate_with_prior(model, [trial], (0,), np.zeros(3), noise_of)  # type: ignore[arg-type]
+            inside[known] += bool(found.low[0] <= theta[0] <= found.high[0])
+    assert 88 <= inside[True] <= 99
+    assert inside[False] < 35
+
+
+def test_without_deviations_it_is_the_fit_of_the_chosen_parameters() -> None:
+    """To 1e-6 of the range, and the interval is that of ordinary least squares."""
+    theta, trial = person(np.random.default_rng(3))
+    model = line(np.zeros(3))
+    alone = estimate(model, [trial], (0, 1), theta)
+    found = estimate_with_prior(model, [trial], (0, 1), np.zeros(3), white_noise)
+    assert found.fit.free == (0, 1)
+    kept = np.array([0, 0, 0.0])
+    kept[:2] = estimate(model, [trial], (0, 1), np.zeros(3)).theta[:2]
+    np.testing.assert_allclose(found.fit.theta, kept, atol=1e-6 * RANGE)
+    assert alone.free == found.fit.free
+    u = trial.input[:, :2]
+    left = trial.outputs[:, 0] - u @ found.value
+    expected = np.sqrt(np.diag(np.linalg.inv(u.T @ u)) * (left @ left) / (SAMPLES - 2))
+    np.testing.assert_allclose((found.high - found.value) / 1.959964, expected, rtol=0.02)
+
+
+def test_an_estimate_at_its_bound_has_a_one_sided_interval() -> None:
+    """The truth, 1.5, lies beyond the bound of 1; the lower end stays inside the bounds."""
+    rng = np.random.default_rng(4)
+    u = rng.standard_normal((SAMPLES, 3))
+    trial = Trial(u, (u @ [1.5, 0, 0] + NOISE * rng.standard_normal(SAMPLES))[:, None])
+    model = line(np.zeros(3), width=1.0)
+    found = estimate_with_prior(model, [trial], (0,), np.zeros(3), white_noise)
+    assert found.fit.at_bound == (0,)
+    assert found.high[0] == 1
+    assert 0.8 < found.low[0] < 0.97
+    ends = float(found.low[0]), float(found.high[0])
+    assert _note(model, 0, found, *ends) == "one-sided: estimate at its upper bound"
+    assert _note(model, 0, found, -0.9, 0.9) == ""
+    assert _note(model, 0, found, -1.0, 1.0) == "not determined"
+    inner = replace(found, fit=replace(found.fit, at_bound=()))
+    assert _note(model, 0, inner, -1.0, 0.2) == "one-sided: ends at the lower bound"
+
+
+def test_a_parameter_without_effect_is_not_determined() -> None:
+    """c does nothing in these recordings: its interval is its range."""
+    _, trial = person(np.random.default_rng(5))
+    silent = Trial(trial.input * [1, 1, 0], trial.outputs)
+    found: PriorFit = estimate_with_prior(
+        line(DEVIATION), [silent], (0, 2), np.zeros(3), white_noise
+    )
+    assert (found.low[1], found.high[1]) == (-RANGE, RANGE)
+
+
+def test_deviations_are_checked_and_default_to_a_quarter_of_the_range() -> None:
+    given = ["a"], [0.0], [4.0], [1.0], lambda p, u: u * p
+    assert parametric_model(*given).deviation == [1.0]
+    for wrong in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="deviation"):
+            parametric_model(*given, deviation=[wrong])
+    with pytest.raises(InputError, match="one a parameter"):
+        parametric_model(*given, deviation=[1.0, 1.0])
+
+
+def test_truth_beside_simulated_recordings_is_compared(tmp_path: Path) -> None:
+    """One person: the command's line, the table and result.json."""
+    study, out = blood_study(tmp_path, 1, 1), tmp_path / "out"
+    truth = {"1 visit 1": {"ka": 1.0, "ke": 0.1, "V": 1e3}}
+    (tmp_path / "truth.json").write_text(json.dumps({"recordings": truth}))
+    command = ["select", str(study), *MINE, "--out", str(out), "--workers", "1"]
+    done = CliRunner().invoke(main, command)
+    assert done.exit_code == 0, done.output
+    found = json.loads((out / "result.json").read_text())
+    table = found["findings"]["intervals"]["table"]
+    assert table["truth"][2] == 1e3
+    assert not table["inside"][2]
+    assert f"{sum(table['inside'])} of the 3 true values" in found["truth"]
+    assert found["truth"] in done.stdout
+
+
+def test_truths_of_others_are_left_alone(tmp_path: Path) -> None:
+    model = line(DEVIATION)
+    assert read_truths(tmp_path, model) == {}
+    for content in (b"no json", b"[1]", b'{"recordings": {"1": {"a": 1}}}', b"\xff"):
+        (tmp_path / "truth.json").write_bytes(content)
+        assert read_truths(tmp_path, model) == {}
+    (tmp_path / "truth.json").write_text('{"recordings": {"1": {"a": 1, "b": 2, "c": 3, "d": 4}}}')
+    np.testing.assert_array_equal(read_truths(tmp_path, model)["1"], [1, 2, 3])
