@@ -154,15 +154,21 @@ def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Pers
 
 
 def covered(person: Person) -> dict[str, Any]:
-    """Deviations of identified entries from the truth, with and without the uncertainty."""
+    """Errors of identified entries and directions in deviations, with and without the uncertainty.
+
+    Of the seat hardly any entry is identified by itself; directions are.
+    """
     problem, truth, _ = person
     both = {}
     for name, posed in (("stated", problem), ("exact", problem.with_body_fixed())):
         estimate = gain_estimate(impc.fit(posed))
         deviation, value = np.array(estimate.covariance.entries), np.array(estimate.K)
         identified = np.array(estimate.covariance.individually_identified)
+        sure = np.array(estimate.covariance.identified)
+        along = np.array(estimate.covariance.along(value - truth))
         both[name] = {
             "z": ((value - truth) / deviation)[identified].tolist(),
+            "directions": (along / estimate.covariance.deviations)[sure].tolist(),
             "width": (deviation / np.abs(truth))[identified].tolist(),
             "error": (np.abs(value - truth) / np.abs(truth))[identified].tolist(),
         }
@@ -186,24 +192,27 @@ def summary(path: str) -> str:
         low, high = _interval(len(alarms), len(rows))
         named = dict(collections.Counter(alarms))
         return f"{len(alarms)} of {len(rows)} ({low:.0f} to {high:.0f} %): {named}"
-    said = []
+    said = [f"{len(rows)} persons"]
     for kind in ("stated", "exact"):
-        inside = [np.abs(row[kind]["z"]) < 1.96 for row in rows if row[kind]["z"]]
-        rates, counts = (
-            np.array([np.mean(one) for one in inside]),
-            np.array([len(one) for one in inside]),
-        )
-        rate = float(counts @ rates / counts.sum())
-        spread = np.sqrt(np.sum((counts * (rates - rate)) ** 2)) / counts.sum()
+        for what, key in (("entries", "z"), ("directions", "directions")):
+            said.append(f"{kind} {_coverage([row[kind][key] for row in rows])} {what}")
         width, error = (
-            np.median(np.concatenate([row[kind][name] for row in rows]))
+            np.median(np.concatenate([row[kind][name] for row in rows] or [np.nan]))
             for name in ("width", "error")
         )
-        said.append(
-            f"{kind} {100 * rate:.0f} ± {196 * spread:.0f} % of {counts.sum()} entries, "
-            f"deviation {100 * width:.2g} %, error {100 * error:.2g} %"
-        )
-    return f"{len(rows)} persons: {'; '.join(said)}"
+        said.append(f"deviation {100 * width:.2g} %, error {100 * error:.2g} %")
+    return "; ".join(said)
+
+
+def _coverage(z: list[list[float]]) -> str:
+    """Share of errors inside 95 %, with its interval, clustered by person."""
+    counts = np.array([len(one) for one in z])
+    if not counts.sum():
+        return "none of 0"
+    inside = np.array([np.sum(np.abs(one) < 1.96) for one in z])
+    rate = inside.sum() / counts.sum()
+    spread = np.sqrt(np.sum((inside - rate * counts) ** 2)) / counts.sum()
+    return f"{100 * rate:.0f} ± {196 * spread:.0f} % of {counts.sum()}"
 
 
 def _interval(k: int, n: int) -> tuple[float, float]:

@@ -196,7 +196,7 @@ def entry_names(plant: Plant) -> tuple[str, ...]:
 def covariance_intervals(
     estimate: GainEstimate, covariance: GainCovariance, method: str
 ) -> tuple[Interval, ...]:
-    """Normal intervals of the entries of K and of the parameters."""
+    """Normal intervals of the entries of K and of free parameters."""
     z = float(scipy.special.ndtri(0.5 + LEVEL / 2))
     names = entry_names(estimate.problem.plant)
     found = [
@@ -213,9 +213,11 @@ def covariance_intervals(
     ]
     family = estimate.problem.family
     if family is not None:
-        for name, value, deviation in zip(
-            family.names, estimate.parameters, covariance.parameters, strict=True
+        for name, value, deviation, stated in zip(
+            family.names, estimate.parameters, covariance.parameters, family.stated, strict=True
         ):
+            if stated:  # what was stated is no result of the recordings
+                continue
             low, high = _around(value, z * float(deviation))
             identified = bool(deviation < PARAMETER)
             found.append(Interval(name, method, LEVEL, float(value), low, high, identified))

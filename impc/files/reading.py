@@ -396,7 +396,8 @@ def require_distinct(paths: Sequence[Path]) -> None:
 
 def label_of(source: str, entry: RecordingTable) -> Label:
     """Whose trial the file `source` is, by its name and the [recording] table."""
-    stem = Path(source).stem
+    # A name that is no text is shown as the bytes that it is not.
+    stem = os.fsencode(Path(source).stem).decode("utf-8", "backslashreplace")
     groups: dict[str, str | None] = {}
     if entry.pattern is not None:
         found = match_apart("recording.pattern", entry.pattern, stem)

@@ -321,7 +321,7 @@ class Estimate(Frozen):
         return evaluate_method(self, self.problem.bounds).vaf
 
     def intervals(self) -> pd.DataFrame:
-        """The gain, and fitted parameters, with 95 % intervals, a row each.
+        """The gain, and free parameters, with 95 % intervals, a row each.
 
         By name, such as "K.u.x1" for the entry from the state x1 to the input u: `unit`, `value`,
         `low`, `high` and `identified`, whether the recordings determine this number by itself.

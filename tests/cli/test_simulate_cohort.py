@@ -33,7 +33,7 @@ def test_the_truth_moved_by_what_is_recorded_leaves_the_noise_of_the_recorder(
     truth = json.loads((tmp_path / "truth.json").read_text())["subjects"]
     for unit in study.units:
         source = plant_source(PLANT, dict(unit.person))
-        plant, body = make_plant(source, ("perturbation",)), source.make(**source.arguments).body
+        plant, body = make_plant(source, ("perturbation",)), source.make(**source.arguments).body()
         (trial,) = read_recordings(unit.files, study.configuration, plant)
         K = np.array(truth[unit.subject]["gain"]["1"])
         x, states = np.zeros(plant.n), np.empty((trial.samples, plant.n))

@@ -70,6 +70,7 @@ def asked_plant(
     Inputs that are `recorded` are disturbances; signals that are `aimed` have a target.
     """
     rates = _observer_rates(settings)
+    _dressed(make_plant(source, recorded), settings, aimed, rates)  # refuses what cannot be
     learned = [name for name in settings.free if name in rates]
     own = [name for name in settings.free if name not in rates]
     for name in own:
