@@ -18,7 +18,7 @@ from click.testing import CliRunner, Result
 from impc.checking import replace
 from impc.cli.main import main
 from impc.files.configuration import read_configuration
-from impc.files.plant_sources import plant_source
+from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
 from impc.files.results import read_result
 from impc.studies.fit.asked import asked_plant
