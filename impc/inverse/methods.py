@@ -138,7 +138,7 @@ def _feedback(start: Estimate) -> GainFit:
     Searched again from where it ends: the prior is about the start, which may be far. Without
     bounds the best gain may be unstable, of a person who saturates; it has no coordinates.
     """
-    first = free_gain(start.problem.without_bounds(), start.stage_weights)
+    first = free_gain(start.problem.without_bounds().with_body_fixed(), start.stage_weights)
     if not stabilises(start.problem.plant, np.array(first.K)):
         return first
     again = refine_gain(first.problem, np.array(first.K), np.array(first.S), prior=1.0)

@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 Part = TypeVar("Part")
 
 # Stages of a fit, and of a comparison.
+_WHOLE = "inverse_mpc"
 _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
 
@@ -42,7 +45,14 @@ class FitMemory(Steps):
         """The estimate of the stage `name`, as `compute` makes it."""
 
         def decode(kept: dict[str, Any]) -> Estimate:
-            return decode_estimate(_seen(self.problem, name, METHODS[kept["method"]]), kept)
+            posed = self.problem
+            whole = None if name == _WHOLE else self.cache.find(_WHOLE, self.digest)
+            if whole is not None and posed.family is not None:  # the body that it has found
+                found = np.array(whole["logarithms"], dtype=float)
+                posed = posed.at(np.array(posed.starts), found, np.array(posed.shifts))
+            if len(kept["logarithms"]) < len(posed.logarithms):
+                posed = posed.with_body_fixed()
+            return decode_estimate(_seen(posed, name, METHODS[kept["method"]]), kept)
 
         return self.get(name, compute, decode, encode_estimate)
 

@@ -425,11 +425,14 @@ def _leaves_out(trials: int, settings: FitSettings) -> bool:
 def _left_out(
     pool: ThreadPoolExecutor, fitted: Estimate, settings: FitSettings, progress: FitProgress
 ) -> list[Future[Estimate]]:
-    """Controllers fitted to all trials but one, each from where the fit to all has ended."""
+    """Controllers fitted to all trials but one, each from where the fit to all has ended.
+
+    What is uncertain of the body stays as all trials have it.
+    """
     pending = []
     for index in range(len(fitted.problem.recordings)):
         if _leaves_out(len(fitted.problem.recordings), settings):
-            others = fitted.problem.leaving_out(index)
+            others = fitted.problem.with_body_fixed().leaving_out(index)
             refit = functools.partial(fit_controller, others, fitted.stage_weights)
             pending.append(pool.submit(progress.estimate, _without(index), refit))
     return pending

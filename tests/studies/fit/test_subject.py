@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import control
@@ -11,6 +12,7 @@ import pytest
 
 from experiments.benchmarks.workloads import seat
 from experiments.simulated_subjects import noisy_recordings
+from experiments.uncertain_body import cart_person
 from impc.assess.intent_statements import dominant_sentence, intent
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
@@ -27,7 +29,7 @@ from impc.model.plant import Plant, change_coordinates
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
-from impc.studies.fit.memory import open_memory
+from impc.studies.fit.memory import FitMemory, open_memory
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
@@ -281,3 +283,28 @@ def test_a_recording_in_which_nothing_moves_is_left_unexplained() -> None:
     outputs[0] = 0.0
     found = fit_controller(fit_problem(plant, [Recording(plant, outputs)], FitSettings(u_max=1.0)))
     assert "It leaves 100 % of the recordings." in found.doubts
+
+
+def test_what_is_kept_has_the_body_that_was_found(tmp_path: Path) -> None:
+    """Of an uncertain body every stage, kept and read again, is what it was."""
+    person = cart_person(1, 99, 0.0)
+    assert person is not None
+    settings = FitSettings(horizon=10, u_max=0.55, intent_draws=False, methods=["feedback_gain"])
+
+    def stages_of(memory: FitMemory) -> dict[str, Estimate]:
+        found: dict[str, Estimate] = {}
+
+        def kept(name: str, compute: Callable[[], Estimate]) -> Estimate:
+            found[name] = memory.estimate(name, compute)
+            return found[name]
+
+        fit_recordings(person.problem, settings, FitProgress(estimate=kept))
+        return found
+
+    first = stages_of(open_memory(tmp_path, person.problem, settings))
+    again = stages_of(open_memory(tmp_path, person.problem, settings))
+    assert set(first) == {"inverse_mpc", "feedback_gain", "without trial 1", "without trial 2"}
+    for name, one in first.items():
+        assert not np.array_equal(one.problem.plant.A, person.problem.plant.A)
+        np.testing.assert_array_equal(again[name].problem.plant.A, one.problem.plant.A)
+        np.testing.assert_array_equal(again[name].gain, one.gain)
