@@ -194,6 +194,7 @@ class Problem(Value):
                 remedy = "give family.make(family.nominal) as plant"
                 raise InputError("family", "makes a plant with other states", remedy)
             family = family.with_limits(plant, bounds)
+            family = family if family.names else None  # all of it is known
         aimed = aims(plant, recordings)
         P = None if terminal_weight is None else terminal_matrix(plant, terminal_weight)
         self._fill(
