@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import collections
 import json
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -34,6 +35,8 @@ from impc.assess.printed_gain import gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
 from impc.inverse.problem import Problem
 
+# Seconds for one person: the searches of one who all but falls go on for minutes.
+_LONGEST = 300
 DT, HORIZON, SAMPLES, LIMIT, KNOWN = 0.05, 10, 400, 0.55, 0.03
 Rng = np.random.Generator
 
@@ -222,6 +225,10 @@ def _interval(k: int, n: int) -> tuple[float, float]:
     return 100 * float(low), 100 * float(high)
 
 
+def _too_long(*_: object) -> None:
+    raise TimeoutError("takes too long")
+
+
 def main(kind: str, *given: str) -> None:
     """Print one line a person, or a summary."""
     if kind == "summary":
@@ -232,14 +239,17 @@ def main(kind: str, *given: str) -> None:
     first = int(given[4]) if len(given) > 4 else 0
     make: Callable[..., Person | None] = seat_person if what == "seat" else cart_person
     error = "none" if kind == "coverage" else what
+    signal.signal(signal.SIGALRM, _too_long)
     for seed in range(first, first + int(count)):
         person = make(seed, float(vaf), float(root), error)
         if person is None:
             continue
+        signal.alarm(_LONGEST)
         try:
             found = covered(person) if kind == "coverage" else tested(person)
-        except impc.ImpcError as refused:
+        except (impc.ImpcError, TimeoutError) as refused:
             found = {"failed": str(refused)}
+        signal.alarm(0)
         print(json.dumps({"seed": seed, **found}), flush=True)
 
 

@@ -62,6 +62,8 @@ LEVEL = 0.05
 DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
 PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
 MODE, NONLINEAR = "a further mode", "a nonlinear body"
+#: Parameters of a family by which some of them can be fitted.
+PARAMETERS = {DELAY: "extra_delay", LIMIT: "u_max", PUSH: "perturbation"}
 # Samples, in shares of the shortest trial, at which an answer may come later.
 _LATER = (0.005, 0.01, 0.02, 0.04)
 # Of a column: less that the fit cannot make up for is nothing to test.
@@ -228,7 +230,8 @@ def _columns(problem: Problem, K: Array, S: Array) -> list[tuple[str, Array]]:
     found = [(name, np.concatenate(parts)) for name, parts in forced.items()]
     found.append((LEAN, scipy.linalg.block_diag(*leans)))
     fitted = problem.parameter_names
-    if not any(name.startswith("u_max") for name in fitted):
+    found = [(name, part) for name, part in found if PARAMETERS.get(name) not in fitted]
+    if not any(name.startswith(PARAMETERS[LIMIT]) for name in fitted):
         found.append((LIMIT, _along_limits(problem, controller)))
     if len(problem.offsets) < len(problem.plant.outputs):
         found.append((OFFSET, _offsets(problem)))

@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, MODE, NONLINEAR, OFFSET, PUSH, STIFFNESS
+from impc.assess.lack_of_fit import (
+    DELAY,
+    LEAN,
+    LIMIT,
+    MODE,
+    NONLINEAR,
+    OFFSET,
+    PARAMETERS,
+    PUSH,
+    STIFFNESS,
+)
 from impc.reporting.finding import Finding, Severity, table_of
 from impc.reporting.rendering import number
 
@@ -33,19 +43,24 @@ _KINDS = {
 
 def body_sentences(result: FitResult) -> tuple[str, ...]:
     """How well the body is known, and what that makes of the intervals."""
-    stated = [item for item in result.parameters if item.stated is not None]
+    added = _added(result)
+    stated = [
+        item
+        for item in result.parameters
+        if item.stated is not None and not (added and item.name.startswith(added))
+    ]
     if not stated:
         return (
             "The body was taken as exact: the intervals on this page contain noise, and not what "
             "is uncertain of masses, lengths, delay and limit ([plant.uncertainty] states it).",
         )
-    wider = _wider(result)
     parts = sorted(stated, key=lambda item: -item.share)
     named = [f"{item.name} {100 * item.share:.0f} %" for item in parts if item.share > _NAMED]
     found_as_before = [item.name for item in stated if item.learned > _AS_BEFORE]
+    count = "one parameter was" if len(stated) == 1 else f"{len(stated)} parameters were"
     said = [
-        f"The body is not known exactly: {len(stated)} of its parameters were fitted within their "
-        f"stated uncertainty, and the intervals contain it{wider}."
+        f"The body is not known exactly: {count} fitted within the stated uncertainty, and the "
+        f"intervals contain it{_wider(result)}."
     ]
     if named:
         said.append(f"Of the variance of the gain come from {', '.join(named)}.")
@@ -55,6 +70,12 @@ def body_sentences(result: FitResult) -> tuple[str, ...]:
             "them. They cannot be tested here, only measured."
         )
     return tuple(said)
+
+
+def _added(result: FitResult) -> str:
+    """The parameter that a first fit was found to lack; empty where there is none."""
+    culprit = result.lack[0].culprit if len(result.lack) > 1 and result.lack[0] else None
+    return "" if culprit is None else PARAMETERS.get(culprit.name, "")
 
 
 def _wider(result: FitResult) -> str:
@@ -80,12 +101,20 @@ def error_words(result: FitResult, error: ModelError) -> str:
 
 def added_sentence(result: FitResult) -> str:
     """What was fitted too because a first fit lacked it; empty where nothing was."""
-    added = [found.culprit for found in result.lack[:-1] if found is not None]
-    if not added or added[0] is None:
+    first = result.lack[0] if len(result.lack) > 1 else None
+    if first is None or first.culprit is None:
         return ""
+    said = (
+        f"A first fit left what {error_words(result, first.culprit)} explains "
+        f"({_probability(first.culprit)}). It was fitted too: all numbers are of that fit."
+    )
+    name = _added(result)
+    unknown = any(item.name == name and not item.determined for item in result.parameters)
+    if first.culprit.name != DELAY or not unknown:
+        return said
     return (
-        f"A first fit left what {error_words(result, added[0])} explains "
-        f"({_probability(added[0])}). It was fitted too: all numbers are of that fit."
+        f"{said} A gain on the last command makes up for much of a delay, so that the intervals "
+        "are wide: measure it, and state it in [plant.uncertainty] extra_delay."
     )
 
 
