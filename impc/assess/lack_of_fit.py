@@ -57,8 +57,9 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.model.recordings import Recording
 
-#: Probability of any alarm where the model holds.
-LEVEL = 0.05
+#: Probability of any alarm where the model holds, by the distributions named above. Persons who all
+#: but fall have heavier tails: at this level 4 % of 161 carts gave one, at .05 it was 7 %.
+LEVEL = 0.02
 DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
 PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
 MODE, NONLINEAR = "a further mode", "a nonlinear body"
@@ -92,7 +93,7 @@ class LackOfFit(Frozen):
     """The test of every kind of error."""
 
     errors: tuple[ModelError, ...]  # Those that can be tested, the most probable culprit first
-    alarm: bool  # Whether any is found at 5 %, all together
+    alarm: bool  # Whether any is found, all together
     untestable: tuple[str, ...]  # Kinds that the fit makes up for, whatever their size
 
     @property
