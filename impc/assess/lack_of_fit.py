@@ -108,7 +108,8 @@ def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
     found = evaluate(problem, K, S)
     samples = sum(trial.samples for trial in problem.recordings)
     size = np.linalg.norm(found.residual) / np.sqrt(problem.recorded_numbers)
-    if found.reason or samples < _FEWEST or size <= _EXACT or _has_gaps(problem):
+    gaps = any(trial.has_gaps for trial in problem.recordings)
+    if found.reason or samples < _FEWEST or size <= _EXACT or gaps:
         return None
     groups = {name: columns for name, columns in _columns(problem, K, S) if columns.shape[1]}
     widths = [columns.shape[1] for columns in groups.values()]
@@ -129,10 +130,6 @@ def _some_trials(problem: Problem) -> Problem:
     """Every k-th trial of many: each has columns of its own, and a few show any error."""
     every = -(-len(problem.recordings) // _MOST)
     return replace(problem, recordings=problem.recordings[::every])
-
-
-def _has_gaps(problem: Problem) -> bool:
-    return any(trial.has_gaps for trial in problem.recordings)
 
 
 class _Tested:

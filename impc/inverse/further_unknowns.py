@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import frozen
 from impc.checking import replace
-from impc.model.plant_family import DELAY, PlantFamily, with_late_commands
+from impc.model.plant_family import DELAY, PlantFamily, plant_at, with_late_commands
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +38,9 @@ def with_limit_unknown(problem: Problem) -> Problem | None:
 def with_delay_unknown(problem: Problem) -> Problem | None:
     """A delay of the commands among the parameters; None for a plant that cannot have one here."""
     plant, m = problem.plant, problem.plant.m
-    dressed = plant.ahead or plant.commands or np.any(plant.observer) or DELAY in _names(problem)
+    dressed = (
+        plant.ahead or plant.commands or np.any(plant.observer) or DELAY in problem.parameter_names
+    )
     if plant.body is not None or dressed or problem.terminal_weight is not None:
         return None
     dt = plant.dt
@@ -69,7 +71,7 @@ def with_offsets_unknown(problem: Problem) -> Problem | None:
 
 def with_strength_unknown(problem: Problem) -> Problem | None:
     """The size of the disturbances, one factor for all, among the parameters."""
-    if problem.plant.ahead or STRENGTH in _names(problem):
+    if problem.plant.ahead or STRENGTH in problem.parameter_names:
         return None
 
     def stronger(plant: Plant, factor: float) -> Plant:
@@ -78,10 +80,6 @@ def with_strength_unknown(problem: Problem) -> Problem | None:
         return replace(plant, E=frozen(E), body=body)
 
     return _posed(problem, _widened(_family(problem), STRENGTH, 1.0, _STRENGTH, stronger))
-
-
-def _names(problem: Problem) -> tuple[str, ...]:
-    return problem.parameter_names
 
 
 def _family(problem: Problem) -> PlantFamily:
@@ -110,10 +108,5 @@ def _posed(problem: Problem, family: PlantFamily, **parts: object) -> Problem:
     """The problem with a wider family, its further parameters at their nominal values."""
     more = np.zeros(len(family.names) - len(problem.logarithms))
     logarithms = np.append(problem.logarithms, more)
-    plant: Plant = family.make(_values(family, logarithms))
-    known = {"family": family, "plant": plant, "logarithms": frozen(logarithms)}
-    return replace(problem, **known, **parts)
-
-
-def _values(family: PlantFamily, logarithms: Array) -> Array:
-    return family.nominal * np.exp(logarithms)
+    known = {"plant": plant_at(family, logarithms), "logarithms": frozen(logarithms)}
+    return replace(problem, family=family, **known, **parts)

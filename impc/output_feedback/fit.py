@@ -160,7 +160,7 @@ def fit_output_feedback(
     """
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
-    problem = found.problem
+    problem = found.problem.with_body_fixed()  # what is uncertain of it, as it was found
     _require_plain(problem)
     require_riccati(problem)
     shortest = min(trial.samples for trial in problem.recordings)
