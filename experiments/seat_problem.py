@@ -50,7 +50,7 @@ def seat_problem(terminal: Array | None = None) -> OptimalControlProblem:
         x,
         u,
         theta,
-        next_state=system.body(x, ca.vertcat(u, d)),
+        next_state=system.body()(x, ca.vertcat(u, d)),
         stage_cost=ca.bilin(Q, x, x) + u**2,
         horizon=HORIZON,
         terminal_cost=ca.bilin(_riccati(plant, Q) if terminal is None else ca.DM(terminal), x, x),

@@ -27,7 +27,7 @@ def test_the_first_torque_from_a_tilt_is_that_of_the_optimality_conditions() -> 
     x, u, effort = ca.SX.sym("x", plant.n), ca.SX.sym("u"), ca.SX.sym("effort")
     Q, P = (ca.DM(np.array(item)) for item in (weights.Q, solve_lqr(plant, weights).P))
     problem = OptimalControlProblem(
-        x, u, {"effort": effort}, seated_balance_for().body(x, ca.vertcat(u, 0)),
+        x, u, {"effort": effort}, seated_balance_for().body()(x, ca.vertcat(u, 0)),
         ca.bilin(Q, x, x) + effort * u**2, HORIZON, terminal_cost=ca.bilin(P, x, x),
     )  # fmt: skip
     for together, gap in ((False, -0.428), (True, -3.278)):

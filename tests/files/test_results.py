@@ -31,9 +31,9 @@ def test_what_a_report_writes_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("{}", "another version of impc (schema 1, not 5)"),
-        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 5"),
-        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 5"),
+        ("{}", "another version of impc (schema 1, not 6)"),
+        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 6"),
+        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 6"),
         (json.dumps(HEAD | {"versions": 3}), "is no result"),
         (json.dumps({"schema": SCHEMA}), "is no result"),
         (json.dumps(HEAD | {"methods": {"a": {"seconds": "x"}}}), "$.methods[...].seconds"),
