@@ -125,11 +125,10 @@ def _print(result: FitResult) -> None:
     """The table of methods and the intent, as the page has them."""
     from impc.assess.intent_statements import dominant_sentence  # noqa: PLC0415
     from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
-    from impc.studies.fit.trial_findings import warnings_of  # noqa: PLC0415
     from impc.studies.fit.verdict import verdict  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
-    stated = (*structure_sentences(result), *result.person_sentences, *warnings_of(result))
+    stated = (*structure_sentences(result), *result.person_sentences, *result.warnings)
     for line in dict.fromkeys((verdict(result), *stated)):
         click.echo(line)
     plant = result.fitted.problem.plant

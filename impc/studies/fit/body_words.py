@@ -150,7 +150,6 @@ def lack_finding(result: FitResult, found: LackOfFit) -> Finding:
             "standard_error": lambda item: float(item.deviation),
         },
     )
-    added, warned = added_sentence(result), lack_sentence(result)
     untestable = ", ".join(_KINDS[name] for name in found.untestable)
     caption = (
         "Each is an error of the model that would move the outputs as the residuals do; p is of as "
@@ -163,7 +162,7 @@ def lack_finding(result: FitResult, found: LackOfFit) -> Finding:
         "residual_tests",
         table,
         caption,
-        [line for line in (added, warned) if line],
-        severity=Severity.AMBER if warned else Severity.GREEN,
+        result.warnings,
+        severity=Severity.AMBER if found.alarm else Severity.GREEN,
         folded="Tests of the model",
     )

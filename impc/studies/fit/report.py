@@ -83,7 +83,6 @@ from impc.studies.fit.trial_findings import (
     offset_findings,
     residual_findings,
     trajectory_finding,
-    warnings_of,
 )
 from impc.studies.fit.verdict import abstract, remarks, verdict
 from impc.studies.fit.weight_findings import reading_finding, statement_findings, weight_finding
@@ -247,7 +246,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     plant, found = result.fitted.problem.plant, result.identifiability
     return _controller(result) | {
         "estimate": _estimate(result),
-        "warnings": warnings_of(result),
+        "warnings": result.warnings,
         "intent": _intent(result),
         "identifiability": {
             "rank": found.rank,

@@ -157,6 +157,13 @@ class FitResult:
         return last is not None and last.alarm
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What has to be read before any number: what was fitted too, and an error that is left."""
+        from impc.studies.fit.body_words import added_sentence, lack_sentence  # noqa: PLC0415
+
+        return tuple(line for line in (added_sentence(self), lack_sentence(self)) if line)
+
+    @property
     def saturated(self) -> float:
         """Share of the samples at which the command is at its bound."""
         return sum(item.saturated for item in self.trials) / len(self.trials)

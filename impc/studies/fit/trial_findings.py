@@ -84,11 +84,6 @@ def residual_findings(result: FitResult) -> list[Finding]:
     return [] if last is None else [lack_finding(result, last)]
 
 
-def warnings_of(result: FitResult) -> list[str]:
-    """What has to be read before any number."""
-    return [line for item in residual_findings(result) for line in item.sentences]
-
-
 RESIDUALS = Picture(
     "residuals",
     "Residuals over time and their autocorrelation",

@@ -24,7 +24,6 @@ from impc.studies.fit.figures import trajectory_figure
 from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
-from impc.studies.fit.trial_findings import warnings_of
 from impc.studies.fit.verdict import abstract, missing, verdict
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def test_an_error_of_the_model_is_said_first() -> None:
     alarm = LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=())
     other = replace(plain, lack=(alarm,))
     assert "is not that of the model" in verdict(other)
-    (said,) = warnings_of(other)
+    (said,) = other.warnings
     assert "A delay of the command of 100 ± 10 ms explains most of it (p < 0.0001)" in said
     assert added_sentence(replace(other, lack=(alarm, None))).startswith("A first fit left what")
 
