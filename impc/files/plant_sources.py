@@ -30,7 +30,7 @@ from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
 from impc.model.plant import Plant
-from impc.model.plant_family import DELAY, LIMIT, PlantFamily, relative_deviation
+from impc.model.plant_family import DELAY, LIMIT, PlantFamily
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -230,12 +230,10 @@ def plant_family_of(
     """
     offered = made_by(source)
     nominal = dict(getattr(offered, "parameters", {}))
-    stated = {
-        name: given
-        for name, given in _stated_uncertainty(source, offered).items()
-        if name not in free and relative_deviation(name, given, nominal.get(name, 1.0)) > 0
-    }
-    names = [*free, *(name for name in stated if name not in (DELAY, LIMIT))]
+    stated = _stated_uncertainty(source, offered)
+    stated = {name: given for name, given in stated.items() if name not in free}
+    uncertain = [name for name in stated if name in nominal or name not in (DELAY, LIMIT)]
+    names = [*free, *uncertain]
     if not names and not stated:
         return None
     values = [nominal[name] if name in nominal else _nominal(source, name) for name in names]
@@ -249,7 +247,8 @@ def plant_family_of(
         moved = (plant.A - plain.A, plant.B - plain.B, plant.E - plain.E)
         return replace(plant, body=plain.body.moved(*moved))
 
-    return PlantFamily(make, names, values, stated)
+    found = PlantFamily(make, names, values, stated)
+    return found if found.names or found.limit_deviation else None
 
 
 def _stated_uncertainty(source: PlantSource, offered: Any) -> dict[str, Any]:

@@ -12,11 +12,10 @@ import numpy as np
 
 from impc.arrays import frozen
 from impc.checking import replace
-from impc.model.plant_family import DELAY, PlantFamily, plant_at, with_late_commands
+from impc.model.plant_family import DELAY, PlantFamily, plant_at
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from impc.arrays import Array
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
 
@@ -38,17 +37,12 @@ def with_limit_unknown(problem: Problem) -> Problem | None:
 def with_delay_unknown(problem: Problem) -> Problem | None:
     """A delay of the commands among the parameters; None for a plant that cannot have one here."""
     plant, m = problem.plant, problem.plant.m
-    dressed = (
-        plant.ahead or plant.commands or np.any(plant.observer) or DELAY in problem.parameter_names
-    )
+    dressed = plant.ahead or plant.commands or np.any(plant.observer)
     if plant.body is not None or dressed or problem.terminal_weight is not None:
         return None
-    dt = plant.dt
-
-    def late(one: Plant, value: float) -> Plant:
-        return with_late_commands(one, value / dt - 1)
-
-    family = _widened(_family(problem), DELAY, dt, _DELAY, late)
+    if DELAY in problem.parameter_names:
+        return None
+    family = _family(problem).with_delay(_DELAY, plant.dt)
     none, far = np.zeros(m), np.full(m, np.inf)
     bounds = replace(
         problem.bounds,
@@ -74,34 +68,16 @@ def with_strength_unknown(problem: Problem) -> Problem | None:
     if problem.plant.ahead or STRENGTH in problem.parameter_names:
         return None
 
-    def stronger(plant: Plant, factor: float) -> Plant:
-        E = factor * plant.E
+    def stronger(plant: Plant, factor: Array) -> Plant:
+        E = factor[0] * plant.E
         body = plant.body and plant.body.moved(0 * plant.A, 0 * plant.B, E - plant.E)
         return replace(plant, E=frozen(E), body=body)
 
-    return _posed(problem, _widened(_family(problem), STRENGTH, 1.0, _STRENGTH, stronger))
+    return _posed(problem, _family(problem).wider([STRENGTH], [1.0], [_STRENGTH], stronger))
 
 
 def _family(problem: Problem) -> PlantFamily:
     return problem.family or PlantFamily(lambda _: problem.plant, [], [])
-
-
-def _widened(
-    family: PlantFamily,
-    name: str,
-    nominal: float,
-    deviation: float,
-    change: Callable[[Plant, float], Plant],
-) -> PlantFamily:
-    """The family with one parameter more, which changes its plants."""
-    make = family.make
-    return replace(
-        family,
-        make=lambda values: change(make(values[:-1]), float(values[-1])),
-        names=(*family.names, name),
-        nominal=frozen([*family.nominal, nominal]),
-        deviations=frozen([*family.deviations, deviation]),
-    )
 
 
 def _posed(problem: Problem, family: PlantFamily, **parts: object) -> Problem:

@@ -34,8 +34,8 @@ _STEP, _FINE_STEP = 1e-3, 1e-4
 DELAY, LIMIT = "extra_delay", "u_max"
 # A step of a free parameter's logarithm that counts as large.
 _FREE = 1 / 3
-# Samples of delay that one more state can stand for, and a logarithm beyond any.
-_LONGEST, _FARTHEST = 2.0, 700.0
+# Samples of delay that one more state can stand for.
+_LONGEST = 2.0
 # Difference of the two central differences, relative to the derivative: h^2 for a smooth plant.
 _ROUGH = 1e-3
 
@@ -118,21 +118,15 @@ class PlantFamily(Value):
                 )
         given = dict(uncertainty or {})
         limit = relative_deviation(LIMIT, given.pop(LIMIT, 0.0), None)
-        names, nominal = list(names), list(nominal)
-        if DELAY in given and DELAY not in names:
-            dt = make(np.array(nominal)).dt
-            make = _delayed(make, given[DELAY], dt)
-            names, nominal = [*names, DELAY], [*nominal, dt]
+        late = 0.0 if DELAY in names else given.pop(DELAY, 0.0)
         unknown = [name for name in given if name not in names]
         if unknown:
             known = ", ".join([*names, DELAY, LIMIT])
             raise InputError(f"uncertainty {unknown[0]}", "is of no parameter", f"known: {known}")
-        found = np.array(
-            [
-                relative_deviation(name, given[name], value) if name in given else np.inf
-                for name, value in zip(names, nominal, strict=True)
-            ]
-        )
+        found = [
+            relative_deviation(name, given[name], value) if name in given else np.inf
+            for name, value in zip(names, nominal, strict=True)
+        ]
         self._fill(
             make=make,
             names=tuple(names),
@@ -140,8 +134,12 @@ class PlantFamily(Value):
             deviations=frozen(found),
             limit_deviation=limit,
         )
-        if np.any(found == 0):  # known exactly
-            self._fill(**vars(self.part(found > 0, np.zeros(len(found)))))
+        if 0.0 in found:  # known exactly
+            uncertain = np.array(found) > 0
+            self._fill(**vars(self.part(uncertain, np.zeros(len(found)))))
+        if relative_deviation(DELAY, late, 1.0) > 0:
+            dt = self.make(self.nominal).dt
+            self._fill(**vars(self.with_delay(relative_deviation(DELAY, late, dt), dt)))
 
     @property
     def stated(self) -> BoolArray:
@@ -155,8 +153,8 @@ class PlantFamily(Value):
 
     def values(self, logarithms: Array) -> Array:
         """The parameters (k,), in their units, at logarithms (k,) of them over their nominal."""
-        found = self.nominal * np.exp(np.clip(logarithms, -_FARTHEST, _FARTHEST))
-        return np.asarray(found - np.where(np.array(self.names) == DELAY, self.nominal, 0.0))
+        begins = np.where(np.array(self.names) == DELAY, self.nominal, 0.0)
+        return np.asarray(self.nominal * np.exp(logarithms) - begins)
 
     def linear(self) -> PlantFamily:
         """The same family without bodies of their own: the matrices alone move."""
@@ -179,6 +177,36 @@ class PlantFamily(Value):
             deviations=frozen(self.deviations[chosen]),
         )
 
+    def wider(
+        self,
+        names: Sequence[str],
+        nominal: Sequence[float],
+        deviations: Sequence[float],
+        change: Callable[[Plant, Array], Plant] = lambda plant, _: plant,
+    ) -> PlantFamily:
+        """The family with more parameters, at whose values (more,) its plants `change`."""
+        count, make = len(self.names), self.make
+        return replace(
+            self,
+            make=lambda values: change(make(values[:count]), values[count:]),
+            names=(*self.names, *names),
+            nominal=frozen([*self.nominal, *nominal]),
+            deviations=frozen([*self.deviations, *deviations]),
+        )
+
+    def with_delay(self, deviation: float, dt: float) -> PlantFamily:
+        """The family with a delay of the commands, known to so many samples of `dt`."""
+        if deviation > _LONGEST:
+            remedy = "make a plant with a delay of its own"
+            raise InputError(f"uncertainty {DELAY}", f"is more than {_LONGEST:g} samples", remedy)
+        # It is counted from one sample on, so that its logarithm is a number where there is none.
+        return self.wider(
+            [DELAY],
+            [dt],
+            [deviation],
+            lambda plant, late: with_late_commands(plant, late[0] / dt - 1),
+        )
+
     def with_limits(self, plant: Plant, bounds: Bounds) -> PlantFamily:
         """The family with the limits of the controls among its parameters, where uncertain."""
         bounded = np.flatnonzero(np.isfinite(bounds.u_max))
@@ -187,15 +215,9 @@ class PlantFamily(Value):
         if np.any(bounds.u_max != -bounds.u_min) or plant.commands:
             remedy = "leave it out of the uncertainty"
             raise InputError(f"uncertainty {LIMIT}", "needs a limit alike on both sides", remedy)
-        count = len(self.names)
-        return replace(
-            self,
-            make=lambda values: self.make(values[:count]),
-            names=(*self.names, *(f"{LIMIT}.{plant.controls[place]}" for place in bounded)),
-            nominal=frozen([*self.nominal, *np.array(bounds.u_max)[bounded]]),
-            deviations=frozen([*self.deviations, *[self.limit_deviation] * len(bounded)]),
-            limit_deviation=0.0,
-        )
+        names = [f"{LIMIT}.{plant.controls[place]}" for place in bounded]
+        limits, known = np.array(bounds.u_max)[bounded], [self.limit_deviation] * len(bounded)
+        return replace(self.wider(names, limits.tolist(), known), limit_deviation=0.0)
 
     def limits(self, plant: Plant) -> list[tuple[int, int]]:
         """Places of the limits among the parameters, each with that of its control."""
@@ -223,17 +245,6 @@ def relative_deviation(name: str, given: float | str, nominal: float | None) -> 
     if not share and number and nominal is None:
         raise InputError(where, f"got {given!r}", 'give a share of the limit, as "5 %"')
     return number / 100 if share else number / (nominal or 1.0)
-
-
-def _delayed(
-    make: Callable[[Array], Plant], given: float | str, dt: float
-) -> Callable[[Array], Plant]:
-    """The plants of `make` with a delay of the commands as their last parameter, from dt on."""
-    deviation = relative_deviation(DELAY, given, dt)
-    if deviation > _LONGEST:
-        remedy = "make a plant with a delay of its own"
-        raise InputError(f"uncertainty {DELAY}", f"is more than {_LONGEST:g} samples", remedy)
-    return lambda values: with_late_commands(make(values[:-1]), values[-1] / dt - 1)
 
 
 def with_late_commands(plant: Plant, lag: float) -> Plant:

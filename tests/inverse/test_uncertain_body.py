@@ -136,6 +136,9 @@ def test_an_uncertainty_of_zero_is_none() -> None:
     assert person is not None
     nothing = family(fall=0, damp="0 %")
     assert nothing.names == ()
+    free = family(extra_delay=0)
+    assert free.names == ("fall", "damp")
+    assert free.make(free.nominal).n == 2
     given = person.problem
     posed = (given.plant, given.bounds, HORIZON, given.recordings)
     one, other = (

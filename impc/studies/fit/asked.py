@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.signal
 
-from impc.arrays import frozen
-from impc.checking import replace
 from impc.errors import InputError
 from impc.files.configuration import require_known
 from impc.files.plant_sources import make_plant, plant_family_of
@@ -70,33 +68,25 @@ def asked_plant(
     Inputs that are `recorded` are disturbances; signals that are `aimed` have a target.
     """
     rates = _observer_rates(settings)
-    _dressed(make_plant(source, recorded), settings, aimed, rates)  # refuses what cannot be
     learned = [name for name in settings.free if name in rates]
-    own = [name for name in settings.free if name not in rates]
-    for name in own:
-        if name.partition(".")[0] == OBSERVER:
-            raise InputError(f"[fit] free {name}", "has no nominal value", f"give {name} in [fit]")
+    unrated = [name for name in settings.free if name.partition(".")[0] == OBSERVER]
+    own = [name for name in settings.free if name not in unrated]
     family = plant_family_of(source, recorded, own)
     plain = make_plant(source, recorded) if family is None else family.make(family.nominal)
     plant = _dressed(plain, settings, aimed, rates)
+    for name in unrated:
+        if name not in rates:
+            raise InputError(f"[fit] free {name}", "has no nominal value", f"give {name} in [fit]")
     if family is None and not learned:
         return plant, None
-    bare, count = (
-        family or PlantFamily(lambda _: plain, [], []),
-        len(family.names if family else ()),
-    )
 
-    def make(values: Array) -> Plant:
-        moved = dict(zip(learned, map(float, values[count:]), strict=True))
-        return _dressed(bare.make(values[:count]), settings, aimed, rates | moved)
+    def dress(one: Plant, values: Array) -> Plant:
+        moved = dict(zip(learned, map(float, values), strict=True))
+        return _dressed(one, settings, aimed, rates | moved)
 
-    return plant, replace(
-        bare,
-        make=make,
-        names=(*bare.names, *learned),
-        nominal=frozen([*bare.nominal, *(rates[name] for name in learned)]),
-        deviations=frozen([*bare.deviations, *[np.inf] * len(learned)]),
-    )
+    nominal, free = [rates[name] for name in learned], [np.inf] * len(learned)
+    bare = family or PlantFamily(lambda _: plain, [], [])
+    return plant, bare.wider(learned, nominal, free, dress)
 
 
 def _observer_rates(settings: FitSettings) -> dict[str, float]:
