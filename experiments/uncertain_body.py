@@ -35,7 +35,7 @@ from impc.assess.printed_gain import gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
 from impc.inverse.problem import Problem
 
-# Seconds for one person: the searches of one who all but falls go on for minutes.
+# Seconds for one person: the searches of one who nearly falls go on for minutes.
 _LONGEST = 300
 DT, HORIZON, SAMPLES, LIMIT, KNOWN = 0.05, 10, 400, 0.55, 0.03
 Rng = np.random.Generator

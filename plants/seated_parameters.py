@@ -41,7 +41,7 @@ class Quantities:
     @property
     def uncertainty(self) -> dict[str, float | str]:
         """How well each is known that is positive and not known exactly, by name."""
-        each = fields(self)  # type: ignore[arg-type]  # as above
+        each = fields(self)  # type: ignore[arg-type]  # as below
         known = {one.name: one.metadata["known"] for one in each}
         return {name: how for name, how in known.items() if how and getattr(self, name) > 0}
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
@@ -64,13 +65,13 @@ def ceiling(problem: Problem, settle: float) -> Ceiling | None:
 
 
 def _alike(recordings: Sequence[Recording], first: int) -> list[list[Recording]]:
-    """The recordings in groups of the same perturbation, as far as all of a group last."""
+    """The recordings in groups of the same drive, as far as all of a group last."""
     groups: list[list[Recording]] = []
     for trial in recordings:
-        if trial.has_gaps or not np.any(trial.disturbance) or trial.samples <= first:
+        if trial.has_gaps or trial.samples <= first or not np.any(_drive(trial)):
             continue
         for group in groups:
-            if _same(np.array(group[0].disturbance), np.array(trial.disturbance)):
+            if group[0].signals == trial.signals and _same(_drive(group[0]), _drive(trial)):
                 group.append(trial)
                 break
         else:
@@ -78,17 +79,23 @@ def _alike(recordings: Sequence[Recording], first: int) -> list[list[Recording]]
     return groups
 
 
+def _drive(trial: Recording) -> Array:
+    """What moves the person (samples, d + targets)."""
+    return np.hstack([trial.disturbance, trial.target])
+
+
 def _same(one: Array, other: Array) -> bool:
     n = min(len(one), len(other))
     if n < max(len(one), len(other)) / 2:
         return False
-    return bool(np.linalg.norm(one[:n] - other[:n]) <= _SAME * np.linalg.norm(one[:n]))
+    apart = np.linalg.norm(one[:n] - other[:n], axis=0)
+    return bool(np.all(apart <= _SAME * np.linalg.norm(one[:n], axis=0)))
 
 
 def _repetitions(group: list[Recording], first: int) -> list[Array]:
     """Outputs (samples, p) of each repetition: the trials, or the periods of them all."""
     samples = min(trial.samples for trial in group)
-    period = _period(np.array(group[0].disturbance)[:samples])
+    period = _period(_drive(group[0])[:samples])
     outputs = [trial.without_offset[:samples] for trial in group]
     if period is None or (samples - first) // period < 2:
         return [part[first:] for part in outputs]
@@ -97,16 +104,26 @@ def _repetitions(group: list[Recording], first: int) -> list[Array]:
     return [part[begin + k * period :][:period] for part in outputs for k in range(count)]
 
 
-def _period(disturbance: Array) -> int | None:
-    """Samples after which a disturbance repeats, at least `_SHORTEST`; None where it does not."""
-    size = np.linalg.norm(disturbance, axis=0).max()
-    for lag in range(_SHORTEST, len(disturbance) // 2):
-        if np.max(np.abs(disturbance[lag] - disturbance[0])) > size:
-            continue
-        here, there = disturbance[:-lag], disturbance[lag:]
-        if np.linalg.norm(here - there) <= _SAME * np.linalg.norm(here):
-            return lag
-    return None
+def _period(drive: Array) -> int | None:
+    """Samples after which a drive repeats, at least `_SHORTEST`; None where it does not.
+
+    Of every lag at once: the squares of what differs are those of both parts less twice their
+    correlation.
+    """
+    moving, n = drive - drive.mean(axis=0), len(drive)
+    size = np.linalg.norm(moving, axis=0)
+    moves = size > _SAME * np.linalg.norm(drive, axis=0)
+    if n < 2 * _SHORTEST + 1 or not np.any(moves):
+        return None
+    moving = moving[:, moves] / size[moves]
+    squares = np.cumsum(np.sum(moving**2, axis=1))
+    lags = np.arange(_SHORTEST, n // 2)
+    alike = [scipy.signal.correlate(one, one, method="fft")[n - 1 :] for one in moving.T]
+    products = np.sum(alike, axis=0)
+    here, there = squares[n - 1 - lags], squares[-1] - squares[lags - 1]
+    apart = here + there - 2 * products[lags]
+    found = lags[apart <= _SAME**2 * here]
+    return int(found[0]) if len(found) else None
 
 
 def _sums(group: list[Array]) -> list[Array]:

@@ -158,10 +158,12 @@ def gain_covariance(
         spread[np.ix_(identified, identified)] += shifts.T @ shifts / 2
         deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
     entries, foreign = _entries(in_units @ directions.T, deviations, spread)
-    known = directions[deviations < IDENTIFIED]
-    along = _span(problem, found, metric_columns).without(
-        np.hstack([on_gain @ known.T, found.dparameters])
-    )
+    shares = np.zeros((m * n, 0))
+    if np.any(problem.stated):
+        known = directions[deviations < IDENTIFIED]
+        seen = np.hstack([on_gain @ known.T, found.dparameters])
+        along = _span(problem, found, metric_columns).without(seen)
+        shares = _shares(along, in_units @ known.T)[:, problem.stated]
     return GainCovariance(
         frozen(T),
         frozen(G),
@@ -171,7 +173,7 @@ def gain_covariance(
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
         frozen(_parameter_deviations(problem, found.dparameters, others, colour, scale)),
-        frozen(_shares(problem, along, in_units @ known.T).reshape(m, n, -1)),
+        frozen(shares.reshape(m, n, shares.shape[1])),
         colour,
         frozen(spread),
     )
@@ -183,25 +185,20 @@ def spread_of_rows(problem: Problem, noise: ResidualNoise, columns: Array, scale
     return spread_of_sum(noise, by_trial(problem, columns)) + scale**2 * below.T @ below
 
 
-def _shares(problem: Problem, along: Array, back: Array) -> Array:
-    """Share of each stated parameter in the variance of each entry (entries, k).
+def _shares(along: Array, back: Array) -> Array:
+    """Share of each parameter in the variance of each entry (entries, k), for white noise.
 
-    `along` (r, c) are derivatives along directions of the gain and by parameters; `back` (entries,
-    d). By how much the variance would fall, were that parameter known, all others as they are.
+    `along` (r, d + k) are derivatives along d directions of the gain and by k parameters; `back`
+    (entries, d). By how much the variance would fall, were that parameter known, all others as they
+    are.
     """
-    stated, d = problem.parameter_units[1], back.shape[1]
-    shares = np.zeros((len(back), np.count_nonzero(stated)))
-    if shares.size == 0:
-        return shares
-    size = np.linalg.norm(along, axis=0)
+    size, d = np.linalg.norm(along, axis=0), back.shape[1]
     size[size == 0] = 1.0
     inverse = np.linalg.pinv(np.linalg.qr(along / size, mode="r")) / size[:, None]
     whole = inverse @ inverse.T
-    entries = np.diag(back @ whole[:d, :d] @ back.T)
-    of_parameters = np.diag(whole)[d:][stated]
-    together = (back @ whole[:d, d:][:, stated]) ** 2
-    scale = entries[:, None] * of_parameters
-    return np.asarray(np.divide(together, scale, out=shares, where=scale > 0))
+    together = (back @ whole[:d, d:]) ** 2
+    scale = np.outer(np.diag(back @ whole[:d, :d] @ back.T), np.diag(whole)[d:])
+    return np.asarray(np.divide(together, scale, out=np.zeros_like(scale), where=scale > 0))
 
 
 def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:

@@ -162,8 +162,8 @@ def expected_intervals(
 
 
 def _body_share(at: Tangent, colour: ResidualNoise) -> BodyShare | None:
-    names, stated = at.problem.parameter_names, at.problem.parameter_units[1]
-    places = [int(place) for place in np.flatnonzero(stated)]
+    names = at.problem.parameter_names
+    places = [int(place) for place in np.flatnonzero(at.problem.stated)]
     if not places:
         return None
 

@@ -43,10 +43,18 @@ from impc.control.body_steps import slopes_along
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.inverse.coordinates import metric_directions
+from impc.inverse.further_unknowns import (
+    STRENGTH,
+    with_delay_unknown,
+    with_limit_unknown,
+    with_offsets_unknown,
+    with_strength_unknown,
+)
 from impc.inverse.least_squares import trial_span
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
 from impc.inverse.residuals import evaluate, residual_along, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
+from impc.model import plant_family
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
@@ -63,8 +71,15 @@ LEVEL = 0.02
 DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
 PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
 MODE, NONLINEAR = "a further mode", "a nonlinear body"
-#: Parameters of a family by which some of them can be fitted.
-PARAMETERS = {DELAY: "extra_delay", LIMIT: "u_max", PUSH: "perturbation"}
+#: Parameters of a family by which some of them can be fitted, as their names begin.
+PARAMETERS = {DELAY: plant_family.DELAY, LIMIT: plant_family.LIMIT, PUSH: STRENGTH}
+_CURES = {
+    DELAY: with_delay_unknown,
+    LIMIT: with_limit_unknown,
+    LEAN: with_offsets_unknown,
+    OFFSET: with_offsets_unknown,
+    PUSH: with_strength_unknown,
+}
 # Samples, in shares of the shortest trial, at which an answer may come later.
 _LATER = (0.005, 0.01, 0.02, 0.04)
 # Of a column: less that the fit cannot make up for is nothing to test.
@@ -124,6 +139,13 @@ def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
     return LackOfFit(
         tuple(errors), alarm, tuple(name for name, item in results.items() if item is None)
     )
+
+
+def with_culprit(problem: Problem, found: LackOfFit | None) -> Problem | None:
+    """The problem with the unknown that it was found to lack; None where there is none to add."""
+    culprit = None if found is None else found.culprit
+    cure = None if culprit is None else _CURES.get(culprit.name)
+    return None if cure is None else cure(problem)
 
 
 def _some_trials(problem: Problem) -> Problem:
@@ -243,7 +265,8 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
     y = y / np.maximum(np.sqrt(np.mean(y**2, axis=0)), 1e-300)
     A, B, E = slopes_along(plant, run.x[:-1], run.u, d)
     late = u - np.vstack([u[:1], u[:-1]])
-    steps = [max(1, round(share * trial.samples)) for share in _LATER]
+    shortest = min(one.samples for one in problem.recordings)
+    steps = [max(1, round(share * shortest)) for share in _LATER]
     forces = {
         DELAY: [-_through(B, np.eye(plant.m)[k] * late) for k in range(plant.m)],
         LEAN: [_through(B, column) for column in _single(np.ones_like(u))],
@@ -295,8 +318,7 @@ def _later(signal: Array, steps: int) -> Array:
 def _along_limits(problem: Problem, controller: Controller) -> Array:
     """Derivatives by the logarithm of the limit of each control that has one (r, k)."""
     rows = bound_rows(controller.bounds, problem.plant)
-    moves = [rows.b * ((rows.F[:, k] != 0) & ~rows.on_state) for k in range(problem.plant.m)]
-    moves = [column for column in moves if np.any(column)]
+    moves = [column for k in range(problem.plant.m) if np.any(column := rows.along_limit(k))]
     if not moves:
         return np.zeros((sum(problem.trial_sizes), 0))
     along = directions(controller, len(moves), bounds=np.stack(moves, axis=1))

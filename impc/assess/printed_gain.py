@@ -87,14 +87,14 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the gain behind a fit, and how far it is determined."""
     here = _search(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     problem, at = here.problem, (frozen(here.K), frozen(here.S))
-    fixed, free = problem.with_body_fixed(), ~problem.parameter_units[1]
-    alone = replace(here.evaluation, dparameters=here.evaluation.dparameters[:, free])
+    fixed, found = problem.with_body_fixed(), here.evaluation
+    alone = replace(found, dparameters=found.dparameters[:, ~problem.stated])
     return GainEstimate(
         problem,
         *at,
         here.misfit,
         here.linear,
-        gain_covariance(problem, *at, curvature=True, evaluation=here.evaluation),
+        gain_covariance(problem, *at, curvature=True, evaluation=found),
         None if fixed is problem else gain_covariance(fixed, *at, curvature=True, evaluation=alone),
     )
 

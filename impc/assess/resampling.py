@@ -5,6 +5,9 @@ the residuals of all trials, laid end to end (Künsch 1989). The length of a blo
 and White (2004) for a first-order process, (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest of the
 outputs.
 
+A parameter of the body with a stated uncertainty is known from a measurement that might have come
+out otherwise: a replicate draws that too, about the estimate.
+
 Replicate k draws from the k-th child of the seed: the same numbers in any order, on any machine.
 Its search begins at the estimate and moves the gain alone (`identified_gain`): fitting weights anew
 would take most of its time, and their gain is not what is printed.
@@ -67,22 +70,32 @@ def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
         new = values + noise + 0 * recorded(model.problem, trial)  # what is missing stays so
         commands = new[:, p:] if len(trial.commands) else trial.commands
         trials.append(replace(trial, outputs=frozen(new[:, :p]), commands=frozen(commands)))
-    again = identified_gain(replace(model.problem, recordings=tuple(trials)), model.K, model.S)
+    problem = _body_measured_again(model.problem, rng)
+    again = identified_gain(replace(problem, recordings=tuple(trials)), model.K, model.S)
     return Replicate(again.K, frozen(again.parameters))
+
+
+def _body_measured_again(problem: Problem, rng: np.random.Generator) -> Problem:
+    """The same body, whose uncertain parameters have other nominal values."""
+    if problem.family is None or not np.any(problem.stated):
+        return problem
+    error = problem.parameter_units * rng.standard_normal(len(problem.stated))
+    moved = np.where(problem.stated, problem.logarithms + error, 0.0)
+    family = replace(problem.family, nominal=frozen(problem.family.nominal * np.exp(moved)))
+    return replace(problem, family=family, logarithms=frozen(problem.logarithms - moved))
 
 
 def bootstrap_intervals(
     estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of entries of K and of parameters; no ends where not identified."""
-    names = list(entry_names(estimate.problem.plant))
-    if estimate.problem.family is not None:
-        names += estimate.problem.family.names
-    values = np.append(np.ravel(estimate.K), estimate.parameters)
-    drawn = np.array([np.append(np.ravel(item.K), item.parameters) for item in replicates])
+    """Percentile intervals of entries of K and of free parameters; no ends if not identified."""
+    problem, free = estimate.problem, ~estimate.problem.stated
+    names = [*entry_names(problem.plant), *np.array(problem.parameter_names)[free].tolist()]
+    values = np.append(np.ravel(estimate.K), estimate.parameters[free])
+    drawn = np.array([np.append(np.ravel(one.K), one.parameters[free]) for one in replicates])
     low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
     identified = np.append(
-        np.ravel(estimate.covariance.individually_identified), np.isfinite(estimate.parameters)
+        np.ravel(estimate.covariance.individually_identified), np.ones(np.count_nonzero(free), bool)
     )
     # Replicates stay where the search began along what is not identified: their spread says
     # nothing.

@@ -13,7 +13,6 @@ from impc.cli.options import out_option, subject_arguments
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from impc.inverse.problem import Problem
     from impc.studies.fit.memory import FitMemory
     from impc.studies.fit.result import FitResult
 
@@ -66,10 +65,8 @@ def command(
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
 
         def remembered(memory: FitMemory) -> FitProgress:
-            def about(further: Problem) -> FitProgress:
-                return remembered(memory.about(further))
-
-            return FitProgress(done, memory.estimate, memory.replicate, memory.part, about)
+            kept = (memory.estimate, memory.replicate, memory.part)
+            return FitProgress(done, *kept, lambda further: remembered(memory.about(further)))
 
         result = fit_recordings(problem, settings, remembered(memory))
         with angles_in(subject.angles):

@@ -100,7 +100,8 @@ def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
         body.given[n + i] = u[i]
     for i in range(len(disturbance)):
         body.given[n + m + i] = disturbance[i]
-    body.slopes[:] = 0.0  # the code writes those alone that may be another number
+    if body.beside.shape[1] > 0:  # it adds to those too that the code leaves as they are
+        body.slopes[:] = 0.0
     _call(body.address, body.constants, body.given, body.found)
     for j in range(body.beside.shape[1]):
         for i in range(n):

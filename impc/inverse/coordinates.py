@@ -94,7 +94,7 @@ class Coordinates:
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
         self.T, self.G = natural_coordinates(plant, gain)
         self.own_unit, self.own = own_unit(problem, gain), problem.own_unknowns
-        self.units, self.stated = problem.parameter_units
+        self.units, self.stated = problem.parameter_units, problem.stated
         self.first = np.linalg.cholesky(metric * (plant.m / np.trace(metric)))
         if gains is None:
             entries = np.eye(self.m * self.n).reshape(-1, self.m, self.n)
@@ -190,7 +190,8 @@ class Coordinates:
         basis = left * (values > _EXPLAINED * largest)[:, None, :]
         shared = rows.shared - basis @ (np.swapaxes(basis, 1, 2) @ rows.shared)
         kept, nuisance = np.split(shared.reshape(-1, shared.shape[2]), [int(self.ends[1])], axis=1)
-        held = self.noise(z) * np.eye(len(self.stated))[self.stated]
+        noise = noise_of_residual(self.problem, self.at(z).residual)
+        held = noise * np.eye(len(self.stated))[self.stated]
         kept = np.vstack([kept, np.zeros((len(held), kept.shape[1]))])
         nuisance = np.vstack([nuisance, held])
         if nuisance.shape[1] == 0:
@@ -199,10 +200,6 @@ class Coordinates:
         rest, values, _ = np.linalg.svd(nuisance, full_matrices=False)
         rest = rest[:, values > _EXPLAINED * max(largest, np.max(size))]
         return np.asarray(kept - rest @ (rest.T @ kept))
-
-    def noise(self, z: Array) -> float:
-        """Root-mean-square of the residual at z (q,), by which a prior is weighed."""
-        return noise_of_residual(self.problem, self.at(z).residual)
 
     def natural(self, gains: Array) -> Array:
         """G^-1 K T, (..., m, n), of gains (..., m, n)."""

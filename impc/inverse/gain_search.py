@@ -143,8 +143,8 @@ def refine_gain(
         raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
     space = Coordinates(problem, gain, metric)
     stop = _stop(problem, _FINE, max_evaluations)
-    uncertain = bool(np.any(problem.parameter_units[1]))
-    stop = replace(stop, nats=_RIDGE if uncertain else min(stop.nats, _NATS))
+    nats = _RIDGE if np.any(problem.stated) else min(stop.nats, _NATS)
+    stop = replace(stop, nats=nats)
     z, spent, _ = descend(space, space.start, stop, shared=prior, own=prior)
     return _gain_fit(space, z, spent)
 

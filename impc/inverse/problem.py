@@ -228,9 +228,9 @@ class Problem(Value):
 
     def with_body_fixed(self) -> Problem:
         """Return the problem with what has a stated uncertainty held where it stands."""
-        if self.family is None or not np.any(self.family.stated):
+        if self.family is None or not np.any(self.stated):
             return self
-        free = ~self.family.stated
+        free = ~self.stated
         family = self.family.part(free, self.logarithms) if np.any(free) else None
         return replace(self, family=family, logarithms=frozen(self.logarithms[free]))
 
@@ -305,11 +305,14 @@ class Problem(Value):
         return () if self.family is None else self.family.names
 
     @property
-    def parameter_units(self) -> tuple[Array, BoolArray]:
-        """Unit of each parameter's logarithm in a search, and whether its uncertainty is stated."""
-        if self.family is None:
-            return np.zeros(0), np.zeros(0, bool)
-        return self.family.unit, self.family.stated
+    def parameter_units(self) -> Array:
+        """Unit of each parameter's logarithm in a search (k,): its deviation where it is stated."""
+        return np.zeros(0) if self.family is None else self.family.unit
+
+    @property
+    def stated(self) -> BoolArray:
+        """Which parameters have a stated uncertainty (k,)."""
+        return np.zeros(0, bool) if self.family is None else self.family.stated
 
     @property
     def trial_sizes(self) -> list[int]:
@@ -319,7 +322,7 @@ class Problem(Value):
     @property
     def row_sizes(self) -> list[int]:
         """The same with the rows of stated uncertainties, which stand last."""
-        stated = int(np.count_nonzero(self.parameter_units[1]))
+        stated = int(np.count_nonzero(self.stated))
         return self.trial_sizes + ([stated] if stated else [])
 
     @property

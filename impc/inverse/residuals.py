@@ -143,11 +143,10 @@ def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evalua
     So a parameter that is q off its nominal value counts q / deviation, as a residual of that many
     deviations of the noise does. Covariances see the prior as rows that have been recorded.
     """
-    units, stated = problem.parameter_units
-    k = int(np.count_nonzero(stated))
+    k = int(np.count_nonzero(problem.stated))
     if k == 0:
         return found
-    slopes = noise * np.diag(1 / units)[stated]
+    slopes = noise * np.diag(1 / problem.parameter_units)[problem.stated]
     below = {"residual": slopes @ problem.logarithms, "dparameters": slopes}
     for name in ("dK", "dS", "own"):
         below[name] = np.zeros((k, *getattr(found, name).shape[1:]))
@@ -313,8 +312,7 @@ def _all_directions(
         bounds = bound_rows(controller.bounds, problem.plant)
         given["bounds"] = np.zeros((len(bounds.b), count))
         for place, control in problem.family.limits(problem.plant):
-            of_control = (bounds.F[:, control] != 0) & ~bounds.on_state
-            given["bounds"][:, layout.parameters.start + place] = bounds.b * of_control
+            given["bounds"][:, layout.parameters.start + place] = bounds.along_limit(control)
     along = directions(controller, count, **given)
     if differential is None:
         return along

@@ -104,6 +104,10 @@ class BoundRows(Value):
     on_state: BoolArray  # Whether the row bounds a state (c,); the others bound a command
     names: tuple[str, ...]  # One name a row, such as ``"u <= 1"``
 
+    def along_limit(self, control: int) -> Array:
+        """Change of `b` (c,) with the logarithm of the limits of one control."""
+        return np.where((self.F[:, control] != 0) & ~self.on_state, self.b, 0.0)
+
 
 @checked
 def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:

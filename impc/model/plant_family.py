@@ -153,8 +153,9 @@ class PlantFamily(Value):
 
     def values(self, logarithms: Array) -> Array:
         """The parameters (k,), in their units, at logarithms (k,) of them over their nominal."""
-        begins = np.where(np.array(self.names) == DELAY, self.nominal, 0.0)
-        return np.asarray(self.nominal * np.exp(logarithms) - begins)
+        begins = self.make(self.nominal).dt if DELAY in self.names else 0.0
+        late = np.array([name == DELAY for name in self.names], float)
+        return np.asarray(self.nominal * np.exp(logarithms) - begins * late)
 
     def linear(self) -> PlantFamily:
         """The same family without bodies of their own: the matrices alone move."""
@@ -184,7 +185,15 @@ class PlantFamily(Value):
         deviations: Sequence[float],
         change: Callable[[Plant, Array], Plant] = lambda plant, _: plant,
     ) -> PlantFamily:
-        """The family with more parameters, at whose values (more,) its plants `change`."""
+        """The family with more parameters.
+
+        Parameters
+        ----------
+        names, nominal, deviations : sequence
+            Of the further parameters, as of the class.
+        change : callable
+            Plant and values (more,) of the further parameters -> plant.
+        """
         count, make = len(self.names), self.make
         return replace(
             self,
@@ -195,7 +204,7 @@ class PlantFamily(Value):
         )
 
     def with_delay(self, deviation: float, dt: float) -> PlantFamily:
-        """The family with a delay of the commands, known to so many samples of `dt`."""
+        """The family with a delay of the commands, known to `deviation` samples of `dt` (s)."""
         if deviation > _LONGEST:
             remedy = "make a plant with a delay of its own"
             raise InputError(f"uncertainty {DELAY}", f"is more than {_LONGEST:g} samples", remedy)

@@ -61,3 +61,25 @@ def test_a_periodic_perturbation_in_one_trial() -> None:
 def test_what_does_not_repeat_has_none() -> None:
     assert ceiling(problem([push(1), push(2)], 0.03)[0], 0.0) is None
     assert ceiling(problem([np.zeros(300)] * 2, 0.03)[0], 0.0) is None
+
+
+def test_targets_count_as_what_drives() -> None:
+    """The same push towards two other targets is no repetition; towards the same one it is."""
+    plant, rng = cart(), np.random.default_rng(3)
+    bounds, force = impc.Bounds(plant, u_min=-5, u_max=5), push(1)
+    paths = [np.repeat(rng.standard_normal(40), 15) for _ in range(2)]
+
+    def found(first: Array, second: Array) -> object:
+        trials = [
+            impc.Recording(plant, rng.standard_normal((600, 1)), force, target={"pos": path})
+            for path in (first, second)
+        ]
+        return ceiling(Problem(plant, bounds, 10, trials, unknown_start=True), 0.0)
+
+    assert found(*paths) is None
+    assert found(paths[0], paths[0]) is not None
+
+
+def test_a_lasting_push_is_not_periodic() -> None:
+    assert ceiling(problem([np.full(600, 0.2)], 0.03)[0], 0.0) is None
+    assert ceiling(problem([np.tile(push(2, 150), 4) + 1.0], 0.03)[0], 0.0) is not None

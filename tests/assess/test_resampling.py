@@ -8,6 +8,7 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
+import impc
 from experiments.coverage import cart, noisy_trial
 from impc.arrays import Array
 from impc.assess import resampling
@@ -33,6 +34,7 @@ from impc.checking import replace
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -46,6 +48,28 @@ SEED = 4
 def fitted(request: pytest.FixtureRequest) -> Estimate:
     trial = noisy_trial(SEED, request.param)
     return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
+
+
+def test_replicates_draw_what_is_known_of_the_body_again() -> None:
+    """A mass known to 10 % makes a gain on force as uncertain; without noise nothing else does."""
+    plant = cart()
+    family = impc.PlantFamily(
+        lambda mass: replace(plant, B=plant.B / mass[0]), ["mass"], [1.0], {"mass": "10 %"}
+    )
+    push = 0.4 * np.random.default_rng(0).standard_normal(300)
+    bounds = impc.Bounds(plant, u_min=-9, u_max=9)
+    law = impc.Controller(plant, impc.Weights(np.diag([4.0, 1.0]), 1), bounds, 10)
+    y = law.simulate([0, 0], disturbance=push).outputs
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(y.shape)
+    trials = [Recording(plant, y + noise, push)]
+    posed = Problem(plant, bounds, 10, trials, unknown_start=True, family=family)
+    at = gain_estimate(fit_controller(posed))
+    model = bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
+    repeated = [replicate(model, index, SEED) for index in range(40)]
+    spread = np.std([np.log(one.K[0, 0] / at.K[0, 0]) for one in repeated])
+    assert 0.07 < spread < 0.13
+    found = bootstrap_intervals(at, repeated, "bootstrap", 0.95)
+    assert [one.name for one in found] == list(entry_names(plant))
 
 
 def first_order(root: float, samples: int, seed: int) -> Array:

@@ -22,7 +22,7 @@ from impc.reporting.rendering import number
 
 if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
-    from impc.studies.fit.result import FitResult
+    from impc.studies.fit.result import FitResult, FittedParameter
 
 # Of a stated deviation: what is known no better after the fit is not identified by it.
 _AS_BEFORE = 0.9
@@ -43,11 +43,10 @@ _KINDS = {
 
 def body_sentences(result: FitResult) -> tuple[str, ...]:
     """How well the body is known, and what that makes of the intervals."""
-    added = _added(result)
     stated = [
         item
         for item in result.parameters
-        if item.stated is not None and not (added and item.name.startswith(added))
+        if item.stated is not None and not _is_added(result, item)
     ]
     if not stated:
         return (
@@ -72,10 +71,10 @@ def body_sentences(result: FitResult) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _added(result: FitResult) -> str:
-    """The parameter that a first fit was found to lack; empty where there is none."""
-    culprit = result.lack[0].culprit if len(result.lack) > 1 and result.lack[0] else None
-    return "" if culprit is None else PARAMETERS.get(culprit.name, "")
+def _is_added(result: FitResult, item: FittedParameter) -> bool:
+    """Whether a parameter is fitted because a first fit was found to lack it."""
+    added = None if result.added is None else PARAMETERS.get(result.added.name)
+    return added is not None and item.name.startswith(added)
 
 
 def _wider(result: FitResult) -> str:
@@ -101,16 +100,17 @@ def error_words(result: FitResult, error: ModelError) -> str:
 
 def added_sentence(result: FitResult) -> str:
     """What was fitted too because a first fit lacked it; empty where nothing was."""
-    first = result.lack[0] if len(result.lack) > 1 else None
-    if first is None or first.culprit is None:
+    added = result.added
+    if added is None:
         return ""
     said = (
-        f"A first fit left what {error_words(result, first.culprit)} explains "
-        f"({_probability(first.culprit)}). It was fitted too: all numbers are of that fit."
+        f"A first fit left what {error_words(result, added)} explains ({_probability(added)}). It "
+        "was fitted too: all numbers are of that fit."
     )
-    name = _added(result)
-    unknown = any(item.name == name and not item.determined for item in result.parameters)
-    if first.culprit.name != DELAY or not unknown:
+    unknown = [
+        item for item in result.parameters if _is_added(result, item) and not item.determined
+    ]
+    if added.name != DELAY or not unknown:
         return said
     return (
         f"{said} A gain on the last command makes up for much of a delay, so that the intervals "
@@ -120,7 +120,7 @@ def added_sentence(result: FitResult) -> str:
 
 def lack_sentence(result: FitResult) -> str:
     """The warning that the model does not fit, with the most probable reason; or nothing."""
-    culprit = None if result.lack[-1] is None else result.lack[-1].culprit
+    culprit = result.culprit
     if culprit is None:
         return ""
     noise = (

@@ -206,7 +206,7 @@ def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
     said = truth_beside(folders.pop()) if len(folders) == 1 else {}
     try:
         states, gain = tuple(said["states"]), np.array(said["K"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError):  # none, or a file of somebody else's
+    except (ValueError, KeyError, TypeError):  # none, or another program's file
         return None
     return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
     from impc.assess.intent_statements import Intent
-    from impc.assess.lack_of_fit import LackOfFit
+    from impc.assess.lack_of_fit import LackOfFit, ModelError
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
@@ -151,10 +151,15 @@ class FitResult:
         return max(self.intent.widest_angle, over_set)
 
     @property
-    def alarm(self) -> bool:
-        """Whether the last fit's residuals follow what drove the recordings."""
-        last = self.lack[-1]
-        return last is not None and last.alarm
+    def added(self) -> ModelError | None:
+        """What a first fit was found to lack, so that it was fitted too."""
+        first = self.lack[0]
+        return first.culprit if len(self.lack) > 1 and first is not None else None
+
+    @property
+    def culprit(self) -> ModelError | None:
+        """What explains most of what follows the perturbation in the last fit's residuals."""
+        return None if self.lack[-1] is None else self.lack[-1].culprit
 
     @property
     def warnings(self) -> tuple[str, ...]:

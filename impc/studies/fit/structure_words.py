@@ -38,7 +38,7 @@ def structure_sentences(result: FitResult) -> tuple[str, ...]:
     lines = [_verdict(found)]
     if found.estimate is None:
         return tuple(lines)
-    if found.refused and result.alarm:
+    if found.refused and result.culprit is not None:
         lines.append(_OF_THE_MODEL)
     lines.append(_explains(result, found))
     if not found.refused:

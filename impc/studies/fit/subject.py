@@ -23,7 +23,7 @@ from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
-from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, OFFSET, PUSH, LackOfFit, lack_of_fit
+from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out_vaf
@@ -33,12 +33,6 @@ from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
-from impc.inverse.further_unknowns import (
-    with_delay_unknown,
-    with_limit_unknown,
-    with_offsets_unknown,
-    with_strength_unknown,
-)
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, aims, simulated
@@ -262,7 +256,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         failures,
         structures,
         attempt("subject with sensory noise", person, None),
-        ceiling(problem, settings.settle),
+        ceiling(fitted.problem, settings.settle),
         attempt("regression of commands", functools.partial(_regressed, fitted), None),
     )
 
@@ -284,26 +278,11 @@ def _first_fits(
         estimate = gain_estimate(fitted)
         test = functools.partial(lack_of_fit, estimate)
         lack.append(attempt("test of the model", test, None))
-        culprit = None if lack[-1] is None else lack[-1].culprit
-        further = None if culprit is None else _CURES.get(culprit.name, _no_cure)(problem)
+        further = with_culprit(problem, lack[-1])
         if further is None or len(lack) > 1:
             progress.done("inverse MPC")
             return problem, progress, fitted, estimate, tuple(lack)
         problem, progress = further, progress.anew(further)
-
-
-def _no_cure(_: Problem) -> None:
-    return None
-
-
-#: What is fitted too where the test of the model names it.
-_CURES: dict[str, Callable[[Problem], Problem | None]] = {
-    DELAY: with_delay_unknown,
-    LIMIT: with_limit_unknown,
-    LEAN: with_offsets_unknown,
-    OFFSET: with_offsets_unknown,
-    PUSH: with_strength_unknown,
-}
 
 
 def _estimates(

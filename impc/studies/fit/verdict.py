@@ -43,7 +43,7 @@ def verdict(result: FitResult) -> str:
         ),
         (result.weights_test.rejected, result.weights_test.sentence),
         (
-            result.alarm,
+            result.culprit is not None,
             "The controller agrees with the recordings, but the body or the controller that moved "
             "is not that of the model, or noise entered the loop at its limit: do not rely on its "
             "gain, its weights or their intervals.",
@@ -84,7 +84,7 @@ def _little(result: FitResult) -> str:
 
 
 def abstract(result: FitResult) -> tuple[str, ...]:
-    """Three to five plain sentences with numbers."""
+    """A few plain sentences with numbers."""
     return (
         _what_was_done(result),
         *aim_sentences(result),

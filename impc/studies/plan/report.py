@@ -130,8 +130,7 @@ def _best(plan: Plan) -> list[Finding]:
         shares = 100 * expected.narrower(body.measured)
         by = pd.DataFrame(shares, columns=[f"{name}_narrower_percent" for name in names])
         by.insert(0, "parameter", body.names)
-        units, stated = problem.parameter_units
-        by.insert(1, "stated_percent", 100 * units[stated])
+        by.insert(1, "stated_percent", 100 * problem.parameter_units[problem.stated])
         of_body = (
             "By how much the interval of each cost weight would be narrower if this parameter of "
             "the body were known exactly, and the others as stated; to first order."

@@ -21,10 +21,8 @@ from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import identified_gain
 from impc.checking import replace
-from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
 from impc.errors import ImpcError, SolverError
-from impc.inverse.problem import scenarios
+from impc.inverse.residuals import verify_hard
 from impc.inverse.structured_fit import structured_estimate
 from impc.inverse.structured_search import search_from
 from impc.studies.effort import SECONDS_A_SAMPLE, Effort
@@ -221,18 +219,10 @@ def simulated_fits(
 
 def _measured(person: Person, problem: Problem, rng: np.random.Generator) -> Problem:
     """Recordings of the presumed weights in a body drawn from what is stated of it."""
-    units, stated = problem.parameter_units
-    body = np.where(stated, units, 0.0) * rng.standard_normal(len(units))
-    drawn, trials = problem.at(problem.starts, body), []
-    law = Controller(
-        drawn.plant,
-        person.structure.weights(person.cost_weights),
-        drawn.bounds,
-        drawn.horizon,
-        terminal_set=bool(drawn.terminal_set),
-    )
-    for trial, drive in zip(problem.recordings, scenarios(drawn), strict=True):
-        run = simulate(law, drive)
+    unknown = np.where(problem.stated, problem.parameter_units, 0.0)
+    drawn = problem.at(problem.starts, unknown * rng.standard_normal(len(unknown)))
+    weights, trials = person.structure.weights(person.cost_weights), []
+    for trial, run in zip(problem.recordings, verify_hard(drawn, weights), strict=True):
         if not run.complete:
             raise SolverError("simulation", "the person falls", "lower amplitude")
         noise = recorded_noise(person, trial.samples, rng)

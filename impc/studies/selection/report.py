@@ -206,7 +206,7 @@ def read_truths(folder: Path, model: ParametricModel) -> dict[str, Array]:
             subject: np.array([values[name] for name in model.names], dtype=np.float64)
             for subject, values in said["recordings"].items()
         }
-    except (AttributeError, KeyError, TypeError, ValueError):  # none, or a file of somebody else's
+    except (AttributeError, KeyError, TypeError, ValueError):  # none, or another program's file
         return {}
 
 
