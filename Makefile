@@ -41,7 +41,7 @@ endif
 .PHONY: remake
 
 help:
-	@echo 'make demo    set up .venv and run the example:   impc example'
+	@echo 'make demo    set up .venv, then fit a simulated person: results/fit/report.html'
 	@echo 'make test    set up .venv, then check and pytest: all that matters, about ten minutes'
 	@echo 'make full    the site, pages that run, experiments, studies in full size: half an hour, before a merge'
 	@echo 'make check   ruff check, ruff format --check, mypy --strict'
@@ -68,8 +68,12 @@ help:
 	@echo 'PYTHON=python3.12 chooses the Python; the one used otherwise is the first of'
 	@echo 'python3, python3.13, python3.12, python3.11 that is of version 3.11 to 3.13.'
 
+# A person on a seat: three simulated trials, their fit, and the methods side by side.
 demo: env
+	$(VENV)/bin/impc simulate seated-balance --out results/subject --formats csv
 	$(VENV)/bin/impc example
+	$(VENV)/bin/impc fit results/subject/trial_1.csv results/subject/trial_2.csv results/subject/trial_3.csv \
+	  --plant seated-balance --config results/subject/subject.toml --out results/fit
 
 # A file of tests stays on one process, in the order of the folders: the longest are first. The loop
 # that they share is compiled on one core while the checks run on the other; the filter of subjects

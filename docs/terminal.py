@@ -86,7 +86,8 @@ class Pictures:
 
         copied = []
         for picture in _WAITING:
-            target = Path(next(block_vars["image_path_iterator"]))
+            named = Path(next(block_vars["image_path_iterator"]))
+            target = named.with_suffix(picture.suffix)
             shutil.copyfile(picture, target)
             copied.append(str(target))
         _WAITING.clear()
@@ -98,17 +99,16 @@ def figures_page() -> str:
     parts = [_HEAD]
     for report in sorted(RESULTS.glob("*/report.html")):
         folder = report.parent
-        pictures = sorted(folder.glob("*.png"))
+        pictures = sorted(folder.glob("figures/*.svg"))
         if not pictures:
             continue
         command = _command(report.read_text(encoding="utf-8")) or f"impc {folder.name}"
         parts.append(f"## `{' '.join(command.split()[:2])}`\n\n```text\n{command}\n```\n")
         for picture in pictures:
             title = picture.stem.replace("-", " ").replace("_", " ")
-            parts.append(f"```{{figure}} _results/{folder.name}/{picture.name}\n:alt: {title}\n\n")
-            parts.append(
-                f"{title.capitalize()} (`{picture.stem}.png`, `{picture.stem}.pdf`)\n```\n"
-            )
+            place = f"_results/{folder.name}/figures/{picture.name}"
+            parts.append(f"```{{figure}} {place}\n:alt: {title}\n\n")
+            parts.append(f"{title.capitalize()} (`figures/{picture.name}`)\n```\n")
     return "\n".join(parts)
 
 
@@ -121,7 +121,6 @@ def _command(page: str) -> str:
 _HEAD = """\
 # Every figure, and the command that draws it
 
-The pictures of the tutorials, made when this site was built. Each is written as PNG and as PDF
-(vectors, text as text), in the width of a journal's column. `report.html` of the same folder says
-what each one shows.
+The pictures of the tutorials, made when this site was built. Each is written as SVG, with `--pdf`
+as PDF too. `report.html` of the same folder says what each one shows.
 """

@@ -9,12 +9,12 @@ import numpy as np
 from experiments.cursor_data import ARCMIN_A_PIXEL, RATE
 from impc.reporting.style import (
     BLUE,
-    DOUBLE_COLUMN,
     GREEN,
+    HALF,
     INK,
     VERMILLION,
-    journal_style,
     new_figure,
+    page_style,
     render,
 )
 
@@ -30,15 +30,15 @@ __all__ = ["cursor_figure"]
 
 def cursor_figure(results: Sequence[ConditionResult]) -> dict[str, bytes]:
     """Draw it: ``cursor-tracking.png`` and ``.pdf``."""
-    with journal_style():
-        figure = new_figure(DOUBLE_COLUMN, 5.6)
+    with page_style():
+        figure = new_figure(HALF, 5.6)
         axes = figure.subplot_mosaic([["A", "A"], ["B", "B"], ["C", "D"]])
         for letter, item in (("A", results[0]), ("B", results[-1])):
             _trial(axes[letter], item, letter)
         axes["A"].legend(ncols=3, loc="upper left", bbox_to_anchor=(0, 1.32))
         _vaf(axes["C"], results)
         _cost_weights(axes["D"], results)
-        return {f"cursor-tracking.{kind}": content for kind, content in render(figure).items()}
+        return {f"cursor-tracking.{kind}": render(figure, kind) for kind in ("png", "pdf")}
 
 
 def _trial(axes: Axes, item: ConditionResult, letter: str) -> None:

@@ -34,12 +34,12 @@ from impc.model.recordings import Recording
 from impc.reporting.rendering import plain
 from impc.reporting.style import (
     BLUE,
-    DOUBLE_COLUMN,
     GREEN,
+    HALF,
     INK,
     VERMILLION,
-    journal_style,
     new_figure,
+    page_style,
     render,
 )
 from impc.reporting.writer import write_files
@@ -207,7 +207,7 @@ def _table(found: dict[str, dict[str, Outcome]], seeds: int) -> str:
 
 
 def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
-    figure = new_figure(DOUBLE_COLUMN, 3.2)
+    figure = new_figure(HALF, 3.2)
     axes = figure.subplots(1, len(_LIMITS), sharey=True)
     noise = [100 - ceiling for ceiling in _CEILINGS]
     for position, (ax, limit) in enumerate(zip(axes, _LIMITS, strict=True)):
@@ -248,9 +248,8 @@ def main() -> None:
         {cell: {name: asdict(item) for name, item in row.items()} for cell, row in found.items()}
     )
     files = {"result.json": (json.dumps(content, indent=1) + "\n").encode()}
-    with journal_style():
-        pictures = render(_figure(found, given.seeds))
-    files |= {f"noise-study.{kind}": picture for kind, picture in pictures.items()}
+    with page_style():
+        files["noise-study.png"] = render(_figure(found, given.seeds), "png")
     write_files(given.out, files)
     print(f"\nwritten to {given.out}")
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.reporting.style import BLUE, VERMILLION, journal_style, new_figure, render
+from impc.reporting.style import BLUE, VERMILLION, new_figure, page_style, render
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ __all__ = ["seat_figure"]
 
 def seat_figure(tilts: Array, from_rest: Mapping[str, Array], people: Sequence[Amplitude]) -> bytes:
     """Draw it as PNG; `tilts` in degrees, `from_rest` as `first_torques` by the posture."""
-    with journal_style():
+    with page_style():
         figure = new_figure(3.5, 4.6)
         above, below = figure.subplots(2, 1)
         marks = (("o", "-", BLUE), ("s", "--", VERMILLION))
@@ -48,4 +48,4 @@ def seat_figure(tilts: Array, from_rest: Mapping[str, Array], people: Sequence[A
         below.set_ylabel("error of the\nusual fit (%)")
         below.set_ylim(0, 140 * max(one.fitted.error for one in people))  # room for the legend
         below.legend(loc="upper left")
-        return render(figure)["png"]
+        return render(figure, "png")

@@ -167,9 +167,9 @@ def _tracking(
     )
     units = {"error": length, "velocity": speed, "target_rate": speed, "command": unit}
     words = {
-        "error": "distance of the cursor from the target",
-        "velocity": "velocity of the cursor",
+        "error": "distance from the target",
+        "velocity": "cursor velocity",
         "command": asked,
-        "target_rate": "velocity of the target",
+        "target_rate": "target velocity",
     }
     return with_units(system, {**units, **dict.fromkeys(stages, unit)}, {**words, **stages})

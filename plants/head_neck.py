@@ -198,7 +198,7 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order
         finite_number(item.name, float(value), f"give it in {item.unit}")
     A, B, C = (item.full() for item in head_neck_matrices(axis, delay_order)(given))
     names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
-    words = {"reference": "angle of the target", "head": "angle of the head"}
+    words = {"reference": "target angle", "head": "head angle"}
     units = dict.fromkeys(words, "rad")
     return with_units(control.ss(A, B, C, 0, **names), units, words)
 

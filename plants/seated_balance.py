@@ -49,13 +49,8 @@ __all__ = [
 
 _BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _INPUTS = ("command", "perturbation")
-_BODY_WORDS = (
-    "tilt of seat and lower body",
-    "tilt of the upper body",
-    "velocity of theta1",
-    "velocity of theta2",
-)
-_INPUT_WORDS = ("torque that the nerves ask for", "torque of the motor at the seat")
+_BODY_WORDS = ("seat tilt", "trunk tilt", "seat velocity", "trunk velocity")
+_INPUT_WORDS = ("commanded torque", "perturbation torque")
 
 
 def seated_balance_plant(
@@ -257,8 +252,8 @@ def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:
     )
     words = {
         **dict(zip(_BODY, _BODY_WORDS, strict=True)),
-        **{name: f"stage {k} of the delay of the nerves" for k, name in enumerate(delays, 1)},
-        "muscle_torque": "torque of the trunk muscles",
+        **{name: f"neural delay, state {k}" for k, name in enumerate(delays, 1)},
+        "muscle_torque": "muscle torque",
         **dict(zip(_INPUTS, _INPUT_WORDS, strict=True)),
     }
     return with_units(system, units, words)

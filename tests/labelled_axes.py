@@ -38,7 +38,8 @@ def _label(ax: Axes, which: str) -> str | None:
         text: str = getattr(other, f"get_{which}label")()
         if text:
             return text
-    return None
+    above = which == "y" or _has_names(ax, "y")  # a panel is named above itself
+    return _title(ax) or None if above else None
 
 
 def _has_names(ax: Axes, which: str) -> bool:

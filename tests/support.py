@@ -39,7 +39,7 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
     """Files of figures with no picture: drawing takes most of some commands' time."""
 
     def blank(_figure: Figure, stream: io.BytesIO, **_: Any) -> None:
-        stream.write(b"blank")
+        stream.write(b'<svg viewBox="0 0 1 1"></svg>')
 
     patch.setattr(Figure, "savefig", blank)
     patch.setattr(Figure, "draw_without_rendering", lambda _: None)

@@ -15,7 +15,7 @@ terminal("impc example --case A --out example")
 # %%
 # Markers are the recording, lines what each method says. Inverse LQR knows no bound: it explains
 # the saturated steps by a weaker gain, and asks for more than the input can do (grey).
-show("example/comparison-case-A.png")
+show("example/figures/comparison-case-A.svg")
 
 # %%
 # The same in Python, one step at a time. The plant is any discrete ``control.StateSpace``.

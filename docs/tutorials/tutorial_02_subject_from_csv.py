@@ -31,7 +31,7 @@ terminal(
 # %%
 # ``fit/report.html`` has everything on one page; its figures are files as well. Recorded and
 # explained angles of the first trial, and the torque with its limit:
-show("fit/trajectories-trial-1.png")
+show("fit/figures/movement.svg")
 
 # %%
 # **Mistakes are reported in one line**, and nothing is written. Angles in degrees that are said

@@ -110,7 +110,7 @@ u_max = 3.0
 # %%
 # **The fit**, of both trials at once:
 terminal("impc fit stick_1.csv stick_2.csv --plant stick:stick --config stick.toml --out stick-fit")
-show("stick-fit/trajectories-trial-1.png")
+show("stick-fit/figures/movement.svg")
 
 # %%
 # The gain that was found, beside the person's:

@@ -13,7 +13,7 @@ terminal("impc reliability reliability-data/study.toml --out reliability")
 
 # %%
 # Transfer functions from the push to the angles, one line a visit, for every subject:
-show("reliability/transfer-visits.png")
+show("reliability/figures/transfer-visits.svg")
 
 # %%
 # :doc:`/reliability` has the definitions, and the findings of chapter 2 beside those of the

@@ -93,7 +93,7 @@ terminal("impc select dosing.toml --model dosing:blood_model --out select")
 
 # %%
 # Intervals of the parameters that can be identified, patient by patient:
-show("select/intervals.png")
+show("select/figures/parameters.svg")
 
 # %%
 # And which of them are key: explaining, reliable between visits, of several pathways.

@@ -247,7 +247,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             f" {gain['max_abs_u']:.3f} against {BOUND:g}.",
             kind(gain["max_abs_u"] > BOUND),
             _LOST_SYSTEM,
-            "example/figure-3.2-case-A.png",
+            "example/figures/comparison-case-A.svg",
         ),
         Entry(
             "Figure 3.3",
@@ -256,7 +256,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             f"Misfit {mpc['state_misfit']:.0e}.",
             kind(mpc["state_misfit"] < 1e-9),
             _LOST_SYSTEM,
-            "example/figure-3.3-case-A.png",
+            "example/figures/comparison-case-A.svg",
         ),
         Entry(
             "Figure 3.4",
@@ -265,7 +265,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             f"Misfit {output['state_misfit']:.3f} against {gain['state_misfit']:.3f}.",
             kind(output["state_misfit"] > gain["state_misfit"]),
             _LOST_SYSTEM,
-            "example/figure-3.4-case-A.png",
+            "example/figures/comparison-case-A.svg",
         ),
         Entry(
             "Claim, 3.4",

@@ -123,7 +123,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             f"Sizes {_sizes(yaw)} (dissertation 2 to 3).",
             Verdict.IN_KIND,
             _FORTY,
-            "yaw/solution-space.png",
+            "yaw/figures/solution-space.svg",
         ),
         Entry(
             "Figure 5.3",
@@ -132,7 +132,7 @@ def _key_tables(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
             f"Sizes {_sizes(pitch)} (dissertation 2 to 4).",
             Verdict.IN_KIND,
             _FORTY,
-            "pitch/solution-space.png",
+            "pitch/figures/solution-space.svg",
         ),
     ]
 

@@ -130,7 +130,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             f"VAF {both[0]:.2f} and {both[1]:.2f} %.",
             kind(min(both) > 90),
             _SUBJECT,
-            "fit/trajectories-trial-1.png",
+            "fit/figures/movement.svg",
         ),
         Entry(
             "(3.24)",
@@ -198,7 +198,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             "The direction is a property of the rule that chooses Q and of the units of the states"
             " as much as of the subject: no recording determines it (docs/equivalent-weights.md)."
             " What the recording says is K.",
-            "fit/intent.png",
+            "fit/figures/statements.svg",
         ),
         Entry(
             "Claim, 3.6",

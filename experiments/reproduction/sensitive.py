@@ -175,7 +175,7 @@ def _reduction(claims: dict[str, Any]) -> Entry:
         kind(bool(np.all(fim[:2] < lasso[:2]) and np.max(fim[:2]) < 20)),
         "One subject, the mean of the FIM column. The two gains, whose common scaling nobody sees,"
         " fall as in the dissertation; tau is identified well even with twelve.",
-        "select/intervals.png",
+        "select/figures/parameters.svg",
     )
 
 

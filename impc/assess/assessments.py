@@ -163,7 +163,7 @@ ASSESSMENTS: dict[str, Assessment] = {
     for item in (
         Assessment(
             "vaf",
-            "Variance accounted for (3.24), over all trials, %.",
+            "Variance accounted for, over all trials, %.",
             lambda plant: plant.outputs,
             lambda fit: fit.vaf,
         ),
@@ -182,7 +182,7 @@ ASSESSMENTS: dict[str, Assessment] = {
         ),
         Assessment(
             "beyond_bound",
-            "Share of the samples at which an input bound is exceeded, %.",
+            "Share of the time beyond the limit of an input, %.",
             whole,
             lambda fit: np.array([np.nan if fit.estimate.K is None else 100 * fit.exceeded]),
         ),

@@ -43,6 +43,8 @@ _LARGEST_ROOT = 0.999
 _UNSEEN = 1e-12
 # Of the noise, what is left of it by ten times as many trials, and by more than will ever be made.
 _TENFOLD, _NO_NOISE = 10**-0.5, 1e-2
+#: Multiples of the planned trials for which standard errors are computed.
+MULTIPLES = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,8 @@ class Expectation(Frozen):
     # infinite where it is never met, or the input has none
     limits: Array
     body: BodyShare | None  # None where no uncertainty is stated
+    # Standard deviations with so many times the trials (multiples, count)
+    by_trials: Array
 
     @property
     def deviations(self) -> Array:
@@ -158,7 +162,18 @@ def expected_intervals(
         gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True, scale=1.0),
         frozen(_limits(at, coloured)),
         _body_share(at, coloured),
+        frozen([_deviations(at, coloured, noise=times**-0.5) for times in MULTIPLES]),
     )
+
+
+def _deviations(at: Tangent, colour: ResidualNoise, *known: int, noise: float = 1.0) -> Array:
+    """Standard deviations of the unknowns with parameters that are `known`, or less `noise`."""
+    slopes = np.delete(np.array(at.on_parameters), known, axis=1)
+    # The rows of a prior are in units of the noise.
+    slopes[sum(at.problem.trial_sizes) :] *= noise
+    less = replace(at, on_parameters=frozen(slopes))
+    found = weight_covariance(less, lambda *_: colour, lambda *_: colour)
+    return noise * np.asarray(found.each)
 
 
 def _body_share(at: Tangent, colour: ResidualNoise) -> BodyShare | None:
@@ -167,20 +182,12 @@ def _body_share(at: Tangent, colour: ResidualNoise) -> BodyShare | None:
     if not places:
         return None
 
-    def each(*known: int, noise: float = 1.0) -> Array:
-        slopes = np.delete(np.array(at.on_parameters), known, axis=1)
-        # The rows of a prior are in units of the noise.
-        slopes[sum(at.problem.trial_sizes) :] *= noise
-        less = replace(at, on_parameters=frozen(slopes))
-        found = weight_covariance(less, lambda *_: colour, lambda *_: colour)
-        return noise * np.asarray(found.each)
-
     return BodyShare(
-        frozen(each(*places)),
-        frozen(each(noise=_TENFOLD)),
-        frozen(each(noise=_NO_NOISE)),
+        frozen(_deviations(at, colour, *places)),
+        frozen(_deviations(at, colour, noise=_TENFOLD)),
+        frozen(_deviations(at, colour, noise=_NO_NOISE)),
         tuple(names[place] for place in places),
-        frozen([each(place) for place in places]),
+        frozen([_deviations(at, colour, place) for place in places]),
     )
 
 

@@ -288,7 +288,7 @@ def dominant_sentence(reading: Reading, plant: Plant, sizes: Array) -> str:
     )
 
 
-_PLANT_UNITS = "least condition number, plant units (the dissertation's)"
+_PLANT_UNITS = "minimum condition number, plant units"
 
 
 def _rules(

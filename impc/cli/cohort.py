@@ -13,7 +13,13 @@ from tqdm import tqdm
 from impc.checking import replace
 from impc.cli.console import print_files, progress
 from impc.cli.ending import ExitStatus
-from impc.cli.options import code_options, out_option, scheduler_options, yes_option
+from impc.cli.options import (
+    code_options,
+    out_option,
+    page_options,
+    scheduler_options,
+    yes_option,
+)
 from impc.cli.plant import named_plant
 
 if TYPE_CHECKING:
@@ -38,6 +44,7 @@ _LOGGED = 10.0
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
 @code_options("plant")
 @out_option("cohort", "results, tables and report; the same folder again goes on")
+@page_options
 @scheduler_options
 @yes_option
 @click.pass_context
@@ -49,6 +56,8 @@ def command(
     out: Path,
     cluster: Cluster,
     yes: bool,
+    pdf: bool,
+    open_page: bool,
 ) -> None:
     """Fit every subject, visit and condition of a study, with bootstrap replicates.
 
@@ -77,11 +86,14 @@ def command(
         keep_failure(store, unit, reason)
     failures = _run(study, tasks, store, cluster, yes)
     failures.units |= unreadable
-    write_report(study, store, failures, f"impc cohort {study_file.name}")
+    report = write_report(study, store, failures, f"impc cohort {study_file.name}", pdf=pdf)
+    click.echo(report.verdict.text())
     for line in failures.lines:
         click.echo(line, err=True)
     fitted = len(study.units) - len(failures.units)
-    click.echo(f"{fitted} of {len(study.units)} units fitted; {out / 'report.html'}")
+    click.echo(f"{fitted} of {len(study.units)} fits made; {out / 'report.html'}")
+    if open_page:
+        click.launch(str(out / "report.html"))
     if failures:
         context.exit(ExitStatus.PARTIAL)
 
@@ -139,6 +151,7 @@ def _run(
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
 @code_options("plant")
 @out_option("reliability", "report.html, result.json, tables and figures")
+@page_options
 @click.option(
     "--last",
     type=click.IntRange(min=1),
@@ -146,7 +159,13 @@ def _run(
     help="How many of a visit's trials count, the last ones.",
 )
 def reliability_command(
-    study_file: Path, plant_name: str | None, allowed: bool, out: Path, last: int
+    study_file: Path,
+    plant_name: str | None,
+    allowed: bool,
+    out: Path,
+    last: int,
+    pdf: bool,
+    open_page: bool,
 ) -> None:
     """Reliability of a study of several subjects, visits, conditions and trials.
 
@@ -159,7 +178,6 @@ def reliability_command(
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.reliability.analysis import analyse  # noqa: PLC0415
     from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
-    from impc.studies.reliability.verdict import findings  # noqa: PLC0415
 
     study = read_study(study_file)
     require_distinct([file for unit in study.units for file in unit.files])
@@ -172,18 +190,22 @@ def reliability_command(
     result = analyse(trials)
     line = f"impc reliability {study_file.name} --plant {source.name} --last {last}"
     with angles_in(study.configuration.report.angles):
-        content = reliability_report(trials, result, line, inputs).files()
-    written = write_files(out, content)
-    for item in findings(result):
-        click.echo(f"{'found' if item.found else 'not found'}: {item.statement} ({item.numbers})")
-    for line in result.notes:
-        click.echo(line)
-    print_files(out, written)
+        report = reliability_report(trials, result, line, inputs)
+        written = write_files(out, report.files(pdf=pdf))
+    click.echo(f"{report.verdict.text()}\n")
+    for item in report.findings():
+        if item.name.startswith("icc-"):
+            heads = ("measure", "condition", "icc", "low", "high", "mdc", "unit")
+            hidden = [name for name in item.shown if name not in heads]
+            labels = {"icc": "ICC", "mdc": "smallest change", "low": "low (95 %)"}
+            click.echo(replace(item, hidden=[*item.hidden, *hidden], labels=labels).text())
+    print_files(out, written, open_page)
 
 
 def _trials_of(units: Sequence[Unit], configuration: Configuration, source: PlantSource) -> Trials:
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
     from impc.files.reading import read_recordings, require_whole  # noqa: PLC0415
+    from impc.reporting.shown_units import signal_name  # noqa: PLC0415
     from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
@@ -193,4 +215,5 @@ def _trials_of(units: Sequence[Unit], configuration: Configuration, source: Plan
         found = read_recordings(unit.files, configuration, plant)
         require_whole(found, "reliability")
         cells[unit.subject, unit.visit, unit.condition] = found
-    return Trials(tuple(plant.outputs), 1 / plant.dt, cells)
+    words = {name: signal_name(plant, name) for name in plant.outputs}
+    return Trials(tuple(plant.outputs), 1 / plant.dt, cells, words)

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 _LONG, _MUCH = 7200.0, 4.0
 
 
+# Files of one kind that are named one by one.
+_NAMED = 4
 #: What to do about a large request of a fit.
 FEWER = "lower horizon, replicates or profiles in [fit], or shorten the trials"
 #: What to do about one of a selection of parameters.
@@ -123,14 +125,20 @@ def _ticking(bar: tqdm[Any]) -> Iterator[None]:
         thread.join()
 
 
-def print_files(out: Path, written: Sequence[Path]) -> None:
-    """Name the files `written` to the folder `out`, one line for each name with its endings."""
+def print_files(out: Path, written: Sequence[Path], open_page: bool = False) -> None:
+    """Name the page first, then the other files `written` to the folder `out`."""
+    page = out / "report.html"
+    if page in written:
+        click.echo(f"Open {one_line(page)}")
     kinds: dict[str, list[str]] = {}
     for path in written:
-        kinds.setdefault(path.stem, []).append(path.suffix)
-    click.echo(f"\nWritten to {one_line(out)}:")
-    for stem, suffixes in kinds.items():
-        click.echo(f"  {stem}{' '.join(suffixes)}")
+        if path != page:
+            kinds.setdefault(path.suffix, []).append(path.name)
+    for suffix, names in kinds.items():
+        many = f"{len(names)} {suffix[1:]} files" if len(names) > _NAMED else ", ".join(names)
+        click.echo(f"  {many}")
+    if open_page:
+        click.launch(str(page))
 
 
 def print_next(command: str, out: Path, *names: str) -> None:

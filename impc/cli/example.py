@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from impc.cli.console import print_files, progress
-from impc.cli.options import out_option, solver_option
+from impc.cli.options import out_option, page_options, solver_option
 from impc.cli.plant import load_plant
 
 if TYPE_CHECKING:
@@ -29,9 +29,10 @@ _EXAMPLE_PLANT = "plants:yalmip_example"
     help="Initial state: A (1, 3), B (2, 3), C (2, 1).",
 )
 @out_option("example", "report.html, result.json and the figures")
+@page_options
 @solver_option
-def command(case: str, out: Path, solver: str | None) -> None:
-    """Run the simulation example of section 3.4 of the dissertation.
+def command(case: str, out: Path, solver: str | None, pdf: bool, open_page: bool) -> None:
+    """Run the simulation example of the dissertation.
 
     The dissertation's own matrices, initial state and bound are lost; a plant that shows
     everything its text says stands in for them.
@@ -47,11 +48,12 @@ def command(case: str, out: Path, solver: str | None) -> None:
     chosen = require_solver(COMPILED if solver is None else solver)
     plant = load_plant(_EXAMPLE_PLANT)
     cases = _run(plant, tuple(CASES) if case == "all" else (case,), chosen)
-    written = write_files(out, example_report(cases, Provenance(_EXAMPLE_PLANT)).files())
-    click.echo(click.wrap_text(LOST, width=100))
-    for result in cases:
-        _print_case(result)
-    print_files(out, written)
+    report = example_report(cases, Provenance(_EXAMPLE_PLANT, f"impc example --case {case}"))
+    written = write_files(out, report.files(pdf=pdf))
+    click.echo(f"{report.verdict.text()}\n{click.wrap_text(LOST, width=100)}")
+    for finding in report.findings():
+        click.echo("\n".join(["", *finding.sentences, finding.caption, finding.text()]))
+    print_files(out, written, open_page)
 
 
 def _run(plant: Plant, names: Sequence[str], solver: str) -> list[CaseResult]:
@@ -59,14 +61,3 @@ def _run(plant: Plant, names: Sequence[str], solver: str) -> list[CaseResult]:
 
     with progress(len(names) * len(EXAMPLE), "method") as step:
         return [run_case(plant, name, solver=solver, progress=step) for name in names]
-
-
-def _print_case(result: CaseResult) -> None:
-    from impc.studies.example.report import methods_finding, others_finding  # noqa: PLC0415
-
-    start = ", ".join(f"{value:g}" for value in result.x0)
-    click.echo(f"\nCase {result.name}: start at ({start}), {result.branch} branch of Table 3.1\n")
-    click.echo(methods_finding(result).text() + "\n")
-    others = others_finding(result)
-    click.echo(f"{others.sentences[0]} {others.caption}")
-    click.echo(others.text())

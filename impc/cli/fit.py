@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import click
 
 from impc.checking import replace
 from impc.cli.console import print_files, progress
-from impc.cli.options import out_option, subject_arguments
+from impc.cli.options import out_option, page_options, subject_arguments
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from impc.arrays import Array
+    from impc.cli.plant import AllFellError
+    from impc.reporting.verdict import Verdict
     from impc.studies.fit.memory import FitMemory
     from impc.studies.fit.result import FitResult
 
@@ -20,6 +24,7 @@ if TYPE_CHECKING:
 @click.command("fit")
 @subject_arguments("What the columns mean, and settings; `impc inspect FILE` writes one.")
 @out_option("fit", "report.html, result.json, tables and the figures")
+@page_options
 def command(
     files: tuple[Path, ...],
     plant_name: str,
@@ -27,6 +32,8 @@ def command(
     out: Path,
     solver: str | None,
     yes: bool,
+    pdf: bool,
+    open_page: bool,
 ) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
@@ -35,25 +42,29 @@ def command(
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.console import require_consent  # noqa: PLC0415
-    from impc.cli.plant import read_subject  # noqa: PLC0415
+    from impc.cli.plant import AllFellError, read_subject  # noqa: PLC0415
     from impc.extras import installed  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
-    from impc.studies.fit.gain_findings import read_truth, truth_sentence  # noqa: PLC0415
+    from impc.studies.fit.findings import read_truth  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fit_report  # noqa: PLC0415
+    from impc.studies.fit.settings import missing  # noqa: PLC0415
     from impc.studies.fit.subject import (  # noqa: PLC0415
         FitProgress,
         fit_recordings,
         stages,
     )
-    from impc.studies.fit.verdict import missing  # noqa: PLC0415
 
     require_writable(out)
     if installed("impc.nonlinear") and _own_problem(files, plant_name, config, out, solver):
         return
-    subject = read_subject("fit", files, plant_name, config, solver)
+    try:
+        subject = read_subject("fit", files, plant_name, config, solver)
+    except AllFellError as fallen:
+        _print_falls(fallen, out, open_page)
+        return
     problem, settings = subject.problem, subject.settings
     require_consent(fit_effort(problem, settings), yes)
     unknown = missing(settings, subject.source)
@@ -69,15 +80,26 @@ def command(
             return FitProgress(done, *kept, lambda further: remembered(memory.about(further)))
 
         result = fit_recordings(problem, settings, remembered(memory))
+        result = replace(result, falls=subject.falls)
         with angles_in(subject.angles):
-            content = fit_report(result, subject.provenance, truth, unknown).files()
+            report = fit_report(result, subject.provenance, truth, unknown)
+            content = report.files(pdf=pdf)
         done("page")
     written = write_files(out, content)
     memory.cache.forget()
-    _print(result)
-    if truth is not None:
-        click.echo(truth_sentence(result, truth))
-    print_files(out, written)
+    with angles_in(subject.angles):
+        _print(result, report.verdict, truth)
+    print_files(out, written, open_page)
+
+
+def _print_falls(fallen: AllFellError, out: Path, open_page: bool) -> None:
+    """The page where no trial is left."""
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+    from impc.studies.fit.report import fallen_report  # noqa: PLC0415
+
+    report = fallen_report(fallen.falls, fallen.provenance)
+    click.echo(report.verdict.text())
+    print_files(out, write_files(out, report.files()), open_page)
 
 
 def _own_problem(
@@ -89,7 +111,7 @@ def _own_problem(
     from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.plant_sources import made_by  # noqa: PLC0415
     from impc.nonlinear.files import fit_files  # noqa: PLC0415
-    from impc.nonlinear.page import abstract, optimal_report, verdict  # noqa: PLC0415
+    from impc.nonlinear.page import optimal_report  # noqa: PLC0415
     from impc.nonlinear.problem import OptimalControlProblem  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
@@ -109,42 +131,34 @@ def _own_problem(
         inputs = gather_inputs(files, config, source.name, source.arguments)
         provenance = Provenance(source.name, line, dict(source.arguments), names, inputs)
         with angles_in(configuration.report.angles):
-            content = optimal_report(fit, provenance).files()
+            report = optimal_report(fit, provenance)
+            content = report.files()
         done("page")
     written = write_files(out, content)
-    for sentence in (verdict(fit), *abstract(fit)):
-        click.echo(sentence)
+    click.echo(report.verdict.text())
     print_files(out, written)
     return True
 
 
-def _print(result: FitResult) -> None:
-    """The table of methods and the intent, as the page has them."""
-    from impc.assess.intent_statements import dominant_sentence  # noqa: PLC0415
-    from impc.studies.fit.structure_words import structure_sentences  # noqa: PLC0415
-    from impc.studies.fit.verdict import verdict  # noqa: PLC0415
+def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
+    """Verdict, gain, methods and, of simulated recordings, the true gain."""
+    from impc.reporting.verdict import WIDTH  # noqa: PLC0415
+    from impc.studies.fit.findings import per_unit_finding, truth_sentence  # noqa: PLC0415
+    from impc.studies.fit.verdict import GAIN, forbidden  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
-    stated = (*structure_sentences(result), *result.person_sentences, *result.warnings)
-    for line in dict.fromkeys((verdict(result), *stated)):
-        click.echo(line)
-    plant = result.fitted.problem.plant
-    click.echo(methods_finding(result.methods).text())
-    if result.held_out:
-        for index, name in enumerate(plant.outputs):
-            each = ", ".join(f"{item.vaf[index]:.2f}" for item in result.held_out)
-            click.echo(f"VAF of trials left out, {name}: {each} %")
-    intent = result.intent
-    click.echo(dominant_sentence(intent.reported, plant, intent.sizes))
-    click.echo(
-        f"Other weights that explain the recordings equally well turn that direction by up to "
-        f"{result.widest_angle:.0f} degrees: so far it is not the subject's."
-    )
+    click.echo(verdict.text())
+    if GAIN not in forbidden(result):
+        click.echo(f"\n{per_unit_finding(result).text()}")
+    click.echo(f"\n{methods_finding(result.methods[::-1]).text()}\n")
+    if truth is not None:
+        click.echo(fill(truth_sentence(result, truth), WIDTH))
 
 
 @click.command("compare")
 @subject_arguments("What the columns mean, and settings, as for `impc fit`.")
 @out_option("compare", "report.html, result.json, tables and the figure")
+@page_options
 def compare_command(
     files: tuple[Path, ...],
     plant_name: str,
@@ -152,6 +166,8 @@ def compare_command(
     out: Path,
     solver: str | None,
     yes: bool,
+    pdf: bool,
+    open_page: bool,
 ) -> None:
     """Compare feedback gain, inverse LQR and inverse MPC, one file a trial.
 
@@ -182,8 +198,10 @@ def compare_command(
         remember = replace(memory, done=done).estimate
         compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)
     with angles_in(subject.angles):
-        content = compare_report(problem, compared, subject.provenance).files()
+        report = compare_report(problem, compared, subject.provenance)
+        content = report.files(pdf=pdf)
     written = write_files(out, content)
     memory.cache.forget()
+    click.echo(report.verdict.text())
     click.echo(methods_finding(compared).text())
-    print_files(out, written)
+    print_files(out, written, open_page)

@@ -46,6 +46,13 @@ yes_option = click.option(
 )
 
 
+def page_options(command: F) -> F:
+    """Add --pdf and --open to a `command` that writes a page."""
+    pdf = click.option("--pdf", is_flag=True, help="Write the figures as PDF too.")
+    shown = click.option("--open", "open_page", is_flag=True, help="Open the page in the browser.")
+    return pdf(shown(command))
+
+
 def out_option(folder: str, holds: str) -> Callable[[F], F]:
     """--out: a `folder` inside results/ by default; its help says what it `holds`.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from impc.cli.console import print_files, progress
-from impc.cli.options import out_option, yes_option
+from impc.cli.options import out_option, page_options, yes_option
 from impc.cli.plant import KNOWN, find_plant
 from impc.cli.seat import TORQUE
 
@@ -28,13 +28,26 @@ _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 
 @click.command("plan")
 @click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
+@click.option("--plant", "plant_name", help=f"{', '.join(KNOWN)}; or as for `impc fit`.")
 @click.option(
-    "--plant", "plant_name", required=True, help=f"{', '.join(KNOWN)}; or as for `impc fit`."
+    "--like",
+    type=click.Path(path_type=Path),
+    help="Results of `impc fit` that give plant, settings, cost weights and noise of the assumed "
+    "person; CONFIG replaces what it names.",
 )
-@out_option("plan", "report.html, result.json, a table and the figures")
+@out_option("plan", "report.html, result.json, tables and the figures")
+@page_options
 @yes_option
-def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
-    """Choose an experiment for a person whom you presume, from the [plan] table of CONFIG.
+def command(
+    config: Path,
+    plant_name: str | None,
+    like: Path | None,
+    out: Path,
+    yes: bool,
+    pdf: bool,
+    open_page: bool,
+) -> None:
+    """Plan an experiment for an assumed person, from the [plan] table of CONFIG.
 
     The file may be the one that `impc fit` reads later: [plant] and [fit] mean the same there. What
     is done when you interrupt it is kept in the folder: the same command goes on from there.
@@ -49,7 +62,6 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
     from impc.studies.cache import Cache, Steps, from_json  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
     from impc.studies.plan.report import plan_report  # noqa: PLC0415
-    from impc.studies.plan.sentences import plan_sentences  # noqa: PLC0415
     from impc.studies.plan.settings import plan_settings  # noqa: PLC0415
     from impc.studies.plan.study import (  # noqa: PLC0415
         OneFit,
@@ -60,13 +72,15 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
 
     require_writable(out)
     configuration = read_configuration(config)
+    configuration, name = _assumed(configuration, plant_name, like)
     settings = plan_settings(configuration.plan)
-    source = find_plant(plant_name, configuration.plant)
+    source = find_plant(name, configuration.plant)
     person = _person(configuration, settings, fit_settings(configuration.fit), source)
     recorded = [config.parent / name for name in settings.files]
     perturbation = _perturbation(person.controller.plant, configuration, settings, recorded)
     require_consent(plan_effort(person, settings), yes, _FEWER)
-    inputs = gather_inputs(recorded, config, source.name, source.arguments)
+    used = [*recorded, *([] if like is None else [like / "result.json"])]
+    inputs = gather_inputs(used, config, source.name, source.arguments)
     steps = Steps(Cache(out / "plan-in-progress"), inputs.digest)
 
     def remember(name: str, compute: Callable[[], OneFit]) -> OneFit:
@@ -74,16 +88,34 @@ def command(config: Path, plant_name: str, out: Path, yes: bool) -> None:
 
     with progress(steps_of(settings), "step", lambda _: steps.kept()) as done:
         plan = make_plan(person, settings, perturbation, done, remember)
-    line = f"impc plan {config.name} --plant {plant_name}"
+    given = {"--plant": plant_name, "--like": None if like is None else like.name}
+    line = f"impc plan {config.name}"
+    line += "".join(f" {key} {value}" for key, value in given.items() if value is not None)
     names = tuple(path.name for path in recorded)
     made = Provenance(source.name, line, dict(source.arguments), names, inputs)
     with angles_in(configuration.report.angles):
-        content, said = plan_report(plan, made).files(), plan_sentences(plan)
-    written = write_files(out, content)
+        report = plan_report(plan, made)
+        written = write_files(out, report.files(pdf=pdf))
     steps.cache.forget()
-    for sentence in said:
-        click.echo(sentence)
-    print_files(out, written)
+    click.echo(report.verdict.text())
+    click.echo("\n".join(f"{key.label}: {key.value} {key.unit}" for key in report.keys))
+    print_files(out, written, open_page)
+
+
+def _assumed(
+    configuration: Configuration, plant_name: str | None, like: Path | None
+) -> tuple[Configuration, str]:
+    """The configuration with what the results of a fit add to it, and the plant's name."""
+    from impc.files.plant_sources import consented_name  # noqa: PLC0415
+    from impc.studies.plan.like import filled  # noqa: PLC0415
+
+    if like is not None:
+        configuration, named = filled(configuration, like)
+        where = f"--like {like}: plant"
+        return configuration, consented_name(where, named, plant_name, False, "plant", tuple(KNOWN))
+    if plant_name is None:
+        raise click.UsageError("Missing option '--plant' or '--like'.")
+    return configuration, plant_name
 
 
 def _person(

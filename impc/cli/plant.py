@@ -65,6 +65,14 @@ def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool
     return find_plant(name, study.configuration.plant)
 
 
+class AllFellError(Exception):
+    """Nothing is left to fit: the falls, and where a page on them comes from."""
+
+    def __init__(self, falls: tuple[str, ...], provenance: Provenance) -> None:
+        super().__init__("; ".join(falls))
+        self.falls, self.provenance = falls, provenance
+
+
 @dataclass(frozen=True)
 class Subject:
     """The recordings of a subject as an inverse problem."""
@@ -76,6 +84,7 @@ class Subject:
     command: str  # The command line, without folders
     files: tuple[str, ...]  # Names of the recordings
     angles: str = "degrees"  # "degrees" or "radians", as [report] says
+    falls: tuple[str, ...] = ()  # Trials that ended in a fall, and when
 
     @property
     def provenance(self) -> Provenance:
@@ -94,11 +103,15 @@ def read_subject(
     config: Path,
     solver: str | None = None,
 ) -> Subject:
-    """Read recordings, one file a trial."""
+    """Read recordings, one file a trial; those that end in a fall are left out.
+
+    Raises AllFellError where none is left.
+    """
     from impc.control.named_solver import require_solver  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.digests import gather_inputs  # noqa: PLC0415
-    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.files.reading import read_unit  # noqa: PLC0415
+    from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.studies.fit.asked import asked_plant  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
     from impc.studies.fit.subject import fit_problem  # noqa: PLC0415
@@ -109,10 +122,15 @@ def read_subject(
         settings = replace(settings, solver=require_solver(solver))
     source = find_plant(plant_name, configuration.plant)
     plant, family = asked_plant(source, configuration.recorded, settings, configuration.aimed)
-    recordings = read_recordings(files, configuration, plant)
+    recordings, fallen = read_unit(files, configuration, plant)
+    falls = tuple(f"{one.subject.partition(':')[0]}: {one.problem}" for one in fallen)
     inputs = gather_inputs(files, config, source.name, source.arguments)
     names = tuple(path.name for path in files)
     line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
     line += "" if solver is None else f" --solver {solver}"
+    if not recordings:
+        arguments = dict(source.arguments)
+        raise AllFellError(falls, Provenance(source.name, line, arguments, names, inputs))
     problem = fit_problem(plant, recordings, settings, family)
-    return Subject(problem, settings, source, inputs, line, names, configuration.report.angles)
+    angles = configuration.report.angles
+    return Subject(problem, settings, source, inputs, line, names, angles, falls)

@@ -9,12 +9,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from impc.cli.console import print_files, progress
-from impc.cli.options import Number, code_options, out_option, scheduler_options, yes_option
+from impc.cli.options import (
+    Number,
+    code_options,
+    out_option,
+    page_options,
+    scheduler_options,
+    yes_option,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from impc.files.digests import Inputs
+    from impc.reporting.document import Report
     from impc.studies.cache import Cache
     from impc.studies.cohort.study import Study
     from impc.studies.pool import Result
@@ -27,10 +35,18 @@ if TYPE_CHECKING:
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
 @code_options("model")
 @out_option("select", "report.html, result.json, tables and figure")
+@page_options
 @scheduler_options
 @yes_option
 def command(
-    study_file: Path, model_name: str | None, allowed: bool, out: Path, cluster: Cluster, yes: bool
+    study_file: Path,
+    model_name: str | None,
+    allowed: bool,
+    out: Path,
+    cluster: Cluster,
+    yes: bool,
+    pdf: bool,
+    open_page: bool,
 ) -> None:
     """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.
 
@@ -54,14 +70,25 @@ def command(
     line = f"impc select {study_file.name} --model {source.name}"
     truths = read_truths(study_file.absolute().parent, source.model)
     page = selection_report(source.model, found, line, inputs, truths)
-    written = write_files(out, page.files())
+    written = write_files(out, page.files(pdf=pdf))
     kept_results(out).forget()
-    names = source.model.names
-    click.echo(f"information: {', '.join(names[index] for index in found.free)}")
-    click.echo(f"LASSO:       {', '.join(names[index] for index in found.lasso)}")
-    if page.data["truth"]:
-        click.echo(page.data["truth"])
-    print_files(out, written)
+    _print(page, "unit", "value", "low", "high")
+    print_files(out, written, open_page)
+
+
+def _print(page: Report, *columns: str) -> None:
+    """Verdict, and these columns of the table of estimates."""
+    from impc.checking import replace  # noqa: PLC0415
+
+    click.echo(page.verdict.text())
+    for table in page.findings():
+        if {*columns} <= {*table.shown}:
+            shown = ("subject", "parameter", *columns)
+            hidden = [name for name in table.shown if name not in shown]
+            labels = {**table.labels, "low": "low (95 %)", "high": "high (95 %)"}
+            click.echo(
+                f"\n{replace(table, hidden=[*table.hidden, *hidden], labels=labels).text()}\n"
+            )
 
 
 def kept_results(out: Path) -> Cache:
@@ -124,6 +151,7 @@ def read_model_study(
 )
 @click.option("--vaf", type=Number(), default=69.0, help="Least mean VAF, %.")
 @click.option("--icc", type=Number(), default=0.75, help="Least ICC(A,k).")
+@page_options
 @scheduler_options
 @yes_option
 def key_command(
@@ -136,6 +164,8 @@ def key_command(
     icc: float,
     cluster: Cluster,
     yes: bool,
+    pdf: bool,
+    open_page: bool,
 ) -> None:
     """Key parameters of a study of several subjects and visits.
 
@@ -160,9 +190,8 @@ def key_command(
         )  # fmt: skip
     options = f"--model {source.name} --bound {bound:g} --vaf {vaf:g} --icc {icc:g}"
     line = f"impc key-parameters {study_file.name} {options}"
-    written = write_files(out, key_report(source.model, found, line, inputs).files())
+    page = key_report(source.model, found, line, inputs)
+    written = write_files(out, page.files(pdf=pdf))
     kept_results(out).forget()
-    names = source.model.names
-    chosen = ", ".join(names[index] for index in found.chosen) or "none passes all filters"
-    click.echo(f"key parameters: {chosen}")
-    print_files(out, written)
+    _print(page, "free", "mean", "sd", "icc", "icc_low", "icc_high")
+    print_files(out, written, open_page)

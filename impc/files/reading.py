@@ -104,7 +104,7 @@ def read_recordings(
 def read_unit(
     paths: Sequence[Path], configuration: Configuration, plant: Plant
 ) -> tuple[tuple[Recording, ...], tuple[FallError, ...]]:
-    """The trials of the `paths` in which the subject did not fall, and the falls."""
+    """The trials of the `paths` in which the subject did not fall, and the falls by file."""
     plant.require_discrete()
     _require_names(configuration, plant)  # before files are read, which may take long
     require_distinct(paths)
@@ -120,7 +120,7 @@ def read_unit(
         except FallError as fall:
             fallen.append(fall)
     if not read:
-        raise fallen[0]
+        return (), tuple(fallen)
     longest = max(trial.samples for _, trial in read)
     trials = (
         trial

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 #: Of the files that are written now. Before the first one that has a number there were others.
-SCHEMA = 6
+SCHEMA = 7
 
 Matrix = list[list[float]]
 

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 _DAY = 86_400.0
 _LONGEST_NAME = 31  # characters of a sheet's
 _ANY_LENGTH = 32_767  # characters of a cell
+_WIDEST, _LOOKED_AT = 100, 200  # characters of a column, and the rows that say how wide it is
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 _TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
 
@@ -254,15 +255,24 @@ def _text(cell: Any) -> str:
     return str(cell).strip()
 
 
-def workbook_bytes(tables: Mapping[str, pd.DataFrame]) -> bytes:
-    """Tables as sheets of one workbook (.xlsx); what is not finite is an empty cell."""
+def workbook_bytes(tables: Mapping[str, pd.DataFrame], readme: pd.DataFrame | None = None) -> bytes:
+    """Tables as sheets of one workbook (.xlsx), what they are first; not finite: an empty cell."""
     import openpyxl  # noqa: PLC0415  # for who writes workbooks only
 
     book = openpyxl.Workbook(write_only=True)
-    for name, table in tables.items():
+    first = {} if readme is None else {"README": readme}
+    for name, table in {**first, **tables}.items():
         sheet = book.create_sheet(name[:_LONGEST_NAME])
         data = as_data(table).replace([np.inf, -np.inf], np.nan)
-        sheet.append(list(data.columns))
+        sheet.freeze_panes = "A2"
+        for place, head in enumerate(data.columns):
+            longest = max(len(str(cell)) for cell in (head, *data.iloc[:_LOOKED_AT, place]))
+            letter = openpyxl.utils.get_column_letter(place + 1)
+            sheet.column_dimensions[letter].width = min(longest, _WIDEST) + 2
+        heads = [openpyxl.cell.WriteOnlyCell(sheet, head) for head in data.columns]
+        for cell in heads:
+            cell.font = openpyxl.styles.Font(bold=True)
+        sheet.append(heads)
         for row in data.itertuples(index=False, name=None):
             sheet.append(row)
     stream = io.BytesIO()

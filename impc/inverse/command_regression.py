@@ -43,11 +43,11 @@ class CommandRegression:
 
 def regress_commands(problem: Problem, gain: Array, metric: Array) -> CommandRegression:
     """Regress the recorded commands; bounds are those of a `gain` (m, n) and a `metric` (m, m)."""
+    if not all(len(trial.commands) for trial in problem.recordings):
+        raise DataError("commands", "were not recorded", "give Recording(..., commands=...)")
     controller = controller_for(problem, gain, metric)
     x, u, used = [], [], 0
     for trial, states in zip(problem.recordings, _states(problem), strict=True):
-        if not len(trial.commands):
-            raise DataError("commands", "were not recorded", "give Recording(..., commands=...)")
         aim = aim_of(controller, drive_of(trial, trial.x0), directions(controller, 0))
         away, command = states[:-1], np.array(trial.commands[:-1])
         if len(aim.x):

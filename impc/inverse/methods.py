@@ -244,40 +244,39 @@ def _cut_off(problem: Problem) -> Problem:
 _TABLE = (
     Method(
         "preliminary",
-        "preliminary gains and parameters (3.19)",
-        "Gains on a few states alone (3.20), fitted together with the physical parameters.",
+        "preliminary gains and parameters",
+        "Gains on a few states alone, fitted together with the physical parameters.",
         _without_bounds,
         _preliminary,
     ),
     Method(
         "feedback_gain",
-        "feedback gain, no bounds (3.12)",
-        "The fixed gain K of u = -Kx whose loop fits the outputs best (3.12). It knows no bounds "
-        "and has no weights.",
+        "no limit, gain only",
+        "The gain whose movement comes nearest to the recorded one, as if there were no limit. It "
+        "has no cost weights.",
         _without_bounds,
         feedback_gain,
     ),
     Method(
         "inverse_lqr_lmi",
-        "inverse LQR, LMI",
-        "Weights whose optimal gain is exactly that K, of least condition number. There may be "
-        "none, and for a gain fitted to noise there are none as a rule: then the program is "
-        "infeasible.",
+        "no limit, inverse LQR (exact)",
+        "Cost weights whose best gain is exactly that gain. There may be none, and for a gain "
+        "fitted to noisy recordings there usually are none.",
         _without_bounds,
         lambda problem, start: of_weights("inverse_lqr_lmi", problem, start, _lmi(start)),
     ),
     Method(
         "inverse_lqr_gradient",
-        "inverse LQR, gradient",
-        "Weights whose optimal gain comes nearest to that K.",
+        "no limit, inverse LQR (nearest)",
+        "Cost weights whose best gain comes nearest to that gain.",
         _without_bounds,
         lambda problem, start: of_weights("inverse_lqr_gradient", problem, start, _gradient(start)),
     ),
     Method(
         "inverse_lqr_auxiliary",
-        "inverse LQR, gain penalty (3.7)",
-        "The same, with a penalty on the condition number that keeps the weights away from "
-        "singular.",
+        "no limit, inverse LQR (regular)",
+        "The same, with a penalty on the condition number that keeps the cost weights away from "
+        "singular ones.",
         _without_bounds,
         lambda problem, start: of_weights(
             "inverse_lqr_auxiliary", problem, start, _auxiliary(start)
@@ -285,9 +284,9 @@ _TABLE = (
     ),
     Method(
         "inverse_lqr",
-        "inverse LQR, lines 2 to 7 of Table 3.1",
-        "Weights with exactly that K where there are any, otherwise those of the gain penalty "
-        "(3.7): where Table 3.1 starts inverse MPC.",
+        "no limit, classical inverse LQR",
+        "The classical method: cost weights with exactly that gain where there are any, otherwise "
+        "regular ones whose gain is near to it.",
         _without_bounds,
         lambda problem, start: of_weights(
             "inverse_lqr", problem, start, _lmi(start) or _auxiliary(start)
@@ -295,15 +294,15 @@ _TABLE = (
     ),
     Method(
         "inverse_lqr_output",
-        "inverse LQR, output penalty (3.16)",
-        "Weights whose optimal gain, without bounds, fits the outputs themselves best.",
+        "no limit, fitted to movement",
+        "Cost weights whose controller, as if there were no limit, fits the movement best.",
         _without_bounds,
         output_penalty,
     ),
     Method(
         "clipped_lqr",
-        "LQR of inverse MPC, clipped",
-        "The regulator of inverse MPC, its command cut off at the bounds.",
+        "cut off at the limit",
+        "The gain of inverse MPC, its command cut off at the limit: it does not plan ahead.",
         _cut_off,
         lambda problem, start: of_gain(
             "clipped_lqr", problem, start, np.array(start.gain), weights=start.weights
@@ -311,31 +310,31 @@ _TABLE = (
     ),
     Method(
         "inverse_mpc_reduced",
-        "inverse MPC, reduced",
-        "First the gain of the bounded controller that fits the outputs best, then the weights of "
-        "least condition number that have this gain, if any.",
+        "with limit, gain first",
+        "First the gain whose controller, with its limits, fits the movement best, then cost "
+        "weights with this gain, if there are any.",
         _as_posed,
         _reduced,
     ),
     Method(
         "inverse_mpc",
-        "inverse MPC, direct (3.6)",
-        "Weights whose controller, with its bounds, fits the outputs best.",
+        "with limit, inverse MPC",
+        "Cost weights whose controller, with its limits, fits the movement best.",
         _as_posed,
         lambda problem, start: fit_controller(problem, start.stage_weights),
     ),
     Method(
         "command_regression",
         "regression on recorded commands",
-        "The gain that recorded commands follow at samples without a bound; no loop is simulated.",
+        "The gain that the recorded commands follow where no limit is reached.",
         _as_posed,
         _commands,
     ),
     Method(
         "structured",
-        "inverse MPC within a structure",
-        "Cost weights of the features that the user names, whose controller, with its bounds, "
-        "fits the outputs best.",
+        "with limit, named cost weights",
+        "Cost weights of the features that you name, whose controller, with its limits, fits the "
+        "movement best.",
         _as_posed,
         _structured,
     ),

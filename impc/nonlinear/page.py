@@ -1,4 +1,4 @@
-"""The page of a problem's fit: sentences, tables, figures, result.json (docs/nonlinear.md)."""
+"""The page of a problem's fit: verdict, movement, parameters, result.json (docs/nonlinear.md)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from markupsafe import Markup
 from impc.arrays import Frozen
 from impc.inverse.estimates import Status
 from impc.nonlinear.combinations import interval
-from impc.reporting.document import Block, Details, Lines, Report, Section, Terms, Verdict
-from impc.reporting.finding import Chart, Finding, Picture
-from impc.reporting.rendering import plain
+from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
+from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_as
-from impc.reporting.style import BLUE, INK, SINGLE_COLUMN, drawn, journal_style, new_figure
-from impc.studies.charts import chart_figure
+from impc.reporting.style import BLUE, HALF, PHONE, RECORDED, new_figure, strip
+from impc.reporting.verdict import Alert, Claim, Key, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from impc.nonlinear.fit import OptimalControlEstimate
     from impc.reporting.provenance import Provenance
 
-#: Recordings that are drawn, the first ones.
+#: Recordings of which every sample is written, the first ones.
 MOST_TRIALS = 6
 # Of the largest value that a row has: nearer to zero it is at its limit. An active row with a
 # multiplier of lam is kept at a distance of 1e-10 / lam.
@@ -35,13 +35,10 @@ _AT_LIMIT = 1e-5
 _EXACT = 1e-9
 _LITTLE = 50.0  # % of a signal below which a fit explains less than it leaves
 _LEVEL = 0.95
-_FURTHEST = 30.0  # factor at which an interval is cut off
+_MOST_PANELS = 4  # of the figure
+_ENDS = {"low": "95 % CI low", "high": "95 % CI high"}
 #: Under which name its numbers stand among the methods of result.json.
 METHOD = "nonlinear_inverse_mpc"
-_CURVES = [
-    {"label": "recorded", "color": "#8C8C8C", "dash": ""},
-    {"label": "simulated", "color": "#D55E00", "dash": "6 3"},
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +55,7 @@ class OptimalFit(Frozen):
 
 
 def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
-    """(3.24) of each state and input over all recordings, %; NaN where nothing was measured."""
+    """VAF of each state and input over all recordings, %; NaN where nothing was measured."""
     recorded = np.vstack([np.hstack([one.x[1:], one.u]) for one in estimate.recordings])
     simulated = np.vstack([np.hstack([x[1:], u]) for x, u in estimate.runs])
     size = np.nansum(recorded**2, axis=0)
@@ -70,7 +67,10 @@ def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
 
 def reached(estimate: OptimalControlEstimate) -> pd.DataFrame:
     """At how many samples each constraint of the path is at its limit, in the estimate's runs."""
-    rows, theta = estimate.problem.rows, list(estimate.theta.values())
+    heads, rows = ["constraint", "at_its_limit", "samples"], estimate.problem.rows
+    if not rows:
+        return pd.DataFrame(columns=heads)
+    theta = list(estimate.theta.values())
     values = np.array([
         estimate.problem.functions[3](*sample, theta).full().ravel()
         for one, (x, u) in zip(estimate.recordings, estimate.runs, strict=True)
@@ -80,112 +80,97 @@ def reached(estimate: OptimalControlEstimate) -> pd.DataFrame:
     at_limit = pd.DataFrame(values > -_AT_LIMIT * size)
     owners = at_limit.T.groupby([row.partition("[")[0] for row in rows], sort=False)
     counts = owners.any().sum(axis=1)
-    return pd.DataFrame(
-        {"constraint": counts.index, "at_its_limit": counts.to_numpy(), "samples": len(values)}
-    )
+    found = [(name, int(count), len(values)) for name, count in counts.items()]
+    return pd.DataFrame(found, columns=heads)
 
 
-def verdict(fit: OptimalFit) -> str:
-    """The one sentence that says what may be made of the fit; what forbids most comes first."""
-    estimate = fit.estimate
-    poor = [name for name, value in signal_vaf(estimate).items() if value < _LITTLE]
-    if not estimate.settled:
-        return (
-            "The search ended before it converged: begin nearer, or allow it more evaluations; "
-            "its parameters are not an answer."
-        )
+def _verdict(fit: OptimalFit, explained: str) -> Verdict:
+    """What may be made of the fit; what forbids most comes first."""
+    vaf, found = signal_vaf(fit.estimate), fit.estimate.combinations
+    poor = ", ".join(_words(name) for name, value in vaf.items() if value < _LITTLE)
+    open_ones = ", ".join(dict.fromkeys(key for one in found.unidentified for key in one.exponents))
+    explains = "The problem explains this movement"
+    if not fit.estimate.settled:
+        headline = "The search ended before it converged."
+        return Verdict(Level.RED, headline, "Its parameters are no answer.")
     if poor:
-        return (
-            f"The problem explains less than half of {', '.join(poor)}: its equations, its cost or "
-            "its limits are not those of the recordings."
-        )
-    if not estimate.combinations.identified:
-        return "The recordings identify none of the parameters."
-    ends = estimate.intervals().items()
-    open_ones = [name for name, (low, high) in ends if not high - low < np.inf]
-    if not open_ones:
-        return (
-            "The problem explains the recordings, which identify every parameter by itself, as far "
-            "as the intervals say."
-        )
-    return (
-        "The problem explains the recordings, but they do not identify all of its parameters: "
-        f"{', '.join(open_ones)} may be others, alone or together, as the sentences below say."
-    )
+        headline = "The problem explains less than half of this movement."
+        said = f"That is so of {poor}: equations, cost or limits do not fit the recordings."
+        return Verdict(Level.RED, headline, said)
+    if not found.identified:
+        headline = f"{explains}, but no parameter is identified."
+        return Verdict(Level.RED, headline, f"{explained}.")
+    level, headline, alerts = Level.GREEN, f"{explains}, and each parameter is identified.", []
+    names = ", ".join(one.name for one in found.identified)
+    may_not = [Claim("The cost as the only one.", "Another form may explain the movement too.")]
+    if open_ones:
+        level, headline = Level.AMBER, f"{explains}, but {open_ones} cannot be determined."
+        alerts = [Alert(
+            level,
+            "Some parameters are not identified",
+            " ".join(one.sentence for one in found.unidentified),
+            "Other values of these parameters lead to the same movement.",
+            ["Report the products that are identified, with their intervals.",
+             "Give one of these parameters as known, or record a movement that depends on it."],
+        )]  # fmt: skip
+        may_not.insert(0, Claim("What is not identified.", f"{open_ones}."))
+    may = [Claim("What is identified, with its intervals.", f"{names}.")]
+    return Verdict(level, headline, f"{explained}.", alerts, may, may_not)
 
 
-def abstract(fit: OptimalFit) -> tuple[str, ...]:
-    """A few plain sentences with numbers: what was done, and what is identified."""
-    estimate, problem = fit.estimate, fit.estimate.problem
-    count, loops = len(estimate.recordings), sum(one.closed_loop for one in estimate.recordings)
-    samples = sum(len(one.u) for one in estimate.recordings)
-    each = "one recording" if count == 1 else f"{count} recordings"
-    kind = {
-        0: "of one plan" if count == 1 else "of one plan each",
-        count: "of a controller that plans anew at every sample",
-    }.get(loops, f"of which {loops} are of a controller that plans anew at every sample")
-    ahead = "" if fit.dt is None else f" ({problem.horizon * fit.dt:.3g} s)"
-    known = f" (and {len(fit.known)} known)" if fit.known else ""
-    return (
-        f"An optimal control problem over {problem.horizon} samples{ahead} with "
-        f"{len(estimate.theta)} unknown parameters{known} was fitted to {each} {kind}, "
-        f"{samples} samples in all.",
-        *estimate.combinations.sentences,
-    )
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
-    """Page, result.json, parameters.csv, combinations.csv, trajectories.csv and figures."""
-    estimate, shown = fit.estimate, fit.trials[:MOST_TRIALS]
-    charts = {f"trajectories-{k + 1}": _trajectories(fit, k) for k in range(len(shown))}
-    with journal_style():
-        figures = {name: chart_figure(chart, 2) for name, chart in charts.items()}
-        figures["parameters"] = _draw_intervals(fit)
-        files = drawn(figures)
-    pictures = [
-        Chart(Picture(name, f"Recorded and simulated states and inputs over time, {trial}",
-                      f"{trial}. Dashed: simulated from the first state alone."), chart)
-        for (name, chart), trial in zip(charts.items(), shown, strict=True)
+    """Page, result.json, tables of parameters, products and samples, and the figure."""
+    estimate, problem = fit.estimate, fit.estimate.problem
+    vaf = {name: value for name, value in signal_vaf(estimate).items() if np.isfinite(value)}
+    each = ", ".join(f"{_words(name)} {number(value, 4)} %" for name, value in vaf.items())
+    explained = f"Variance accounted for: {each}"
+    verdict, table, limits = _verdict(fit, explained), _parameters(fit), reached(estimate)
+    count, alone = len(estimate.theta), int(np.sum(np.isfinite(estimate.combinations.deviations)))
+    lowest = min(vaf.values(), default=0.0)
+    keys = [
+        Key(number(lowest, 4), "%", "lowest VAF of a signal"),
+        Key(str(alone), f"of {count}", "parameters identified"),
+        *(Key(str(row.at_its_limit), f"of {row.samples} samples", f"at limit of {row.constraint}")
+          for row in limits.nlargest(1, "at_its_limit").itertuples()),
     ]  # fmt: skip
-    vaf = pd.DataFrame(signal_vaf(estimate).items(), columns=["signal", "vaf_percent"])
-    at_limit = "At how many samples each constraint is at its limit."
-    agreement: list[Block] = [
-        Finding("vaf", vaf, "Variance accounted for (VAF, 3.24), over all recordings.", digits=6),
-        *([Finding("limits", reached(estimate), at_limit)] if estimate.problem.rows else []),
-        pictures[0],
-        *([Details("The other recordings", pictures[1:])] if pictures[1:] else []),
+    given = {"Problem": provenance.plant_name, **provenance.plant_arguments, **fit.settings}
+    own = [(_words(key).capitalize(), Markup("<code>{}</code>").format(value))
+           for key, value in given.items() if value not in (None, "")]  # fmt: skip
+    values = "; ".join(f"{row[0]} {row[1]} {row[4]} (95 % CI {row[2]} to {row[3]})"
+                       for row in table.rows[:count])  # fmt: skip
+    notes = " ".join(f"{name}: {'; '.join(one)}." for name, one in
+                     zip(fit.trials, fit.findings, strict=True) if one)  # fmt: skip
+    search = f"{_status(estimate).value.capitalize()} after {estimate.evaluations} evaluations."
+    checks = [
+        Check(Level.GREEN if estimate.settled else Level.RED, "Search", search),
+        Check(Level.NOTE if notes else Level.GREEN, "Recordings", notes or "No notes."),
     ]
-    meaning = (
-        "A product that is identified has one value whatever the others have. Along a direction "
-        "that is not the parameters may change together, and the recordings stay what they are."
+    recordings = f"{len(fit.trials)} recording{'s' * (len(fit.trials) > 1)}"
+    methods = (
+        f"An optimal control problem over {problem.horizon} samples with {count} parameters was "
+        f"fitted to {recordings} by nonlinear least squares."
     )
-    checks = [(name, found or ("Nothing found.",))
-              for name, found in zip(fit.trials, fit.findings, strict=True)]  # fmt: skip
-    arguments = (f"{key} = {value}" for key, value in provenance.plant_arguments.items())
-    code, settings = Markup("<code>{}</code>"), fit.settings.items()
-    made = {
-        "Command": code.format(provenance.command),
-        "Made": f"{provenance.made}, in {estimate.seconds:.1f} s of search",
-        "Problem": code.format("; ".join((provenance.plant_name, *arguments))),
-        "Search": f"{estimate.evaluations} evaluations; {_status(estimate).value}",
-        "Settings": code.format("; ".join(f"{key} = {value}" for key, value in settings)),
-        "Recordings": ", ".join(provenance.files),
-        "Versions": provenance.all_versions,
-    }
-    terms = Terms([(key, (words,)) for key, words in made.items()])
     return Report(
         f"impc fit: {provenance.plant_name}",
-        "The optimal control problem behind the recordings",
-        (Verdict(verdict(fit)), Lines(abstract(fit))),
+        "fit report",
+        verdict,
         [
-            Section("1. The parameters", (_parameters(fit),), "Parameters", together=True),
-            Section("2. What is identified", (meaning, _combinations(fit)), "What is identified"),
-            Section("3. Recorded and simulated", agreement, "Trajectories"),
-            Section("4. Checks of the recordings", (Terms(checks),), "Checks", folded=True),
-            Section("5. Settings and versions", (terms,), "Settings", folded=True),
+            Section("Parameters", [table, _combinations(fit)]),
+            Section("Checks", [Checks(checks)]),
+            Section("Provenance", [Terms([*provenance.terms, *own])]),
         ],
-        figures=files,
-        beside=[_samples(fit)],
+        ["Optimal control problem", recordings, provenance.made[:10]],
+        Picture("movement", "Recorded and modelled signals over time",
+                f"Grey: recorded; blue: model, from the first state alone ({fit.trials[0]})."),
+        keys,
+        {"movement": lambda narrow: _draw_movement(fit, narrow)},
+        Copy(methods, f"{explained}. {values}.") if verdict.level is Level.GREEN
+        else "There is text to copy when no check is open.",
+        beside=[_samples(fit), Finding("limits", limits, "Samples at a limit.")],
         data=_data(fit, provenance),
         provenance=provenance,
     )  # fmt: skip
@@ -200,41 +185,21 @@ def _status(estimate: OptimalControlEstimate) -> Status:
     return Status.SETTLED if estimate.settled else Status.STOPPED
 
 
-def _trajectories(fit: OptimalFit, index: int) -> dict[str, Any]:
-    """Recorded and simulated signals, as `impc.studies.charts` has curves."""
-    problem, one = fit.estimate.problem, fit.estimate.recordings[index]
-    x, u = fit.estimate.runs[index]
+def _draw_movement(fit: OptimalFit, narrow: bool) -> Figure:
+    """The first signals of the first recording, over time."""
+    problem, one, (x, u) = fit.estimate.problem, fit.estimate.recordings[0], fit.estimate.runs[0]
     pairs = [*zip(one.x.T, x.T, strict=True), *zip(one.u.T, u.T, strict=True)]
-    panels = []
-    for name, pair in zip((*problem.state_names, *problem.input_names), pairs, strict=True):
+    names = (*problem.state_names, *problem.input_names)
+    drawn = [item for item in zip(names, pairs, strict=True) if np.any(np.isfinite(item[1][0]))]
+    figure = new_figure(PHONE if narrow else HALF, 0.6 + 1.2 * len(drawn[:_MOST_PANELS]))
+    axes = np.atleast_1d(figure.subplots(len(drawn[:_MOST_PANELS]), 1, sharex=True))
+    for ax, (name, pair) in zip(axes, drawn, strict=False):
         factor, unit = shown_as(problem.units.get(name, "-"))
-        curves = [factor * values for values in pair]
-        panels.append({"label": f"{name} ({unit})", "bounds": [], "curves": curves})
-    label = "sample (-)" if fit.dt is None else "time (s)"
-    title = f"Recorded and simulated, {fit.trials[index]}"
-    chart = {"title": title, "label": label, "step": fit.dt or 1.0, "curves": _CURVES}
-    return dict(plain({**chart, "panels": panels}))
-
-
-def _draw_intervals(fit: OptimalFit) -> Figure:
-    rows = {one.name: interval(1.0, one.deviation, False, _LEVEL)
-            for one in fit.estimate.combinations.identified if not one.difference}  # fmt: skip
-    figure = new_figure(SINGLE_COLUMN, 0.7 + 0.24 * len(rows))
-    ax = figure.subplots()
-    for place, ends in enumerate(rows.values()):
-        ax.plot(ends, [place, place], color=BLUE, linewidth=1.6)
-        ax.plot(1.0, place, color=BLUE, marker="o", markerfacecolor="white")
-    ax.axvline(1.0, color=INK, linewidth=0.6)
-    reach = min(max(1.01, *(high for _, high in rows.values()), 1.0) ** 1.1, _FURTHEST)
-    ticks = [1 / reach, 1.0, reach]
-    ax.set_xscale("log")
-    ax.set_xlim(ticks[0], ticks[-1])
-    ax.set_xticks(ticks, [f"{tick:.4g}" for tick in ticks])
-    ax.minorticks_off()
-    ax.set_yticks(range(len(rows)), list(rows))
-    ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_xlabel("95 % interval over the value (-)")
-    ax.set_ylabel("identified (-)")
+        strip(ax, f"{_words(name).capitalize()} ({unit})")
+        for values, color, width in zip(pair, (RECORDED, BLUE), (4.5, 1.4), strict=True):
+            time = (fit.dt or 1.0) * np.arange(len(values))
+            ax.plot(time, factor * values, color=color, linewidth=width)
+    axes[-1].set_xlabel("Sample (-)" if fit.dt is None else "Time (s)")
     return figure
 
 
@@ -244,71 +209,52 @@ def _parameters(fit: OptimalFit) -> Finding:
     identified = {one.name: one.identified for one in found.identified}
     identified |= {name: "no" for one in found.unidentified for name in one.exponents}
     rows = [
-        (name, units.get(name, ""), value, *ends[name], _LEVEL, identified.get(name, "yes"),
+        (name, value, *ends[name], units.get(name, ""), identified.get(name, "yes"),
          estimate.start[name])
         for name, value in estimate.theta.items()
     ]  # fmt: skip
-    rows += [
-        (name, unit, value, np.nan, np.nan, np.nan, "known", np.nan)
-        for name, (value, unit) in fit.known.items()
-    ]
-    heads = ["parameter", "unit", "value", "low", "high", "level", "identified", "start"]
-    caption = (
-        "Value with its 95 % interval, and where the search began. One that is not individually "
-        "identified stays near its start; section 2 says what of it is identified."
-    )
-    figure = Picture(
-        "parameters",
-        "Intervals of the parameters and products of parameters that the recordings identify",
-        "Parameters, and products of them, that the recordings identify: 95 % intervals over the "
-        "value. One that ends at the edge goes on.",
-        narrow=True,
-    )
-    return Finding("parameters", pd.DataFrame(rows, columns=heads), caption, figure=figure)
+    rows += [(name, value, np.nan, np.nan, unit, "known", np.nan)
+             for name, (value, unit) in fit.known.items()]  # fmt: skip
+    heads = ["parameter", "value", "low", "high", "unit", "identified", "start"]
+    return Finding("parameters", pd.DataFrame(rows, columns=heads), labels=_ENDS)
 
 
 def _combinations(fit: OptimalFit) -> Finding:
-    found = fit.estimate.combinations
-    free = {True: "any factor of these", False: "near these values"}
+    found, free = fit.estimate.combinations, {True: "any factor", False: "near these values"}
     rows = [
-        (one.name, one.value, *interval(one.value, one.deviation, one.difference, _LEVEL), _LEVEL,
+        (one.name, one.value, *interval(one.value, one.deviation, one.difference, _LEVEL),
          one.identified, free[one.scaling] if one.identified == "no" else "")
         for one in (*found.identified, *found.unidentified)
     ]  # fmt: skip
-    heads = ["product", "value", "low", "high", "level", "identified", "free"]
-    caption = "Products of parameters with their 95 % intervals, in the problem's units."
-    return Finding("combinations", pd.DataFrame(rows, columns=heads), caption)
+    heads = ["product", "value", "low", "high", "identified", "free"]
+    table = pd.DataFrame(rows, columns=heads)
+    return Finding("combinations", table, folded="Products of parameters", labels=_ENDS)
 
 
 def _samples(fit: OptimalFit) -> Finding:
     """A row a sample: recorded and simulated signals, and disturbances."""
     problem, tables = fit.estimate.problem, []
     names = {"x": problem.state_names, "u": problem.input_names, "d": problem.disturbance_names}
-    runs = zip(fit.estimate.recordings, fit.estimate.runs, strict=True)
-    for index, (one, (x, u)) in enumerate([*runs][:MOST_TRIALS]):
-        time = pd.DataFrame({
-            "trial": index + 1.0,
-            "sample" if fit.dt is None else "time": (fit.dt or 1.0) * np.arange(len(x)),
-        })  # fmt: skip
+    runs = zip(fit.trials, fit.estimate.recordings, fit.estimate.runs, strict=True)
+    for trial, one, (x, u) in [*runs][:MOST_TRIALS]:
+        clock = {"sample" if fit.dt is None else "time": (fit.dt or 1.0) * np.arange(len(x))}
         blocks = [("x", one.x, "_recorded"), ("x", x, "_simulated"), ("u", one.u, "_recorded"),
                   ("u", u, "_simulated"), ("d", one.d, "")]  # fmt: skip
         parts = [pd.DataFrame(values, columns=names[kind]).add_suffix(end)
                  for kind, values, end in blocks]  # fmt: skip
-        tables.append(pd.concat([time, *parts], axis=1))
+        tables.append(pd.concat([pd.DataFrame({"trial": trial, **clock}), *parts], axis=1))
     return Finding("trajectories", pd.concat(tables, ignore_index=True))
 
 
 def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
     estimate, problem, found = fit.estimate, fit.estimate.problem, fit.estimate.combinations
     trials = zip(fit.trials, estimate.recordings, fit.findings, strict=True)
+    kept = ("name", "exponents", "value", "deviation")
     return {
-        "verdict": verdict(fit),
-        "sentences": abstract(fit),
-        "combinations": {
-            kind: [{key: getattr(one, key) for key in ("name", "exponents", "value", "deviation")}
-                   for one in getattr(found, kind)]
-            for kind in ("identified", "unidentified")
-        },
+        "sentences": found.sentences,
+        "combinations": {kind: [{key: getattr(one, key) for key in kept}
+                                for one in getattr(found, kind)]
+                         for kind in ("identified", "unidentified")},
         "singular_values": found.singular_values,
         "loss": estimate.loss,
         "x0": estimate.x0,
@@ -316,23 +262,17 @@ def _data(fit: OptimalFit, provenance: Provenance) -> dict[str, Any]:
             {"trial": name, "samples": len(one.u), "closed_loop": one.closed_loop, "findings": said}
             for name, one, said in trials
         ],
-        "methods": {
-            METHOD: {
-                "status": _status(estimate).value,
-                "misfit": float(np.linalg.norm(estimate.residual)),
-                "evaluations": estimate.evaluations,
-                "seconds": estimate.seconds,
-                "vaf": signal_vaf(estimate),
-            }
-        },
+        "methods": {METHOD: {
+            "status": _status(estimate).value,
+            "misfit": float(np.linalg.norm(estimate.residual)),
+            "evaluations": estimate.evaluations,
+            "seconds": estimate.seconds,
+            "vaf": signal_vaf(estimate),
+        }},
         "problem": {
-            "name": provenance.plant_name,
-            "arguments": dict(provenance.plant_arguments),
-            "states": problem.state_names,
-            "inputs": problem.input_names,
-            "disturbances": problem.disturbance_names,
-            "horizon": problem.horizon,
-            "dt": fit.dt,
+            "name": provenance.plant_name, "arguments": dict(provenance.plant_arguments),
+            "states": problem.state_names, "inputs": problem.input_names,
+            "disturbances": problem.disturbance_names, "horizon": problem.horizon, "dt": fit.dt,
         },
         "settings": dict(fit.settings),
     }  # fmt: skip

@@ -1,22 +1,21 @@
-"""What a fit says of a person who senses with noise: sentences, tables, numbers."""
+"""What a fit says of a person who senses with noise: one section of its page, and numbers."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from impc.arrays import Array, Frozen
-from impc.assess.printed_gain import entry_names
 from impc.control.simulation import Status
 from impc.inverse.regulator_span import kept_to
 from impc.output_feedback.profile import FARTHEST
-from impc.reporting.document import Block, Heading, Section
-from impc.reporting.finding import Finding, table_of
-from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit
+from impc.reporting.document import Block, Fold, Section
+from impc.reporting.finding import Finding
+from impc.reporting.shown_units import shown_unit, signal_name
 
 if TYPE_CHECKING:
     from impc.model.plant import Plant
@@ -30,26 +29,17 @@ _CONFUSED = 0.9
 # Criteria that differ by less do not decide (Burnham and Anderson 2002).
 _UNDECIDED = 4.0
 _WHITE = 0.01
-# Of simulated subjects, by the sandwich (docs/noisy-people.md, "What the intervals hold").
+# Of simulated subjects (docs/noisy-people.md, "What the intervals hold").
 _AT_LIMIT = (
-    "A limit was met, where this likelihood is an approximation: there such intervals held 90 to "
-    "95 % of the true values of simulated carts, and 91 % on the simulated seat, 80 % where the "
-    "senses alone were noisy."
+    "A limit was met, where these intervals are approximate: in simulations they contained 80 to "
+    "95 % of the true values."
 )
-
-
-class _Level(NamedTuple):
-    """A level with its interval of 95 %, in the unit in which it is shown."""
-
-    name: str
-    unit: str
-    value: float
-    low: float
-    high: float
-
-    @property
-    def identified(self) -> bool:
-        return bool(np.log(self.high / self.value) < _IDENTIFIED)
+_KINDS = {
+    "motor": "noise in", "share": "noise in proportion to", "process": "unmodelled change of",
+    "sensory": "sensory noise of", "walk": "assumed step of", "recorder": "recording noise of",
+}  # fmt: skip
+_PROFILED = ", by profile likelihood"
+_ENDS = {"low": "95 % CI low", "high": "95 % CI high", "sd": "SD"}
 
 
 @dataclass(frozen=True)
@@ -67,12 +57,10 @@ class PersonModel:
 
     def data(self) -> dict[str, Any]:
         """For result.json."""
-        fit = self.fit
-        numbers: tuple[float | None, ...] = (None,) * 4
-        if fit is not None:
-            numbers = fit.log_likelihood, fit.criterion, fit.count, fit.converged
-        heads = "log_likelihood", "aic", "count", "converged"
-        return {"name": self.name, **dict(zip(heads, numbers, strict=True)), "reason": self.reason}
+        heads = {"log_likelihood": "log_likelihood", "aic": "criterion", "count": "count"}
+        numbers = {head: getattr(self.fit, name, None)
+                   for head, name in {**heads, "converged": "converged"}.items()}  # fmt: skip
+        return {"name": self.name, **numbers, "reason": self.reason}
 
 
 @dataclass(frozen=True)
@@ -114,33 +102,50 @@ class PersonReport(Frozen):
         least = min(item.criterion for item in self.models)
         return asked.criterion < least + _UNDECIDED
 
-    def sentences(self, sizes: Array) -> tuple[str, ...]:
-        """What may be said of the subject; `sizes` (n,) are those of the states."""
-        asked = self.models[0]
-        if asked.fit is None:
-            return (f"Nothing can be said of a person who senses with noise: {asked.reason}.",)
-        lines = [_compared(self)]
-        identified = [item for item in _levels(self) if item.identified]
-        if identified:
-            each = ", ".join(
-                f"{item.name} {number(item.value)} {item.unit} ({number(item.low, 2)} to "
-                f"{number(item.high, 2)})"
-                for item in identified
-            )
-            lines.append(
-                f"As one who {asked.name}: {each}, standard deviations of a sample (95 %)."
-            )
-        limited = [_AT_LIMIT] if self.at_limit else []
-        return (*lines, *_gain_identified(self), *limited, *_apart(self, sizes), *_left(self))
+    def sentences(self) -> list[str]:
+        """What may be said of the subject."""
+        asked, fit, entries = self.models[0], self.fit, np.array(self.entries)
+        if fit is None or self.confusion is None:
+            return [f"Nothing can be said of a person who senses with noise: {asked.reason}."]
+        found, together = [self._compared()], self.confusion.correlation
+        if len(entries):
+            count = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
+            loose = " The search did not converge: do not report these gains." * (not fit.converged)
+            found.append(f"The 95 % CI of {count} of {len(entries)} gains excludes zero.{loose}")
+        if self.at_limit:
+            found.append(_AT_LIMIT)
+        if together >= _CONFUSED:
+            how = f"correlation {together:.2f}"
+            found.append(f"Gain and noise can hardly be separated here ({how}).")
+        outputs = zip(self.plant.outputs, self.whiteness, strict=True)
+        left = [signal_name(self.plant, name) for name, p in outputs if p < _WHITE]
+        if left:
+            named = " and ".join(left)
+            found.append(f"The model misses something: residuals of {named} are autocorrelated.")
+        return found
+
+    def _compared(self) -> str:
+        asked, *others = self.models
+        best = min(others, key=lambda item: item.criterion, default=asked)
+        if best is asked or best.fit is None:
+            return "No other model of sensing could be fitted for comparison."
+        apart = best.criterion - asked.criterion
+        if abs(apart) < _UNDECIDED:
+            return (f"It cannot be decided whether the person “{asked.name}” or “{best.name}” (AIC "
+                    f"{abs(apart):.1f} apart).")  # fmt: skip
+        first, second = (asked, best) if apart > 0 else (best, asked)
+        return (f"The model in which the person “{first.name}” explains the recordings better than "
+                f"“{second.name}” (AIC lower by {abs(apart):.1f}).")  # fmt: skip
 
     def section(self) -> Section:
         """Section of the page."""
-        blocks: list[Block] = [_model_finding(self)]
+        blocks: list[Block] = [*self.sentences(), _model_finding(self)]
         if self.fit is not None:
-            blocks += [Heading("Noise"), _level_finding(self)]
-            blocks += [Heading("Gain"), _gain_finding(self)]
-            blocks += [Heading("What is left"), _left_finding(self)]
-        return Section("A person who senses with noise", blocks, "Senses and noise")
+            fold = Fold(
+                "Noise and models, in numbers", [_level_finding(self, self.fit), blocks.pop()]
+            )
+            blocks += [_gain_finding(self, self.fit), fold]
+        return Section("Noise in the loop", blocks)
 
     def data(self) -> dict[str, Any]:
         """For result.json."""
@@ -168,173 +173,51 @@ class PersonReport(Frozen):
         }
 
 
-def _compared(report: PersonReport) -> str:
-    asked = report.models[0]
-    others = sorted(report.models[1:], key=lambda item: item.criterion)
-    if not others or others[0].fit is None:
-        return (
-            f"As one who {asked.name} the recordings can be identified; nothing stands beside it."
-        )
-    best = others[0]
-    apart = best.criterion - asked.criterion
-    if abs(apart) < _UNDECIDED:
-        return (
-            f"Whether the person {asked.name}, or {best.name}, the recordings do not identify "
-            f"(Akaike's criterion {abs(apart):.1f} apart)."
-        )
-    if apart > 0:
-        return (
-            f"The recordings prefer one who {asked.name} to all others, by {apart:.1f} in Akaike's "
-            f"criterion to the next, who {best.name}."
-        )
-    return (
-        f"The recordings prefer one who {best.name} to the one that was asked for, who "
-        f"{asked.name}, by {-apart:.1f} in Akaike's criterion."
-    )
-
-
-def _gain_identified(report: PersonReport) -> list[str]:
-    """How much of the gain may be read as a number, and whether its search settled."""
-    fit, entries = report.fit, np.array(report.entries)
-    if fit is None or not len(entries):
-        return []
-    identified = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
-    said = (
-        f"{identified} of the {len(entries)} entries of this person's gain are distinguishable "
-        "from zero: their intervals (95 %) leave it out."
-    )
-    if identified == 0:
-        said = (
-            f"None of the {len(entries)} entries of this person's gain is distinguishable from "
-            "zero (95 %): the values stand for gains that are several times as large or as "
-            "small."
-        )
-    loose = "" if fit.converged else " The search did not settle: another may end beside it."
-    return [f"{said}{loose}"]
-
-
-def _apart(report: PersonReport, sizes: Array) -> list[str]:
-    """Which step of gain and noise is distinguished least, where that is not identified."""
-    fit, found = report.fit, report.confusion
-    if fit is None or found is None or found.correlation < _CONFUSED:
-        return []
-    names = entry_names(fit.problem.plant)
-    sizes = np.ravel(found.gain) / np.maximum(np.abs(np.ravel(fit.K)), 1e-300)
-    entry = int(np.argmax(np.abs(np.ravel(found.gain)) * np.tile(sizes, report.plant.m)))
-    level = int(np.argmax(np.abs(found.levels)))
-    more = "more" if found.levels[level] * sizes[entry] > 0 else "less"
-    return [
-        f"Gain and noise are hardly distinguished here (correlation {found.correlation:.2f}): a "
-        f"gain {names[entry]} that is {100 * abs(sizes[entry]):.0f} % larger goes with "
-        f"{100 * abs(np.expm1(abs(found.levels[level]))):.0f} % {more} of the noise "
-        f"{fit.space.names[level]}."
-    ]
-
-
-def _left(report: PersonReport) -> list[str]:
-    outputs = report.plant.outputs
-    coloured = [
-        name
-        for name, value in zip(outputs, report.whiteness, strict=True)
-        if value < _WHITE  # NaN: nothing is left
-    ]
-    if not coloured:
-        return []
-    return [
-        f"What this person leaves of {' and '.join(coloured)} is not white: the model misses "
-        "something, and its intervals are those of a model that is not true."
-    ]
-
-
 def _model_finding(report: PersonReport) -> Finding:
     least = min(item.criterion for item in report.models)
     rows = [
-        (item.name, None, np.nan, np.nan, None, item.reason)
-        if item.fit is None
-        else (
-            item.name,
-            item.fit.count,
-            float(item.fit.log_likelihood),
-            float(item.criterion - least),
-            item.fit.converged,
-            item.reason,
-        )
+        (item.name, item.fit.count, float(item.fit.log_likelihood), float(item.criterion - least),
+         item.fit.converged, item.reason)
+        if item.fit is not None else (item.name, None, np.nan, np.nan, None, item.reason)
         for item in report.models
-    ]
+    ]  # fmt: skip
     heads = ["the_person", "searched", "log_likelihood", "criterion", "settled", "reason"]
-    caption = (
-        "Models of sensing on the same recordings, the one that was asked for first. The criterion "
-        "is Akaike's, over the least; searched: gain or cost weights, initial states, levels of "
-        "noise."
-    )
-    return Finding("person_models", pd.DataFrame(rows, columns=heads), caption, digits=6)
+    labels = {"searched": "Numbers fitted", "criterion": "AIC over the lowest",
+              "settled": "Converged", "reason": "Why not"}  # fmt: skip
+    caption = "Models of sensing on the same recordings, the requested one first."
+    table = pd.DataFrame(rows, columns=heads)
+    hidden = () if any(item.reason for item in report.models) else ("reason",)
+    return Finding("person_models", table, caption, digits=6, labels=labels, hidden=hidden)
 
 
-def _level_finding(report: PersonReport) -> Finding:
-    how = ", by profile where a level is weakly identified" if report.profiled else ""
-    table = table_of(
-        _levels(report),
-        {
-            "noise": lambda item: item.name,
-            "level": lambda item: item.value if item.identified else np.nan,
-            "low": lambda item: item.low if item.identified else 0.0,
-            "high": lambda item: item.high if np.log(item.high / item.value) < FARTHEST else np.inf,
-            "unit": lambda item: item.unit,
-        },
-    )
-    caption = (
-        f"Levels of noise: standard deviations of one sample, with intervals of 95 %{how}. Of a "
-        "level whose interval reaches a factor of ten only the upper end is known."
-    )
-    return Finding("person_levels", table, caption, digits=3)
+def _level_finding(report: PersonReport, fit: OutputFeedbackFit) -> Finding:
+    """Of noise that is not identified only the upper end is known."""
+    rows, plant = [], report.plant
+    names = zip(fit.space.names, fit.levels, report.levels, strict=True)
+    for (kind, signal), value, ends in ((one[0].split(" ", 1), *one[1:]) for one in names):
+        factor, unit = (100.0, "%") if kind == "share" else shown_unit(plant, signal)
+        reach = np.log(ends[1] / value)
+        sd, low = (value, ends[0]) if reach < _IDENTIFIED else (np.nan, 0.0)
+        high = ends[1] if reach < FARTHEST else np.inf
+        words = f"{_KINDS[kind]} {signal_name(plant, signal)}"
+        rows.append((words, *(factor * float(one) for one in (sd, low, high)), unit))
+    table = pd.DataFrame(rows, columns=["noise", "sd", "low", "high", "unit"])
+    caption = f"Noise: SD of one sample, with 95 % intervals{_PROFILED * report.profiled}."
+    return Finding("person_levels", table, caption, digits=3, labels=_ENDS)
 
 
-def _gain_finding(report: PersonReport) -> Finding:
-    fit = report.fit
-    assert fit is not None
-    least, own = np.ravel(report.least), np.ravel(fit.K)
-    how = (
-        ", by profile. An entry that is not identified by itself has none."
-        if report.profiled
-        else ". profiles = true in [fit.observer] follows the likelihood instead, on a seat for "
-        "ten minutes and more."
-    )
+def _gain_finding(report: PersonReport, fit: OutputFeedbackFit) -> Finding:
+    plant, rows = report.plant, []
+    numbers = np.column_stack([np.ravel(fit.K), report.entries, np.ravel(report.least)])
+    for k, (control, state) in enumerate(itertools.product(plant.controls, plant.states)):
+        (above, unit), (below, per) = shown_unit(plant, control), shown_unit(plant, state)
+        by = f", {signal_name(plant, control)}" * (plant.m > 1)
+        shown = map(float, above / below * numbers[k])
+        rows.append((f"{signal_name(plant, state)}{by}", *shown, f"{unit} per {per}"))
+    heads = ["gain", "maximum_likelihood", "low", "high", "without_noise_in_the_loop", "unit"]
     kept = kept_to(fit.problem)
-    among = "" if kept is None else f", among those that weights over {kept.name} can have,"
-    rows = [
-        (name, float(own[k]), *map(float, report.entries[k]), float(least[k]))
-        for k, name in enumerate(entry_names(fit.problem.plant))
-    ]
-    heads = ["entry", "maximum_likelihood", "low", "high", "least_squares"]
-    caption = (
-        f"The gain of this person{among} beside that of least squares, with intervals of 95 %{how}"
-    )
-    return Finding("person_gain", pd.DataFrame(rows, columns=heads), caption)
-
-
-def _left_finding(report: PersonReport) -> Finding:
-    rows = []
-    for index, name in enumerate(report.plant.outputs):
-        factor, unit = shown_unit(report.plant, name)
-        errors = [float(factor * value) for value in report.errors[:, index]]
-        rows.append((name, float(report.whiteness[index]), *errors, unit))
-    heads = ["output", "p_white", *(f"error_{k}_ahead" for k in report.ahead), "unit"]
-    caption = (
-        "What the filter leaves: Ljung and Box's test of the innovations over one second, and "
-        "root-mean-square errors of what it expects so many samples ahead."
-    )
-    return Finding("person_residuals", pd.DataFrame(rows, columns=heads), caption, digits=3)
-
-
-def _levels(report: PersonReport) -> list[_Level]:
-    fit = report.fit
-    if fit is None:
-        return []
-    found = []
-    for index, name in enumerate(fit.space.names):
-        kind, signal = name.split(" ", 1)
-        factor, unit = (100.0, "%") if kind == "share" else shown_unit(report.plant, signal)
-        value = float(fit.levels[index])
-        low, high = (float(end) for end in report.levels[index])
-        found.append(_Level(name, unit, factor * value, factor * low, factor * high))
-    return found
+    among = "" if kept is None else f", among those that weights over {kept.name} can have"
+    caption = f"Gain of this person{among}, with 95 % intervals{_PROFILED * report.profiled}."
+    labels = {**_ENDS, "maximum_likelihood": "Value"}
+    table = pd.DataFrame(rows, columns=heads)
+    return Finding("person_gain", table, caption, labels=labels, digits=3)

@@ -1,4 +1,4 @@
-"""A report as one value: the sections of its page, and the tables, figures and numbers beside it.
+"""A report as one value: its verdict, the sections of its page, and the files beside it.
 
 Text is escaped when the page is made. Where a sentence holds a piece of code or a link it is a
 `markupsafe.Markup`, whose `format` escapes what is put into it.
@@ -6,26 +6,22 @@ Text is escaped when the page is made. Where a sentence holds a piece of code or
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from impc.files.results import SCHEMA
 from impc.files.spreadsheet import workbook_bytes
-from impc.reporting.finding import (
-    MOST_CELLS,
-    Chart,
-    Finding,
-    Picture,
-    csv_bytes,
-)
-from impc.reporting.glossary import Glossary, used_words
+from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
+from impc.reporting.style import inline, written
+from impc.reporting.verdict import Alert, Key, Verdict
 
 
 @dataclass(frozen=True)
@@ -39,41 +35,50 @@ class Lines:
 class Terms:
     """Terms, and what is said of each."""
 
-    terms: Sequence[tuple[str, Sequence[str]]]  # Each term with its paragraphs
+    terms: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
-class Heading:
-    """Heading of a part of a section."""
+class Quiet:
+    """Why something does not stand where a reader looks for it."""
 
-    text: str  # Its words
-
-
-@dataclass(frozen=True)
-class Note:
-    """A paragraph that stands out."""
-
-    title: str  # Its first words, in bold
-    text: str  # The others
+    text: str
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The one sentence that answers what the page was made for."""
+class Check:
+    """One line of a list of checks."""
 
-    text: str  # The sentence
+    level: Level
+    name: str
+    text: str
 
 
 @dataclass(frozen=True)
-class Details:
-    """What is folded until a reader asks for it."""
+class Checks:
+    """What was checked, and how it came out."""
+
+    checks: Sequence[Check]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What a reader has to open."""
 
     summary: str  # What is inside, always shown
-    blocks: Sequence[Block]  # What is folded, in this order
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two parts beside each other, on a phone below each other."""
+
+    left: Block
+    right: Block
 
 
 #: What a section is made of; a str is a paragraph.
-Block = str | Finding | Picture | Chart | Lines | Terms | Heading | Note | Verdict | Details
+Block = str | Finding | Picture | Chart | Lines | Terms | Quiet | Checks | Alert | Fold | Pair
 
 
 @dataclass(frozen=True)
@@ -82,9 +87,25 @@ class Section:
 
     title: str  # Its heading
     blocks: Sequence[Block]  # What stands in it, in this order
-    contents: str = ""  # Its name in the table of contents; without one it is not there
-    together: bool = False  # Whether it stays on the page of what is before it when it is printed
-    folded: bool = False  # Whether its blocks show only when a reader opens it
+    contents: str = ""  # Its name in the contents; by default the title
+
+    @property
+    def anchor(self) -> str:
+        """Its id on the page."""
+        words = self.contents or self.title
+        return "".join(mark if mark.isalnum() else "-" for mark in words.lower())
+
+
+@dataclass(frozen=True)
+class Copy:
+    """What may be copied into a paper."""
+
+    methods: str
+    results: str
+
+
+#: How a figure is drawn; True for the drawing of a phone.
+Draw = Callable[[bool], Figure]
 
 
 @dataclass(frozen=True)
@@ -92,58 +113,85 @@ class Report:
     """All that a command leaves behind; nothing is written here."""
 
     window: str  # Title of the browser's window
-    title: str  # First heading
-    opening: Sequence[Block]  # Before the first section
+    kind: str  # Such as "fit report"
+    verdict: Verdict
     sections: Sequence[Section]
-    figures: Mapping[str, bytes] = field(default_factory=dict)  # By the name of the file
+    meta: Sequence[str] = ()  # What the page is about, in a few words each
+    hero: Picture | None = None  # Beside the verdict
+    keys: Sequence[Key] = ()
+    figures: Mapping[str, Draw] = field(default_factory=dict)
+    copy: Copy | str | None = None  # Or why there is nothing to copy
     beside: Sequence[Finding] = ()  # Whose tables are written as files and stand on no page
     # Content of result.json beside the findings and what every one has (docs/results.md)
     data: Mapping[str, Any] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)  # Where the result comes from
-    # What the page is about, signals and parameters: with these its glossary begins
-    words: Sequence[tuple[str, str]] = ()
 
     def page(self) -> str:
-        """The page as one HTML text that needs no other file; it ends with its glossary."""
-        bare = render_page(report=self, glossary=Glossary())
-        found = Glossary((*self.words, *used_words(bare)))
-        return render_page(report=self, glossary=found)
+        """The page as one HTML text that needs no other file."""
+        return render_page(self, any(isinstance(one, Chart) for one in self._blocks()))
 
-    def source(self, name: str) -> str:
-        """The picture `name` as the address of an <img> that needs no other file."""
-        return "data:image/png;base64," + base64.b64encode(self.figures[f"{name}.png"]).decode()
+    def picture(self, shown: Picture) -> Markup:
+        """The drawing of a picture within the page."""
+        return inline(self.figures[shown.name], shown.name, shown.alternative, phone=shown.phone)
 
     def findings(self) -> list[Finding]:
         """Those of the page, in the order in which they stand there."""
-        blocks = [*self.opening, *(item for section in self.sections for item in section.blocks)]
-        return _findings(blocks)
+        return [one for one in self._blocks() if isinstance(one, Finding)]
+
+    def _blocks(self) -> list[Block]:
+        return _flat([item for section in self.sections for item in section.blocks])
 
     def _tables(self) -> dict[str, pd.DataFrame]:
         found = [*self.findings(), *self.beside]
         return {item.name: item.table for item in found if item.table is not None}
 
-    def files(self) -> dict[str, bytes]:
-        """Page, result.json, tables and figures by name."""
+    def files(self, *, pdf: bool = False) -> dict[str, bytes]:
+        """Page, result.json, tables and figures by name; with `pdf` the figures as PDF too."""
         tables = self._tables()
-        sheets = {name: one for name, one in tables.items() if one.size <= MOST_CELLS}
+        heads = {one.name: one.labels for one in [*self.findings(), *self.beside]}
+        sheets = {
+            name: one.rename(columns=heads[name])
+            for name, one in tables.items()
+            if one.size <= MOST_CELLS
+        }
         found = {item.name: item.data() for item in self.findings()}
-        own = {"schema": SCHEMA, **self.provenance.data(), **self.data}
+        own = {"schema": SCHEMA, **self.provenance.data(), "verdict": self.verdict.data()}
+        drawn = {
+            f"figures/{name}.{kind}": written(draw, kind)
+            for name, draw in self.figures.items()
+            for kind in (("svg", "pdf") if pdf else ("svg",))
+        }
         return {
             "report.html": self.page().encode(),
-            "result.json": json_bytes({**own, "findings": found} if found else own),
+            "result.json": json_bytes({**own, **self.data, "findings": found}),
             **{f"{name}.csv": csv_bytes(table) for name, table in tables.items()},
-            **({"tables.xlsx": workbook_bytes(sheets)} if sheets else {}),
-            **self.figures,
+            **({"tables.xlsx": workbook_bytes(sheets, self._readme(sheets))} if sheets else {}),
+            **drawn,
         }
 
+    def _readme(self, sheets: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+        """The first sheet: what the workbook is, and what each other sheet holds."""
+        captions = {item.name: item.caption for item in [*self.findings(), *self.beside]}
+        rows = [
+            ("verdict", f"{self.verdict.words}: {self.verdict.headline}"),
+            ("made", f"{self.provenance.made}, impc {self.provenance.versions['impc']}"),
+            ("command", self.provenance.command),
+            *((name, captions[name]) for name in sheets),
+        ]
+        return pd.DataFrame(rows, columns=["sheet", "what it holds"])
 
-def _findings(blocks: Sequence[Block]) -> list[Finding]:
-    found: list[Finding] = []
+
+def _flat(blocks: Sequence[Block]) -> list[Block]:
+    found: list[Block] = []
     for item in blocks:
-        if isinstance(item, Finding):
-            found.append(item)
-        elif isinstance(item, Details):
-            found += _findings(item.blocks)
+        inside: Sequence[Block] = ()
+        if isinstance(item, Fold):
+            inside = item.blocks
+        elif isinstance(item, Pair):
+            inside = (item.left, item.right)
+        elif isinstance(item, Finding) and item.figure is not None:
+            inside = (item.figure,)
+        found += [item, *_flat(inside)]
     return found
 
 

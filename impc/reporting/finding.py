@@ -11,7 +11,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,13 +19,13 @@ import pandas as pd
 
 from impc.files.spreadsheet import as_data
 from impc.files.table import in_columns
-from impc.reporting.rendering import number
+from impc.reporting.rendering import fixed, number
 
 T = TypeVar("T")
 
 
-class Severity(enum.Enum):
-    """How far a finding forbids statements about the person."""
+class Level(enum.Enum):
+    """How far a finding restricts what may be said of the subject."""
 
     GREEN = "green"  # Nothing speaks against it
     AMBER = "amber"  # Some statements must not be made
@@ -37,23 +37,23 @@ class Severity(enum.Enum):
 class Picture:
     """A figure of the report."""
 
-    name: str  # Of its PNG among the report's figures, without the ending
+    name: str  # Of its drawing among the report's figures
     alternative: str  # In place of the picture for those who do not see it
     caption: str  # Below it
-    narrow: bool = False  # Whether its words can be read at the width of a phone
+    phone: bool = True  # Whether it has a drawing for the width of a phone
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure whose curves the page's script lets a reader move, zoom and switch on and off."""
+    """Curves that a reader may zoom, move and switch on and off; without scripts nothing of it."""
 
-    picture: Picture  # What is seen without scripts, in print, and before a reader asks for more
+    title: str
     data: Mapping[str, Any]  # The curves, as `impc.studies.charts` makes them
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Name, table, sentences and figure of one assessment, and how severe it is.
+    """Name, table, sentences and figure of one assessment, and how far it restricts a report.
 
     Heads of the table are words joined by `_`, which R and MATLAB take for names, and numbers are
     numbers in the units of the plant. `p` and heads that begin with `p_` are of probabilities.
@@ -64,15 +64,27 @@ class Finding:
     caption: str = ""  # Above the table
     sentences: Sequence[str] = ()  # Before the figure
     figure: Picture | Chart | None = None
-    severity: Severity = Severity.NOTE
+    level: Level = Level.NOTE
     folded: str = ""  # What the table is called where a reader has to unfold it on the page
     digits: int = 4  # Of its numbers on the page
+    # Heads for readers, by the names of columns; others are their names in words
+    labels: Mapping[str, str] = field(default_factory=dict)
+    hidden: Sequence[str] = ()  # Columns that stand in the files alone
+    links: Mapping[str, str] = field(default_factory=dict)  # Addresses of first cells, on the page
+    badges: Mapping[str, Level] = field(default_factory=dict)  # Cells that are badges on the page
+
+    @property
+    def shown(self) -> list[str]:
+        """The columns of the page."""
+        names = [] if self.table is None else list(map(str, self.table.columns))
+        return [name for name in names if name not in self.hidden]
 
     @property
     def heads(self) -> list[str]:
         """Heads of the table for readers."""
-        names: Sequence[str] = () if self.table is None else list(self.table.columns)
-        return [str(name).replace("percent", "%").replace("_", " ") for name in names]
+        words = {name: name.replace("percent", "(%)").replace("_", " ") for name in self.shown}
+        heads = [self.labels.get(name, words[name]) for name in self.shown]
+        return [head[:1].upper() + head[1:] for head in heads]
 
     @property
     def rows(self) -> list[list[str]]:
@@ -80,8 +92,7 @@ class Finding:
         if self.table is None:
             return []
         columns = [
-            [_shown(name, value, self.digits) for value in self.table[name]]
-            for name in self.table.columns
+            [_shown(name, value, self.digits) for value in self.table[name]] for name in self.shown
         ]
         return [list(row) for row in zip(*columns, strict=True)]
 
@@ -92,7 +103,7 @@ class Finding:
     def data(self) -> dict[str, Any]:
         """For result.json."""
         table = {} if self.table is None else {"table": self.table.to_dict("list")}
-        return {"severity": self.severity.value, "sentences": list(self.sentences), **table}
+        return {"level": self.level.value, "sentences": list(self.sentences), **table}
 
 
 def table_of(items: Iterable[T], columns: Mapping[str, Callable[[T], Any]]) -> pd.DataFrame:
@@ -124,4 +135,4 @@ def _shown(column: str, value: Any, digits: int) -> str:
         return str(value)
     if re.match(r"p(_|$)", column):
         return "< 0.001" if value < 1e-3 else number(float(value), 2)
-    return number(float(value), digits)
+    return fixed(float(value), digits)

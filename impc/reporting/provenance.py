@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from markupsafe import Markup
+
 if TYPE_CHECKING:
     from impc.files.digests import Inputs
 
@@ -53,6 +55,14 @@ class Provenance:
             "made": self.made,
             "sha256": None if self.inputs is None else self.inputs.plain(),
         }
+
+    @property
+    def terms(self) -> list[tuple[str, str]]:
+        """For the last section of a page; what is not known is left out."""
+        command = Markup("<code>{}</code>").format(self.command) if self.command else ""
+        found = [("Recordings", ", ".join(self.files)), ("Command", command)]
+        found += [("Created", self.made), ("Versions", self.all_versions)]
+        return [(name, text) for name, text in found if text]
 
     @property
     def all_versions(self) -> str:

@@ -1,14 +1,13 @@
-"""In which unit a signal is shown: angles in degrees or radians, all else as the plant has it.
+"""How a signal is shown: its name in words, and angles in degrees or radians.
 
 Every page and figure asks here; a command says once, with `angles_in`, what [report] angles asks
 for (docs/units.md).
-
-What a plant and its signals are, in words: for the end of every page (docs/units.md).
 """
 
 from __future__ import annotations
 
 import math
+import re
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TYPE_CHECKING
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
     from impc.model.plant import Plant
 
-_DEGREES = {"rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2"}
+_DEGREES = {"rad": "°", "rad/s": "°/s", "rad/s^2": "°/s²"}
 # Of plants that say no units, angles are identified by their names.
 _ANGLES = ("theta", "angle", "yaw", "pitch", "roll")
 _CHOSEN: ContextVar[str] = ContextVar("angles", default="degrees")
@@ -38,7 +37,7 @@ def angles_in(choice: str) -> Iterator[None]:
 
 def shown_angle() -> tuple[float, str]:
     """Factor from radians, and the unit in which angles are shown."""
-    return (math.degrees(1.0), "deg") if _CHOSEN.get() == "degrees" else (1.0, "rad")
+    return (math.degrees(1.0), "°") if _CHOSEN.get() == "degrees" else (1.0, "rad")
 
 
 def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
@@ -56,19 +55,25 @@ def shown_as(unit: str) -> tuple[float, str]:
     return 1.0, "-" if unit == "1" else unit
 
 
+def signal_name(plant: Plant, name: str) -> str:
+    """What a signal is called for readers: its words, or its name without underscores."""
+    return plant.word(name) or name.replace("_", " ")
+
+
+def words_of(plant: Plant, feature: str) -> str:
+    """A feature with its signals in words: "trunk tilt - 0.5 seat tilt"."""
+    signals = (*plant.states, *plant.controls)
+
+    def word(found: re.Match[str]) -> str:
+        return signal_name(plant, found[0]) if found[0] in signals else found[0]
+
+    return re.sub(r"[^\W\d]\w*(\[\d+\])?", word, feature)
+
+
 def axis_label(plant: Plant, name: str) -> str:
-    """The `name` of a signal of a `plant` with the unit in which it is shown."""
-    return f"{name} ({shown_unit(plant, name)[1]})"
-
-
-def signal_words(plant: Plant) -> tuple[tuple[str, str], ...]:
-    """Each signal of a `plant` that has words, with them and its unit."""
-    names = dict.fromkeys((*plant.outputs, *plant.states, *plant.controls, *plant.disturbances))
-    return tuple(
-        (name, f"{words[0].upper()}{words[1:]}, in {plant.unit(name)}.")
-        for name in names
-        if (words := plant.word(name))
-    )
+    """A signal with the unit in which it is shown: "Seat tilt (°)"."""
+    words = signal_name(plant, name)
+    return f"{words[:1].upper()}{words[1:]} ({shown_unit(plant, name)[1]})"
 
 
 def body_sentence(plant: Plant) -> str:

@@ -1,18 +1,19 @@
-"""How every figure looks: sizes of a journal, marks that survive grey print and colour blindness.
+"""How figures look, and a figure as SVG that follows light, dark and print.
 
-Colours are three of the set of Okabe and Ito. None of them carries a meaning alone: recorded data
-are open markers, models are lines; the first state is round and solid, the second square and
-dashed.
+Every colour of the light palette stands once in the style sheet too: in the SVG of a page it is
+replaced by its variable, so that one drawing serves all grounds. No colour carries a meaning alone.
 """
 
 from __future__ import annotations
 
+import re
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
+from markupsafe import Markup, escape
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -21,50 +22,63 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter
 from impc.errors import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
+    from matplotlib.axes import Axes
     from matplotlib.ticker import Formatter
 
-# Their lightness (46, 56, 60 of 100) is too near to distinguish them in grey, hence the markers
-# and line styles beside them.
-#: Colours of Okabe and Ito (2008).
-BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
-#: Axes, text and recorded data.
-INK = "#222222"
-#: Areas: beyond a bound, or a band that noise explains.
-FORBIDDEN = "#E3E3E3"
-#: Inside of the terminal set.
-SET_FILL = "#DCE9F2"
+#: Text and axes; what is less important; lines of a grid; areas that nothing is drawn in.
+INK, MUTED, RULE, PAPER = "#1b2229", "#566270", "#d9dfe5", "#ffffff"
+#: The model; what is at or beyond a limit, and the area there; what was recorded.
+BLUE, VERMILLION, FORBIDDEN, RECORDED = "#0a5ca8", "#a84300", "#f3e6dc", "#b4bec9"
+#: A third curve.
+GREEN = "#0f6130"
+_VARIABLES = {
+    INK: "ink",
+    MUTED: "muted",
+    RULE: "rule",
+    PAPER: "bg",
+    BLUE: "accent",
+    VERMILLION: "limit",
+    FORBIDDEN: "band",
+    RECORDED: "rec",
+    GREEN: "ok",
+}
 
-#: Column widths in inches, as most journals of the field set them.
-SINGLE_COLUMN, DOUBLE_COLUMN = 3.5, 7.2
-# 700 pixels for one column: sharp on a telephone of 360 points at twice the density.
-_DPI = 200
+#: Inches of a drawing over the whole page, beside a text, and on a phone.
+WIDE, HALF, PHONE = 11.0, 7.2, 4.0
 
 # Any: matplotlib types its keys one by one, and each version has others.
 _RC: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
-    "font.size": 8.0,
-    "axes.labelsize": 8.0,
-    "axes.titlesize": 8.0,
-    "legend.fontsize": 7.0,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "axes.edgecolor": INK,
+    "font.family": "sans-serif",
+    "font.size": 11.0,
+    "axes.labelsize": 11.0,
+    "axes.titlesize": 11.0,
+    "axes.titlelocation": "left",
+    "legend.fontsize": 10.5,
+    "xtick.labelsize": 10.5,
+    "ytick.labelsize": 10.5,
+    "text.color": INK,
+    "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
-    "axes.linewidth": 0.7,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "axes.linewidth": 0.8,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 4.0,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 5.0,
     "legend.frameon": False,
-    "legend.handlelength": 2.4,
+    "legend.handlelength": 1.6,
+    "svg.fonttype": "none",  # the page's own fonts, and text that can be found and read aloud
     "pdf.fonttype": 42,  # journals ask for TrueType, so that text stays text
-    "figure.facecolor": "white",
+    "path.simplify_threshold": 0.3,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
     # A figure without an engine stays as it is laid out, whatever the user's own settings.
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
-    "savefig.facecolor": "white",
 }
 
 
@@ -72,7 +86,7 @@ _RC: dict[Any, Any] = {
 class Mark:
     """How one signal is drawn, in the words of matplotlib."""
 
-    color: str  # Such as "#0072B2"
+    color: str  # Such as "#0a5ca8"
     marker: str  # Empty for none
     line: str  # Its style, such as "--"
 
@@ -82,7 +96,7 @@ STATE_MARKS = (Mark(BLUE, "o", "-"), Mark(VERMILLION, "s", "--"))
 
 
 @contextmanager
-def journal_style() -> Iterator[None]:
+def page_style() -> Iterator[None]:
     """Apply the style inside the block; matplotlib's settings are as before after it."""
     with mpl.rc_context():
         mpl.rcdefaults()  # not the user's own: text.usetex alone ends a figure where TeX is missing
@@ -97,34 +111,58 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def drawn(figures: Mapping[str, Figure], *, mathematics: bool = False) -> dict[str, bytes]:
-    """Each of the `figures` as PNG and PDF, by the name of its file."""
-    return {
-        f"{name}.{kind}": content
-        for name, figure in figures.items()
-        for kind, content in render(figure, mathematics=mathematics).items()
-    }
+def strip(ax: Axes, title: str) -> None:
+    """Name a panel above itself, with its unit, and draw its zero."""
+    ax.set_title(title, pad=5)
+    ax.axhline(0, color=RULE, linewidth=0.8, zorder=0)
 
 
-def render(figure: Figure, *, mathematics: bool = False) -> dict[str, bytes]:
-    r"""Return the figure as ``"png"`` and ``"pdf"``, without date or program name.
+def written(draw: Callable[[bool], Figure], kind: str) -> bytes:
+    """The wide drawing as a file of its own, "svg" or "pdf", without date or program name."""
+    with page_style():
+        return render(draw(False), kind)
 
-    The same figure gives the same bytes, so that a committed picture changes only when it does.
-    """
-    files = {}
-    if not mathematics:
-        _set_literally(figure)
-    # Once for both files, and nothing is drawn for it. Without an engine, since the one that
-    # "none" leaves behind has everything drawn once more before each file.
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-    figure.set_layout_engine(None)
-    for kind, metadata in (("png", {"Software": None}), ("pdf", {"CreationDate": None})):
-        stream = BytesIO()
-        figure.savefig(stream, format=kind, dpi=_DPI, metadata=metadata)
-        files[kind] = stream.getvalue()
-    return files
+
+def inline(draw: Callable[[bool], Figure], name: str, title: str, *, phone: bool) -> Markup:
+    """The drawing within a page; where a `phone` has one of its own, both, and the page chooses."""
+    with page_style():
+        parts = [_svg(draw(False), f"{name}-w", title, "w" if phone else "")]
+        if phone:
+            parts.append(_svg(draw(True), f"{name}-n", title, "n"))
+    return Markup("").join(parts)
+
+
+def _svg(figure: Figure, name: str, title: str, kind: str) -> Markup:
+    text = render(figure, "svg", ground="none").decode()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)
+    text = text.replace("url(#", f"url(#{name}-").replace('xlink:href="#', f'href="#{name}-')
+    text = re.sub(r"font: (?:(\d+) )?([\d.]+)px [^;\"]+", _font, text)
+    for colour, variable in _VARIABLES.items():
+        text = text.replace(colour, f"var(--{variable})")
+    head = (
+        rf'<svg class="{kind}" viewBox="\1" role="img" aria-labelledby="{name}-title">'
+        f'<title id="{name}-title">{{}}</title>'
+    )
+    first, _, rest = text.partition(">")
+    first = re.sub(r'<svg [^>]*viewBox="([^"]+)".*', head, first, flags=re.DOTALL)
+    return Markup(first.replace("{}", str(escape(title))) + re.sub(r"\n\s*", "\n", rest))
+
+
+def _font(found: re.Match[str]) -> str:
+    weight = f"font-weight: {found[1]}; " if found[1] else ""
+    return f"{weight}font-size: {found[2]}px"
+
+
+def render(figure: Figure, kind: str, ground: str = PAPER) -> bytes:
+    """The bytes of a figure as "svg", "pdf" or "png": the same figure gives the same."""
+    _set_literally(figure)
+    metadata = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
+    stream = BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "impc"}):
+        figure.savefig(stream, format=kind, metadata=metadata.get(kind), dpi=200, facecolor=ground)
+    return stream.getvalue()
 
 
 def _set_literally(figure: Figure) -> None:

@@ -7,36 +7,24 @@ the answer of one method, whatever the method, beside its recordings.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
-
-import numpy as np
-import pandas as pd
-from markupsafe import Markup
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Protocol
 
 from impc.assess.assessments import evaluate_method
-from impc.checking import checked
-from impc.control.named_solver import described
+from impc.checking import checked, replace
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
-from impc.inverse.methods import METHODS
-from impc.reporting.document import Block, Lines, Report, Section, Verdict
-from impc.reporting.estimate_text import gain_table
-from impc.reporting.finding import Chart, Finding, Picture
+from impc.reporting.document import Report, Section
+from impc.reporting.finding import Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
-from impc.reporting.shown_units import body_sentence, signal_words
-from impc.reporting.style import drawn, journal_style
+from impc.reporting.verdict import Alert
 from impc.reporting.writer import owned, write_files
-from impc.studies.charts import chart_figure, methods_chart
+from impc.studies.compare.report import compare_report
+from impc.studies.fit.figures import movement_figure
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import FitProgress, fit_recordings
-from impc.studies.methods_table import (
-    column_terms,
-    methods_data,
-    methods_finding,
-    weight_entries,
-)
+from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
@@ -52,8 +40,11 @@ class OwnPage(Protocol):
         """The page, its tables and its figures."""
 
 
-# Trials that are drawn, the first ones.
-_DRAWN = 6
+_PICTURE = Picture(
+    "trial-1",
+    "Outputs and commands of the first trial: recorded and simulated",
+    "Trial 1. Grey: recorded; blue: simulated; orange: at the limit.",
+)
 
 
 @checked
@@ -117,104 +108,36 @@ def report(
 
 
 def _document(fit: MethodFit) -> Report:
-    estimate, method = fit.estimate, METHODS[fit.estimate.method]
-    provenance = Provenance(_CALLER)
-    with journal_style():
-        shown = range(min(len(fit.runs), _DRAWN))
-        charts = [methods_chart(estimate.problem, [fit], index) for index in shown]
-        figures = drawn({f"trial-{k + 1}": chart_figure(one, 2) for k, one in enumerate(charts)})
-    pictures = [
-        Picture(
-            f"trial-{index + 1}",
-            f"Outputs and inputs of trial {index + 1}: recorded, and as {method.label} has them",
-            f"Trial {index + 1}. Grey: recorded. In colour: simulated. Dotted: bounds.",
-        )
-        for index in shown
-    ]
-    shown_blocks: list[Block] = list(pictures)
-    if pictures:
-        shown_blocks[0] = Chart(pictures[0], charts[0])
-    return Report(
-        f"impc: {method.label}",
-        f"Estimate: {method.label}",
-        (Verdict(fit.estimate.status.sentence), method.sentence, Lines(_findings(fit))),
-        [
-            Section(
-                "1. Recorded and simulated",
-                (methods_finding([fit]), column_terms(), _vaf(fit), *shown_blocks),
-                together=True,
-            ),
-            Section("2. Controller", [_gain(estimate), *_weights(estimate)]),
-            Section(
-                "3. Versions",
-                (
-                    f"{provenance.made}; {provenance.all_versions}.",
-                    body_sentence(estimate.problem.plant),
-                    f"Quadratic programs: solved by {described(estimate.problem.solver)}.",
-                ),
-            ),
-        ],
-        figures=figures,
-        data={
-            "methods": methods_data([fit]),
-            "states": estimate.problem.plant.states,
-            "controls": estimate.problem.plant.controls,
-            "outputs": estimate.problem.plant.outputs,
-            "horizon": estimate.problem.horizon,
-            "body": estimate.problem.plant.moves,
-            "solver": estimate.problem.solver,
-            "starts": estimate.problem.starts,
-            "logarithms": estimate.problem.logarithms,
-        },
-        provenance=provenance,
-        words=signal_words(estimate.problem.plant),
+    """The page of a comparison of this method with none, which shows a trial first."""
+    problem, label = fit.estimate.problem, method_label(fit.name)
+    page = compare_report(problem, [fit], Provenance(_CALLER))
+    page = replace(page, window=f"impc: {label}", kind="estimate of one method")
+    if page.verdict.level is Level.RED:
+        return page
+    todo = "Use impc compare."
+    if fit.name == _OURS:
+        todo = "Call impc.report with settings, or use impc fit."
+    alert = Alert(
+        Level.AMBER,
+        "Intervals and left-out trials are missing",
+        "This page shows the answer of one method to the trials that it was fitted to.",
+        "How far gain and cost weights are identified is not known.",
+        [todo],
     )
-
-
-def _findings(fit: MethodFit) -> list[str]:
-    estimate, outputs = fit.estimate, fit.estimate.problem.plant.outputs
-    shares = ", ".join(
-        f"{number(float(value), 5)} % of {name}"
-        for name, value in zip(outputs, fit.vaf, strict=True)
+    drawn: Any = SimpleNamespace(fitted=fit.estimate, inverse_mpc=fit, given=problem)
+    return replace(
+        page,
+        sections=[*page.sections, Section("Gain and cost weights", page.beside[:2])],
+        beside=page.beside[2:],
+        meta=(label, *page.meta[2:]),
+        verdict=replace(
+            page.verdict,
+            level=Level.AMBER,
+            sentence=fit.estimate.status.sentence,
+            alerts=[alert],
+        ),
+        hero=_PICTURE,
+        figures={"trial-1": lambda narrow: movement_figure(drawn, 0, narrow)},
+        copy=None,
+        data={**page.data, "starts": problem.starts, "logarithms": problem.logarithms},
     )
-    lines = [f"Variance accounted for (3.24): {shares}."]
-    if np.any(np.isfinite(estimate.problem.bounds.u_max)):
-        lines.append(
-            "No input exceeds its bound."
-            if fit.keeps_bounds
-            else f"An input exceeds its bound at {100 * fit.exceeded:.1f} % of the samples."
-        )
-    lines += [f"{estimate.reason}."] if estimate.reason else []
-    if estimate.weights is not None:
-        lines.append(
-            Markup(
-                "Other weights have the same gain and behave alike: "
-                "<code>impc.identifiability</code> says how many numbers the recordings identify."
-            )
-        )
-    return lines
-
-
-def _gain(estimate: Estimate) -> Finding:
-    table = gain_table(estimate.problem.plant, estimate.gain)
-    return Finding("gain", table, "Gain K of u = -Kx.", digits=6)
-
-
-def _weights(estimate: Estimate) -> list[Finding]:
-    if estimate.weights is None:
-        return []
-    entries = weight_entries(estimate.problem.plant, estimate.stage_weights)
-    table = pd.DataFrame(entries, columns=["matrix", "first", "second", "unit", "value"])
-    return [Finding("weights", table, "Weights, scaled to R = 1 of the first input.", digits=6)]
-
-
-def _vaf(fit: MethodFit) -> Finding:
-    outputs = fit.estimate.problem.plant.outputs
-    trials = [("all", fit.vaf), *((str(k + 1), vaf) for k, vaf in enumerate(fit.trial_vaf))]
-    rows = [
-        (trial, name, float(value))
-        for trial, values in trials
-        for name, value in zip(outputs, values, strict=True)
-    ]
-    table = pd.DataFrame(rows, columns=["trial", "output", "vaf_percent"])
-    return Finding("vaf", table, "Variance accounted for (3.24).", digits=5)

@@ -5,16 +5,20 @@ The columns are those of `impc.assess.assessments`, whichever command asks (docs
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from impc.assess.assessments import ASSESSMENTS, assessed
+from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
 from impc.model.plant import weight_unit
-from impc.reporting.document import Terms
+from impc.reporting.document import Fold, Section, Terms
+from impc.reporting.estimate_text import gain_table
 from impc.reporting.finding import Finding
+from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -25,22 +29,63 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.model.weights import Weights
+    from impc.reporting.provenance import Provenance
+
+# Heads for readers, by the names of assessments; others are their names in words.
+_HEADS = {
+    "vaf": "VAF, {} (%)",
+    "held_out_vaf": "VAF, {} (%)",
+    "largest_input": "Largest command ({})",
+    "first_fall": "Fell at (s)",
+}
+_AFTER_A_FALL = ("largest_input", "beyond_bound")  # Say nothing of a method that falls
+
+
+def method_label(name: str) -> str:
+    """The label of a method, as a row or a term begins with it."""
+    label = METHODS[name].label
+    return label[:1].upper() + label[1:]
+
+
+def methods_fold(names: Iterable[str]) -> Fold:
+    """What each method does."""
+    terms = [(method_label(name), METHODS[name].sentence) for name in names]
+    return Fold("What each method does", [Terms(terms)])
+
+
+def provenance_section(problem: Problem, provenance: Provenance) -> Section:
+    """Where the page comes from, which body was simulated, and what solved its programs."""
+    solver = f"Solved by {described(problem.solver)}."
+    own = [("Body", body_sentence(problem.plant)), ("Quadratic programs", solver)]
+    return Section("Provenance", [Terms([*provenance.terms, *own])])
 
 
 def methods_finding(fits: Sequence[MethodFit]) -> Finding:
     """What methods reach on the same recordings; no column without a number."""
     plant, rows = fits[0].estimate.problem.plant, []
+    labels, hidden = {}, ["beyond_bound", "condition_number", "seconds", "name", "note"]
+    held = all(len(fit.held_out) for fit in fits if fit.estimate.K is not None)
     for fit in fits:
-        row: dict[str, Any] = {"method": METHODS[fit.name].label}
+        row: dict[str, Any] = {"method": method_label(fit.name)}
+        fallen = any(time is not None for time in fit.fell)
         for item in ASSESSMENTS.values():
-            row |= dict(zip(item.keys(plant), map(float, item.find(fit)), strict=True))
+            unsaid = fallen and item.name in _AFTER_A_FALL
+            values = [math.nan if unsaid else float(value) for value in item.find(fit)]
+            row |= dict(zip(item.keys(plant), values, strict=True))
         ended = {"seconds": fit.estimate.seconds, "name": fit.name, "note": fit.estimate.reason}
         rows.append(row | ended)
+    for item in ASSESSMENTS.values():
+        for key, name in zip(item.keys(plant), item.signals(plant), strict=True):
+            of_input = item.name == "largest_input"
+            words = shown_unit(plant, name)[1] if of_input else signal_name(plant, name)
+            labels[key] = _HEADS.get(item.name, key.replace("_", " ")).format(words)
+        hidden += item.keys(plant) if item.name == ("vaf" if held else "held_out_vaf") else []
     table = pd.DataFrame(rows).dropna(axis="columns", how="all")
     if not any(table["note"]):
         table = table.drop(columns="note")
-    caption = "Every method on the same recordings, all trials at once."
-    return Finding("methods", table, caption)
+    where = "left-out trials" if held else "all trials"
+    caption = f"Variance accounted for in {where}, and the largest command of all trials."
+    return Finding("methods", table, caption, labels=labels, hidden=hidden)
 
 
 def methods_data(fits: Sequence[MethodFit]) -> dict[str, Any]:
@@ -48,28 +93,60 @@ def methods_data(fits: Sequence[MethodFit]) -> dict[str, Any]:
     return {fit.name: _data(fit) for fit in fits}
 
 
-def column_terms() -> Terms:
-    """What each column says, in a sentence."""
-    return Terms([(key.replace("_", " "), (item.sentence,)) for key, item in ASSESSMENTS.items()])
+def problem_data(problem: Problem, fits: Sequence[MethodFit]) -> dict[str, Any]:
+    """The same with the problem that they were fitted to."""
+    plant = problem.plant
+    return {
+        "methods": methods_data(fits),
+        **{name: getattr(plant, name) for name in ("states", "controls", "outputs")},
+        "horizon": problem.horizon,
+        "body": plant.moves,
+        "solver": problem.solver,
+    }
 
 
 def _data(fit: MethodFit) -> dict[str, Any]:
     found = fit.estimate
+    named = ("K", "S", "misfit", "evaluations", "seconds", "reason")
     return {
-        "K": found.K,
-        "S": found.S,
+        **{name: getattr(found, name) for name in named},
         "Q": None if found.weights is None else found.weights.Q,
         "R": None if found.weights is None else found.weights.R,
         "status": found.status.value,
-        "reason": found.reason,
-        "misfit": found.misfit,
-        "evaluations": found.evaluations,
-        "seconds": found.seconds,
         **assessed(fit),
         "trial_vaf": fit.trial_vaf,
         "held_out_trial_vaf": fit.held_out,
         "fell": fit.fell,
     }
+
+
+def controller_findings(fits: Sequence[MethodFit]) -> list[Finding]:
+    """Gain and cost weights of every method, in units of the plant."""
+    plant = fits[0].estimate.problem.plant
+    hidden = ["number", *(["method"] if len(fits) == 1 else [])]
+    gains = [
+        (signal_name(plant, state), f"K.{control}.{state}", unit, fit.name, value)
+        for fit in fits
+        if fit.estimate.K is not None
+        for control, state, unit, value in gain_table(plant, fit.estimate.K).to_numpy().tolist()
+    ]
+    costs = [
+        (*entry[:-1], fit.name, entry[-1])
+        for fit in fits
+        if fit.estimate.weights is not None
+        for entry in weight_entries(plant, fit.estimate.weights)
+    ]
+    heads = ["gain_on", "number", "unit", "method", "value"]
+    gain = "Gain: command against one unit of each state, in units of the plant, without intervals."
+    cost = "Cost weights, with one for the first command, without intervals."
+    tables = (
+        pd.DataFrame(gains, columns=heads),
+        pd.DataFrame(costs, columns=["matrix", "first", "second", "unit", "method", "value"]),
+    )
+    return [
+        Finding("gain", tables[0], gain, hidden=hidden),
+        Finding("weights", tables[1], cost, hidden=hidden),
+    ]
 
 
 def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, str, float]]:
@@ -86,22 +163,36 @@ def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, 
 
 
 def trajectory_table(
-    problem: Problem, trials: Iterable[int], runs: Mapping[str, Sequence[Simulation]]
+    problem: Problem,
+    trials: Mapping[int, str],
+    runs: Mapping[str, Sequence[Simulation]],
 ) -> pd.DataFrame:
-    """A row a sample of these trials: recorded, what drove them, and the runs of each name."""
+    """A row a sample of these trials, with their names: recorded, what drove, runs by name.
+
+    Angles are in the unit that is shown, which ends the names of their columns.
+    """
     plant, blocks = problem.plant, []
     for index in trials:
         trial = problem.recordings[index]
-        steps = trial.samples
-        parts = [np.full((steps, 1), index + 1.0), plant.dt * np.arange(steps)[:, None]]
-        parts += [np.asarray(trial.without_offset), np.asarray(trial.disturbance)]
+        parts = [np.asarray(trial.without_offset), np.asarray(trial.disturbance)]
         for each in runs.values():
             parts += until_its_end(plant, each[index])
-        blocks.append(np.hstack(parts))
-    heads = ["trial", "time", *(f"{name}_recorded" for name in plant.outputs), *plant.disturbances]
+        blocks.append(np.hstack([plant.dt * np.arange(trial.samples)[:, None], *parts]))
+    signals = [(name, "_recorded") for name in plant.outputs]
+    signals += [(name, "") for name in plant.disturbances]
     for ending in runs:
-        heads += [f"{name}_{ending}" for name in (*plant.outputs, *plant.controls)]
-    return pd.DataFrame(np.vstack(blocks), columns=heads)
+        signals += [(name, f"_{ending}") for name in (*plant.outputs, *plant.controls)]
+    factors, heads = [1.0], ["time"]
+    for name, ending in signals:
+        factor, unit = shown_unit(plant, name)
+        angle = unit.startswith(("°", "rad"))
+        words = unit.replace("°", "deg").replace("/", "_per_").replace("²", "2").replace("^", "")
+        factors.append(factor)
+        heads.append(f"{name}{ending}_{words}" if angle else f"{name}{ending}")
+    table = pd.DataFrame(np.vstack(blocks) * factors, columns=heads)
+    lengths = [problem.recordings[index].samples for index in trials]
+    table.insert(0, "trial", np.repeat(list(trials.values()), lengths))
+    return table
 
 
 def until_its_end(plant: Plant, run: Simulation) -> tuple[Array, Array]:

@@ -244,7 +244,7 @@ def test_damaged_recordings_stop_nobody_else(
     assert len(pd.read_csv(out / "units.csv")) == subjects - 3
     reasons = [line for line in done.stderr.splitlines() if line.startswith("sub-")]
     assert len(reasons) == 3
-    assert f"{subjects - 3} of {subjects} units fitted" in done.stdout
+    assert f"{subjects - 3} of {subjects} fits made" in done.stdout
     for path, content in whole.items():
         path.write_bytes(content)
     again = run_here(study, out, "--workers", "1")

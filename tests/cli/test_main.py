@@ -35,15 +35,14 @@ def test_example_writes_the_files_that_it_names(case_b: tuple[Result, Path]) -> 
     result, folder = case_b
     assert result.exit_code == 0
     assert result.stderr == ""
-    names = {path.name for path in folder.iterdir()}
-    assert {
-        "report.html",
-        "result.json",
-        "figure-3.2-case-B.png",
-        "terminal-set-case-B.pdf",
-    } < names
-    listed = result.stdout.split("Written to ")[1]
-    assert all(path.stem in listed for path in folder.iterdir() if path.name != ".impc")
+    names = {path.name for path in folder.rglob("*")}
+    tables = {"methods-B.csv", "tables.xlsx"}
+    assert {"report.html", "result.json", "comparison-case-B.svg", *tables} < names
+    listed = result.stdout.split("Open ")[1]
+    assert all(
+        path.name in listed for path in folder.rglob("*") if path.suffix and path.name != ".impc"
+    )
+    assert max(map(len, result.stdout.split("Open ")[0].splitlines())) <= 100
 
 
 def test_result_json_is_the_run(case_b: tuple[Result, Path], example_plant: Plant) -> None:

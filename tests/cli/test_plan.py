@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from impc.cli.main import main
 from impc.files.formats import write_table
-from impc.files.results import read_result
+from impc.files.results import SCHEMA, read_result
 from impc.files.table import make_table
 
 PLAN = """
@@ -59,7 +59,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("plan")
     done = planned(folder, PLAN)
     assert done.exit_code == 0, done.output
-    assert "The best of 2 experiments, 1 trial of 8 s: 4 N m" in done.output
+    assert "One 8-s trial at 4 N m identif" in done.output
+    assert "best of 2 experiments: 4 N m, held for 0.25 s" in done.output
+    assert max(map(len, done.output.partition("Open ")[0].splitlines())) <= 100
     return folder
 
 
@@ -81,13 +83,14 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
     assert found["findings"]["body"]["table"]["theta1_narrower_percent"] == pytest.approx(
         list(body["theta1_narrower_percent"])
     )
-    assert "Measuring " in " ".join(found["sentences"])
-    text = html.unescape(re.sub("<[^>]*>", "", page))  # words link to what they mean
-    for sentence in found["sentences"]:
-        assert sentence in text
+    assert "table of the body" in " ".join(found["verdict"]["alerts"][0]["todo"])
+    assert list(body.index) == found["findings"]["body"]["table"]["parameter"]
+    text = html.unescape(re.sub("<[^>]*>", "", page)).replace("\u00a0", " ")
+    assert found["verdict"]["headline"] in text
     assert read_result(folder / "out").content["best"] == found["best"]
-    for name in ("cost_weights", "experiments"):
-        assert (folder / "out" / f"{name}.png").stat().st_size > 10_000
+    assert (folder / "out" / "figures" / "trials.svg").stat().st_size > 5_000
+    highest = table[["theta1_high", "theta2_high"]].max(axis=1)
+    np.testing.assert_allclose(table["widest_interval_percent"], 100 * (highest - 1))
 
 
 EXACT = PLAN.replace("[fit]", "[plant.uncertainty]\nall = 0\n\n[fit]", 1)
@@ -96,7 +99,8 @@ EXACT = PLAN.replace("[fit]", "[plant.uncertainty]\nall = 0\n\n[fit]", 1)
 def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
     done = planned(tmp_path, EXACT)
     assert done.exit_code == 0, done.output
-    assert "The body is taken as exact" in done.output
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Taken as exact" in page
     # Twice the torque in a body that nothing stops: half the standard error.
     errors = pd.read_csv(tmp_path / "out" / "experiments.csv")["theta1_standard_error"]
     assert errors[1] == pytest.approx(errors[0] / 2, rel=1e-6)
@@ -106,7 +110,7 @@ def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
 def test_an_interval_without_an_upper_end_is_infinite_not_a_large_number(tmp_path: Path) -> None:
     done = planned(tmp_path, PLAN.replace("0.05 deg", "100000 deg").replace("[2, 4]", "[2]"))
     assert done.exit_code == 0, done.output
-    assert "says next to nothing of theta1" in done.output
+    assert "Seat tilt: not at all" in " ".join(done.output.split())
     found = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["findings"]
     (row,) = pd.read_csv(tmp_path / "out" / "experiments.csv").to_dict("records")
     assert found["experiments"]["table"]["theta1_high"] == [None]
@@ -126,7 +130,7 @@ def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
     )
     done = planned(folder, text + signals, "file")
     assert done.exit_code == 0, done.output
-    assert "the recorded perturbation times 2" in done.output
+    assert "One trial with 2 times the recorded perturbation" in " ".join(done.output.split())
     found = json.loads((folder / "file" / "result.json").read_text(encoding="utf-8"))
     table = found["findings"]["experiments"]["table"]
     assert table["amplitude"] == [1, 2]
@@ -155,3 +159,71 @@ def test_a_plan_that_cannot_be_made_is_refused_in_one_line(
     assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "out" / "report.html").exists()
+
+
+FITTED = {
+    "schema": SCHEMA, "command": "impc fit", "made": "", "versions": {}, "files": [],
+    "sha256": None, "outputs": ["theta1", "theta2"],
+    "plant": {"name": "plants:seated_balance_for", "arguments": {"mass": 70.0, "height": 1.7}},
+    "settings": {"u_max": 6.0, "horizon": 20, "body": "linear", "observer": None,
+                 "structure": {"Q": "diagonal", "over": ["theta1", "theta2"]}},
+    "trials": [{"rms_residual": [1e-3, 2e-3]}, {"rms_residual": [1e-3, 4e-3]}],
+    "findings": {
+        "structure_cost_weights": {"table": {"feature": ["theta1", "theta2"],
+                                             "value": [5e3, 7e3]}},
+    },
+}  # fmt: skip
+LIKE = """
+[plan]
+perturbed = ["perturbation"]
+amplitude = [4]
+dwell = [0.25]
+duration = 4.0
+trials = 1
+draws = 1
+"""
+
+
+def planned_like(folder: Path, fitted: dict[str, object], text: str = LIKE) -> Result:
+    (folder / "fit").mkdir(exist_ok=True)
+    (folder / "fit" / "result.json").write_text(json.dumps(fitted), encoding="utf-8")
+    (folder / "plan.toml").write_text(text, encoding="utf-8")
+    arguments = ("--like", str(folder / "fit"), "--out", str(folder / "out"))
+    return run("plan", str(folder / "plan.toml"), *arguments)
+
+
+def test_a_person_like_the_one_of_a_fit(tmp_path: Path) -> None:
+    done = planned_like(tmp_path, FITTED)
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert found["presumed"] == pytest.approx({"theta1": 5e3, "theta2": 7e3})
+    page = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    assert "seat tilt 0.0573°, trunk tilt 0.181°" in page  # roots of mean squares, in degrees
+    own = LIKE.replace("[plan]", "[plan]\ncost_weights = { theta1 = 1e3, theta2 = 2e3 }")
+    assert planned_like(tmp_path, FITTED, own).exit_code == 0
+    found = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert found["presumed"] == pytest.approx({"theta1": 1e3, "theta2": 2e3})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"findings": {}}, "has no cost weights of named features"),
+        ({"trials": 1}, "is no result of a fit"),
+        ({"plant": {"name": "os:getcwd", "arguments": {}}}, "names code that would be run"),
+    ],
+)
+def test_a_fit_that_gives_no_person_is_refused(
+    tmp_path: Path, change: dict[str, object], message: str
+) -> None:
+    done = planned_like(tmp_path, {**FITTED, **change})
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_plan_needs_a_plant(tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
+    done = run("plan", str(tmp_path / "plan.toml"))
+    assert done.exit_code == 2
+    assert "--plant" in done.stderr

@@ -61,6 +61,12 @@ def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path
     stated = shown.query("output == 'theta1' and condition == 'EC'").iloc[0]
     for key, name in (("icc", "value"), ("low", "low"), ("high", "high")):
         assert stated[key] == pytest.approx(getattr(expected, name))
+    other = icc(table, "A,k")
+    assert (stated["low_f"], stated["high_f"]) == pytest.approx((other.low, other.high))
+    assert max(map(len, analysed[0].stdout.splitlines())) <= 100
+    changed = pd.DataFrame(found["findings"]["conditions"]["table"])
+    assert set(changed["against"]) == {"EC"}
+    assert set(changed["condition"]) == {"EO", "VIB"}
     # The error of a single visit, not of the mean over visits that ICC(A,k) is of.
     complete = table[np.all(np.isfinite(table), axis=1)]
     within = np.rad2deg(1) * np.sqrt(np.mean(np.var(complete, axis=1, ddof=1)))

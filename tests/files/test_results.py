@@ -11,13 +11,15 @@ import pytest
 from impc.errors import DataError
 from impc.files.results import SCHEMA, read_result
 from impc.reporting.document import Report
+from impc.reporting.finding import Level
+from impc.reporting.verdict import Verdict
 
 HEAD = {"schema": SCHEMA, "command": "", "made": "", "versions": {}, "files": [], "sha256": None}
 
 
 def test_what_a_report_writes_is_read(tmp_path: Path) -> None:
     data = {"methods": {"inverse_mpc": {"K": [[1.0, 2.0]], "seconds": 2.0}}, "more": [1]}
-    files = Report("w", "t", (), (), data=data).files()
+    files = Report("w", "t", Verdict(Level.NOTE, "", ""), (), data=data).files()
     (tmp_path / "result.json").write_bytes(files["result.json"])
     found = read_result(tmp_path)
     assert found.methods["inverse_mpc"].K == [[1.0, 2.0]]
@@ -31,9 +33,9 @@ def test_what_a_report_writes_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("{}", "another version of impc (schema 1, not 6)"),
-        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 6"),
-        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 6"),
+        ("{}", "another version of impc (schema 1, not 7)"),
+        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 7"),
+        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 7"),
         (json.dumps(HEAD | {"versions": 3}), "is no result"),
         (json.dumps({"schema": SCHEMA}), "is no result"),
         (json.dumps(HEAD | {"methods": {"a": {"seconds": "x"}}}), "$.methods[...].seconds"),

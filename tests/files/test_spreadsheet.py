@@ -126,6 +126,22 @@ def test_workbooks_of_impc_are_read_by_openpyxl(tmp_path: Path) -> None:
     assert sheet["A2"].data_type == "s"  # no formula
 
 
+def test_a_workbook_begins_with_what_it_is(tmp_path: Path) -> None:
+    readme = pd.DataFrame({"sheet": ["gain"], "what it holds": ["The gain of " + "a" * 60]})
+    numbers = pd.DataFrame({"a_head_that_is_long": [1.0], "b": ["a text that is longer"]})
+    path = tmp_path / "a.xlsx"
+    path.write_bytes(workbook_bytes({"gain": numbers}, readme))
+    book = openpyxl.load_workbook(path)
+    assert book.sheetnames == ["README", "gain"]
+    for sheet, table in zip(book.worksheets, (readme, numbers), strict=True):
+        assert sheet.freeze_panes == "A2"
+        for cell, head in zip(sheet[1], table.columns, strict=True):
+            assert cell.font.bold
+            longest = max(len(str(one)) for one in (head, *table[head]))
+            assert longest < sheet.column_dimensions[cell.column_letter].width < longest + 5
+    assert book["gain"]["A2"].value == 1
+
+
 def test_ods_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"write \.xlsx, which opens there too"):
         write_table(tmp_path / "a.ods", make_table("trial", {"x": np.arange(2.0)}))

@@ -105,7 +105,7 @@ def test_a_search_goes_on_from_an_earlier_answer(found: impc.Estimate) -> None:
     ("damage", "said"),
     [
         (lambda text: text[:-40], "is no result"),
-        (lambda text: text.replace('"schema": 6', '"schema": 3'), "another version"),
+        (lambda text: text.replace('"schema": 7', '"schema": 3'), "another version"),
         (lambda text: text.replace('"status": "settled"', '"status": "odd"'), "is damaged"),
         (lambda text: text.replace('"K": [[', '"K": [["x", '), "K: expected real numbers"),
         (lambda text: text.replace('"K": [[', '"K": [[1.0, '), "K: expected shape"),

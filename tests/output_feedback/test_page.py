@@ -21,13 +21,12 @@ from impc.model.weights import Weights
 from impc.output_feedback.models import asked_observer
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
-from impc.reporting.document import Report
+from impc.reporting.document import Fold, Section
+from impc.reporting.finding import Finding
 from impc.reporting.rendering import plain
-from impc.studies.fit.gain_findings import truth_sentence
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
-from impc.studies.fit.verdict import verdict
 from tests.output_feedback.test_fit import cart
 
 pytestmark = pytest.mark.full
@@ -71,78 +70,58 @@ def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
     assert criteria[asked] < criteria["sees every state, noise in the loop"] - 10
     assert criteria[asked] < criteria["sees every state, noise in the recorder alone"] - 100
     assert f"{asked}, no limit" in criteria
-    lines = result.person_sentences
-    assert "Akaike's criterion" in lines[0]
-    assert any("sensory" in line and "of a sample (95 %)" in line for line in lines[1:])
+    assert f"“{asked}” or “{asked}, no limit” (AIC 0.0 apart)" in result.person.sentences()[0]
 
 
-def test_it_is_said_how_much_of_the_gain_is_told() -> None:
-    result = fitted()
-    report = result.person
+def findings(section: Section) -> dict[str, Finding]:
+    """Those of a section, in folds too."""
+    inside = [one.blocks if isinstance(one, Fold) else [one] for one in section.blocks]
+    return {one.name: one for part in inside for one in part if isinstance(one, Finding)}
+
+
+def test_it_is_said_how_many_gains_differ_from_zero() -> None:
+    report = fitted().person
     assert report is not None
     assert report.fit is not None
-    settled = replace(report, fit=replace(report.fit, converged=True))
 
     def said(intervals: list[list[float]], *, loose: bool = False) -> str:
         fit = replace(report.fit, converged=not loose)
-        other = replace(settled, entries=np.array(intervals), fit=fit)
-        (line,) = [
-            line
-            for line in replace(result, person=other).person_sentences
-            if "distinguishable from zero" in line
-        ]
-        return line
+        return replace(report, entries=np.array(intervals), fit=fit).sentences()[1]
 
     both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
-    assert said(both).startswith(
-        "2 of the 2 entries of this person's gain are distinguishable from zero"
-    )
-    assert said(one).startswith("1 of the 2 entries")
+    assert "of 2 of 2 gains" in said(both)
+    assert "of 1 of 2 gains" in said(one)
     # By profile an entry that is not individually identified has no interval.
-    nothing = said([[np.nan, np.nan], [-1.0, np.inf]])
-    assert nothing.startswith("None of the 2 entries")
-    assert nothing.endswith("several times as large or as small.")
-    assert said(both, loose=True).endswith("The search did not settle: another may end beside it.")
-
-
-def test_the_truth_stands_beside_the_gain_of_the_person() -> None:
-    result = fitted()
-    report = result.person
-    assert report is not None
-    ends = np.array(report.entries)
-    inside = np.mean(ends, axis=1)[None]
-    ours = "Of the gain of the person who senses with noise"
-    assert truth_sentence(result, inside).endswith(f"{ours} 2 of 2 lie inside theirs.")
-    beside = np.add(inside, [[0.0, 2 * np.ptp(ends[1])]])
-    assert truth_sentence(result, beside).endswith(f"{ours} 1 of 2 lie inside theirs.")
-    one = replace(report, entries=np.array([[np.nan, np.nan], ends[1]]))
-    said = truth_sentence(replace(result, person=one), inside)
-    assert said.endswith(f"{ours} 1 of 1 lie inside theirs.")
-    nobody = truth_sentence(replace(result, person=None), inside)
-    assert "senses with noise" not in nobody
+    assert "of 0 of 2 gains" in said([[np.nan, np.nan], [-1.0, np.inf]])
+    assert "did not converge" in said(both, loose=True)
 
 
 def test_the_section_and_result_json_have_the_same_numbers() -> None:
     result = fitted()
     assert result.person is not None
-    section = result.person.section()
-    tables = [block for block in section.blocks if hasattr(block, "rows")]
-    assert [len(table.rows) for table in tables] == [5, 4, 2, 1]
+    found = findings(result.person.section())
+    sizes = {name: len(one.rows) for name, one in found.items()}
+    assert sizes == {"person_gain": 2, "person_levels": 4, "person_models": 5}
     kept = json.loads(json.dumps(plain(result.person.data())))
-    assert [item["name"] for item in kept["models"]] == [row[0] for row in tables[0].rows]
+    rows = found["person_models"].rows
+    assert [item["name"] for item in kept["models"]] == [row[0] for row in rows]
     level = kept["levels"]["motor u"]
     assert level["low"] < level["value"] < level["high"]
     assert kept["known"] is True
     assert kept["sensed"] == ["x", "v"]
     assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
     np.testing.assert_allclose(kept["K"], result.person.fit.K)  # type: ignore[union-attr]
+    table = found["person_gain"].table
+    assert table is not None
+    np.testing.assert_allclose([table["maximum_likelihood"]], kept["K"])  # no angles
+    np.testing.assert_allclose(table[["low", "high"]], kept["K_intervals"][0])
     assert kept["at_limit"] is False
 
 
 def test_the_page_says_what_intervals_held_where_a_limit_was_met() -> None:
     result = fitted()
     assert result.person is not None
-    assert not any("90 to 95 %" in line for line in result.person_sentences)
+    assert not any("80 to 95 %" in line for line in result.person.sentences())
     fit = result.person.fit
     assert fit is not None
     limited = [
@@ -152,7 +131,7 @@ def test_the_page_says_what_intervals_held_where_a_limit_was_met() -> None:
     met = replace(
         result.person, fit=replace(fit, identified=replace(fit.identified, trials=limited))
     )
-    assert any("90 to 95 %" in line for line in replace(result, person=met).person_sentences)
+    assert any("80 to 95 %" in line for line in met.sentences())
     assert met.data()["at_limit"] is True
 
 
@@ -179,42 +158,36 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     # The gain is well identified: ends are half a width at most from those of deviations.
     width = np.ptp(about, axis=-1, keepdims=True)
     assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
-    assert "follows the likelihood" in str(quick.person.section())
-    assert "follows the likelihood" not in str(result.person.section())
+    assert "profile likelihood" not in findings(quick.person.section())["person_gain"].caption
+    assert "profile likelihood" in findings(result.person.section())["person_gain"].caption
 
 
-def test_the_page_says_by_which_gain_to_go() -> None:
-    """By that of the person, where least squares leaves noise inside the loop."""
-    result = fitted()
-    held = tuple(replace(item, saturated=0.2) for item in result.trials)
-    result = replace(result, lack=(None,), trials=held)
-    report = result.person
+def test_which_model_is_preferred() -> None:
+    report = fitted().person
     assert report is not None
     assert report.fit is not None
     assert report.preferred
-    assert verdict(result).endswith("go by the gain of that subject, in its section.")
     unsettled = replace(report.models[0], fit=replace(report.fit, converged=False))
     for first in (unsettled, replace(unsettled, fit=None)):
-        other = replace(report, models=(first, *report.models[1:]))
-        assert not other.preferred
-        assert "do not rely on its gain" in verdict(replace(result, person=other))
+        assert not replace(report, models=(first, *report.models[1:])).preferred
     best = replace(report.models[1], fit=replace(report.fit, log_likelihood=1e6))
-    assert not replace(report, models=(report.models[0], best)).preferred
+    other = replace(report, models=(report.models[0], best))
+    assert not other.preferred
+    assert f"“{best.name}” explains" in other.sentences()[0]
 
 
 @pytest.mark.parametrize(
     ("ends", "words"),
     [
-        ([-np.inf, 2.5], ["not determined", "2.5"]),
+        ([-np.inf, 2.5], ["not determined", "2.50"]),
         ([np.nan, np.nan], ["-", "-"]),
-        ([2.5, 3.5], ["2.5", "3.5"]),
+        ([2.5, 3.5], ["2.50", "3.50"]),
     ],
 )
 def test_an_interval_without_end_says_so(ends: list[float], words: list[str]) -> None:
     result = fitted()
     assert result.person is not None
-    section = replace(result.person, entries=frozen([ends, ends])).section()
-    found = {item.name: item for item in Report("", "", (), [section]).findings()}
+    found = findings(replace(result.person, entries=frozen([ends, ends])).section())
     assert [row[2:4] for row in found["person_gain"].rows] == [words, words]
 
 

@@ -27,11 +27,13 @@ from impc.errors import DataError, one_line
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Sequence
 
     import pandas as pd
 
     from impc.arrays import Array
+
+    _Test = Callable[[pd.DataFrame, "Comparison"], "Comparison"]
 
 _FEWEST = 3
 _COST_WEIGHT = "log_cost_weight."
@@ -44,19 +46,19 @@ _LARGEST = 2.0
 
 @dataclass(frozen=True)
 class Comparison:
-    """One question asked of one measure in one condition."""
+    """One question asked of one measure in one condition; NaN where there is no number."""
 
     question: str  # "group", "visit", "change", "mixed" or "reliability"
-    measure: str  # Of which, by name
+    measure: str
     condition: str
-    first: str  # What is compared; empty for the reliability
-    second: str
-    estimate: float  # Difference of means (second minus first), or the ICC
-    low: float  # Interval of 95 %; NaN where the method gives none
-    high: float
-    effect: float  # Hedges' g or d_z; NaN for the others
-    p: float  # NaN for the reliability
-    n: int  # Subjects
+    first: str = ""  # What is compared; empty for the reliability
+    second: str = ""
+    estimate: float = np.nan  # Difference of means (second minus first), or the ICC
+    low: float = np.nan  # Interval of 95 %
+    high: float = np.nan
+    effect: float = np.nan  # Hedges' g or d_z
+    p: float = np.nan
+    n: int = 0  # Subjects
     p_holm: float = np.nan
     note: str = ""  # Why there is no number; empty otherwise
 
@@ -84,108 +86,100 @@ def compare_cohort(units: pd.DataFrame) -> tuple[Comparison, ...]:
     if len(units) == 0:
         return ()
     chosen = measures_of(units)
+    penalised = [name for name in chosen if name.startswith(_COST_WEIGHT)]
     found: list[Comparison] = []
-    for condition, part in only_identified(units).groupby("condition", sort=True, dropna=False):
-        stated = str(condition)
-        groups = sorted(set(part["group"]) - {""})
-        visits = list(dict.fromkeys(part["visit"]))
-        for one, other in itertools.combinations(groups, 2):
-            found += _holm([_groups(part, name, stated, one, other) for name in chosen])
-            if len(visits) > 1:
-                found += _holm([_interaction(part, name, stated, one, other) for name in chosen])
-                penalised = [name for name in chosen if name.startswith(_COST_WEIGHT)]
-                found += _holm([_mixed(part, name, stated, one, other) for name in penalised])
-        for one, other in itertools.combinations(visits, 2):
-            found += _holm([_visits(part, name, stated, one, other) for name in chosen])
+    for label, part in only_identified(units).groupby("condition", sort=True, dropna=False):
+        condition, visits = str(label), list(dict.fromkeys(part["visit"]))
+        between: dict[str, tuple[_Test, Sequence[str]]] = {"group": (_groups, chosen)}
         if len(visits) > 1:
-            found += [_reliability(part, name, stated) for name in chosen]
+            between |= {"change": (_changes, chosen), "mixed": (_mixed, penalised)}
+        for pair in itertools.combinations(sorted(set(part["group"]) - {""}), 2):
+            for question, (test, names) in between.items():
+                asked = [Comparison(question, name, condition, *pair) for name in names]
+                found += _holm([test(part, one) for one in asked])
+        for pair in itertools.combinations(visits, 2):
+            asked = [Comparison("visit", name, condition, *pair) for name in chosen]
+            found += _holm([_visits(part, one) for one in asked])
+        if len(visits) > 1:
+            found += [_reliable(part, Comparison("reliability", name, condition))
+                      for name in chosen]  # fmt: skip
     return tuple(found)
 
 
-def _groups(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
-    means = part.groupby(["group", "subject"])[measure].mean().dropna()
-    a, b = (np.asarray(means.get(name, [])) for name in (one, other))
-    return _welch("group", measure, condition, one, other, a, b)
+def _groups(part: pd.DataFrame, asked: Comparison) -> Comparison:
+    means = part.groupby(["group", "subject"])[asked.measure].mean().dropna()
+    return _welch(asked, *(np.asarray(means.get(name, [])) for name in (asked.first, asked.second)))
 
 
-def _welch(
-    question: str, measure: str, condition: str, one: str, other: str, a: Array, b: Array
-) -> Comparison:
-    n = len(a) + len(b)
+def _welch(asked: Comparison, a: Array, b: Array) -> Comparison:
     if min(len(a), len(b)) < _FEWEST:
-        return _nothing(question, measure, condition, one, other, n)
-    test: Any = scipy.stats.ttest_ind(b, a, equal_var=False)
-    interval = test.confidence_interval(0.95)
-    return Comparison(
-        question, measure, condition, one, other, float(b.mean() - a.mean()),
-        float(interval.low), float(interval.high), _hedges(a, b), float(test.pvalue), n,
-    )  # fmt: skip
+        return _nothing(asked, len(a) + len(b))
+    return _tested(asked, scipy.stats.ttest_ind(b, a, equal_var=False), b.mean() - a.mean(),
+                   _hedges(a, b), len(a) + len(b))  # fmt: skip
 
 
-def _visits(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
-    wide = part.pivot_table(index="subject", columns="visit", values=measure)
-    both = wide[[one, other]].dropna() if {one, other} <= set(wide.columns) else wide.iloc[:0]
-    if len(both) < _FEWEST:
-        return _nothing("visit", measure, condition, one, other, len(both))
-    difference = np.asarray(both[other] - both[one])
-    test: Any = scipy.stats.ttest_1samp(difference, 0.0)
-    interval = test.confidence_interval(0.95)
-    spread = float(difference.std(ddof=1))
-    return Comparison(
-        "visit", measure, condition, one, other, float(difference.mean()), float(interval.low),
-        float(interval.high), float(difference.mean() / spread) if spread else np.nan,
-        float(test.pvalue), len(both),
-    )  # fmt: skip
+def _tested(asked: Comparison, test: Any, estimate: float, effect: float, n: int) -> Comparison:
+    """With the numbers of one of scipy's t-tests."""
+    low, high = map(float, test.confidence_interval(0.95))
+    return replace(asked, estimate=float(estimate), low=low, high=high, effect=float(effect),
+                   p=float(test.pvalue), n=n)  # fmt: skip
 
 
-def _interaction(
-    part: pd.DataFrame, measure: str, condition: str, one: str, other: str
-) -> Comparison:
+def _visits(part: pd.DataFrame, asked: Comparison) -> Comparison:
+    wide = part.pivot_table(index="subject", columns="visit", values=asked.measure)
+    wide = wide.reindex(columns=[asked.first, asked.second]).dropna()
+    if len(wide) < _FEWEST:
+        return _nothing(asked, len(wide))
+    difference = np.asarray(wide[asked.second] - wide[asked.first])
+    mean, spread = difference.mean(), difference.std(ddof=1)
+    effect = mean / spread if spread else np.nan
+    return _tested(asked, scipy.stats.ttest_1samp(difference, 0.0), mean, effect, len(wide))
+
+
+def _changes(part: pd.DataFrame, asked: Comparison) -> Comparison:
     """Welch's t on each subject's change per visit, its least-squares slope over the visits."""
     place = {visit: index for index, visit in enumerate(dict.fromkeys(part["visit"]))}
-    slopes: dict[str, list[float]] = {one: [], other: []}
-    for (group, _), rows in part.dropna(subset=[measure]).groupby(["group", "subject"]):
+    slopes: dict[str, list[float]] = {asked.first: [], asked.second: []}
+    for (group, _), rows in part.dropna(subset=[asked.measure]).groupby(["group", "subject"]):
         if group in slopes and rows["visit"].nunique() > 1:
             visits = [place[visit] for visit in rows["visit"]]
-            slopes[group].append(float(np.polyfit(visits, rows[measure], 1)[0]))
-    a, b = np.array(slopes[one]), np.array(slopes[other])
-    return _welch("change", measure, condition, one, other, a, b)
+            slopes[group].append(float(np.polyfit(visits, rows[asked.measure], 1)[0]))
+    return _welch(asked, *map(np.array, slopes.values()))
 
 
-def _mixed(part: pd.DataFrame, measure: str, condition: str, one: str, other: str) -> Comparison:
+def _mixed(part: pd.DataFrame, asked: Comparison) -> Comparison:
     """Group effect with a mean for each visit and each subject, by restricted likelihood."""
-    rows = part[part["group"].isin([one, other])].dropna(subset=[measure])
-    each = rows.groupby("group")["subject"].nunique()
+    pair = [asked.first, asked.second]
+    rows = part[part["group"].isin(pair)].dropna(subset=[asked.measure])
+    each = rows.groupby("group")["subject"].nunique().reindex(pair, fill_value=0)
     n = int(each.sum())
-    if min(each.get(one, 0), each.get(other, 0)) < _FEWEST:
-        return _nothing("mixed", measure, condition, one, other, n)
+    if each.min() < _FEWEST:
+        return _nothing(asked, n)
     visits = list(dict.fromkeys(rows["visit"]))[1:]
-    second = [rows["group"] == other, *(rows["visit"] == visit for visit in visits)]
+    second = [rows["group"] == asked.second, *(rows["visit"] == visit for visit in visits)]
     design = [np.ones(len(rows)), *(one.to_numpy(float) for one in second)]
     with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")
-        model = MixedLM(np.asarray(rows[measure], float), np.transpose(design), rows["subject"])
-        fitted = model.fit(reml=True)
+        scores = np.asarray(rows[asked.measure], float)
+        fitted = MixedLM(scores, np.transpose(design), rows["subject"]).fit(reml=True)
     effect, error = float(fitted.params[1]), float(fitted.bse[1])
     if not (np.isfinite(error) and error > 0) or not fitted.converged:
         why = "; ".join(str(item.message) for item in raised[:1]) or "no deviation"
-        found = _nothing("mixed", measure, condition, one, other, n)
-        return replace(found, note=f"the mixed model did not converge ({one_line(why)[:60]})")
+        note = f"the mixed model did not converge ({one_line(why)[:60]})"
+        return replace(asked, n=n, note=note)
     # The effect lies between subjects: exact where every subject has all visits.
     reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
     p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
-    ends = effect - reach, effect + reach
-    return Comparison("mixed", measure, condition, one, other, effect, *ends, np.nan, p, n)
+    return replace(asked, estimate=effect, low=effect - reach, high=effect + reach, p=p, n=n)
 
 
-def _reliability(part: pd.DataFrame, measure: str, condition: str) -> Comparison:
-    wide = part.pivot_table(index="subject", columns="visit", values=measure)
+def _reliable(part: pd.DataFrame, asked: Comparison) -> Comparison:
+    wide = part.pivot_table(index="subject", columns="visit", values=asked.measure)
     try:
         found = icc(wide.to_numpy(), "A,1")
     except DataError:
-        return _nothing("reliability", measure, condition, "", "", len(wide.dropna()))
-    nan, ends = float("nan"), (found.value, found.low, found.high)
-    return Comparison("reliability", measure, condition, "", "", *ends, nan, nan, found.subjects)
+        return _nothing(asked, len(wide.dropna()))
+    return replace(asked, estimate=found.value, low=found.low, high=found.high, n=found.subjects)
 
 
 def _hedges(a: Array, b: Array) -> float:
@@ -197,21 +191,13 @@ def _hedges(a: Array, b: Array) -> float:
     return float((b.mean() - a.mean()) / pooled * (1 - 3 / (4 * freedom - 1)))
 
 
-def _nothing(
-    question: str, measure: str, condition: str, one: str, other: str, n: int
-) -> Comparison:
-    nan, note = float("nan"), f"too few subjects ({n})"
-    return Comparison(
-        question, measure, condition, one, other, nan, nan, nan, nan, nan, n, note=note
-    )
+def _nothing(asked: Comparison, n: int) -> Comparison:
+    return replace(asked, n=n, note=f"too few subjects ({n})")
 
 
 def _holm(found: list[Comparison]) -> list[Comparison]:
     corrected = holm(np.array([item.p for item in found]))
-    return [
-        replace(item, p_holm=float(p)) if np.isfinite(p) else item
-        for item, p in zip(found, corrected, strict=True)
-    ]
+    return [replace(item, p_holm=float(p)) for item, p in zip(found, corrected, strict=True)]
 
 
 def not_identified(units: pd.DataFrame) -> dict[str, int]:
@@ -237,32 +223,3 @@ def only_identified(units: pd.DataFrame) -> pd.DataFrame:
             usual = units[name].astype(float).abs()[np.isfinite(deviation)].median()
             kept[name] = units[name].where(deviation <= _LARGEST * usual)
     return kept
-
-
-def unidentified_sentences(counts: Mapping[str, int], of: int) -> list[str]:
-    """What is left out for it, in one sentence; none where nothing is."""
-    if not counts:
-        return []
-    each = "; ".join(f"the {measure_words(name)} of {count}" for name, count in counts.items())
-    return [
-        "A gain whose standard deviation is more than twice its usual size is not identified, and "
-        f"not compared: of {of} units {each}."
-    ]
-
-
-_WORDS = {
-    "K": "gain of {1} to {0}",
-    "K_of_weights": "gain of the weights, {1} to {0}",
-    "vaf": "VAF of {0}",
-    "held_out_vaf": "VAF of {0}, left out",
-    "cost_weight": "cost weight of {0}",
-    "centre_weight": "cost weight of {0}, analytic centre",
-    "largest_input": "largest {0}",
-    "log_cost_weight": "logarithm of the cost weight of {0}",
-}
-
-
-def measure_words(name: str) -> str:
-    """A column by its `name` in words: "K.command.theta1" is "gain of theta1 to command"."""
-    kind, *rest = name.split(".", 2 if name.startswith("K") else 1)
-    return _WORDS[kind].format(*rest) if kind in _WORDS and rest else name.replace("_", " ")

@@ -1,89 +1,95 @@
-"""Figures of a cohort: measures by group, and a subject's fit."""
+"""Figures of a cohort: people by group, and a subject's first trial."""
 
 from __future__ import annotations
 
-import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.stats
 
-from impc.model.plant import UNKNOWN
-from impc.reporting.style import DOUBLE_COLUMN, INK, STATE_MARKS, VERMILLION, new_figure
-from impc.studies.cohort.comparison import measure_words
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, HALF, INK, MUTED, PHONE, RECORDED, RULE, new_figure, strip
+from impc.studies.cohort.verdict import LOGARITHM
+from impc.studies.fit.facts import between
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLUMNS = 3
-_SOFT = "#8C8C8C"
+    from impc.arrays import Array
+    from impc.studies.cohort.verdict import Cohort
+
+_NAMED = 45  # Rows up to which each has the name of its subject
 
 
-def group_figure(units: pd.DataFrame, measures: Sequence[str], names: Mapping[str, str]) -> Figure:
-    """Every unit by group and visit; a line joins the visits of one subject; bars are means."""
-    groups = sorted(set(units["group"])) or [""]
-    visits = list(dict.fromkeys(units["visit"]))
-    rows = -(-len(measures) // _COLUMNS)
-    figure = new_figure(DOUBLE_COLUMN, 2.2 * rows)
-    axes = np.ravel(figure.subplots(rows, _COLUMNS, squeeze=False))
-    for ax in axes[len(measures) :]:
-        ax.set_visible(False)
-    reach = 0.3 if len(visits) > 1 else 0.0
-    offsets = dict(zip(visits, np.linspace(-reach, reach, len(visits)), strict=True))
-    for ax, name in zip(axes, measures, strict=False):
-        for place, group in enumerate(groups):
-            own = units[units["group"] == group]
-            _people(ax, own, name, place, offsets)
-            half = 0.35 if len(visits) == 1 else 0.5 * reach / (len(visits) - 1)
-            for visit, offset in offsets.items():
-                values = own.loc[own["visit"] == visit, name].to_numpy(dtype=float)
-                if np.any(np.isfinite(values)):
-                    at, mean = place + offset, np.nanmean(values)
-                    ax.hlines(mean, at - half, at + half, color=INK, linewidth=1.5)
-        ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
-        ax.set_xlim(-0.6, len(groups) - 0.4)
-        ax.set_title(textwrap.fill(measure_words(name), 28), loc="left")
-        percent = name.startswith(("vaf.", "held_out_vaf."))
-        unit = "-" if name.startswith("log_cost_weight.") else names.get(name, UNKNOWN)
-        ax.set_ylabel(f"value ({'%' if percent else unit})")
+def forest(cohort: Cohort, narrow: bool) -> Figure:
+    """A row each unit with its interval, by group or visit, and the mean of each."""
+    lead, units = cohort.lead, cohort.units.join(cohort.ends)
+    units = units if lead is None else units[units["condition"] == lead.condition]
+    label = "visit" if lead is not None and lead.question == "visit" else "group"
+    blocks = units.sort_values("shown", ascending=False).groupby(label)
+    rows = len(units) + len(blocks)
+    figure = new_figure(PHONE if narrow else HALF, float(np.clip(0.9 + 0.16 * rows, 2.6, 6.4)))
+    ax, at = figure.subplots(), 0.0
+    if cohort.measure.startswith(LOGARITHM):
+        ax.set_xscale("log")
+    column = "value" if units["value"].count() > 2 else "shown"
+    low, high = ax.xaxis.get_transform().transform([units[column].min(), units[column].max()])
+    pad = 0.6 * (high - low) or 1.0  # wider intervals go on beyond the figure
+    ax.set_xlim(*ax.xaxis.get_transform().inverted().transform([low - pad, high + pad]))
+    across: Any = {"transform": ax.get_yaxis_transform(), "va": "center"}
+    for block, part in blocks:
+        title = f"{label.capitalize()} {block!s}" if block else "All people"
+        ax.text(0, at, title, weight="bold", **across)
+        means = part.groupby("subject")["value"].mean().dropna().to_numpy(float)
+        if len(means) > 1:
+            _mean(ax, means, at, len(part), cohort.measure.startswith(LOGARITHM), across)
+        for row in part.to_dict("records"):
+            at -= 1
+            if rows <= _NAMED:
+                ax.text(-0.015, at, row["subject"], ha="right", fontsize=9, color=MUTED, **across)
+            ax.plot([row["low"], row["high"]], [at, at], color=BLUE, linewidth=1.3)
+            known = np.isfinite(row["value"])
+            shown = row["value"] if known else np.clip(row["shown"], *ax.get_xlim())
+            ax.plot(shown, at, "o", color=BLUE if known else MUTED, markersize=4.5,
+                    markerfacecolor=BLUE if known else "none")  # fmt: skip
+        at -= 1.6
+    ax.set_ylim(at + 0.8, 0.9)
+    ax.set_yticks([])
+    ax.spines["left"].set_visible(False)
+    words = cohort.name(cohort.measure)
+    ax.set_xlabel(f"{words[:1].upper()}{words[1:]} ({cohort.unit(cohort.measure)})", loc="left")
+    ax.xaxis.set_label_position("top")
     return figure
 
 
-def _people(ax: Axes, own: pd.DataFrame, name: str, place: int, offsets: dict[str, float]) -> None:
-    """One group's units: a mark each, a line for each person who came more than once."""
-    mark = STATE_MARKS[place % len(STATE_MARKS)]
-    people = [part for _, part in own.groupby(["subject", "condition"], sort=False)]
-    # Side by side, in the order of the table: no two points hide each other.
-    wide = 0.25 if len(offsets) == 1 else 0.04
-    apart = np.linspace(-wide, wide, len(people)) if len(people) > 1 else [0.0]
-    for shift, part in zip(apart, people, strict=True):
-        ax.plot(
-            [place + shift + offsets[visit] for visit in part["visit"]],
-            part[name].to_numpy(dtype=float),
-            linewidth=0.5,
-            marker=mark.marker,
-            color=mark.color,
-            markerfacecolor="white",
-            markersize=3.0,
-        )
+def _mean(ax: Axes, means: Array, at: float, rows: int, ratio: bool, across: Any) -> None:
+    """The mean over people with its interval, behind their rows."""
+    own = np.log(means) if ratio else means
+    reach = scipy.stats.t.ppf(0.975, len(own) - 1) * scipy.stats.sem(own)
+    ends = own.mean() + reach * np.array([-1.0, 0.0, 1.0])
+    low, value, high = np.exp(ends) if ratio else ends
+    height = [at - rows - 0.3, at - 0.5]
+    ax.fill_betweenx(height, low, high, color=RULE, linewidth=0, zorder=0)
+    ax.plot([value, value], height, color=INK, linewidth=1.2, zorder=1)
+    ax.text(1, at, f"mean {number(value)} ({between(low, high)})", ha="right", **across)
 
 
-def subject_figure(fit: dict[str, Any]) -> Figure:
-    """Recorded and simulated outputs of a unit's first trial, from the content of its `fit`."""
+def subject_figure(fit: Mapping[str, Any], narrow: bool) -> Figure:
+    """Recorded and modelled outputs of a unit's first trial, from the content of its `fit`."""
     shown = fit["trajectory"]
     recorded, simulated = np.array(shown["recorded"]), np.array(shown["simulated"])
-    figure = new_figure(DOUBLE_COLUMN, 1.3 * recorded.shape[1] + 0.5)
-    axes = np.ravel(figure.subplots(recorded.shape[1], 1, sharex=True, squeeze=False))
-    time = np.arange(len(recorded)) * shown["dt"]
-    dashed: Any = {"color": VERMILLION, "linestyle": "--", "linewidth": 1.0}
+    time = np.arange(len(recorded) // (3 if narrow else 1)) * shown["dt"]
+    outputs = recorded.shape[1]
+    figure = new_figure(PHONE if narrow else HALF, 0.5 + 1.35 * outputs)
+    axes = np.ravel(figure.subplots(outputs, 1, sharex=True, squeeze=False))
     for index, ax in enumerate(axes):
         factor, unit = fit["shown_units"][index]
-        ax.plot(time, factor * recorded[:, index], color=_SOFT, linewidth=1.6, label="recorded")
-        ax.plot(time, factor * simulated[:, index], label="simulated", **dashed)
-        ax.set_ylabel(f"{fit['outputs'][index]} ({unit})")
-    axes[-1].set_xlabel("time (s)")
-    axes[0].legend(loc="upper right", ncols=2, bbox_to_anchor=(1.0, 1.3))
+        words = fit["words"].get(fit["outputs"][index], fit["outputs"][index])
+        strip(ax, f"{words[:1].upper()}{words[1:]} ({unit})")
+        ax.plot(time, factor * recorded[: len(time), index], color=RECORDED, linewidth=4.5)
+        ax.plot(time, factor * simulated[: len(time), index], color=BLUE)
+    axes[-1].set_xlabel("Time (s)")
     return figure

@@ -1,267 +1,329 @@
-"""Tables, page and figures of a cohort, made from its folder."""
+"""Tables, pages and figures of a cohort, made from its folder."""
 
 from __future__ import annotations
 
-from operator import attrgetter
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from impc.checking import replace
 from impc.files.checks import FELL
-from impc.reporting.document import Lines, Report, Section, Verdict
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.model.plant import UNKNOWN
+from impc.reporting.document import Block, Check, Checks, Copy, Lines, Report, Section, Terms
+from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.style import drawn, journal_style
+from impc.reporting.rendering import number
+from impc.reporting.verdict import Key, Verdict
 from impc.reporting.writer import write_files
-from impc.studies.cohort.comparison import (
-    compare_cohort,
-    measure_words,
-    measures_of,
-    not_identified,
-    only_identified,
-    unidentified_sentences,
-)
-from impc.studies.cohort.figures import group_figure
+from impc.studies.cohort.comparison import measures_of, not_identified
+from impc.studies.cohort.figures import forest, subject_figure
 from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.subject_page import described_signals, subject_files
-from impc.studies.cohort.tables import cohort_tables
+from impc.studies.cohort.tables import cohort_tables, or_nan
+from impc.studies.cohort.verdict import LOGARITHM, Cohort, cohort_verdict
+from impc.studies.fit.facts import between
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    from impc.studies.cohort.comparison import Comparison
     from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Study, Unit
 
+_BESIDE = {
+    "units": "All numbers of every fit, angles in radians.",
+    "replicates": "Gain and parameters of every bootstrap repetition, angles in radians.",
+    "intervals": "Percentiles of the bootstrap repetitions.",
+}
 _QUESTIONS = {
     "group": "between groups",
     "visit": "between visits",
-    "change": "change from visit to visit",
-    "mixed": "between groups, over all visits (mixed model of the cost weights)",
-    "reliability": "reliability between visits",
+    "change": "change per visit, between groups",
+    "mixed": "between groups, over all visits (mixed model)",
+    "reliability": "ICC(A,1) between visits",
 }
-_COMPARED = (
-    "Gains are what the recordings give. Cost weights are {}. Holm's correction is over the "
-    "measures of one question."
+_METHODS = (
+    "The recordings of {people} people were analysed by inverse model predictive control, one fit "
+    "for each person, visit and condition. Groups were compared by Welch's t-test on the means of "
+    "people over their visits (effect size: Hedges' g), visits by paired t-tests (Cohen's d of the "
+    "differences). P-values were corrected by Holm's method over the measures of one question. "
+    "Gains with a standard error above twice the median size of that gain were taken as not "
+    "identified and left out."
 )
-_WITHIN = "those of the structure, compared in their logarithms"
-_CENTRE = (
-    "those of the analytic centre of all weights with the same gain: a choice, the same for every "
-    "subject"
-)
-_NUMBERS = ("n", "estimate", "low", "high", "effect", "p", "p_holm", "note")
-_RUN = Markup(
-    "<code>{}</code>. units.csv, replicates.csv, intervals.csv and comparisons.csv hold all "
-    "numbers, cohort.log the times."
-)
-_GROUPS = Picture(
-    "groups",
-    "Measures of every unit by group",
-    "Every unit, by group, visits from left to right; a line joins those of one person. Bars are "
-    "means. The measures that differ most.",
-)
+#: Word of a fit's badge in a table, and its level, by the name of the level; worst last.
+_BADGES = {
+    "green": ("Ready", Level.GREEN),
+    "amber": ("Check", Level.AMBER),
+    "red": ("Do not report", Level.RED),
+}
+_HOME = Markup('<a href="../report.html">All subjects</a>')
+_INTERVAL = {"low": "95 % CI low", "high": "95 % CI high"}
+_CURVES = "First trial. Grey: recorded. Blue: the model, moved by the perturbation alone."
 
 
-def write_report(study: Study, store: Store, failures: Failures, command: str) -> None:
+def write_report(
+    study: Study, store: Store, failures: Failures, command: str, *, pdf: bool = False
+) -> Report:
     """Write the tables, result.json, pages and figures of a study."""
-    tables = cohort_tables(study, store)
-    units = tables["units"]
-    compared = compare_cohort(units)
-    subjects: dict[str, list[Unit]] = {}
+    tables, subjects = cohort_tables(study, store), dict[str, list["Unit"]]()
     for unit in study.units:
         subjects.setdefault(unit.subject, []).append(unit)
     for subject, own in subjects.items():
-        # One after the other: the figures of a thousand subjects would fill the memory.
-        write_files(store.folder, subject_files(subject, own, store, failures))
-    signals = described_signals(study.units, store)
-    figures = _figures(units, compared, signals.get("units", {}))
-    left_out = {name: n for name, n in not_identified(units).items() if name in measures_of(units)}
-    said = [
-        *_findings(compared),
-        *_structure_lines(units),
-        *unidentified_sentences(left_out, len(units)),
-        *_limits(units),
-        *_falls(study.units, store, failures),
-    ]
-    count = int(study.configuration.fit.get("replicates", 0))
-    summary = (
-        f"{len(units)} of {len(study.units)} units of {len(subjects)} subjects were fitted, "
-        f"{len(tables['replicates'])} bootstrap replicates of {count * len(units)} done, "
-        f"{sum(map(len, failures.replicates.values()))} failed."
+        # One after the other: the pages of a thousand subjects would fill the memory.
+        page = _subject_page(subject, own, store, failures)
+        write_files(store.folder, {_address(subject): page.page().encode()})
+    described = next((fit for unit in study.units if (fit := store.fit(unit.name))), {})
+    cohort = Cohort(tables["units"], described, failures.units)
+    lost, measures = not_identified(cohort.units), measures_of(cohort.units)
+    data = {
+        "units": len(study.units),
+        "fitted": len(cohort.units),
+        "failed": failures.units,
+        "failed_replicates": failures.replicates,
+        "digests": store.digests,
+        "not_identified": {name: count for name, count in lost.items() if name in measures},
+    }
+    beside = [Finding(name, table, _BESIDE[name]) for name, table in tables.items()]
+    report = _page(study, cohort, _checks(study, store, failures, cohort), command)
+    report = replace(report, data=data, beside=beside)
+    write_files(store.folder, report.files(pdf=pdf))
+    return report
+
+
+def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -> Report:
+    """The page of a cohort."""
+    verdict, name = cohort_verdict(cohort), cohort.name(cohort.measure)
+    people = len({unit.subject for unit in study.units})
+    provenance = Provenance(command=command)
+    recordings = f"{sum(len(unit.files) for unit in study.units)} files of {people} people"
+    compared: list[Block] = [comparisons(cohort)] if cohort.compared else []
+    copied: Copy | str = "There is no comparison to copy."
+    if cohort.lead is not None:
+        others = " ".join(f"{claim.text} {claim.why}" for claim in verdict.may[1:])
+        without = cohort.without_warned() if verdict.alerts else ""
+        results = f"{verdict.headline} {verdict.sentence} {others}{without}".strip()
+        copied = Copy(_METHODS.format(people=people), results)
+    caption = (
+        "A row for each fit, with its 95 % CI where there is one. Grey band: mean of the people "
+        "with its 95 % CI. Lines at the edge go on. Hollow: not identified, and not compared."
     )
-    report = Report(
-        "impc cohort",
-        f"Groups and visits of {len(subjects)} subjects",
-        (Verdict(said[0]), *((Lines(said[1:]),) if said[1:] else ()), summary),
+    alternative = f"{name[:1].upper()}{name[1:]} of every person, by group, with intervals"
+    return Report(
+        "impc cohort", "cohort report", verdict,
         [
-            *([Section("Not fitted", (Lines(failures.lines),))] if failures.lines else ()),
-            Section(
-                "1. Groups and visits",
-                [
-                    _COMPARED.format(_WITHIN if "structure_refused" in units.columns else _CENTRE),
-                    *([_GROUPS] if figures else []),
-                    *([_comparison(compared)] if compared else []),
-                ],
-            ),
-            Section("2. Subjects", [_links(subjects), *_unit_findings(units)]),
-            Section("3. The run", [_RUN.format(command)]),
+            Section("Comparisons", compared or ["With one group and visit nothing is compared."]),
+            Section("Subjects", [_subjects(study, cohort)]),
+            Section("Checks", [Checks(checks)]),
+            Section("Provenance", [Terms([("Recordings", recordings), *provenance.terms])]),
         ],
-        figures=figures,
-        provenance=Provenance(command=command),
-        words=signals.get("words", ()),
-        data={
-            "units": len(study.units),
-            "fitted": len(units),
-            "failed": failures.units,
-            "failed_replicates": failures.replicates,
-            "digests": store.digests,
-            "not_identified": left_out,
-        },
-        beside=[Finding(name, table) for name, table in tables.items()],
+        meta=("Cohort", f"{people} people", f"{len(study.units)} fits asked for"),
+        hero=Picture("people", alternative, caption) if name else None,
+        keys=_keys(cohort),
+        figures={"people": partial(forest, cohort)} if name else {},
+        copy=copied,
+        provenance=provenance,
+    )  # fmt: skip
+
+
+def _address(subject: str) -> str:
+    return f"subjects/sub-{safe_name(subject)}.html"
+
+
+def _keys(cohort: Cohort) -> list[Key]:
+    (name, known, of), fits = cohort.identified, len(cohort.units)
+    keys = []
+    if cohort.lead is not None:
+        value, ends = cohort.amount(cohort.lead)
+        first, _, unit = value.partition(" ")
+        what = f"difference, {cohort.name(cohort.lead.measure)}"
+        keys = [Key(first, unit, what, f"95 % CI {ends}")]
+    if name:
+        keys.append(Key(f"{known} of {of}", "people", f"{name} identified", "others: not compared"))
+    return [*keys, Key(f"{cohort.warned} of {fits}", "fits", "with a warning", "see Subjects")]
+
+
+def comparisons(cohort: Cohort) -> Finding:
+    """Every comparison; those of logarithms as ratios."""
+    rows = []
+    for item in cohort.compared:
+        ends, unit = np.array([item.estimate, item.low, item.high]), cohort.unit(item.measure)
+        if item.question == "reliability":
+            unit = "-"
+        elif item.measure.startswith(LOGARITHM):
+            ends, unit = np.exp(ends), "ratio"
+        rows.append({
+            "measure": cohort.name(item.measure), "question": _QUESTIONS[item.question],
+            "condition": item.condition,
+            "compared": f"{item.second} - {item.first}" if item.first else "",
+            **dict(zip(("difference", "low", "high"), map(float, ends), strict=True)),
+            "unit": unit, "n": item.n, "effect": item.effect, "p": item.p, "p_holm": item.p_holm,
+            "note": item.note,
+        })  # fmt: skip
+    table = pd.DataFrame(rows)
+    weights = (
+        "Cost weights are those of the structure, compared as ratios."
+        if "structure_refused" in cohort.units.columns
+        else "Central cost weights are a convention, the same for everybody: compare gains first."
     )
-    write_files(store.folder, report.files())
-
-
-def _links(subjects: Iterable[str]) -> str:
-    return Markup(", ").join(
-        Markup('<a href="subjects/sub-{}.html">{}</a>').format(safe_name(name), name)
-        for name in subjects
+    caption = (
+        "Difference of means (second minus first) or ICC(A,1), with 95 % CI. Effect: Hedges' g, "
+        "between visits Cohen's d of the differences. n: people. p (Holm): corrected over the "
+        f"measures of one question. {weights}"
     )
+    heads = ("question", "condition", "compared", "note")
+    return Finding(
+        "comparisons", table, caption, digits=3,
+        folded="All comparisons in numbers" if len(table) > 12 else "",
+        labels={**_INTERVAL, "p_holm": "p (Holm)"},
+        hidden=[name for name in heads if table[name].nunique() < 2],
+    )  # fmt: skip
 
 
-def _unit_findings(units: pd.DataFrame) -> list[Finding]:
-    """How much of every unit is explained; its weights within the structure, where one is asked."""
-    if not len(units):
-        return []
-    shown = [name for name in units.columns if name.startswith(("vaf.", "held_out_vaf."))]
-    explained = units[["unit", "group", *shown]].assign(
-        at_the_bound_percent=100 * units["saturated"]
-    )
-    found = [Finding("agreement", explained, "Every unit. units.csv has all numbers.")]
-    penalised = [name for name in units.columns if name.startswith("log_cost_weight.")]
-    if penalised:
-        word = np.where(units["structure_refused"], "refused", "holds")
-        cost_weights = units[["unit", "group"]].assign(structure=word)
-        for name in penalised:
-            label = name.removeprefix("log_cost_weight.")
-            for end in ("", "_low", "_high"):
-                logarithm = units[f"log_cost_weight{end}.{label}"].astype(float)
-                cost_weights[f"{label}{end}"] = np.exp(logarithm.fillna(-np.inf))
-        caption = (
-            "Cost weights within the structure, with one for the first command, and their "
-            "intervals of 95 %; it holds where the recordings do not refuse it."
-        )
-        found.append(Finding("cost_weights", cost_weights, caption, digits=3))
-    return found
-
-
-def _findings(compared: tuple[Comparison, ...]) -> list[str]:
-    """Differences that stand after Holm's correction; of logarithms as factors."""
-    lines = []
-    for item in compared:
-        if not item.p_holm <= 0.05:
-            continue
-        effect = f", effect {item.effect:+.2f}" if np.isfinite(item.effect) else ""
-        significance = f"p = {item.p_holm:.2g} after Holm{effect}"
-        kind, _, feature = item.measure.partition(".")
-        if kind == "log_cost_weight" and item.question in ("group", "visit", "mixed"):
-            factor, low, high = (f"{np.exp(x):.2g}" for x in (item.estimate, item.low, item.high))
-            over = " over all visits" if item.question == "mixed" else ""
-            line = (
-                f"the cost weight of {feature} is {factor} times as high in {item.second} as in "
-                f"{item.first}{over} (95 %: {low} to {high}; {significance})."
-            )
+def _subjects(study: Study, cohort: Cohort) -> Finding:
+    """Every unit in a table, with a badge and a link to its page."""
+    rows, name = [], cohort.name(cohort.measure)
+    found = cohort.units.join(cohort.ends) if cohort.measure else cohort.units
+    made = {row["unit"]: row for row in found.to_dict("records")}
+    signals = {f"vaf.{one}": cohort.word(one) for one in cohort.described.get("outputs", ())}
+    for unit in study.units:
+        row = {head: getattr(unit, head) for head in ("subject", "group", "visit", "condition")}
+        own = made.get(unit.name)
+        if own is None:
+            row |= {"verdict": "Not fitted", "why": cohort.failed.get(unit.name, "")}
         else:
-            what = f"{item.first} and {item.second}" if item.first else "groups over visits"
-            line = f"{measure_words(item.measure)} differs between {what} ({significance})."
-        line = f"{item.condition}: {line}" if item.condition else line
-        lines.append(line[0].upper() + line[1:])
-    return lines or ["No difference between groups or visits stands after Holm's correction."]
+            row |= {"verdict": _BADGES[own["level"]][0]}
+            row |= {head: own[head] for head in ("value", "low", "high", *signals)}
+            row |= {"at_limit_percent": 100 * float(own["saturated"])}
+            row |= {"why": "" if own["level"] == Level.GREEN.value else own["headline"]}
+        rows.append(row)
+    heads = ["subject", "group", "visit", "condition", "verdict", "value", "low", "high"]
+    table = pd.DataFrame(rows, columns=[*heads, *signals, "at_limit_percent", "why"])
+    table.insert(5, "measure", name)
+    table.insert(9, "unit", cohort.unit(cohort.measure))
+    plain = [one for one in ("group", "visit", "condition", "why") if table[one].nunique() < 2]
+    return Finding(
+        "subjects", table,
+        "Every subject and visit; click a head to sort. Without a number: not identified.",
+        digits=4,
+        labels={
+            **{head: f"{words}, VAF (%)" for head, words in signals.items()}, **_INTERVAL,
+            "value": f"{name} ({cohort.unit(cohort.measure)})",
+            "at_limit_percent": "At limit (% of time)",
+        },
+        hidden=["measure", "unit", *plain],
+        links={unit.subject: _address(unit.subject) for unit in study.units},
+        badges=dict(_BADGES.values()) | {"Not fitted": Level.RED},
+    )  # fmt: skip
 
 
-def _structure_lines(units: pd.DataFrame) -> list[str]:
-    """Whether the structure holds, unit by unit."""
-    if "structure_refused" not in units.columns:
-        return []
-    refused = int(np.sum(units["structure_refused"]))
-    penalised = [name for name in units.columns if name.startswith("log_cost_weight.")]
-    absent = np.isnan(units[penalised].to_numpy()) & np.isfinite(units[["structure_p"]].to_numpy())
-    zero = int(np.sum(np.any(absent, axis=1)))
-    lines = [
-        f"The structure of the weights is refused by the recordings of {refused} of {len(units)} "
-        "units; at 5 % one in twenty would be by chance."
-    ]
-    if zero:
-        lines.append(
-            f"{zero} units want a cost weight of zero somewhere: it has no logarithm, and they "
-            "are not in the comparison of that cost weight."
-        )
-    return lines
+def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> list[Check]:
+    """What was checked over all fits; amber where it restricts what may be reported."""
+    units, total, warned = cohort.units, len(study.units), cohort.warned
+    fits, (name, known, of) = len(units), cohort.identified
+    never = int(np.sum(units["saturated"] == 0)) if fits else 0
+    refused = int(units.get("structure_refused", pd.Series(dtype=bool)).sum())
+    drawn = fits * int(study.configuration.fit.get("replicates", 0))
+    lost = sum(map(len, failures.replicates.values()))
+    cases = (
+        (True, fits == total, "Fits", f"{fits} of {total} fits were made."),
+        (True, not warned, "Warnings", f"{warned} of {fits} fits have a warning."),
+        (name, known == of, "Identified",
+         f"The {name} is identified in {known} of {of} people; the others are not compared."),
+        (never, None, "Limit",
+         f"{never} of {fits} fits never reach the torque limit, and say nothing about it."),
+        ("structure_refused" in units.columns, refused <= 0.1 * fits, "Structure",
+         f"Rejected in {refused} of {fits} fits; at 5 % one in twenty is so by chance."),
+        (drawn, not lost, "Bootstrap",
+         f"{drawn - lost} of {drawn} bootstrap repetitions done, {lost} failed."),
+    )  # fmt: skip
+    levels = {True: Level.GREEN, False: Level.AMBER, None: Level.NOTE}
+    found = [Check(levels[passed], head, said) for there, passed, head, said in cases if there]
+    return [*found, _falls(study.units, store, failures)]
 
 
-def _limits(units: pd.DataFrame) -> list[str]:
-    """What those units say of the limit that never reach it."""
-    never = int(np.sum(units["saturated"] == 0)) if len(units) else 0
-    if not never:
-        return []
-    return [
-        f"{never} of {len(units)} units never reach the limit of their command: they cannot say "
-        "inverse MPC from inverse LQR, nor where the limit is."
-    ]
-
-
-def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> list[str]:
-    """Trials that were left out because the subject fell, and what that does to a comparison."""
+def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> Check:
+    """Trials that were left out because the person fell, by group."""
     fallen: dict[str, int] = {}
     for unit in units:
         fit, group = store.fit(unit.name), unit.group or "all"
         all_fell = FELL in failures.units.get(unit.name, "")
         kept = 0 if all_fell else len(unit.files) if fit is None else int(fit["trials"])
         fallen[group] = fallen.get(group, 0) + len(unit.files) - kept
-    counts = ", ".join(f"{lost} of group {group}" for group, lost in sorted(fallen.items()))
     if not any(fallen.values()):
-        return []
+        return Check(Level.GREEN, "Falls", "No person fell in any trial.")
+    counts = ", ".join(f"{lost} in group {group}" for group, lost in sorted(fallen.items()))
+    return Check(
+        Level.AMBER, "Falls",
+        f"Trials with a fall were left out ({counts}). If one group falls more often, the rest "
+        "may understate how the groups differ: compare the numbers of falls as well.",
+    )  # fmt: skip
+
+
+def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failures) -> Report:
+    """The page of a subject: a section for each visit and condition."""
+    fits = {unit.name: fit for unit in units if (fit := store.fit(unit.name)) is not None}
+    sections, first = [], next(iter(fits), "")
+    for unit in units:
+        title = ", ".join(filter(None, (unit.visit and f"Visit {unit.visit}", unit.condition)))
+        blocks: list[Block] = [f"Not fitted: {failures.units.get(unit.name, 'not fitted yet')}."]
+        if unit.name in fits:
+            shown = Picture(unit.name, "Recorded and modelled outputs", _CURVES)
+            blocks = [*([shown] if unit.name != first else []), *_blocks(unit, fits[unit.name])]
+        sections.append(Section(title or "Fit", blocks))
+    verdict = Verdict(Level.RED, "No recording of this subject could be fitted.", "")
+    if fits:  # That of the fit with the worst level
+        worst = max((fit["verdict"] for fit in fits.values()),
+                    key=lambda one: [*_BADGES].index(one["level"]))  # fmt: skip
+        verdict = Verdict(Level(worst["level"]), worst["headline"], worst["sentence"])
+    group = [f"Group {units[0].group}"] if units[0].group else []
+    return Report(
+        f"impc cohort: {subject}", "subject report", verdict, sections,
+        meta=(_HOME, f"Subject {subject}", *group, f"{len(fits)} of {len(units)} fits"),
+        hero=Picture(first, "Recorded and modelled outputs", _CURVES) if first else None,
+        keys=_subject_keys(fits[first]) if first else (),
+        figures={name: partial(subject_figure, fit) for name, fit in fits.items()},
+    )  # fmt: skip
+
+
+def _subject_keys(fit: Mapping[str, Any]) -> list[Key]:
+    least, name = min((or_nan(value), name) for name, value in fit["vaf"].items())
     return [
-        f"Trials in which the subject fell are left out ({counts}). Where one group falls more "
-        "often than another, what is left may understate how the groups differ: compare the "
-        "numbers of falls as well."
-    ]
+        Key(number(least, 4), "%", "explained (VAF)", f"least: {fit['words'].get(name, name)}"),
+        Key(number(100 * fit["saturated"]), "% of the time", "at the torque limit"),
+        *(Key(number(row["gain"]), row["unit"], f"gain on {row['state']}",
+              f"95 % CI {between(row['low'], row['high'])}")
+          for row in _gains(fit) if row["identified"]),
+    ][:3]  # fmt: skip
 
 
-def _figures(
-    units: pd.DataFrame, compared: tuple[Comparison, ...], names: Mapping[str, str]
-) -> dict[str, bytes]:
-    measures = _most_telling(compared, units) if len(units) else []
-    with journal_style():
-        shown = only_identified(units)
-        return drawn({"groups": group_figure(shown, measures, names)} if measures else {})
+def _blocks(unit: Unit, fit: Mapping[str, Any]) -> list[Block]:
+    left_out = {name: f" (left-out trials: {number(value, 4)} %)"
+                for name, value in fit["held_out_vaf"].items() if value is not None}  # fmt: skip
+    explained = " and ".join(
+        f"{number(or_nan(fit['vaf'][name]), 4)} % of {fit['words'].get(name, name)}"
+        f"{left_out.get(name, '')}" for name in fit["outputs"]
+    )  # fmt: skip
+    gains = pd.DataFrame(_gains(fit))
+    notes = [line for trial in fit["findings"] for line in trial]
+    return [
+        f"{fit['verdict']['headline']} Explained in {fit['trials']} trials (VAF): {explained}.",
+        Finding(f"{unit.name}-gain", gains, "Feedback gain.", digits=3, labels=_INTERVAL,
+                hidden=["control"] if len(fit["controls"]) == 1 else []),
+        *([Lines(notes)] if notes else []),
+    ]  # fmt: skip
 
 
-def _most_telling(compared: tuple[Comparison, ...], units: pd.DataFrame) -> list[str]:
-    """Six measures for the picture: those that differ most, else the first ones."""
-    ranked = sorted(
-        (item for item in compared if item.question == "group" and np.isfinite(item.p)),
-        key=lambda item: item.p,
-    )
-    names = [item.measure for item in ranked] + list(measures_of(units))
-    return [name for name in dict.fromkeys(names) if units[name].notna().any()][:6]
-
-
-def _comparison(compared: tuple[Comparison, ...]) -> Finding:
-    table = table_of(
-        compared,
-        {
-            "question": lambda item: _QUESTIONS[item.question],
-            "measure": lambda item: measure_words(item.measure),
-            "condition": attrgetter("condition"),
-            "compared": lambda item: f"{item.second} - {item.first}" if item.first else "",
-            **{name: attrgetter(name) for name in _NUMBERS},
-        },
-    )
-    caption = (
-        "Difference of means, or ICC(A,1) of the reliability, with its interval of 95 %; effect: "
-        "Hedges' g between groups and of changes, d_z between visits."
-    )
-    return Finding("comparisons", table, caption, digits=3)
+def _gains(fit: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Every entry of the gain; an interval where it is identified by itself."""
+    words, rows = fit["words"], []
+    for i, control in enumerate(fit["controls"]):
+        for j, state in enumerate(fit["states"]):
+            known, gain = bool(fit["K_identified"][i][j]), float(fit["K"][i][j])
+            reach = 1.96 * or_nan(fit["K_deviation"][i][j]) if known else np.nan
+            rows.append({
+                "state": words.get(state, state), "control": words.get(control, control),
+                "gain": gain, "low": gain - reach, "high": gain + reach,
+                "unit": fit["units"].get(f"K.{control}.{state}", UNKNOWN), "identified": known,
+            })  # fmt: skip
+    return rows

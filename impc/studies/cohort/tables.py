@@ -1,6 +1,6 @@
 """Tables of a cohort, made from the folder: what pandas, R and MATLAB read.
 
-    units.csv       a row a unit: labels, VAF, gain, its deviations, dominant direction, parameters,
+    units.csv       a row a unit: labels, verdict, VAF, gain and its standard errors, parameters,
                     logarithms of the cost weights within a structure
     replicates.csv  a row a replicate: labels, number, gain, parameters
     intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
@@ -19,6 +19,7 @@ import pandas as pd
 
 from impc.arrays import percentiles
 from impc.assess.assessments import ASSESSMENTS
+from impc.model.plant import UNKNOWN
 from impc.studies.cohort.study import LABELS
 
 if TYPE_CHECKING:
@@ -32,33 +33,29 @@ _CENTRE = "analytic centre (no units)"
 
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
     """The tables of the module's text by name; units without a fit are in none."""
-    units, replicates, intervals = [], [], []
+    found: dict[str, list[dict[str, Any]]] = {"units": [], "replicates": [], "intervals": []}
     count = int(study.configuration.fit.get("replicates", 0))
     for unit in study.units:
         fit = store.fit(unit.name)
         if fit is None:
             continue
         labels = {"unit": unit.name} | {name: getattr(unit, name) for name in LABELS}
-        units.append(labels | _unit_row(fit))
-        drawn = {}
+        found["units"].append(labels | _unit_row(fit))
+        drawn = []
         for index in range(count):
-            found = store.fit(unit.name, index)
-            if found is not None:
-                drawn[index + 1] = _gain(fit, "K", found["K"]) | dict(
-                    zip(fit["parameters"], found["parameters"], strict=True)
-                )
-        replicates += [labels | {"replicate": number} | row for number, row in drawn.items()]
+            again = store.fit(unit.name, index)
+            if again is not None:
+                own = zip(fit["parameters"], again["parameters"], strict=True)
+                drawn.append(_gain(fit, "K", again["K"]) | dict(own))
+                found["replicates"].append(labels | {"replicate": index + 1} | drawn[-1])
         if len(drawn) > 1:
-            intervals += [labels | row for row in _intervals(fit, pd.DataFrame(drawn.values()))]
-    return {
-        "units": pd.DataFrame(units),
-        "replicates": pd.DataFrame(replicates),
-        "intervals": pd.DataFrame(intervals),
-    }
+            found["intervals"] += [labels | row for row in _intervals(fit, pd.DataFrame(drawn))]
+    return {name: pd.DataFrame(rows) for name, rows in found.items()}
 
 
 def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
-    row: dict[str, Any] = {"trials": fit["trials"], "samples": fit["samples"]}
+    said = {name: fit["verdict"][name] for name in ("level", "headline")}
+    row: dict[str, Any] = {**said, "trials": fit["trials"], "samples": fit["samples"]}
     for name in ASSESSMENTS:
         given = fit[name] if isinstance(fit[name], dict) else {"": fit[name]}
         row |= {f"{name}.{signal}".rstrip("."): value for signal, value in given.items()}
@@ -66,10 +63,12 @@ def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
     for name in ("K", "K_deviation", "K_identified", "K_of_weights"):
         row |= _gain(fit, name, fit[name])
     reported = next(iter(fit["readings"].values()))
-    row |= _states(fit, "dominant", reported["dominant"])
-    row |= _states(fit, "cost_weight", np.diag(reported["Q"]))
+    of_states = {"dominant": reported["dominant"], "cost_weight": np.diag(reported["Q"])}
     if _CENTRE in fit["readings"]:
-        row |= _states(fit, "centre_weight", np.diag(fit["readings"][_CENTRE]["Q"]))
+        of_states["centre_weight"] = np.diag(fit["readings"][_CENTRE]["Q"])
+    for name, values in of_states.items():
+        row |= {f"{name}.{state}": float(one)
+                for state, one in zip(fit["states"], values, strict=True)}  # fmt: skip
     row |= fit["parameters"]
     return row | structure_row(fit)
 
@@ -82,12 +81,6 @@ def _gain(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
     }
 
 
-def _states(fit: dict[str, Any], name: str, values: Any) -> dict[str, float]:
-    return {
-        f"{name}.{state}": float(value) for state, value in zip(fit["states"], values, strict=True)
-    }
-
-
 def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, Any]]:
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
     identified = _gain(fit, "K", fit["K_identified"])
@@ -97,13 +90,9 @@ def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, A
         known = identified.get(str(name), True)
         low, high = percentiles(values, 0.95) if known else (np.nan, np.nan)
         yield {
-            "name": name,
-            "value": estimate[name],
-            "low": float(low),
-            "high": float(high),
-            "level": 0.95,
-            "replicates": len(drawn),
-        }
+            "name": name, "unit": fit["units"].get(name, UNKNOWN), "value": estimate[name],
+            "low": float(low), "high": float(high), "level": 0.95, "replicates": len(drawn),
+        }  # fmt: skip
 
 
 def structure_row(fit: dict[str, Any]) -> dict[str, Any]:

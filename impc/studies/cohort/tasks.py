@@ -19,10 +19,12 @@ import psutil
 from impc.arrays import frozen
 from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent_statements import intent
+from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import bootstrap_model, replicate
 from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
+from impc.assess.weights_test import weights_test
 from impc.checking import replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.files.digests import content_digest, digest, source_digest, versions
@@ -30,12 +32,12 @@ from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured_fit import fit_structured
-from impc.model.plant import weight_unit
+from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
-from impc.reporting.shown_units import angles_in, shown_unit, signal_words
+from impc.reporting.shown_units import angles_in, shown_unit, signal_name
+from impc.studies.cohort.unit_verdict import unit_verdict
 from impc.studies.effort import Effort, fit_effort
 from impc.studies.fit.asked import asked_plant, fit_structures
-from impc.studies.fit.gain_findings import number_units
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_problem, state_sizes
 
@@ -43,10 +45,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
+    from impc.assess.assessments import MethodFit
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.model.plant import Plant
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
 
@@ -150,7 +154,10 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     configuration = task.configuration
     plant, family = asked_plant(source, configuration.recorded, settings, configuration.aimed)
     paths = [Path(name) for name in task.files]
-    (first, *others), fallen = read_unit(paths, configuration, plant)
+    read, fallen = read_unit(paths, configuration, plant)
+    if not read:
+        raise fallen[0]
+    first, *others = read
     left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
     recordings = (replace(first, findings=(*first.findings, *left)), *others)
     return fit_problem(plant, recordings, settings, family), settings
@@ -183,21 +190,18 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     sizes = state_sizes(fit.runs)
     readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
     family = estimate.problem.family
-    names = () if family is None else family.names
-    units = number_units(plant) | {
-        f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states
-    }
+    known = () if family is None else family.names
+    try:
+        lack = lack_of_fit(estimate)
+    except (ImpcError, np.linalg.LinAlgError):
+        lack = None
+    test = weights_test(fitted, estimate, contradicted=lack is not None and lack.alarm)
+    identified = bool(np.any(estimate.covariance.individually_identified))
     limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
-    first = fitted.problem.recordings[0]
-    step = max(1, first.samples // 600)
+    saturated = saturated_share(fit.commands, *limits)
     return {
-        "states": plant.states,
-        "controls": plant.controls,
-        "outputs": plant.outputs,
-        "shown_units": [shown_unit(plant, name) for name in plant.outputs],
-        "words": signal_words(plant),
-        # Of the measures that a cohort compares, by their columns of units.csv.
-        "units": {name: "-" if unit == "1" else unit for name, unit in units.items()},
+        **_named(plant),
+        "verdict": unit_verdict(fit, lack, test, saturated, identified).data(),
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
@@ -211,24 +215,51 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "exact": fitted.explained,
         "converged": fitted.converged,
         **assessed(fit),
-        "saturated": saturated_share(fit.commands, *limits),
+        "saturated": saturated,
+        "fell": fit.fell,
+        "limit": np.max(np.abs(limits), axis=0),
         "state_sizes": sizes,
         "readings": {
             item.rule: {"Q": item.weights.Q, "dominant": item.dominant, "angle": item.angle}
             for item in readings.readings
         },
-        "parameters": dict(zip(names, estimate.parameters, strict=True)),
+        "parameters": dict(zip(known, estimate.parameters, strict=True)),
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
         "offsets": estimate.problem.shifts,
         "findings": [trial.findings for trial in problem.recordings],
-        # Of the first trial, a few hundred points.
-        "trajectory": {
-            "dt": plant.dt * step,
-            "recorded": first.without_offset[::step],
-            "simulated": (fit.runs[0].x @ plant.C.T)[::step],
-        },
+        "trajectory": _trajectory(fit),
         "structure": _structure(problem, fitted, settings),
+    }
+
+
+def _named(plant: Plant) -> dict[str, Any]:
+    """Names and units of what the pages of a cohort show."""
+    names = (*plant.outputs, *plant.states, *plant.controls)
+    units = {
+        f"K.{control}.{state}": gain_unit(plant, control, state)
+        for control in plant.controls
+        for state in plant.states
+    } | {f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states}
+    return {
+        "states": plant.states,
+        "controls": plant.controls,
+        "outputs": plant.outputs,
+        "shown_units": [shown_unit(plant, name) for name in plant.outputs],
+        "words": {name: signal_name(plant, name) for name in names},
+        # Of the measures that a cohort compares, by their columns of units.csv.
+        "units": {name: "-" if unit == "1" else unit for name, unit in units.items()},
+    }
+
+
+def _trajectory(fit: MethodFit) -> dict[str, Any]:
+    """A few hundred points of the first trial, recorded and modelled."""
+    plant, first = fit.estimate.problem.plant, fit.estimate.problem.recordings[0]
+    step = max(1, first.samples // 600)
+    return {
+        "dt": plant.dt * step,
+        "recorded": first.without_offset[::step],
+        "simulated": (fit.runs[0].x @ plant.C.T)[::step],
     }
 
 

@@ -1,238 +1,281 @@
-"""The report of a comparison of methods: page, table as CSV, result.json, one figure."""
+"""The page of a comparison of methods, and its files."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
-from markupsafe import Markup
 
-from impc.assess.assessments import ASSESSMENTS
 from impc.checking import replace
-from impc.control.named_solver import described
-from impc.inverse.methods import METHODS
-from impc.reporting.document import Lines, Report, Section, Terms, Verdict
-from impc.reporting.estimate_text import gain_table
-from impc.reporting.finding import Chart, Finding, Picture
-from impc.reporting.shown_units import axis_label, body_sentence, signal_words
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
-from impc.studies.charts import chart_figure, methods_chart
+from impc.inverse.estimates import Status
+from impc.reporting.document import Block, Check, Checks, Copy, Fold, Report, Section
+from impc.reporting.finding import Chart, Finding, Level, Picture
+from impc.reporting.rendering import number
+from impc.reporting.shown_units import signal_name
+from impc.reporting.style import HALF
+from impc.reporting.verdict import Alert, Claim, Key, Verdict
+from impc.studies.charts import trajectories
+from impc.studies.fit.facts import limits, with_unit
+from impc.studies.methods_figure import (
+    by_score,
+    explained,
+    first_fall,
+    largest_commands,
+    methods_figure,
+    unexplained,
+)
 from impc.studies.methods_table import (
-    column_terms,
-    methods_data,
+    controller_findings,
+    method_label,
     methods_finding,
+    methods_fold,
+    problem_data,
+    provenance_section,
     trajectory_table,
-    weight_entries,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from matplotlib.figure import Figure
-
-    from impc.arrays import Array
     from impc.assess.assessments import MethodFit
     from impc.inverse.problem import Problem
     from impc.reporting.provenance import Provenance
 
-# Percent that exact recordings leave, and less.
-_ROUNDING = 1e-6
-_PICTURE = Picture(
-    "comparison",
-    "VAF in and out of sample and largest command of every method",
-    "Left: what a method does not explain, 100 % less its VAF, mean over outputs; filled, all "
-    "trials; open, trials left out; farther left is better. Right: largest command; the dotted "
-    "line is the subject's bound, hatched bars exceed it.",
-)
+# Below this VAF, %, a model explains little; more variance left than this many times is worse.
+_HALF, _WORSE = 50.0, 1.1
+# Trials whose trajectories are on the page, the first ones.
+_DRAWN = 6
 
 
-# Curves in the picture of a trial: recorded, and the three methods that explain most.
-_CURVES = 4
-_TRAJECTORIES = Picture(
-    "trajectories",
-    "Outputs and commands of the first trial: recorded, and as the best three methods have them",
-    "The first trial: recorded (grey), and the three methods that explain most. Dotted: the "
-    "subject's bounds.",
-)
+class _Facts:
+    """What the methods come to: sentences and numbers are made of these."""
+
+    def __init__(self, fits: Sequence[MethodFit]) -> None:
+        plant, bounds = fits[0].estimate.problem.plant, fits[0].bounds
+        word = signal_name(plant, plant.controls[0]).removeprefix("commanded ")
+        self.fits = fits
+        # Those that reach the end of every trial, the best one first
+        self.ranked = [one for one in by_score(fits) if not np.any(np.isnan(explained(one)))]
+        # Such as "6 N m", empty without limits; "torque limit"
+        self.limit = " and ".join(limits(plant, np.array(bounds.u_min), np.array(bounds.u_max)))
+        self.word = f"{word} limit" if plant.m == 1 else "limit"
+        # The best that does not know the limits; without limits the next
+        free = [one for one in self.ranked if not _knows(one)]
+        self.other = next(iter(free if self.limit else self.ranked[1:]), None)
+        self.against = "best model without a limit" if self.limit else "next model"
+        self.held = bool(self.ranked) and all(len(one.held_out) for one in self.ranked)
+        self.where = "left-out trials" if self.held else "the trials that it was fitted to"
+
+    @property
+    def best(self) -> MethodFit:
+        """Of those that reach the end."""
+        return self.ranked[0]
+
+    @property
+    def times(self) -> float:
+        """How many times as much variance the other one leaves."""
+        return 1.0 if self.other is None else unexplained(self.other) / unexplained(self.best)
 
 
 def compare_report(
-    problem: Problem,
-    compared: Sequence[MethodFit],
-    provenance: Provenance,
+    problem: Problem, compared: Sequence[MethodFit], provenance: Provenance
 ) -> Report:
-    """Page, result.json, tables and the figures."""
-    subject = str(problem.recordings[0].label.subject) or "a subject"
-    methods = [METHODS[item.name] for item in compared]
+    """Page, result.json, tables and figure."""
+    subject = str(problem.recordings[0].label.subject) or "one person"
     found = compared[-1].estimate.problem.recordings  # with their offsets
-    problem = replace(problem, recordings=found)
-    with journal_style():
-        curves = methods_chart(problem, _by_score(compared), 0)
-        figures = drawn(
-            {
-                "comparison": _figure(problem, compared),
-                "trajectories": chart_figure(curves, _CURVES),
-            }
-        )
-    sections = [
-        Section(
-            "1. All methods on the same recordings",
-            (_PICTURE, methods_finding(compared), Chart(_TRAJECTORIES, curves)),
-            "Methods",
-            together=True,
-        ),
-        Section(
-            "2. What each method does, and what each column says",
-            (Terms([(one.label, (one.sentence,)) for one in methods]), column_terms()),
-            "Columns",
-            folded=True,
-        ),
-        Section("3. Weights", (_weights(problem, compared),), "Weights", folded=True),
-        Section(
-            "4. Versions",
-            (
-                Markup("<code>{}</code>").format(provenance.command),
-                Terms(
-                    [
-                        ("Made", (provenance.made,)),
-                        ("Plant", (Markup("<code>{}</code>").format(provenance.plant_name),)),
-                        ("Body", (body_sentence(problem.plant),)),
-                        ("Quadratic programs", (f"Solved by {described(problem.solver)}.",)),
-                        ("Versions", (provenance.all_versions,)),
-                    ]
-                ),
-            ),
-            folded=True,
-        ),
-    ]
+    problem, facts = replace(problem, recordings=found), _Facts(compared)
+    verdict, count = _verdict(facts), len(found)
+    ranked = [*by_score(compared), *(fit for fit in compared if fit.estimate.K is None)]
+    files = provenance.files
+    names = dict(enumerate(files if len(files) == count else map(str, range(1, count + 1))))
+    drawn = trajectories(problem, ranked, dict(list(names.items())[:_DRAWN]))
+    sway = trajectory_table(problem, names, {one.name: one.runs for one in ranked if one.runs})
+    seconds = sum(trial.samples for trial in found) * problem.plant.dt
+    chart = Fold(
+        "Recorded, and simulated by each method from the start of the trial",
+        [Chart("Trajectories", drawn)],
+    )
+    methods: list[Block] = [methods_finding(ranked), methods_fold(fit.name for fit in compared)]
     return Report(
         f"impc compare: {subject}",
-        f"Methods for the weights behind the recordings of {subject}",
-        (Verdict(_verdict(compared)), Lines(_findings(compared))),
-        sections,
-        figures=figures,
-        beside=[_gain(problem, compared), _trajectories(problem, compared)],
-        data=_data(problem, compared),
+        "comparison of methods",
+        verdict,
+        [
+            Section("Methods", methods),
+            Section("Trajectories", [chart]),
+            Section("Checks", [Checks(_checks(facts, problem))]),
+            provenance_section(problem, provenance),
+        ],
+        meta=(
+            subject,
+            f"{len(compared)} methods",
+            f"{count} trial{'s' * (count > 1)}, {number(seconds)} s",
+        ),
+        hero=Picture(
+            "comparison",
+            "Variance that each method leaves unexplained, and the largest command it needs",
+            f"Left: variance in {facts.where}; farther left is better (logarithmic axis)."
+            + (" Blue: stays within the limit. Shaded: beyond it." if facts.limit else ""),
+        ),
+        keys=_keys(facts),
+        figures={"comparison": lambda narrow: methods_figure(compared, narrow, HALF)},
+        copy=_copy(facts, count) if verdict.level is Level.GREEN else verdict.sentence,
+        beside=[*controller_findings(compared), Finding("trajectories", sway, "A row a sample.")],
+        data=problem_data(problem, compared),
         provenance=provenance,
-        words=signal_words(problem.plant),
     )
 
 
-def _usable(compared: Sequence[MethodFit]) -> list[MethodFit]:
-    return [item for item in compared if not np.any(np.isnan(item.vaf))]
+def _knows(fit: MethodFit) -> bool:
+    """Whether the method knows the limits of the command."""
+    return bool(np.any(np.isfinite(fit.estimate.problem.bounds.u_max)))
 
 
-def _by_score(compared: Sequence[MethodFit]) -> list[MethodFit]:
-    """Those with a simulation, best first; those that fall are last."""
-    shown = [item for item in compared if item.runs]
-    return sorted(shown, key=lambda item: -np.nan_to_num(float(np.mean(_score(item))), nan=-np.inf))
+def _share(fit: MethodFit) -> str:
+    return f"{100 - unexplained(fit):.2f} %"
 
 
-def _verdict(compared: Sequence[MethodFit]) -> str:
-    usable = _usable(compared)
-    held = [item for item in usable if len(item.held_out) and not np.any(np.isnan(item.held_out))]
-    ranked = sorted(held or usable, key=lambda item: -float(np.mean(_score(item))))
-    if not ranked:
-        return "No method explains these recordings to their end."
-    best = ranked[0]
-    where = "trials that it has not seen" if held else "the trials that it was fitted to"
-    kept = "keeps" if best.keeps_bounds else "exceeds"
-    return (
-        f"Best on {where}: {METHODS[best.name].label}, {np.mean(_score(best)):.2f} % on average "
-        f"over the outputs; it {kept} the subject's bounds."
+def _needs(fit: MethodFit) -> str:
+    """Its largest command in words: "12.7 N m", of several commands "210 % of a limit"."""
+    value, _, label = largest_commands(fit)
+    unit = label[label.rindex("(") + 1 : -1].replace("its limit", "a limit")
+    return with_unit(number(value), unit)
+
+
+def _verdict(facts: _Facts) -> Verdict:
+    if not facts.ranked:
+        headline = "No model follows these recordings to their end."
+        return Verdict(Level.RED, headline, "The simulation of every model falls.")
+    best, other = facts.best, facts.other
+    sentence = f"“{method_label(best.name)}” explains {_share(best)} of the variance in "
+    sentence += facts.where
+    if other is not None:
+        sentence += f", the {facts.against} {_share(other)} with up to {_needs(other)}"
+    sentence += "."
+    if float(np.min(explained(best))) < _HALF:
+        poor = Claim("Which model is the best one.", "All are poor.")
+        headline = "No model explains half of this movement."
+        return Verdict(Level.RED, headline, sentence, may_not=[poor])
+    level, headline = _headline(facts)
+    alert = Alert(
+        Level.AMBER,
+        f"The {facts.word} does not agree with the recordings",
+        f"“{method_label(best.name)}” explains most and takes up to {_needs(best)}; "
+        f"{facts.limit} was given.",
+        "The limit may be too low, or the movement is not that of a controller with such a limit.",
+        [
+            "Fit with `unknown_limit = true`, which estimates the limit, and compare again.",
+            "Check body mass, height and the units of the recordings.",
+        ],
     )
-
-
-def _findings(compared: Sequence[MethodFit]) -> list[str]:
-    keeping = [METHODS[item.name].label for item in _usable(compared) if item.keeps_bounds]
-    lines = [f"Keep the subject's bounds: {', '.join(keeping) or 'none'}."]
-    lines += [
-        f"{METHODS[item.name].label}: {item.estimate.reason}."
-        for item in compared
-        if item.estimate.reason
+    same = "Models with the same gain and the same limit move identically."
+    may_not = [
+        Claim("Gains and cost weights.", "They have no intervals here; impc fit computes them."),
+        Claim("That the person computes in this way.", same),
+        *([] if facts.held else [Claim("How well it predicts.", "No trial was left out.")]),
     ]
-    return lines
+    alerts = [] if level is Level.GREEN else [alert]
+    return Verdict(level, headline, sentence, alerts, _may(facts, level), may_not)
 
 
-def _held_out(item: MethodFit) -> Array:
-    return ASSESSMENTS["held_out_vaf"].find(item)
+def _headline(facts: _Facts) -> tuple[Level, str]:
+    best, limit, word = facts.best, facts.limit, facts.word
+    if facts.other is None or not limit:
+        return Level.GREEN, f"“{method_label(best.name)}” explains {_share(best)} of this movement."
+    kept = [fit for fit in facts.ranked if fit.keeps_bounds]
+    free = [fit.keeps_bounds for fit in facts.ranked if not _knows(fit)]
+    if not best.keeps_bounds and (not kept or unexplained(kept[0]) > _WORSE * unexplained(best)):
+        return Level.AMBER, f"The model that explains most needs more than {limit}."
+    if all(free):
+        return Level.GREEN, f"No model needs more than {limit}: the {word} decides nothing here."
+    if any(free):
+        return Level.GREEN, f"The model that explains most keeps to the {word} of {limit}."
+    which = (
+        f"Only models with a {word} fit" if len(kept) > 1 else f"Only a model with a {word} fits"
+    )
+    return Level.GREEN, f"{which} without exceeding {limit}."
 
 
-def _score(item: MethodFit) -> Array:
-    """VAF of each output on trials left out, (p,); on all trials where none was, %."""
-    outside = _held_out(item)
-    return item.vaf if np.any(np.isnan(outside)) else outside
+def _may(facts: _Facts, level: Level) -> list[Claim]:
+    best, other = facts.best, facts.other
+    plant = best.estimate.problem.plant
+    parts = zip(plant.outputs, explained(best), strict=True)
+    each = ", ".join(f"{value:.2f} % ({signal_name(plant, name)})" for name, value in parts)
+    which = "How much is explained."
+    if other is not None:
+        which = f"“{method_label(best.name)}” explains most."
+    found = [Claim(which, f"{each} of {facts.where}.")]
+    if other is not None and facts.limit and not other.keeps_bounds and level is Level.GREEN:
+        much = f"{number(facts.times, 2)} times as much variance is left, and "
+        why = f"Without it, {much * (facts.times > _WORSE)}up to {_needs(other)} is needed."
+        found.append(Claim(f"The {facts.word} matters.", why))
+    return found
 
 
-def _gain(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
+def _keys(facts: _Facts) -> list[Key]:
+    if not facts.ranked:
+        return []
+    best, other = facts.best, facts.other
+    explains = f"{method_label(best.name)}, {facts.where}"
+    first = Key(_share(best)[:-2], "%", "of the variance explained", explains)
+    value, _, unit = _needs(other or best).partition(" ")
+    limit = f"the limit is {facts.limit}" if facts.limit else "no limit"
+    if other is None:
+        beyond = Key(number(100 * best.exceeded), "% of the time", "beyond the limit")
+        return [first, Key(value, unit, "largest command", limit), beyond]
+    lead = number(unexplained(other) - unexplained(best))
+    left = f"{number(facts.times, 2)} times as much variance is left"
+    needs = f"{method_label(other.name)}; {limit}"
+    return [
+        first,
+        Key(lead, "percentage points", f"lead over the {facts.against}", left),
+        Key(value, unit, f"needed by the {facts.against}", needs),
+    ]
+
+
+def _checks(facts: _Facts, problem: Problem) -> list[Check]:
+    count = len(problem.recordings)
+    odd = sum(bool(trial.findings) for trial in problem.recordings)
+    falls = [(method_label(fit.name), first_fall(fit)) for fit in facts.fits]
+    fallen = " ".join(f"{name}: fell at {time:.1f} s." for name, time in falls if time is not None)
+    stopped = [method_label(f.name) for f in facts.fits if f.estimate.status is Status.STOPPED]
+    left_out, level = "No trial was left out.", Level.NOTE
+    if facts.held and facts.other is not None:
+        ahead = facts.best.held_out.mean(axis=1) > facts.other.held_out.mean(axis=1)
+        level = Level.GREEN if np.all(ahead) else Level.NOTE
+        left_out = f"The best model leads in {np.count_nonzero(ahead)} of {len(ahead)}."
+    good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
+    ended = f"Stopped early: {'; '.join(stopped)}." if stopped else "Every search converged."
     rows = [
-        (f"K.{control}.{state}", unit, item.name, value)
-        for item in compared
-        if (K := item.estimate.K) is not None
-        for control, state, unit, value in gain_table(problem.plant, K).itertuples(index=False)
+        (
+            doubt if odd else good,
+            "Recordings",
+            f"{count - odd} of {count} trials without findings.",
+        ),
+        (level, "Left-out trials", left_out),
+        (note if fallen else good, "Falls", fallen or "No model fell."),
+        (doubt if stopped else good, "Searches", ended),
     ]
-    return Finding("gain", pd.DataFrame(rows, columns=["number", "unit", "method", "value"]))
+    for fit in facts.fits:
+        doubts = fit.estimate.doubts if len(facts.fits) == 1 else ()
+        # Without the remedy, which is for programs
+        for said in (fit.estimate.reason.partition(";")[0], *doubts):
+            if said:
+                text = f"{said[:1].upper()}{said[1:].rstrip('.')}."
+                rows.append((note, method_label(fit.name), text))
+    return [Check(*row) for row in rows]
 
 
-def _weights(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
-    rows = [
-        (*entry[:-1], item.name, entry[-1])
-        for item in compared
-        if item.estimate.weights is not None
-        for entry in weight_entries(problem.plant, item.estimate.weights)
-    ]
-    heads = ["matrix", "first", "second", "unit", "method", "value"]
-    caption = "Entries of Q and R, at R = 1 of the first command."
-    return Finding("weights", pd.DataFrame(rows, columns=heads), caption)
-
-
-def _trajectories(problem: Problem, compared: Sequence[MethodFit]) -> Finding:
-    """Every trial; a method that falls has no numbers from there on."""
-    runs = {item.name: item.runs for item in compared if item.runs}
-    every = range(len(problem.recordings))
-    return Finding("trajectories", trajectory_table(problem, every, runs))
-
-
-def _figure(problem: Problem, compared: Sequence[MethodFit]) -> Figure:
-    shown = [item for item in compared if item.estimate.K is not None][::-1]
-    figure = new_figure(DOUBLE_COLUMN, 0.5 + 0.36 * max(len(shown), 2))
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1))
-    rows = np.arange(len(shown))
-    inside = [_unexplained(item.vaf) for item in shown]
-    outside = [_unexplained(_held_out(item)) for item in shown]
-    left.plot(inside, rows, "o", color=BLUE, label="all trials")
-    if not np.all(np.isnan(outside)):
-        left.plot(
-            outside, rows, "o", color=INK, markerfacecolor="none", markersize=9, label="left out"
-        )
-    left.set_xscale("log")
-    left.grid(axis="y", linewidth=0.4)
-    left.set_yticks(rows, [METHODS[item.name].label for item in shown])
-    left.set_xlabel("not explained, 100 - VAF (%)")
-    left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-    largest = [float(item.largest_input[0]) for item in shown]
-    hatches = ["" if item.keeps_bounds else "////" for item in shown]
-    right.barh(rows, largest, 0.6, color="#C8C8C8", edgecolor=INK, linewidth=0.6, hatch=hatches)
-    limit = float(problem.bounds.u_max[0])
-    if np.isfinite(limit):
-        right.axvline(limit, color=INK, linestyle=":", linewidth=1.2)
-        right.set_xlim(0, min(1.05 * max(largest), 5 * limit))
-    right.set_xlabel(f"largest {axis_label(problem.plant, problem.plant.controls[0])}")
-    return figure
-
-
-def _unexplained(shares: Array) -> float:
-    """100 % less the mean VAF; rounding where all is explained, so that it has a logarithm."""
-    return max(100.0 - float(np.mean(shares)), _ROUNDING)
-
-
-def _data(problem: Problem, compared: Sequence[MethodFit]) -> dict[str, Any]:
-    return {
-        "methods": methods_data(compared),
-        "states": problem.plant.states,
-        "outputs": problem.plant.outputs,
-        "horizon": problem.horizon,
-        "body": problem.plant.moves,
-        "solver": problem.solver,
-    }
+def _copy(facts: _Facts, count: int) -> Copy:
+    best, other = facts.best, facts.other
+    others = " and to all trials but one, which they then predicted" if facts.held else ""
+    results = f"{method_label(best.name)} explained {_share(best)} of the variance in {facts.where}"
+    if other is not None:
+        results += f"; the {facts.against} explained {_share(other)}"
+        if facts.limit:
+            results += f" and required up to {_needs(other)}, where {facts.limit} was available"
+    return Copy(
+        f"{len(facts.fits)} models were fitted to {count} trials{others}. Agreement is variance "
+        "accounted for (VAF), averaged over the recorded signals.",
+        f"{results}.",
+    )

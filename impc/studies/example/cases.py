@@ -60,9 +60,8 @@ SETTINGS: dict[str, float] = {
 }
 #: What the page of the example says of the dissertation's own plant.
 LOST = (
-    "The dissertation's own plant (3.8), initial state and input bound are lost. "
-    "This plant stands in for them: it shows everything that the dissertation says of its own, "
-    "but its numbers are not the dissertation's."
+    "The dissertation's own plant, initial state and limit are lost. This plant stands in for "
+    "them: it shows everything that the dissertation says of its own, with other numbers."
 )
 
 

@@ -17,7 +17,7 @@ from impc.assess.lack_of_fit import (
     PUSH,
     STIFFNESS,
 )
-from impc.reporting.finding import Finding, Severity, table_of
+from impc.reporting.finding import Finding, Level, table_of
 from impc.reporting.rendering import number
 
 if TYPE_CHECKING:
@@ -41,34 +41,41 @@ _KINDS = {
 }
 
 
-def body_sentences(result: FitResult) -> tuple[str, ...]:
+def body_sentence_of(result: FitResult) -> str:
     """How well the body is known, and what that makes of the intervals."""
-    stated = [
+    stated = _stated(result)
+    if not stated:
+        return (
+            "The body model was taken as exact: intervals contain noise, and not what is uncertain "
+            "about masses, lengths, delay and limit; state it in [plant.uncertainty]."
+        )
+    count = "one parameter was" if len(stated) == 1 else f"{len(stated)} parameters were"
+    return (
+        f"The body is not known exactly: {count} fitted within the stated uncertainty, and the "
+        f"intervals include it{_wider(result)}."
+    )
+
+
+def parameter_words(result: FitResult) -> str:
+    """Which parameters cause the uncertainty of the gain, and which only a measurement improves."""
+    stated = _stated(result)
+    parts = sorted(stated, key=lambda item: -item.share)
+    named = [f"{item.name} {100 * item.share:.0f} %" for item in parts if item.share > _NAMED]
+    as_before = [item.name for item in stated if item.learned > _AS_BEFORE]
+    said = ""
+    if named:
+        said += f" Of the variance of the gain these cause: {', '.join(named)}."
+    if as_before:
+        said += f" The recordings add nothing on {', '.join(as_before)}: they can only be measured."
+    return said
+
+
+def _stated(result: FitResult) -> list[FittedParameter]:
+    return [
         item
         for item in result.parameters
         if item.stated is not None and not _is_added(result, item)
     ]
-    if not stated:
-        return (
-            "The body was taken as exact: the intervals on this page contain noise, and not what "
-            "is uncertain of masses, lengths, delay and limit ([plant.uncertainty] states it).",
-        )
-    parts = sorted(stated, key=lambda item: -item.share)
-    named = [f"{item.name} {100 * item.share:.0f} %" for item in parts if item.share > _NAMED]
-    found_as_before = [item.name for item in stated if item.learned > _AS_BEFORE]
-    count = "one parameter was" if len(stated) == 1 else f"{len(stated)} parameters were"
-    said = [
-        f"The body is not known exactly: {count} fitted within the stated uncertainty, and the "
-        f"intervals contain it{_wider(result)}."
-    ]
-    if named:
-        said.append(f"Of the variance of the gain come from {', '.join(named)}.")
-    if found_as_before:
-        said.append(
-            f"These recordings say nothing of {', '.join(found_as_before)}: a gain makes up for "
-            "them. They cannot be tested here, only measured."
-        )
-    return tuple(said)
 
 
 def _is_added(result: FitResult, item: FittedParameter) -> bool:
@@ -104,8 +111,8 @@ def added_sentence(result: FitResult) -> str:
     if added is None:
         return ""
     said = (
-        f"A first fit left what {error_words(result, added)} explains ({_probability(added)}). It "
-        "was fitted too: all numbers are of that fit."
+        f"The residuals of a first fit pointed to {error_words(result, added)} "
+        f"({probability_words(added)}). It was fitted too: all numbers come from that fit."
     )
     unknown = [
         item for item in result.parameters if _is_added(result, item) and not item.determined
@@ -118,28 +125,22 @@ def added_sentence(result: FitResult) -> str:
     )
 
 
-def lack_sentence(result: FitResult) -> str:
-    """The warning that the model does not fit, with the most probable reason; or nothing."""
-    culprit = result.culprit
-    if culprit is None:
+def alternative_reason(result: FitResult, error: ModelError) -> str:
+    """That noise in the loop does the same, where the limit is reached and it may be that."""
+    if result.saturated == 0 or error.name not in (LEAN, NONLINEAR):
         return ""
-    noise = (
-        " Noise that enters the loop and is answered at the limit does the same; [fit.observer] "
-        "asks for a subject with such noise."
-    )
     return (
-        "Warning: a part of what the fit leaves follows the perturbation, as noise does not. "
-        f"{error_words(result, culprit).capitalize()} explains most of it "
-        f"({_probability(culprit)}). The intervals on this page do not contain this error."
-        f"{noise if result.saturated > 0 and culprit.name in (LEAN, NONLINEAR) else ''}"
+        " Noise in muscles or senses that the person answers at the limit does the same: it is "
+        "mistaken for a reaction to the perturbation."
     )
 
 
-def _probability(error: ModelError) -> str:
+def probability_words(error: ModelError) -> str:
+    """The probability of as much where the model holds."""
     return "p < 0.0001" if error.probability < 1e-4 else f"p = {error.probability:.4f}"
 
 
-def lack_finding(result: FitResult, found: LackOfFit) -> Finding:
+def lack_finding(found: LackOfFit) -> Finding:
     """Every error of the model that was tested."""
     table = table_of(
         found.errors,
@@ -152,17 +153,15 @@ def lack_finding(result: FitResult, found: LackOfFit) -> Finding:
     )
     untestable = ", ".join(_KINDS[name] for name in found.untestable)
     caption = (
-        "Each is an error of the model that would move the outputs as the residuals do; p is of as "
-        "much where the model holds, each test by itself. Sizes: delay in samples, limit and "
+        "Errors of the model that would move the outputs as the residuals do; p is the probability "
+        "of as much if the model holds, each test by itself. Sizes: delay in samples, limit and "
         "perturbation as shares."
     )
     if untestable:
-        caption += f" The fit makes up for {untestable}, whatever the size."
+        caption += (
+            f" The fit makes up for {untestable}, whatever the size: it can only be measured."
+        )
+    level = Level.AMBER if found.alarm else Level.GREEN
     return Finding(
-        "residual_tests",
-        table,
-        caption,
-        result.warnings,
-        severity=Severity.AMBER if found.alarm else Severity.GREEN,
-        folded="Tests of the model",
+        "residual_tests", table, caption, level=level, folded="Tests of the model, one by one"
     )

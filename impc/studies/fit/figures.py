@@ -1,286 +1,282 @@
-"""Figures of a fit: trajectories (figure 3.7), residuals, intent, methods."""
+"""Figures of a fit: each takes whether it is drawn for a phone."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.ticker import FuncFormatter, NullLocator
 
-from impc.inverse.methods import METHODS
-from impc.model.foresight import physical_disturbances
-from impc.reporting.shown_units import axis_label, shown_unit
+from impc.reporting.shown_units import axis_label, shown_unit, signal_name
 from impc.reporting.style import (
     BLUE,
-    DOUBLE_COLUMN,
     FORBIDDEN,
-    GREEN,
+    HALF,
     INK,
+    MUTED,
+    PAPER,
+    PHONE,
+    RECORDED,
+    RULE,
     VERMILLION,
-    drawn,
-    journal_style,
+    WIDE,
     new_figure,
+    strip,
 )
-from impc.studies.fit.interval_figures import (
-    gain_figure,
-    shown_statements,
-    statements_figure,
-)
-from impc.studies.fit.result import MOST_TRIALS, shown_trials, trial_name
-from impc.studies.fit.structures import cost_weight_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
+    from impc.assess.frequency_response import FrequencyResponse
+    from impc.assess.limit_curve import LimitCurve
     from impc.studies.fit.result import FitResult
 
-_SOFT = "#8C8C8C"
+_WINDOW, _PHONE_WINDOW = 10.0, 6.0  # s
 _LAGS = 1.0  # s of the autocorrelation
-_WINDOW = 10.0  # s of the comparison
-_METHOD_LINES = {
-    "inverse_mpc": (VERMILLION, "-"),
-    "inverse_lqr_output": (BLUE, "--"),
-    "clipped_lqr": (GREEN, ":"),
-}
+# Signals that are drawn of each kind: more are in the part that readers explore.
+_MOST = 3
+_MOST_STATEMENTS = 12
 
 
-def fit_figures(result: FitResult) -> dict[str, bytes]:
-    """Draw all figures: PNG and PDF by file name."""
-    with journal_style():
-        figures = {
-            f"trajectories-trial-{index + 1}": trajectory_figure(result, index)
-            for index in shown_trials(result)
-        }
-        figures["gain"] = gain_figure(result)
-        if shown_statements(result):
-            figures["statements"] = statements_figure(result)
-        figures["residuals"] = _residuals(result)
-        figures["intent"] = _intent(result)
-        figures["methods"] = _methods(result)
-        if result.structures and result.structures[0].ratios:
-            figures["structured-weights"] = cost_weight_figure(result)
-        return drawn(figures)
-
-
-def trajectory_figure(result: FitResult, index: int) -> Figure:
-    """Outputs, command and disturbance of a trial, recorded and simulated."""
-    plant = result.fitted.problem.plant
-    trial, run = result.fitted.problem.recordings[index], result.inverse_mpc.runs[index]
-    time = np.arange(trial.samples) * plant.dt
-    drives = plant.disturbances[: physical_disturbances(plant)]
-    pushes = trial.disturbance[:, : len(drives)]
-    rows = len(plant.outputs) + plant.m + (1 if np.any(pushes) else 0)
-    figure = new_figure(DOUBLE_COLUMN, 0.5 + 1.15 * rows)
+def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
+    """Some seconds of a trial: outputs, recorded and modelled, and commands within their limit."""
+    plant, trial = result.fitted.problem.plant, result.fitted.problem.recordings[index]
+    run = result.inverse_mpc.runs[index]
+    window = shown_window(result, index, _PHONE_WINDOW if narrow else _WINDOW)
+    outputs, controls = plant.outputs[:_MOST], plant.controls[:_MOST]
+    rows = len(outputs) + len(controls)
+    figure = new_figure(PHONE if narrow else HALF, 0.6 + 1.35 * rows)
     axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
-    for column, name in enumerate(plant.outputs):
+    time = np.arange(window.start, window.stop) * plant.dt
+    modelled = run.x @ plant.C.T
+    for column, (ax, name) in enumerate(zip(axes, outputs, strict=False)):
         factor, _ = shown_unit(plant, name)
-        ax = axes[column]
-        ax.plot(
-            time,
-            factor * trial.without_offset[:, column],
-            color=_SOFT,
-            linewidth=1.6,
-            label="recorded",
-            rasterized=True,
-        )
+        recorded = factor * trial.without_offset[window, column]
+        strip(ax, axis_label(plant, name))
+        ax.plot(time, recorded, color=RECORDED, linewidth=4.5, label="recorded")
+        ax.plot(time, factor * modelled[window, column], color=BLUE, label="model")
         if name in trial.signals:
-            target = factor * trial.target[:, trial.signals.index(name)]
-            ax.plot(time, target, "k--", linewidth=0.6, drawstyle="steps-post", label="target")
-        simulated = run.x @ plant.C.T
-        ax.plot(
-            time,
-            factor * simulated[:, column],
-            color=VERMILLION,
-            linestyle="--",
-            linewidth=1.0,
-            label="simulated",
-        )
-        ax.set_ylabel(axis_label(plant, name))
-    for column in range(plant.m):
-        _command(axes[len(plant.outputs) + column], result, index, column)
-    if np.any(pushes):
-        ax = axes[-1]
-        ax.plot(time, pushes, color=INK, linewidth=0.8, drawstyle="steps-post")
-        ax.set_ylabel(", ".join(axis_label(plant, name) for name in drives))
-    axes[0].set_title(trial_name(result, index), loc="right")
-    axes[0].legend(loc="upper left", ncols=3, bbox_to_anchor=(0, 1.28))
-    axes[-1].set_xlabel("time (s)")
-    axes[-1].set_xlim(0, time[-1])
+            target = factor * trial.target[window, trial.signals.index(name)]
+            ax.plot(time, target, color=INK, linewidth=0.8, linestyle="--", label="target")
+        reach = 1.18 * float(np.nanmax(np.abs(recorded), initial=1e-9))
+        ax.set_ylim(-reach, reach)
+    for column, (ax, name) in enumerate(zip(axes[len(outputs) :], controls, strict=True)):
+        _command(ax, result, index, column, window)
+        ax.set_title(f"{axis_label(plant, name).replace(' (', ' in the model (')}", pad=5)
+    if np.any(np.isfinite(result.given.bounds.u_max)):
+        axes[0].plot([], [], color=VERMILLION, linewidth=4.5, label="at the limit")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=4, columnspacing=1.2)
+    axes[-1].set_xlabel("Time (s)")
+    axes[-1].set_xlim(time[0], time[-1])
     return figure
 
 
-def _command(ax: Axes, result: FitResult, index: int, column: int) -> None:
-    name = result.given.plant.controls[column]
-    dt = result.fitted.problem.plant.dt
-    u = result.inverse_mpc.runs[index].u[:, column]
-    time = np.arange(len(u)) * dt
-    bounds = result.given.bounds
-    for limit in (bounds.u_min[column], bounds.u_max[column]):
+def _command(ax: Axes, result: FitResult, index: int, column: int, window: slice) -> None:
+    """The command of the model, with the area beyond its limit and the samples at it."""
+    plant, bounds = result.fitted.problem.plant, result.fitted.problem.bounds
+    factor, _ = shown_unit(plant, plant.controls[column])
+    run = result.inverse_mpc.runs[index]
+    u = factor * run.u[window, column]
+    time = (window.start + np.arange(len(u))) * plant.dt
+    low, high = factor * bounds.u_min[column], factor * bounds.u_max[column]
+    top = 1.15 * float(np.max(np.abs(u), initial=1e-9))
+    if np.isfinite(high):
+        top = max(top, 1.6 * abs(high))
+        ax.axhspan(high, top, color=FORBIDDEN, linewidth=0)
+        ax.text(time[-1], high + 0.1 * (top - high), "beyond the limit", color=VERMILLION,
+                fontsize=10, ha="right", va="bottom")  # fmt: skip
+    if np.isfinite(low):
+        ax.axhspan(-top, low, color=FORBIDDEN, linewidth=0)
+    recorded = result.given.recordings[index].commands
+    if len(recorded):
+        ax.plot(time, factor * recorded[window, column][: len(u)], color=RECORDED, linewidth=4.5)
+    ax.plot(time, u, color=BLUE, linewidth=1.3)
+    for limit in (low, high):
         if np.isfinite(limit):
-            ax.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
-            at = np.isclose(u, limit, rtol=1e-6)
-            ax.fill_between(
-                time,
-                0,
-                1,
-                where=at,
-                transform=ax.get_xaxis_transform(),
-                color=FORBIDDEN,
-                linewidth=0,
-                step="post",
-            )
-    commands = result.given.recordings[index].commands[: len(u), column]
-    if len(commands):
-        ax.plot(time, commands, color=_SOFT, linewidth=1.6, drawstyle="steps-post")
-    ax.plot(time, u, color=BLUE, linewidth=0.9, drawstyle="steps-post")
-    ax.set_ylabel(axis_label(result.given.plant, name))
+            ax.axhline(limit, color=VERMILLION, linewidth=0.9, linestyle=(0, (4, 3)))
+            at = np.where(np.isclose(u, limit, rtol=1e-4), limit, np.nan)
+            ax.plot(time, at, color=VERMILLION, linewidth=4.5, solid_capstyle="butt")
+    ax.set_ylim(-top, top)
 
 
-def _residuals(result: FitResult) -> Figure:
-    plant = result.fitted.problem.plant
-    trials, p = result.fitted.problem.recordings, len(plant.outputs)
-    count = min(len(trials), MOST_TRIALS)
-    figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.3 * p * 1.0)
-    axes = np.array(figure.subplots(p, 2, width_ratios=[3, 1], squeeze=False, sharex="col"))
-    for column, name in enumerate(plant.outputs):
-        factor, unit = shown_unit(plant, name)
-        series = [
-            factor * (trial.without_offset - run.x @ plant.C.T)[:, column]
-            for trial, run in zip(trials, result.inverse_mpc.runs, strict=True)
-        ]
-        offset = 6 * max(float(np.nanstd(part)) for part in series)
-        for index, part in enumerate(series[:MOST_TRIALS]):
-            axes[column, 0].plot(
-                np.arange(len(part)) * plant.dt,
-                part - index * offset,
-                color=INK,
-                linewidth=0.4,
-                rasterized=True,
-            )
-        axes[column, 0].set_yticks(
-            [-index * offset for index in range(count)],
-            [trial_name(result, index)[-12:] for index in range(count)],
-        )
-        axes[column, 0].set_ylabel("trial (-)")
-        axes[column, 0].set_title(f"residual of {name}, {offset:.2g} {unit} apart", loc="left")
-        _autocorrelation(axes[column, 1], series, plant.dt)
-    axes[-1, 0].set_xlabel("time (s)")
-    axes[-1, 1].set_xlabel("lag (s)")
-    return figure
+def shown_window(result: FitResult, index: int, seconds: float) -> slice:
+    """The samples of a trial that are drawn: where the command is at its limit most often."""
+    problem = result.fitted.problem
+    run, samples = result.inverse_mpc.runs[index], problem.recordings[index].samples
+    length = min(round(seconds / problem.plant.dt), samples)
+    high = np.asarray(problem.bounds.u_max)
+    at = np.any(np.abs(run.u) >= (1 - 1e-6) * np.where(np.isfinite(high), high, np.inf), axis=1)
+    counts = np.convolve(at.astype(float), np.ones(length), "valid")
+    first = min(int(np.argmax(counts)), samples - length) if len(counts) else 0
+    return slice(max(first, 0), max(first, 0) + length)
 
 
-def _autocorrelation(ax: Axes, series: list[Array], dt: float) -> None:
-    lags = min(round(_LAGS / dt), min(len(part) for part in series) // 4)
-    styles = ("-", "--", ":", "-.")
-    for index, part in enumerate(series):
+def residual_figure(result: FitResult, narrow: bool) -> Figure:
+    """Residuals of the first output, trial after trial, and their autocorrelation."""
+    plant, trials = result.fitted.problem.plant, result.fitted.problem.recordings
+    factor, unit = shown_unit(plant, plant.outputs[0])
+    series = [
+        factor * (trial.without_offset - run.x @ plant.C.T)[:, 0]
+        for trial, run in zip(trials, result.inverse_mpc.runs, strict=True)
+    ][:_MOST]
+    figure = new_figure(PHONE if narrow else 5.4, 3.5)
+    above, below = figure.subplots(2, 1)
+    name = signal_name(plant, plant.outputs[0])
+    strip(above, f"{name[:1].upper()}{name[1:]}, recorded minus model ({unit})")
+    strip(below, "Autocorrelation (no unit)")
+    lags = min(round(_LAGS / plant.dt), min(map(len, series)) // 4)
+    for k, part in enumerate(series):
+        colour, width = (BLUE, 1.2) if k == 0 else (MUTED, 0.7)
+        stride = -(-len(part) // 700)
+        time = np.arange(0, len(part), stride) * plant.dt
+        above.plot(time, part[::stride], color=colour, linewidth=0.6, zorder=3 - k)
         centred = np.nan_to_num(part - np.nanmean(part))
         power = float(centred @ centred) or 1.0
-        values = [float(centred[k:] @ centred[: len(centred) - k]) / power for k in range(1, lags)]
-        ax.plot(
-            np.arange(1, lags) * dt,
-            values,
-            color=INK,
-            linewidth=0.8,
-            linestyle=styles[index % len(styles)],
-        )
-    band = 1.96 / np.sqrt(min(len(part) for part in series))
-    ax.axhspan(-band, band, color=FORBIDDEN, linewidth=0)
-    ax.set_ylim(-0.4, 1.0)
-    ax.set_ylabel("autocorrelation (-)")
-    ax.set_title("grey: white noise", loc="left")
-
-
-def _intent(result: FitResult) -> Figure:
-    plant, readings = result.fitted.problem.plant, result.intent.readings
-    figure = new_figure(DOUBLE_COLUMN, 2.9)
-    left, right = figure.subplots(1, 2, width_ratios=[1, 2.2])
-    marks = ("o", "s", "D")
-    for index, reading in enumerate(readings):
-        values = reading.eigenvalues[::-1]
-        left.plot(
-            np.arange(1, len(values) + 1),
-            values,
-            marker=marks[index % 3],
-            linewidth=0.7,
-            color=_shade(index),
-            markerfacecolor="white" if index else _shade(index),
-        )
-        parts = np.abs(reading.dominant * np.array(result.intent.sizes))
-        width = 0.8 / len(readings)
-        right.bar(
-            np.arange(plant.n) + (index - (len(readings) - 1) / 2) * width,
-            100 * parts / np.sum(parts),
-            width,
-            color=_shade(index),
-            edgecolor=INK,
-            linewidth=0.4,
-            hatch=("", "//", "..")[index % 3],
-            label=reading.rule,
-        )
-    left.set_yscale("log")
-    left.set_xlabel("eigenvalue of Q, largest first (-)")
-    left.set_ylabel("cost weight at R = 1 (SI units)")
-    right.set_xticks(np.arange(plant.n), plant.states, rotation=35, ha="right")
-    right.set_ylabel("share in dominant cost (%)")
-    right.legend(fontsize=5.5, loc="upper right")
+        values = [float(centred[j:] @ centred[: len(centred) - j]) / power for j in range(lags)]
+        below.plot(np.arange(lags) * plant.dt, values, color=colour, linewidth=width, zorder=3 - k)
+    band = 1.96 / np.sqrt(len(series[0]))
+    below.axhspan(-band, band, color=RULE, linewidth=0, zorder=0)
+    above.set_xlabel("Time (s)")
+    below.set_xlabel("Lag (s)")
     return figure
 
 
-def _shade(index: int) -> str:
-    return (VERMILLION, BLUE, GREEN, "#E69F00", "#CC79A7", "#BBBBBB")[index % 6]
-
-
-def _methods(result: FitResult) -> Figure:
-    """Ten seconds about the largest disagreement of inverse LQR, in the trial that has it."""
-    plant = result.fitted.problem.plant
-    shown = {item.name: item for item in result.methods if item.name in _METHOD_LINES and item.runs}
-    index, first = _most_telling(result)
-    trial = result.fitted.problem.recordings[index]
-    window = slice(first, min(first + round(_WINDOW / plant.dt), trial.samples - 1))
-    time = np.arange(window.start, window.stop) * plant.dt
-    figure = new_figure(DOUBLE_COLUMN, 3.4)
-    above, below = figure.subplots(2, 1, sharex=True)
-    factor, _ = shown_unit(plant, plant.outputs[0])
-    recorded = factor * trial.without_offset[window, 0]
-    above.plot(time, recorded, color=_SOFT, linewidth=1.8, label="recorded")
-    for name, method in shown.items():
-        color, line = _METHOD_LINES[name]
-        run = method.runs[index]
-        output = factor * (run.x @ plant.C.T)[window, 0]
-        above.plot(
-            time, output, color=color, linestyle=line, linewidth=1.1, label=METHODS[name].label
-        )
-        below.plot(time, run.u[window, 0], color=color, linestyle=line, linewidth=1.0)
-    for limit in (result.given.bounds.u_min[0], result.given.bounds.u_max[0]):
-        if np.isfinite(limit):
-            below.axhline(limit, color=INK, linewidth=0.8, linestyle=":")
-    reach = 1.6 * float(np.nanmax(np.abs(recorded), initial=0.0)) or 1.0
-    above.set_ylim(-reach, reach)
-    above.set_ylabel(axis_label(plant, plant.outputs[0]))
-    below.set_ylabel(axis_label(plant, plant.controls[0]))
-    largest = max(float(np.max(np.abs(item.runs[index].u[window, 0]))) for item in shown.values())
-    below.set_ylim(-1.1 * largest, 1.1 * largest)
-    below.set_xlabel("time (s)")
-    below.set_xlim(time[0], time[-1])
-    above.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1.02))
-    above.set_title(trial_name(result, index), loc="right")
+def limit_figure(result: FitResult, curve: LimitCurve, narrow: bool) -> Figure:
+    """Variance not explained against the limit."""
+    plant = result.given.plant
+    factor, unit = shown_unit(plant, curve.control)
+    figure = new_figure(PHONE if narrow else 5.4, 3.5)
+    ax = figure.subplots()
+    limits = factor * curve.limits
+    marks = (("o", "-", BLUE, BLUE), ("s", "--", MUTED, PAPER), ("^", ":", INK, PAPER))
+    for column, name in enumerate(plant.outputs[:_MOST]):
+        mark, line, colour, face = marks[column]
+        values = curve.unexplained[:, column]
+        ax.plot(limits, values, marker=mark, linestyle=line, color=colour, markerfacecolor=face,
+                label=signal_name(plant, name))  # fmt: skip
+    used = factor * float(result.given.bounds.u_max[plant.controls.index(curve.control)])
+    ax.axvline(used, color=VERMILLION, linewidth=1.2, linestyle=(0, (4, 3)), label="given limit")
+    ax.set_yscale("log")
+    _plain_log(ax, "y")
+    ax.set_title("Variance not explained (%)")
+    ax.set_xlabel(f"Limit assumed in the fit ({unit})")
+    ax.legend()
     return figure
 
 
-def _most_telling(result: FitResult) -> tuple[int, int]:
-    """Trial and first sample of the window in which clipped or plain LQR departs most."""
-    plant, best = result.fitted.problem.plant, (0.0, 0, 0)
-    window = round(_WINDOW / plant.dt)
-    for method in result.methods:
-        if method.name not in ("clipped_lqr", "inverse_lqr_output") or not method.runs:
-            continue
-        for index, run in enumerate(method.runs):
-            own = result.inverse_mpc.runs[index].x @ plant.C.T
-            apart = np.abs((run.x @ plant.C.T - own)[:, 0])
-            stop = run.reached + 1
-            sample = int(np.argmax(np.minimum(apart[:stop], 10 * np.std(own[:, 0]))))
-            if apart[sample] > best[0]:
-                first = max(0, min(sample - window // 2, len(own) - 1 - window))
-                best = (float(apart[sample]), index, first)
-    return best[1], best[2]
+def _plain_log(ax: Axes, axis: str) -> None:
+    """A logarithmic axis whose numbers are no powers."""
+    one = ax.yaxis if axis == "y" else ax.xaxis
+    one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    if len(one.get_majorticklocs()) > 3:
+        one.set_minor_locator(NullLocator())
+    else:
+        one.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def frequency_figure(result: FitResult, found: FrequencyResponse, narrow: bool) -> Figure:
+    """Magnitude, phase and coherence of every output: recorded as points, modelled as lines."""
+    plant = result.given.plant
+    outputs = plant.outputs[: 1 if narrow else 2]
+    figure = new_figure(PHONE if narrow else WIDE, 5.4)
+    axes = figure.subplots(3, len(outputs), sharex=True, squeeze=False, height_ratios=[2, 2, 1.2])
+    drive, _ = shown_unit(plant, found.signal)
+    for column, name in enumerate(outputs):
+        magnitude, phase, coherence = axes[:, column]
+        factor, unit = shown_unit(plant, name)
+        per = shown_unit(plant, found.signal)[1]
+        known = found.coherence[:, column] > found.threshold
+        f, scale = found.frequencies, factor / drive
+        recorded, errors = scale * found.recorded[:, column], found.errors[:, column]
+        for ax, values, spread, model in (
+            (magnitude, recorded, recorded * errors, scale * found.modelled[:, column]),
+            (phase, found.recorded_phase[:, column], np.degrees(errors),
+             found.modelled_phase[:, column]),
+        ):  # fmt: skip
+            turn = 360 * np.round(np.median((values - model)[known] if any(known) else 0) / 360)
+            points = values - (turn if ax is phase else 0)
+            ax.errorbar(f[known], points[known], 1.96 * spread[known], fmt="o", color=MUTED,
+                        markersize=4, linewidth=0.9, label="recorded")  # fmt: skip
+            ax.plot(f, model, color=BLUE, linewidth=1.6, label="model")
+        coherence.plot(f, found.coherence[:, column], color=MUTED)
+        coherence.plot(f, found.threshold, color=RULE, linestyle="--")
+        coherence.set_ylim(0, 1.05)
+        magnitude.set_yscale("log")
+        _plain_log(magnitude, "y")
+        words = signal_name(plant, name)
+        unit = "no unit" if unit == per else f"{unit} per {per}"
+        magnitude.set_title(f"{words[:1].upper()}{words[1:]}, magnitude ({unit})")
+        phase.set_title("Phase (°)")
+        coherence.set_title("Coherence (no unit)")
+        coherence.set_xscale("log")
+        _plain_log(coherence, "x")
+        coherence.set_xlabel("Frequency (Hz)")
+    axes[0, 0].legend()
+    return figure
+
+
+def statements_figure(result: FitResult, narrow: bool) -> Figure:
+    """The range of each comparison of costs over all weights; its side of zero decides."""
+    plant = result.given.plant
+    shown = sorted(result.compared, key=lambda item: not item.made)[:_MOST_STATEMENTS]
+    figure = new_figure(PHONE if narrow else WIDE, 1.4 + (0.5 if narrow else 0.3) * len(shown))
+    ax = figure.subplots()
+    ends = np.array([[item.low, item.high] for item in shown])
+    reach = 1.5 * float(np.max(np.abs(ends[np.isfinite(ends)]), initial=1.0))
+    labels = []
+    for row, item in enumerate(shown):
+        one, other = signal_name(plant, item.first), signal_name(plant, item.second)
+        same = "" if item.kind == "order" else ": same vs opposite sign"
+        label = f"{one} {'+' if same else 'vs'} {other}{same}"
+        labels.append(label[:1].upper() + label[1:])
+        low, high = np.clip(ends[row], -reach, reach)
+        colour, width = (BLUE, 7) if item.made else (RECORDED, 5)
+        ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt")
+        if narrow:  # above its bar: beside it there is no room
+            ax.text(0, row - 0.22, labels[-1], transform=ax.get_yaxis_transform(), va="bottom",
+                    fontsize=10)  # fmt: skip
+    ax.axvline(0, color=INK, linewidth=1)
+    ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
+    ax.set_xlim(-reach, reach)
+    most = int(np.log10(reach))
+    powers = [10.0**k for k in range(0, most + 1, max(1, -(-most // (2 if narrow else 4))))]
+    ticks = [*(-one for one in powers[::-1]), 0.0, *powers]
+    ax.set_xticks(ticks, [f"{one:g}".replace("-", "\u2212") for one in ticks])
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_yticks(range(len(shown)), [""] * len(shown) if narrow else labels)
+    ax.tick_params(axis="y", length=0, labelcolor=INK)
+    ax.set_ylim(len(shown) - 0.4, -0.9 if narrow else -0.7)
+    ax.spines["left"].set_visible(False)
+    words = "less  \u2190   \u2192  more" if narrow else "first costs less  \u2190   \u2192  more"
+    ax.text(0, 1.01, words, transform=ax.get_xaxis_transform(), ha="center", color=MUTED)
+    ax.set_xlabel("Difference in cost (relative)" if narrow else
+                  "Difference in cost (relative to the first, symmetric log scale)")  # fmt: skip
+    return figure
+
+
+def interval_figure(
+    labels: list[str], ends: Array, values: Array, axis: str, narrow: bool
+) -> Figure:
+    """Rows with a value and an interval (rows, 2) each on a logarithmic axis; arrows go on."""
+    figure = new_figure(PHONE if narrow else HALF, 0.9 + 0.32 * len(labels))
+    ax = figure.subplots()
+    finite = np.append(ends[np.isfinite(ends) & (ends > 0)], values[np.isfinite(values)])
+    left, right = float(np.min(finite)) / 3, float(np.max(finite)) * 3
+    for row in range(len(labels)):
+        low, high = np.clip(ends[row], left, right)
+        ax.plot([low, high], [row, row], color=BLUE, linewidth=1.6)
+        for end, at, mark in ((ends[row, 0], low, "<"), (ends[row, 1], high, ">")):
+            if end != at:
+                ax.plot(at, row, mark, color=BLUE, clip_on=False)
+        if np.isfinite(values[row]) and values[row] > 0:
+            ax.plot(values[row], row, "o", color=VERMILLION)
+    ax.set_xscale("log")
+    ax.set_xlim(left, right)
+    ax.set_yticks(range(len(labels)), labels)
+    ax.tick_params(axis="y", length=0, labelcolor=INK)
+    ax.set_ylim(len(labels) - 0.4, -0.7)
+    ax.set_xlabel(axis)
+    return figure

@@ -1,360 +1,547 @@
-"""The report of a fit: its sections, and what result.json has beside their findings.
-
-    vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of the trials left out
-    states, controls, outputs, disturbances  names, in the order of every array below
-    units.<signal>                           where the plant says them
-    body                                     "nonlinear" where the plant's own equations moved, or
-                                             "linear"
-    solver                                   what solved the quadratic programs
-    usable                                   whether half of every recorded signal is explained
-    K                                        the gain that the recordings identify
-    estimate                                 standard errors of K and of its directions, and which
-                                             of them are identified
-    Q, R, P, S, weights_gain                 the weights whose gain comes nearest, at R[0][0] = 1
-    weights_rule                             which of all weights with that gain Q and R are
-    weights_test                             whether any weights explain K: statistic, freedom,
-                                             p_value, rejected, return_difference
-    terminal_set, doubts                     of the fitted controller; sentences
-    horizon, bounds                          as given
-    lack_of_fit                              of the first fit and, where something was added, of the
-                                             last: alarm, and errors with probability and size
-    failures.<stage>                         why the stage has no result
-    warnings                                 sentences
-    ceiling                                  VAF that repeats with the perturbation, low, high, %
-    intent                                   eigenvalues (ascending), dominant, sentence, weights
-                                             of every rule
-    structures                               weights and gain of each that was named
-    person                                   of [fit.observer]: K, levels with intervals, models
-                                             with log_likelihood and aic, whiteness, errors ahead
-    identifiability                          rank, free, chosen, singular_values
-    aim                                      targets, samples that they are known ahead, rates (1/s)
-                                             of lasting disturbances, offsets (SI), commands
-    trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
-    methods.<name>                           as in every result (docs/results.md)
-    findings.<name>                          severity, sentences and table of each of the page
-    truth                                    K of a truth.json beside the recordings, or null
-    plant, settings, files, versions, made
-
-Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.
-"""
+"""The page of a fit: what stands on it, in its order."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+import functools
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
-from impc.assess.intent_statements import dominant_sentence
+from impc.assess.lasting_response import LastingResponse, lasting_responses
 from impc.control.named_solver import described
-from impc.inverse.problem import aims
 from impc.reporting.document import (
     Block,
-    Details,
-    Heading,
+    Check,
+    Checks,
+    Copy,
+    Draw,
+    Fold,
     Lines,
-    Note,
+    Pair,
+    Quiet,
     Report,
     Section,
     Terms,
-    Verdict,
 )
-from impc.reporting.finding import Chart, Picture
-from impc.reporting.shown_units import body_sentence, signal_words
-from impc.studies.charts import methods_chart
-from impc.studies.fit.aim import aim_data
-from impc.studies.fit.figures import fit_figures
-from impc.studies.fit.gain_findings import (
-    direction_finding,
-    gain_finding,
-    limit_findings,
-    parameter_findings,
-    truth_finding,
+from impc.reporting.finding import Chart, Level, Picture
+from impc.reporting.provenance import Provenance
+from impc.reporting.rendering import fixed, number, probability
+from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
+from impc.reporting.verdict import Key, Verdict
+from impc.studies.charts import trajectories
+from impc.studies.fit import figures, findings
+from impc.studies.fit.aim import aim_sentences
+from impc.studies.fit.body_words import added_sentence, body_sentence_of, lack_finding
+from impc.studies.fit.data import fit_data
+from impc.studies.fit.facts import (
+    amount,
+    between,
+    decided,
+    first_gain,
+    given_limit,
+    held_out,
+    left_out_text,
+    limit_ends,
+    named_gains,
+    one_of,
+    saturation,
+    shares,
+    statement_text,
+    unlimited_ratio,
+    with_unit,
 )
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
-from impc.studies.fit.structures import structure_data, structure_section
-from impc.studies.fit.trial_findings import (
-    RESIDUALS,
-    agreement_finding,
-    check_finding,
-    command_findings,
-    offset_findings,
-    residual_findings,
-    trajectory_finding,
+from impc.studies.fit.structures import (
+    structure_draw,
+    structure_section,
+    structure_sentences,
 )
-from impc.studies.fit.verdict import abstract, remarks, verdict
-from impc.studies.fit.weight_findings import reading_finding, statement_findings, weight_finding
-from impc.studies.methods_table import column_terms, methods_data, methods_finding
+from impc.studies.fit.verdict import (
+    GAIN,
+    SHARE,
+    WEIGHTS,
+    fallen_verdict,
+    fit_verdict,
+    forbidden,
+)
+from impc.studies.methods_figure import methods_figure
+from impc.studies.methods_table import methods_finding
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.reporting.provenance import Provenance
+    from impc.assess.limit_curve import LimitCurve
     from impc.studies.fit.result import FitResult
 
-_LEFT = (
-    "What the controller does not explain. A residual that is autocorrelated (a small p-value "
-    "above, a curve outside the grey band) is the rule with people: they also move for reasons of "
-    "their own. The intervals of the gain allow for that."
-)
-_METHODS = Picture(
-    "methods",
-    "Output and command of ten seconds under three methods",
-    "The ten seconds in which the methods differ most. A method that leaves the dotted lines uses "
-    "more than the subject has; one whose curve ends has fallen.",
-)
-_SAME_GAIN = (
-    "Many weights have exactly the fitted gain, so the same behaviour under the same bounds. Which "
-    "of them is reported is a convention. What holds for all of them may be said of the subject; "
-    "what differs between them may not."
-)
+_HIDDEN = "Not shown as a result, because of the warning above."
 
 
 def fit_report(
-    result: FitResult,
-    provenance: Provenance,
-    truth: Array | None = None,
-    missing: str = "",
+    result: FitResult, provenance: Provenance, truth: Array | None = None, missing: str = ""
 ) -> Report:
     """Page, result.json, tables and figures; `truth` (m, n)."""
-    subject = str(result.given.recordings[0].label.subject) or "a subject"
-    others: list[Block] = [*residual_findings(result)]
-    if missing:
-        others.append(Note("Not given:", missing.removeprefix("Not given: ")))
-    if truth is not None:
-        others.append(truth_finding(result, truth))
+    verdict, subject = fit_verdict(result), str(result.given.recordings[0].label.subject)
+    trials, dt = result.given.recordings, result.given.plant.dt
+    seconds = sum(trial.samples for trial in trials) * dt
+    count = "1 trial" if len(trials) == 1 else f"{len(trials)} trials"
+    meta = [subject, *(["simulated"] if truth is not None else []), f"{count}, {seconds:.3g} s"]
+    window = shown_trials(result)[0]
+    meta = list(dict.fromkeys(meta))
     return Report(
-        f"impc fit: {subject}",
-        f"The controller behind the recordings of {subject}",
-        [
-            Verdict(verdict(result)),
-            *others,
-            Lines(abstract(result)),
-            Details("What stands behind these sentences", (Lines(remarks(result)),)),
-        ],
-        _sections(result, provenance),
-        figures=fit_figures(result),
-        beside=[trajectory_finding(result)],
+        f"Fit report: {subject}" if subject else "Fit report",
+        "fit report",
+        verdict,
+        _sections(result, provenance, truth, missing),
+        [part for part in (*meta, provenance.made[:10]) if part],
+        _hero(result, window),
+        _keys(result),
+        _draws(result, window),
+        _copy(result, verdict, provenance),
+        beside=[findings.trajectory_finding(result), *findings.response_findings(result)],
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
-        words=signal_words(result.given.plant),
     )
 
 
-def _sections(result: FitResult, provenance: Provenance) -> list[Section]:
-    """What a page has, in its order; a finding more is a line here."""
-    weights: list[Block] = [_SAME_GAIN, *statement_findings(result)]
-    methods: list[Block] = [
-        _METHODS,
-        methods_finding(result.methods),
-        Details("What each column says", (column_terms(),)),
-    ]
-    every = [reading_finding(result), weight_finding(result)]
+def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
+    """The page where the subject fell in every trial."""
+    verdict = fallen_verdict(falls)
+    sections = [Section("Falls", [Lines(falls)]), _made(provenance)]
+    data = {"falls": falls}
+    return Report("Fit report", "fit report", verdict, sections, data=data, provenance=provenance)
+
+
+def _hero(result: FitResult, index: int) -> Picture:
+    plant, run = result.fitted.problem.plant, result.inverse_mpc.runs[index]
+    trial = result.fitted.problem.recordings[index]
+    factor, unit = shown_unit(plant, plant.outputs[0])
+    left = factor * (trial.without_offset - run.x @ plant.C.T)[:, 0]
+    said = with_unit(number(float(np.sqrt(np.nanmean(left**2))), 2), unit)
+    limit = "; orange: at the limit" if given_limit(result) else ""
+    name = trial_name(result, index)
+    return Picture(
+        "movement",
+        f"Recorded and modelled outputs, and the command within its limit, in {name}",
+        f"{name}, 10 s of it. Grey: recorded; blue: model{limit}. Recording and model differ by "
+        f"{said} (RMS, {signal_name(plant, plant.outputs[0])}).",
+    )
+
+
+def _keys(result: FitResult) -> list[Key]:
+    plant, held = result.given.plant, held_out(result)
+    vaf = result.inverse_mpc.vaf if held is None else held
+    names = [signal_name(plant, name) for name in plant.outputs]
+    others = "; ".join(
+        f"{name} {value:.2f} %" for name, value in zip(names[1:], vaf[1:], strict=True)
+    )
+    where = "left-out trials" if held is not None else "fitted trials"
+    keys = [
+        Key(f"{vaf[0]:.2f}", "%", "of the variance explained",
+            f"{names[0]}, {where}{'; ' + others if others else ''}")
+    ]  # fmt: skip
+    if SHARE in forbidden(result) and result.limit_found is not None:
+        found = result.limit_found
+        keys.append(
+            Key(number(found.value), f"{found.unit}, not {number(found.given)}",
+                "limit that fits best", limit_ends(found))
+        )  # fmt: skip
+    elif given_limit(result) and result.met:
+        each = [100 * one.saturated for one in result.trials]
+        keys.append(
+            Key(f"{saturation(result):.1f}", "% of the time", "at the limit",
+                f"{min(each):.1f} to {max(each):.1f} % in single trials")
+        )  # fmt: skip
+    else:
+        largest = amount(result, result.inverse_mpc.largest_input)
+        value, _, unit = largest.partition(" ")
+        limit = given_limit(result)
+        keys.append(
+            Key(value, unit, "largest command in the model",
+                f"{limit} was allowed" if limit else "no limit was given")
+        )  # fmt: skip
+    row, gains = first_gain(result), named_gains(result)
+    if row is None or GAIN in forbidden(result):
+        known = 0 if GAIN in forbidden(result) else sum(row.certain for _, row in gains)
+        keys.append(Key(str(known), f"of {len(gains)}", "gains to report", "see the warning"))
+    else:
+        unit = row.unit if row.unit == "-" else f"{row.unit} per {row.per[1:].partition(' of ')[0]}"
+        keys.append(
+            Key(number(row.value), unit.replace("per  ", "per "), f"opposing command, {row.state}",
+                f"95 % CI {row.ends}")
+        )  # fmt: skip
+    return keys
+
+
+def _draws(result: FitResult, window: int) -> dict[str, Draw]:
+    """How every figure of the page is drawn."""
+    found: dict[str, Draw] = {
+        "movement": functools.partial(figures.movement_figure, result, window),
+        "methods": functools.partial(methods_figure, result.methods[::-1]),
+        "residuals": functools.partial(figures.residual_figure, result),
+    }
+    for curve in result.curves:
+        found[f"limit-{curve.control}"] = functools.partial(figures.limit_figure, result, curve)
+    if result.response is not None:
+        response = functools.partial(figures.frequency_figure, result, result.response)
+        found["frequency-response"] = response
+    if result.compared and WEIGHTS not in forbidden(result):
+        found["statements"] = functools.partial(figures.statements_figure, result)
+    if result.structures and result.structures[0].ratios:
+        found["structured-weights"] = structure_draw(result)
+    return found
+
+
+def _sections(
+    result: FitResult, provenance: Provenance, truth: Array | None, missing: str
+) -> list[Section]:
+    """A section more is a line here."""
+    no = forbidden(result)
     return [
-        Section("1. The gain, and how sure it is", _gain(result), "Gain", together=True),
-        *([structure_section(result)] if result.structures else []),
+        Section("Feedback gain", _gain(result, truth, GAIN in no)),
         *([] if result.person is None else [result.person.section()]),
-        Section("2. What may be said of the weights", weights, "Weights"),
-        Section("3. Inverse LQR on the same recordings", methods, "Inverse LQR"),
-        Section("4. Recorded and simulated", _trajectories(result), "Trajectories"),
-        Section("5. What is left", (_LEFT, RESIDUALS), "What is left", folded=True),
-        Section("6. All weights with this gain", every, "Intent", folded=True),
-        Section("7. Checks of the recordings", (check_finding(result),), "Checks", folded=True),
-        Section("8. Settings and versions", _made(result, provenance), "Settings", folded=True),
+        Section("Does the limit matter?", _limit(result, SHARE in no), "Limit"),
+        *([structure_section(result)] if result.structures else []),
+        Section("Intent: what the cost weights say", _intent(result, WEIGHTS in no), "Intent"),
+        *([Section("Frequency response", _response(result))] if result.response else []),
+        Section("Checks", _checks(result, truth)),
+        _made(provenance, result, missing),
     ]
 
 
-def _gain(result: FitResult) -> list[Block]:
-    if not result.usable:
-        return [verdict(result)]
-    limits = limit_findings(result)
-    found = [gain_finding(result), *parameter_findings(result), direction_finding(result)]
-    found += [*offset_findings(result), *command_findings(result)]
-    return [*found, *([Heading("Limit and horizon")] if limits else []), *limits]
-
-
-def _trajectories(result: FitResult) -> list[Block]:
-    shown, trials = shown_trials(result), len(result.given.recordings)
-    blocks: list[Block] = [agreement_finding(result)]
-    if len(shown) < trials:
-        blocks.append(
-            f"The {len(shown)} trials that are explained least, of {trials}; the table has all."
-        )
-    pictures = [
-        Picture(
-            f"trajectories-trial-{index + 1}",
-            f"Recorded and simulated outputs, command and disturbance over time, "
-            f"{trial_name(result, index)}",
-            f"{trial_name(result, index)}. Grey: recorded. Dashed: simulated from the disturbance "
-            "and targets alone. Dotted: bound of the command; shaded: where it is at the bound.",
-        )
-        for index in shown
+def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
+    if not result.preferred:
+        return [Quiet(_HIDDEN)]
+    tables = [
+        findings.gain_finding(result, truth),
+        findings.direction_finding(result),
+        *findings.parameter_findings(result),
     ]
-    others = [Details("The other trials", pictures[1:])] if len(pictures) > 1 else []
-    data = methods_chart(result.fitted.problem, result.methods[::-1], shown[0])
-    return [*blocks, Chart(pictures[0], data), *others]
-
-
-def _made(result: FitResult, provenance: Provenance) -> list[Block]:
-    plant = result.fitted.problem.plant
-    arguments = "; ".join(f"{key} = {value}" for key, value in provenance.plant_arguments.items())
-    settings = "; ".join(
-        f"{key} = {value}" for key, value in plain_settings(result.settings).items()
-    )
-    code = Markup("<code>{}</code>")
-    moved = Markup("<code>{}</code>, sample time {} s, states {} <code>{}</code>").format(
-        provenance.plant_name, plant.dt, ", ".join(plant.states), arguments
+    if hidden:
+        return [
+            Quiet(f"{_HIDDEN} Numbers are kept under details for troubleshooting."),
+            Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
+        ]
+    settled = [_lasting(result, one) for one in lasting_responses(result.estimate)]
+    lasting = (
+        f" Contributions add up and partly cancel: {'; '.join(settled)}, once nerves and muscles "
+        "have settled."
+        if settled
+        else ""
     )
     return [
-        _terminal_set(result),
-        code.format(provenance.command),
-        Terms(
-            [
-                ("Made", (f"{provenance.made}, in {result.seconds:.1f} s",)),
-                ("Plant", (moved,)),
-                ("Settings", (code.format(settings),)),
-                ("Body", (body_sentence(plant),)),
-                (
-                    "Quadratic programs",
-                    (f"Solved by {described(result.fitted.problem.solver)}.",),
-                ),
-                ("Recordings", (", ".join(provenance.files),)),
-                ("Versions", (provenance.all_versions,)),
-            ]
+        "Gain is the command against a deviation, as long as the limit is not reached."
+        f"{lasting} {body_sentence_of(result)}",
+        *([added_sentence(result)] if result.added else []),
+        findings.per_unit_finding(result),
+        Fold("All gains in SI units, combinations and parameters", tables),
+        *findings.command_findings(result),
+        *findings.offset_findings(result),
+    ]
+
+
+def _lasting(result: FitResult, found: LastingResponse) -> str:
+    """What an output that persists ends up with, in words."""
+    plant = result.given.plant
+    (factor, unit), (scale, of) = (shown_unit(plant, one) for one in (found.state, found.control))
+    value, low, high = (scale / factor * one for one in (found.value, found.low, found.high))
+    known = f"95 % CI {between(low, high)}" if found.identified else "not identified"
+    return (
+        f"a {signal_name(plant, found.state)} of {one_of(unit)} that persists ends up with "
+        f"{fixed(value)} {of} ({known})"
+    )
+
+
+def _limit(result: FitResult, doubtful: bool) -> list[Block]:
+    limit, ratio = given_limit(result), unlimited_ratio(result)
+    if limit is None:
+        said = "No limit was given, so that the model has none."
+    elif not result.met:
+        said = "These recordings cannot answer it: the limit is never reached."
+    elif doubtful:
+        said = f"Some limit may, but {limit} is probably not the one of this person."
+    elif ratio:
+        said = (
+            "Yes. The same recordings were fitted with and without a limit. Models without a limit "
+            "leave more of the movement unexplained."
+        )
+    else:
+        said = "Not measurably: models without a limit explain these recordings as well."
+    methods: Block = Picture(
+        "methods",
+        "Variance not explained, and largest command, of every method",
+        "Left: further left is better (logarithmic axis). Right: shading marks commands beyond the "
+        "limit. Inverse LQR is the classical method.",
+    )
+    return [
+        said,
+        methods,
+        *_limit_pictures(result)[1:],
+        *findings.limit_findings(result),
+        Fold("All methods in numbers", [methods_finding(result.methods[::-1])]),
+    ]
+
+
+def _limit_pictures(result: FitResult) -> list[Block]:
+    return [
+        Picture(
+            f"limit-{curve.control}",
+            f"Variance not explained against the limit of {curve.control} in the fit",
+            "Limit curve: each point is a fit of its own with that limit. The lowest fits best.",
+        )
+        for curve in result.curves
+    ]
+
+
+def _intent(result: FitResult, hidden: bool) -> list[Block]:
+    if hidden:
+        return [
+            Quiet("No comparison of costs is made, because of the warning above."),
+            Fold("Cost weights (do not report)", [findings.weight_finding(result)]),
+        ]
+    plant, summary, made = result.given.plant, result.uncertainty.weights, decided(result)
+    tables = [*findings.weight_findings(result), findings.reading_finding(result)]
+    if summary is None:
+        return [Quiet(f"Not available: {result.uncertainty.weights_reason}"), *tables]
+    drawn = (
+        f" They hold for {summary.drawn} other gains that the recordings allow too."
+        if summary.drawn and made
+        else ""
+    )
+    count = f"{len(made)} of {len(summary.statements)} comparisons"
+    return [
+        "Many cost weights lead to exactly this movement. Only what holds for all of them says "
+        f"something about the person: {count}, at the 95 % level.{drawn}",
+        *([Lines([statement_text(plant, item) for item in made])] if made else []),
+        *([_STATEMENTS] if summary.statements else []),
+        Fold("Cost weights by convention, and how far they could differ", tables),
+    ]
+
+
+_STATEMENTS = Picture(
+    "statements",
+    "Ranges of the differences in cost over all weights with the fitted gain",
+    "Each bar is the range of one difference in cost over all weights with the fitted gain. Blue: "
+    "on one side of zero, for other gains that the recordings allow too. Grey: undecided.",
+)
+
+
+def _response(result: FitResult) -> list[Block]:
+    found, plant = result.response, result.given.plant
+    assert found is not None
+    known = found.coherence > found.threshold[:, None]
+    share = 100 * float(np.mean(known))
+    return [
+        f"From the {signal_name(plant, found.signal)} to the movement, estimated in the same way "
+        "from recording and model. Points are left out where chance alone reaches their "
+        f"coherence ({share:.0f} % are shown).",
+        Picture(
+            "frequency-response",
+            "Magnitude, phase and coherence of the response to the perturbation",
+            "Grey: recorded, with 95 % intervals; blue: model. The lower panel is the coherence of "
+            "the recording.",
         ),
     ]
 
 
+def _checks(result: FitResult, truth: Array | None) -> list[Block]:
+    checks = [
+        _recordings(result),
+        Check(Level.GREEN if result.usable else Level.RED, "Explained variance",
+              left_out_text(result)),
+        *_limit_check(result),
+        _model(result),
+        _weights(result),
+        *_others(result),
+    ]  # fmt: skip
+    if truth is not None and result.preferred:
+        inside, count, level = findings.truth_count(result, truth)
+        checks.append(
+            Check(Level.NOTE if inside == count else Level.AMBER, "Known truth",
+                  f"Simulated recordings: {inside} of {count} true gains lie inside their "
+                  f"{level:.0f} % intervals.")
+        )  # fmt: skip
+    residuals = Picture(
+        "residuals",
+        "Residuals of the first output and their autocorrelation",
+        "Blue: first trial; grey: others. Shaded: expected for uncorrelated noise.",
+    )
+    names = {index: trial_name(result, index) for index in shown_trials(result)}
+    chart = Chart("Trials", trajectories(result.fitted.problem, result.methods[::-1], names))
+    curves = _limit_pictures(result)
+    return [
+        Checks(checks),
+        Pair(curves[0], residuals) if curves else residuals,
+        Fold("Every trial in numbers", [findings.agreement_finding(result)]),
+        Fold("Every trial, to explore", [chart]),
+        *([] if result.lack[-1] is None else [lack_finding(result.lack[-1])]),
+    ]
+
+
+def _recordings(result: FitResult) -> Check:
+    said = [
+        f"{trial_name(result, index)}: {line}"
+        for index, trial in enumerate(result.given.recordings)
+        for line in trial.findings
+    ]
+    if result.falls:
+        return Check(Level.AMBER, "Recordings", "; ".join([*result.falls, *said]))
+    used = f"{len(result.trials)} of {len(result.trials)} trials used"
+    if said:
+        return Check(Level.NOTE, "Recordings", f"{used}; {'; '.join(said)}")
+    return Check(Level.GREEN, "Recordings", f"{used}; no gaps, jumps or unit problems; no fall.")
+
+
+def _limit_check(result: FitResult) -> list[Check]:
+    limit, found = given_limit(result), result.limit_found
+    if limit is None:
+        return [Check(Level.NOTE, "Limit", "None was given.")]
+    if not result.met:
+        return [Check(Level.NOTE, "Limit", "Never reached: nothing can be said about it.")]
+    if found is None:
+        best = [_best_limit(curve) for curve in result.curves]
+        if best and all(best):
+            return [Check(Level.GREEN, "Limit", f"Given as {limit}: of the limit curve the best.")]
+        return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not estimated.")]
+    said = (
+        f"Given as {limit}; the recordings point to {number(found.value)} {found.unit} "
+        f"({limit_ends(found)})."
+    )
+    return [Check(Level.AMBER if found.disagrees else Level.GREEN, "Limit", said)]
+
+
+def _best_limit(curve: LimitCurve) -> bool:
+    """Whether no other limit leaves less unexplained."""
+    left = np.nansum(np.where(np.isnan(curve.unexplained), np.inf, curve.unexplained), axis=1)
+    return bool(np.argmin(left) == np.argmin(np.abs(curve.limits - curve.given)))
+
+
+def _model(result: FitResult) -> Check:
+    last = result.lack[-1]
+    if last is None:
+        return Check(Level.NOTE, "Body model", "Could not be tested.")
+    least = min((one.probability for one in last.errors), default=1.0)
+    if last.alarm:
+        return Check(Level.AMBER, "Body model",
+                     "Part of the residual follows the perturbation; see the warning.")  # fmt: skip
+    return Check(
+        Level.GREEN,
+        "Body model",
+        f"No sign of a mismatch in {len(last.errors)} tests (smallest {probability(least)}).",
+    )
+
+
+def _weights(result: FitResult) -> Check:
+    test = result.weights_test
+    if test.rejected:
+        return Check(Level.AMBER, "Cost weights", "No cost weights lead to this gain.")
+    return Check(Level.GREEN, "Cost weights", "Some cost weights lead to this gain.")
+
+
+def _others(result: FitResult) -> list[Check]:
+    """Notes: residuals, what repeats, doubts of the search, what could not be computed."""
+    white = min(float(np.nanmin(one.whiteness)) for one in result.trials)
+    coloured = "Autocorrelated" if white < 0.05 else "Not autocorrelated"
+    found = [
+        Check(Level.NOTE, "Residuals",
+              f"{coloured} ({probability(white)}). Intervals allow for autocorrelation.")
+    ]  # fmt: skip
+    if result.ceiling is not None:
+        one = result.ceiling
+        found.append(
+            Check(Level.NOTE, "What repeats",
+                  f"{shares(result, one.vaf, 1)} of the variance repeats with the perturbation "
+                  f"({one.repetitions} repetitions): no controller without noise explains more.")
+        )  # fmt: skip
+    found += [Check(Level.NOTE, "Search", doubt) for doubt in result.fitted.doubts]
+    for stage, reason in result.failures.items():
+        found.append(Check(Level.NOTE, f"Not available: {stage}", reason))
+    return found
+
+
+def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy | str:
+    if verdict.level in (Level.AMBER, Level.RED):
+        return "There is text to copy when no check is open."
+    plant, problem, limit = result.given.plant, result.fitted.problem, given_limit(result)
+    trials, dt = result.given.recordings, plant.dt
+    seconds = sum(trial.samples for trial in trials) * dt
+    bounded = f"with the command limited to ±{limit}" if limit else "without a limit"
+    version, names = provenance.versions["impc"], [signal_name(plant, one) for one in plant.outputs]
+    methods = (
+        f"{' and '.join(names).capitalize()} from {len(trials)} trials ({seconds:.3g} s in all) "
+        f"were analysed by inverse model predictive control (impc {version}). The body model was "
+        f"{provenance.plant_name}{_arguments(provenance)}. The controller predicted "
+        f"{problem.horizon * dt:.3g} s ahead at {1 / dt:.3g} samples per second, {bounded}. "
+        f"{' '.join(aim_sentences(result))}{' ' if aim_sentences(result) else ''}"
+        "The feedback gain was estimated by minimising the difference between recorded and "
+        "modelled outputs in all trials together; 95 % confidence intervals allow for "
+        "autocorrelated residuals."
+    )
+    if any(one.stated is not None for one in result.parameters):
+        methods += " They include the stated uncertainty of the body model."
+    if held_out(result) is not None:
+        methods += " Predictive accuracy was assessed by leaving out one trial at a time."
+    results = [f"The model accounted for {shares(result, result.inverse_mpc.vaf)} of the variance"]
+    held = held_out(result)
+    results[0] += (
+        f", and for {shares(result, held)} in left-out trials." if held is not None else "."
+    )
+    if limit and result.met:
+        results.append(
+            f"The command was at its limit for {saturation(result):.1f} % of the time."
+            f"{unlimited_ratio(result)}"
+        )
+    gains = [
+        f"{number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})"
+        for _, row in named_gains(result)
+        if row.certain
+    ]
+    results.append(f"Gains were {'; '.join(gains)}.")
+    made = [statement_text(plant, one) for one in decided(result)]
+    if made:
+        results.append(f"For all cost weights compatible with the recordings: {' '.join(made)}")
+    results += structure_sentences(result)[:1]
+    return Copy(methods, " ".join(results))
+
+
+def _arguments(provenance: Provenance) -> str:
+    given = ", ".join(f"{name} {value}" for name, value in provenance.plant_arguments.items())
+    return f" ({given})" if given else ""
+
+
+def _made(provenance: Provenance, result: FitResult | None = None, missing: str = "") -> Section:
+    code = Markup("<code>{}</code>")
+    terms = [
+        ("Recordings", ", ".join(provenance.files)),
+        ("Command", code.format(provenance.command)),
+        ("Plant", code.format(f"{provenance.plant_name}{_arguments(provenance)}")),
+        ("Created", f"{provenance.made}" + (f", in {result.seconds:.1f} s" if result else "")),
+        ("Software", provenance.all_versions),
+    ]
+    if provenance.inputs is not None:
+        digest = provenance.inputs.digest[:16]
+        terms.append(("Fingerprint", f"{digest} (SHA-256 of all inputs; in full in result.json)"))
+    if missing:
+        terms.insert(0, ("Not given", missing.removeprefix("Not given: ")))
+    blocks: list[Block] = [Terms(terms)]
+    if result is not None:
+        settings = [
+            (name, code.format(value)) for name, value in plain_settings(result.settings).items()
+        ]
+        problem = result.fitted.problem
+        how = [
+            ("Body", body_sentence(problem.plant)),
+            ("Quadratic programs", f"Solved by {described(problem.solver)}."),
+            ("Terminal set", _terminal_set(result)),
+        ]
+        blocks.append(Fold("All settings", [Terms([*how, *settings])]))
+    return Section("Provenance", blocks)
+
+
 def _terminal_set(result: FitResult) -> str:
-    changed = result.terminal_set_difference
-    within = bool(result.fitted.problem.terminal_set)
-    present = "without" if within else "with"
-    problem = result.fitted.problem
-    if aims(problem.plant, problem.recordings):
-        return "The fitted controller has no terminal set: what it regulates to moves."
+    changed, within = result.terminal_set_difference, bool(result.fitted.problem.terminal_set)
+    ends = "The controller ends in it" if within else "The controller has none"
     if np.isnan(changed):
-        effect = "does not reach the end of every trial"
-    else:
-        effect = f"differs by {changed:.2g} of an output's size at most"
-    ends = "ends in its terminal set" if within else "has no terminal set"
-    return f"The fitted controller {ends}. The loop {present} it {effect}."
-
-
-def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
-    """What result.json has beside the findings."""
-    plant, found = result.fitted.problem.plant, result.identifiability
-    return _controller(result) | {
-        "estimate": _estimate(result),
-        "warnings": result.warnings,
-        "intent": _intent(result),
-        "identifiability": {
-            "rank": found.rank,
-            "free": found.free,
-            "chosen": found.chosen,
-            "singular_values": found.singular_values,
-        },
-        "trials": [_trial(result, index) for index in range(len(result.trials))],
-        "methods": methods_data(result.methods),
-        "structures": structure_data(result),
-        "aim": aim_data(result),
-        "person": None if result.person is None else result.person.data(),
-        "plant": {
-            "name": provenance.plant_name,
-            "arguments": dict(provenance.plant_arguments),
-            **{name: getattr(plant, name) for name in ("A", "B", "E", "C", "dt")},
-        },
-        "settings": plain_settings(result.settings),
-        "ceiling": None if result.ceiling is None else asdict(result.ceiling),
-        "seconds": result.seconds,
-    }
-
-
-def _controller(result: FitResult) -> dict[str, Any]:
-    plant, fitted = result.fitted.problem.plant, result.fitted
-    weights, bounds = result.intent.reported.weights, result.given.bounds
-    held = np.array([item.vaf for item in result.held_out])
-    left_out = np.mean(held, axis=0) if len(held) else [None] * len(plant.outputs)
-    return {
-        "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
-        "held_out_vaf": dict(zip(plant.outputs, left_out, strict=True)),
-        **{name: getattr(plant, name) for name in ("states", "controls", "outputs")},
-        "disturbances": plant.disturbances,
-        "units": dict(plant.units),
-        "usable": result.usable,
-        "K": result.estimate.K,
-        "S": fitted.metric * (weights.R[0, 0] / fitted.stage_weights.R[0, 0]),
-        "Q": weights.Q,
-        "R": weights.R,
-        "weights_gain": fitted.gain,
-        "weights_rule": result.intent.reported.rule,
-        "P": result.reported_P,
-        "weights_test": {**asdict(result.weights_test), "rejected": result.weights_test.rejected},
-        "terminal_set": bool(fitted.problem.terminal_set),
-        "doubts": fitted.doubts,
-        "failures": dict(result.failures),
-        "lack_of_fit": [None if one is None else asdict(one) for one in result.lack],
-        "horizon": fitted.problem.horizon,
-        "body": plant.moves,
-        "solver": fitted.problem.solver,
-        "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
-    }
-
-
-def _intent(result: FitResult) -> dict[str, Any]:
-    found, reported = result.intent, result.intent.reported
-    return {
-        "eigenvalues": reported.eigenvalues,
-        "vectors": reported.vectors,
-        "dominant": reported.dominant,
-        "sentence": dominant_sentence(reported, result.fitted.problem.plant, np.array(found.sizes)),
-        "widest_angle": result.widest_angle,
-        "state_sizes": found.sizes,
-        "readings": [
-            {
-                "rule": item.rule,
-                "Q": item.weights.Q,
-                "R": item.weights.R,
-                "condition_number": item.condition,
-                "dominant": item.dominant,
-                "angle": item.angle,
-            }
-            for item in found.readings
-        ],
-    }
-
-
-def _estimate(result: FitResult) -> dict[str, Any]:
-    estimate, covariance = result.estimate, result.estimate.covariance
-    return {
-        "S": estimate.S,
-        "misfit": estimate.misfit,
-        "standard_errors": covariance.entries,
-        "standard_errors_exact_body": None if estimate.exact is None else estimate.exact.entries,
-        "identified": covariance.individually_identified,
-        "singular_values": covariance.singular_values,
-        "directions": covariance.directions,
-        "direction_standard_errors": covariance.deviations,
-        "identified_directions": covariance.identified,
-        "natural_coordinates": covariance.T,
-        "natural_inputs": covariance.G,
-    }
-
-
-def _trial(result: FitResult, index: int) -> dict[str, Any]:
-    trial, found = result.given.recordings[index], result.trials[index]
-    held = result.held_out[index] if result.held_out else None
-    return {
-        **asdict(trial.label),
-        "samples": trial.samples,
-        "missing": int(np.isnan(trial.outputs).any(axis=1).sum()),
-        "findings": trial.findings,
-        "vaf": found.vaf,
-        "centred_vaf": found.centred_vaf,
-        "whiteness": found.whiteness,
-        "rms_residual": found.rms,
-        "saturated": found.saturated,
-        "x0": result.fitted.problem.recordings[index].x0,
-        "held_out_vaf": None if held is None else held.vaf,
-        "held_out_centred_vaf": None if held is None else held.centred_vaf,
-    }
+        return f"{ends}."
+    other = "without" if within else "with"
+    return f"{ends}; {other} it an output differs by {changed:.2g} of its size at most."

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import PARAMETER, entry_names
 from impc.control.simulation import Status
+from impc.inverse.problem import recorded_size
+from impc.model.plant_family import LIMIT
 from impc.model.riccati import solve_lqr
+from impc.reporting.shown_units import shown_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,8 +23,10 @@ if TYPE_CHECKING:
     from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
-    from impc.assess.intent_statements import Intent
+    from impc.assess.frequency_response import FrequencyResponse
+    from impc.assess.intent_statements import Intent, Statement
     from impc.assess.lack_of_fit import LackOfFit, ModelError
+    from impc.assess.limit_curve import LimitCurve
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
@@ -33,6 +39,8 @@ if TYPE_CHECKING:
 #: Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
 MOST_TRIALS = 24
 
+# Share of what a given limit leaves, below which another that was tried is better.
+_BETTER = 0.7
 #: % of an output below which a fit explains less than it leaves.
 LITTLE = 50.0
 
@@ -66,6 +74,24 @@ class FittedParameter:
         What is not stays near its nominal value, where the search began.
         """
         return self.deviation < PARAMETER * self.value
+
+
+class LimitFound(NamedTuple):
+    """The limit of a control as the recordings have it, in its shown unit."""
+
+    given: float
+    value: float
+    low: float  # At 95 %
+    high: float
+    unit: str
+    known: float  # How far it may be from the given one by what was stated about it
+    fitted: bool = True  # Whether low and high are of 95 %, else the next limits that were tried
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the given limit is outside the interval, and beyond what was stated."""
+        outside = not self.low <= self.given <= self.high
+        return outside and abs(self.value - self.given) > max(self.known, 0.01 * self.given)
 
 
 @dataclass(frozen=True)
@@ -104,16 +130,49 @@ class FitResult:
     ceiling: Ceiling | None = None
     # The gain by regression on recorded commands (`command_regression`); None where there are none
     commands: pd.DataFrame | None = None
+    curves: tuple[LimitCurve, ...] = ()  # Of the controls that reach their limit
+    response: FrequencyResponse | None = None  # From the perturbation to the outputs
+    falls: tuple[str, ...] = ()  # Trials that ended in a fall and were not fitted, and when
 
     @property
-    def person_sentences(self) -> tuple[str, ...]:
-        """What may be said of the subject with sensory noise; nothing where none was asked for."""
-        return () if self.person is None else self.person.sentences(np.array(self.intent.sizes))
+    def limit_found(self) -> LimitFound | None:
+        """The limit of the first control that has one, where it was estimated."""
+        for control, item in zip(self.given.plant.controls, self.uncertainty.limits, strict=False):
+            if item.value is not None:
+                given = float(self.given.bounds.u_max[self.given.plant.controls.index(control)])
+                return self._limit(control, given, item.value, item.low, item.high)
+        for one in self.parameters:
+            kind, _, control = one.name.partition(".")
+            if kind == LIMIT and (one.stated is None or one.deviation < one.stated / 2):
+                half = TWO_SIDED * one.deviation
+                return self._limit(control, one.nominal, one.value, one.value - half,
+                                   one.value + half)  # fmt: skip
+        for curve in self.curves:
+            left = np.nan_to_num(curve.unexplained, nan=np.inf).sum(axis=1)
+            best, own = int(np.argmin(left)), int(np.argmin(np.abs(curve.limits - curve.given)))
+            if left[best] < _BETTER * left[own]:
+                around = curve.limits[[max(best - 1, 0), min(best + 1, len(left) - 1)]]
+                found = self._limit(curve.control, curve.given, curve.limits[best], *around)
+                return found._replace(fitted=False)
+        return None
+
+    def _limit(self, control: str, *numbers: float) -> LimitFound:
+        factor, unit = shown_unit(self.given.plant, control)
+        stated = {one.name: one.stated or 0.0 for one in self.parameters}
+        known = 0.0 if self.added is not None else stated.get(f"{LIMIT}.{control}", 0.0)
+        given, value, low, high = (factor * one for one in numbers)
+        return LimitFound(given, value, low, high, unit, TWO_SIDED * factor * known)
 
     @property
     def usable(self) -> bool:
         """Whether half of every recorded signal is explained: else nothing may be said."""
         return bool(np.all(self.inverse_mpc.vaf >= LITTLE))
+
+    @property
+    def gain_vaf(self) -> float:
+        """Variance that the identified gain explains, over all outputs in their scales, %."""
+        size = recorded_size(self.given)
+        return 100 * (1 - (self.estimate.misfit / size) ** 2) if size else float("nan")
 
     @property
     def met(self) -> bool:
@@ -139,6 +198,11 @@ class FitResult:
         return first
 
     @property
+    def compared(self) -> tuple[Statement, ...]:
+        """Comparisons of cost that were tried."""
+        return () if self.uncertainty.weights is None else self.uncertainty.weights.statements
+
+    @property
     def reported_P(self) -> Array:  # noqa: N802
         """Terminal weight (3.4) of the reported weights (n, n)."""
         return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
@@ -162,13 +226,6 @@ class FitResult:
         return None if self.lack[-1] is None else self.lack[-1].culprit
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What has to be read before any number: what was fitted too, and an error that is left."""
-        from impc.studies.fit.body_words import added_sentence, lack_sentence  # noqa: PLC0415
-
-        return tuple(line for line in (added_sentence(self), lack_sentence(self)) if line)
-
-    @property
     def saturated(self) -> float:
         """Share of the samples at which the command is at its bound."""
         return sum(item.saturated for item in self.trials) / len(self.trials)
@@ -180,8 +237,9 @@ class FitResult:
 
 
 def trial_name(result: FitResult, index: int) -> str:
-    """Label of the trial `index`, its number where it has none."""
-    return str(result.given.recordings[index].label) or f"trial {index + 1}"
+    """What the trial `index` is called: as its file says, else by its number."""
+    name = result.given.recordings[index].label.trial or str(index + 1)
+    return f"Trial {name}" if name.isdigit() else name
 
 
 def shown_trials(result: FitResult) -> list[int]:

@@ -17,6 +17,7 @@ from impc.inverse.methods import method_named
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
+    from impc.files.plant_sources import PlantSource
 
 # Percentiles of 95 % lie between replicates only from 20 on.
 _FEWEST = 20
@@ -239,3 +240,16 @@ def _require_distinct(settings: FitSettings) -> None:
         twice = [item for index, item in enumerate(given) if item in given[:index]]
         if twice:
             raise InputError(f"[fit] {name}", f"names {twice[0]} twice", "name each once")
+
+
+def missing(settings: FitSettings, source: PlantSource) -> str:
+    """What was not given, and what that excludes, in one line; empty where nothing is missing."""
+    parts = []
+    if settings.u_max is None:
+        parts.append("u_max: without a limit of the command inverse MPC is inverse LQR")
+    typical = source.assumed()
+    own = [name for name in typical if name not in settings.free]
+    if own:
+        values = ", ".join(f"{name} {typical[name]}" for name in own)
+        parts.append(f"the subject's own {' and '.join(own)}: the gains are those of {values}")
+    return f"Not given: {'; '.join(parts)}." if parts else ""

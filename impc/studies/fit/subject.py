@@ -21,9 +21,11 @@ from impc.assess.all_intervals import assess, count_stages
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
+from impc.assess.frequency_response import frequency_response
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
+from impc.assess.limit_curve import LimitCurve, limit_curve
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out_vaf
@@ -237,6 +239,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     trials = _agreements(known, methods[-1].runs, problem.bounds)
     body_known = replace(fitted, problem=fitted.problem.with_body_fixed())
     person = functools.partial(_person, problem, settings, body_known, progress)
+    curves = attempt("limit curve", functools.partial(_curves, fitted, methods[-1]), ())
     return FitResult(
         settings,
         problem,
@@ -258,7 +261,16 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         attempt("subject with sensory noise", person, None),
         ceiling(fitted.problem, settings.settle),
         attempt("regression of commands", functools.partial(_regressed, fitted), None),
+        curves,
+        frequency_response(fitted.problem, methods[-1].runs),
     )
+
+
+def _curves(fitted: Estimate, own: MethodFit) -> tuple[LimitCurve, ...]:
+    """Other limits of every control that reaches its own."""
+    reached = own.largest_input >= (1 - 1e-6) * np.asarray(fitted.problem.bounds.u_max)
+    found = [limit_curve(fitted, int(control)) for control in np.flatnonzero(reached)]
+    return tuple(curve for curve in found if curve is not None)
 
 
 def _regressed(fitted: Estimate) -> pd.DataFrame | None:

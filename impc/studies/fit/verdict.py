@@ -1,310 +1,508 @@
-"""What the page of a fit says first: one sentence, and a few that may be copied into a paper."""
+"""What a fit allows to be said: kinds of findings, worst first, and the verdict they add up to.
+
+A kind is one function: the result -> a `Kind` where it applies. The page shows the headline of the
+first, and an alert of each; what they forbid is not shown as a result anywhere on the page.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.covariance import IDENTIFIED
-from impc.assess.intent_statements import dominant_sentence
+from impc.assess.lack_of_fit import LIMIT
+from impc.reporting.finding import Level
 from impc.reporting.rendering import number
-from impc.studies.fit.aim import aim_sentences
-from impc.studies.fit.body_words import body_sentences
-from impc.studies.fit.result import LITTLE, trial_name
-from impc.studies.fit.structure_words import structure_sentences
+from impc.reporting.shown_units import signal_name
+from impc.reporting.verdict import Alert, Claim, Verdict
+from impc.studies.fit.body_words import alternative_reason, error_words, probability_words
+from impc.studies.fit.facts import (
+    amount,
+    decided,
+    given_limit,
+    lasting_or_first,
+    left_out_text,
+    limit_ends,
+    named_gains,
+    no_limit,
+    saturation,
+    shares_text,
+    unlimited_ratio,
+)
+from impc.studies.fit.result import LITTLE
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.files.plant_sources import PlantSource
-    from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
-    from impc.studies.fit.settings import FitSettings
+
+# Explained variance (%) below which much is left, and p of a residual that is no recorder's.
+_MUCH, _COLOURED = 90.0, 1e-3
+#: What a kind may forbid.
+GAIN, WEIGHTS, SHARE = "gain", "weights", "share"
 
 
-# Parts of a direction below this are not named.
-_NAMED = 0.15
+@dataclass(frozen=True)
+class Kind:
+    """A finding that restricts what may be reported."""
+
+    headline: str
+    sentence: str
+    alert: Alert
+    forbids: frozenset[str]
 
 
-def verdict(result: FitResult) -> str:
-    """The one sentence that says what may be made of the fit; what forbids most comes first."""
-    within = structure_sentences(result)
-    cases = (
-        (bool(within) and result.structures[0].refused, next(iter(within), "")),
-        (not result.usable, _little(result)),
+def fit_kinds(result: FitResult) -> list[Kind]:
+    """Those that apply, worst first."""
+    found = [kind(result) for kind in _KINDS]
+    return [kind for kind in found if kind is not None]
+
+
+def forbidden(result: FitResult) -> frozenset[str]:
+    """What none of the page may show as a result."""
+    return frozenset().union(*(kind.forbids for kind in fit_kinds(result)))
+
+
+def fit_verdict(result: FitResult) -> Verdict:
+    """The verdict of a fit."""
+    kinds = fit_kinds(result)
+    may, may_not = _may(result), _may_not(result)
+    if kinds:
+        red = [kind for kind in kinds if kind.alert.level is Level.RED]
+        shown = red or kinds
+        worst = shown[0]
+        alerts = [kind.alert for kind in shown]
+        return Verdict(worst.alert.level, worst.headline, worst.sentence, alerts, may, may_not)
+    headline, sentence, note = _explained(result)
+    return Verdict(Level.GREEN, headline, sentence, [note] if note else [], may, may_not)
+
+
+def fallen_verdict(falls: tuple[str, ...]) -> Verdict:
+    """The verdict where nothing was fitted: a fall in every trial."""
+    alert = Alert(
+        Level.RED,
+        "No trial is long enough to fit",
+        f"{'; '.join(falls)}.",
+        "The recordings show that the task was too hard, not how it was controlled.",
         (
-            not result.fitted.converged,
-            "The search ended before it converged: a longer or less noisy recording is needed.",
-        ),
-        (
-            result.person is not None and result.person.preferred,
-            "A subject with noise inside the loop explains the recordings better than noise in "
-            "the recorder: go by the gain of that subject, in its section.",
-        ),
-        (result.weights_test.rejected, result.weights_test.sentence),
-        (
-            result.culprit is not None,
-            "The controller agrees with the recordings, but the body or the controller that moved "
-            "is not that of the model, or noise entered the loop at its limit: do not rely on its "
-            "gain, its weights or their intervals.",
-        ),
-        (
-            not bounded(result),
-            "No limit of the command or of a state was given: this is inverse LQR, and says "
-            "nothing of how the subject uses what strength there is.",
-        ),
-        (
-            not result.met,
-            "No bound is ever active: these recordings cannot distinguish inverse MPC from inverse "
-            "LQR.",
-        ),
-        (bool(within), next(iter(within), "")),
-        (
-            True,
-            "Inverse MPC explains the recordings inside the bound: the gain is the subject's, as "
-            "far as its intervals say; the weights are a choice, but for what holds for all of "
-            "them.",
+            "Report the times of the falls; they are a result.",
+            "For new recordings, use a weaker perturbation or a more stable seat: impc plan shows "
+            "what would be enough.",
+            "If nobody fell, a recording has a jump or a wrong unit: run impc inspect.",
         ),
     )
-    return next(sentence for holds, sentence in cases if holds)
-
-
-def _little(result: FitResult) -> str:
-    """Which signals are explained by less than half."""
-    plant = result.given.plant
-    least = [
-        f"{name} (VAF {value:.0f} %)" if np.isfinite(value) else f"{name} (no simulation ends)"
-        for name, value in zip(plant.outputs, result.inverse_mpc.vaf, strict=True)
-        if not value >= LITTLE
-    ]
-    return (
-        f"The fitted controller explains less than half of {' and '.join(least)}: do not interpret "
-        "it. Check the units, the plant and the limit of the command."
-    )
-
-
-def abstract(result: FitResult) -> tuple[str, ...]:
-    """A few plain sentences with numbers."""
-    return (
-        _what_was_done(result),
-        *aim_sentences(result),
-        *body_sentences(result),
-        _agreement(result),
-        *_at_the_bound(result),
-        *((_gain(result), _weights(result)) if result.usable else ()),
+    return Verdict(
+        Level.RED,
+        "The person fell in every trial.",
+        "Nothing was fitted: from a fall on, nobody is balancing.",
+        [alert],
+        [Claim("The number and times of the falls.")],
+        [Claim("Gains, torque limit, cost weights.", "No controller was fitted.")],
     )
 
 
-def _what_was_done(result: FitResult) -> str:
-    problem = result.fitted.problem
-    plant, horizon = problem.plant, problem.horizon
-    trials = result.given.recordings
-    seconds = sum(trial.samples for trial in trials) * plant.dt
-    bounds = result.given.bounds
-    most_of = dict(zip(plant.states, bounds.x_max, strict=True))
-    most_of = {name: most_of[name] for name in plant.commands}
-    most_of |= zip(plant.controls, bounds.u_max, strict=True)
-    limits = [
-        f"{number(float(most))} {plant.unit(name)} of {_named(plant, name)}"
-        for name, most in most_of.items()
-        if np.isfinite(most)
-    ]
-    bounded = f"limited to {' and '.join(limits)}" if limits else "without a limit"
-    count = "one trial" if len(trials) == 1 else f"{len(trials)} trials"
-    return (
-        f"A model predictive controller (MPC) that looks {horizon * plant.dt:.3g} s ahead "
-        f"({horizon} samples), {bounded}, was fitted to {count}, {seconds:.3g} s in all."
-    )
-
-
-def _named(plant: Plant, name: str) -> str:
-    words = plant.word(name)
-    return f"{name} ({words})" if words else name
-
-
-def _agreement(result: FitResult) -> str:
-    plant = result.fitted.problem.plant
-    parts = [
-        f"{value:.2f} % of {_named(plant, name)}"
-        for name, value in zip(plant.outputs, result.inverse_mpc.vaf, strict=True)
-    ]
-    text = f"It accounts for {' and '.join(parts)} (VAF)"
-    if result.held_out:
-        held = np.mean([item.vaf for item in result.held_out], axis=0)
-        text += (
-            f"; in trials that the fit has not seen, for "
-            f"{' and '.join(f'{value:.2f} %' for value in held)}"
+def _explained(result: FitResult) -> tuple[str, str, Alert | None]:
+    """Headline and sentence where nothing restricts, and a note on the limit where one is due."""
+    limit = given_limit(result)
+    if limit is None:
+        note = Alert(
+            Level.NOTE,
+            "Note: no limit of the command was given",
+            "The model was fitted without a limit: it is the one of inverse LQR.",
+            "Gains and cost weights hold if the person never met a limit.",
+            ("Set u_max in [fit] to ask whether a limit matters.",),
         )
-    return f"{text}.{_ceiling(result)}"
-
-
-def _ceiling(result: FitResult) -> str:
-    """What any controller without noise can explain, where the perturbation repeats."""
-    found = result.ceiling
-    if found is None:
-        return ""
-    parts = [
-        f"{value:.1f} % ({low:.1f} to {high:.1f}) of {name}"
-        for name, value, low, high in zip(
-            result.given.plant.outputs, found.vaf, found.low, found.high, strict=True
+        return (
+            "A linear feedback explains this movement; no limit was given.",
+            "You may report the gains. Nothing can be said about a limit of the command.",
+            note,
         )
-    ]
+    if not result.met:
+        largest = amount(result, result.inverse_mpc.largest_input)
+        note = Alert(
+            Level.NOTE,
+            "Note: these recordings say nothing about the limit",
+            f"The largest command in the model is {largest}. Models with and without the limit are "
+            "the same model here.",
+            "Gains and cost weights are as valid as without a limit. An estimate of the limit "
+            f"would only say “more than {largest}”.",
+            (
+                "Do not report the limit as a finding, or that it matters.",
+                "If the limit is your question, record again with a stronger perturbation: impc "
+                "plan shows how strong.",
+            ),
+        )
+        return (
+            "The controller explains this movement, but its limit was never reached.",
+            f"You may report the gains. Nothing can be said about the limit: the largest command "
+            f"was {largest}, and {limit} was allowed.",
+            note,
+        )
+    held = "It predicts trials it was not fitted to, its" if result.held_out else "Its"
     return (
-        f" Of the movement {' and '.join(parts)} repeats with the perturbation: no controller "
-        f"without noise of its own explains more ({found.repetitions} repetitions)."
+        f"A controller with a limit of {limit} explains this movement.",
+        f"{held} limit is reached, and the command per unit of tilt or velocity is identified.",
+        None,
     )
 
 
-def _at_the_bound(result: FitResult) -> list[str]:
-    """How often the command is at its bound, and what inverse LQR needs instead."""
-    share = 100 * float(np.mean([item.saturated for item in result.trials]))
-    text = f"The command is at its bound for {share:.1f} % of the time"
-    methods = {item.name: item for item in result.methods}
-    other, own = methods.get("inverse_lqr_output"), result.inverse_mpc
-    if other is None or other.estimate.K is None or np.any(np.isnan(other.vaf)):
-        return [f"{text}."] if limited(result) else []
-    gain = float(np.mean(own.vaf - other.vaf))
-    sign = "more" if gain >= 0 else "less"
-    plant = result.given.plant
-    largest = f"{number(float(other.largest_input[0]))} {plant.unit(plant.controls[0])}"
-    than = f"inverse MPC accounts for {abs(gain):.2f} points {sign} than inverse LQR on the outputs"
-    if not limited(result):
-        return [f"{than[0].upper()}{than[1:]} (largest command {largest})."]
-    kept = "keeps the bound too" if other.keeps_bounds else "exceeds the bound"
-    return [f"{text}; {than}, which {kept} (largest command {largest})."]
-
-
-def _gain(result: FitResult) -> str:
-    identified = result.estimate.covariance.individually_identified
-    count, total = int(np.count_nonzero(identified)), int(np.size(identified))
-    zero = sum(item.excludes_zero for item in result.gain_intervals)
-    apart = f"the 95 % intervals of {zero} exclude zero"
-    if count == total:
-        return f"All {total} entries of the gain are individually identified; {apart}."
-    return (
-        f"Of the {total} entries of the gain {count} are individually identified, of the others "
-        f"only combinations; {apart}."
+def _little(result: FitResult) -> Kind | None:
+    outputs, held = result.given.plant.outputs, result.held_out
+    shares = np.mean([one.vaf for one in held], axis=0) if held else result.inverse_mpc.vaf
+    if result.usable and not np.any(shares < LITTLE):
+        return None
+    if result.weights_test.rejected and result.gain_vaf > LITTLE:
+        return None  # the gain explains it, and its nearest weights do not
+    if result.usable and _weak(result) is not None:
+        return None  # what is not known cannot predict
+    shares = shares if result.usable else result.inverse_mpc.vaf
+    said = " and ".join(
+        f"{value:.0f} % of the {signal_name(result.given.plant, name)}"
+        if np.isfinite(value)
+        else f"nothing of the {signal_name(result.given.plant, name)}, since no simulation ends"
+        for name, value in zip(outputs, shares, strict=True)
+    )
+    where = "left-out trials" if result.usable else "the recordings"
+    alert = Alert(
+        Level.RED,
+        "The model does not describe these recordings",
+        f"In {where} it explains {said}. With recordings that suit the model, values above 90 % "
+        "are usual.",
+        "Gains and cost weights describe the best of a set of poor models. They are kept under "
+        "details for troubleshooting only.",
+        (
+            "Look at the figure above. If the model moves in the opposite direction, a sign is "
+            "reversed; if it lags or leads, the clocks of two devices differ; if it has the wrong "
+            "size, a unit is wrong.",
+            "Run impc inspect and compare the range of each signal with what you expect.",
+            "Check that the column of the perturbation is what reached the person, and that "
+            "nothing else did.",
+            "If all of this is right, the person may have moved on purpose, or this body model "
+            "does not apply.",
+        ),
+    )
+    return Kind(
+        "The model explains less than half of this movement.",
+        f"It explains {said} in {where}. Nothing else on this page says anything about the person.",
+        alert,
+        frozenset([GAIN, WEIGHTS, SHARE]),
     )
 
 
-def _weights(result: FitResult) -> str:
-    text = (
-        "Other weights with exactly the same behaviour turn the dominant cost by up to "
-        f"{result.widest_angle:.0f} degrees"
+def _unfinished(result: FitResult) -> Kind | None:
+    if result.fitted.converged:
+        return None
+    alert = Alert(
+        Level.AMBER,
+        "The search ended before it converged",
+        f"{result.fitted.status.sentence}",
+        "A better fit may exist, with other gains.",
+        ("Fit longer or less noisy recordings.", "Fit fewer unknowns: take names out of free."),
     )
-    summary = result.uncertainty.weights
+    return Kind(
+        "The model follows the movement, but the search did not finish.",
+        "Gains and cost weights may still change: do not report them.",
+        alert,
+        frozenset([GAIN, WEIGHTS]),
+    )
+
+
+def _limit(result: FitResult) -> Kind | None:
+    limit, estimated = given_limit(result), result.limit_found
+    if limit is None or estimated is None or not estimated.disagrees:
+        return None
+    unit = estimated.unit
+    value = f"{number(estimated.value)} {unit}"
+    ends = limit_ends(estimated)
+    refitted = result.added is not None and result.added.name == LIMIT
+    culprit = result.culprit is not None
+    of_what = (
+        f"The gains on this page are those of a fit with {value}."
+        if refitted and not culprit
+        else "With a wrong limit gains come out several times too small or too large, and their "
+        "intervals do not show it."
+    )
+    alert = Alert(
+        Level.AMBER,
+        "The limit does not agree with the recordings",
+        f"It was given as {limit}. Fitted together with the gain it is {value} ({ends}).",
+        f"{of_what} A high percentage of explained variance is no protection.",
+        (
+            f"Set u_max = {number(estimated.value)} if the person can produce no more, and fit "
+            "again.",
+            "If a warning stays, allow for noise in muscles and senses: add [fit.observer].",
+            "If it still stays, check body mass, height and the model of the body.",
+        ),
+    )
+    return Kind(
+        f"The model follows the movement, but a limit of {limit} is probably wrong.",
+        f"When the limit is estimated, the recordings point to {value}. Until that is settled, do "
+        "not report gains or cost weights from this page.",
+        alert,
+        frozenset([GAIN, WEIGHTS, SHARE]),
+    )
+
+
+def _observer(result: FitResult) -> Kind | None:
+    if result.person is None or not result.person.preferred:
+        return None
+    alert = Alert(
+        Level.AMBER,
+        "The person reacts to noise",
+        "A model whose person senses and moves with noise explains the recordings better than one "
+        "with noise in the recorder alone.",
+        "Gains that do not allow for it may be wrong by half.",
+        ("Report the gains of the section on noise in the loop, with their intervals.",),
+    )
+    return Kind(
+        "The model follows the movement, and the person reacts to noise.",
+        "Report the gains of the section on noise in the loop, not those of the model without it.",
+        alert,
+        frozenset([GAIN, WEIGHTS]),
+    )
+
+
+def _body(result: FitResult) -> Kind | None:
+    error = result.culprit
+    if error is None or _limit(result) is not None:  # a wrong limit does all that
+        return None
+    reason = alternative_reason(result, error)
+    alert = Alert(
+        Level.AMBER,
+        "What the model misses depends on the perturbation",
+        f"Part of the residual follows the perturbation, which measurement noise cannot do. Most "
+        f"of it is explained by {error_words(result, error)} ({probability_words(error)}).{reason}",
+        "The gains make up for the error. Their intervals do not contain it; the true uncertainty "
+        "may be several times larger.",
+        (
+            *(("Add [fit.observer] to the settings and fit again.",) if reason else ()),
+            "Check body mass, height and sex in the settings, and the measures of the device.",
+            "State how well they are known in [plant.uncertainty], or let a doubtful one vary with "
+            "free = [...], and report how much the gains change.",
+            "For group comparisons, use the same model for everyone: much of the error then "
+            "cancels.",
+        ),
+    )
+    headline = (
+        "The model follows the movement, but the person seems to react to noise."
+        if reason
+        else "The model follows the movement, but the body model does not quite fit."
+    )
+    return Kind(
+        headline,
+        "Part of what it misses follows the perturbation. Gains may be off by more than their "
+        "intervals show, so do not report them yet.",
+        alert,
+        frozenset([GAIN, WEIGHTS]),
+    )
+
+
+def _noise(result: FitResult) -> Kind | None:
+    """Much is left, and it is no recorder's noise: the person may react to what made it."""
+    least = float(np.min(result.inverse_mpc.vaf))
+    coloured = all(np.nanmin(one.whiteness) < _COLOURED for one in result.trials)
+    if least > _MUCH or not coloured or result.person is not None or result.weights_test.rejected:
+        return None
+    alert = Alert(
+        Level.AMBER,
+        "Much of the movement is not explained, and it is no measurement noise",
+        f"The model explains {shares_text(result)}. What it misses is autocorrelated, as movement "
+        "is and noise of a recorder is not.",
+        "Noise of a recorder does no harm, because nobody reacts to it. Noise in muscles or senses "
+        "does: where the person answers it at the limit, or its share is large, gains may be wrong "
+        "by half.",
+        (
+            "Add [fit.observer] to the settings and fit again; expect about half an hour.",
+            "Report the gains of that fit, with its intervals, if its checks pass.",
+            "For new recordings, use a stronger perturbation: it makes the reaction to noise "
+            "relatively smaller.",
+        ),
+    )
+    return Kind(
+        "The model follows part of the movement; the person may react to noise.",
+        "Noise in muscles or senses probably feeds back into the movement. Do not report gains "
+        "that do not allow for it yet.",
+        alert,
+        frozenset([GAIN, WEIGHTS]),
+    )
+
+
+def _no_weights(result: FitResult) -> Kind | None:
+    if not result.weights_test.rejected:
+        return None
+    alert = Alert(
+        Level.AMBER,
+        "No cost weights lead to this gain",
+        result.weights_test.sentence,
+        "Either the person does not keep a cost of this form small, or an error in the body model, "
+        "the delay or the limit has shifted the gain.",
+        (
+            "Report the gain with its intervals; leave out cost weights and intent.",
+            "Let the uncertain parts of the model vary, and see whether the conflict remains.",
+            "Do not enter a similar gain by hand to obtain weights: they would not be this "
+            "person's.",
+        ),
+    )
+    return Kind(
+        "The gain is identified, but no cost weights explain it.",
+        "No quadratic cost makes this gain the best one. You may report the gain; you may not "
+        "infer intent.",
+        alert,
+        frozenset([WEIGHTS]),
+    )
+
+
+def _fell(result: FitResult) -> Kind | None:
+    if not result.falls:
+        return None
+    used, count = len(result.trials), len(result.trials) + len(result.falls)
+    one = len(result.falls) == 1
+    alert = Alert(
+        Level.AMBER,
+        "One trial ended in a fall" if one else f"{len(result.falls)} trials ended in a fall",
+        f"{'; '.join(result.falls)}. The other trials were fitted.",
+        "From the fall on, nobody is balancing, so there is nothing to fit. Leaving out trials "
+        "that ended in a fall makes a person, or a group, look steadier than it is.",
+        (
+            "Report how many trials ended in a fall, in each group.",
+            "To use the part before a fall, set stop in [recording] for that file and fit again.",
+            "If nobody fell, the recording has a jump or a wrong unit: run impc inspect.",
+        ),
+    )
+    return Kind(
+        f"The model explains {used} of {count} trials; in the other{'' if one else 's'} the person "
+        "fell.",
+        "The results below come from the trials without a fall.",
+        alert,
+        frozenset(),
+    )
+
+
+def _weak(result: FitResult) -> Kind | None:
+    gains = named_gains(result)
+    if any(row.certain and row.high - row.low < abs(row.value) for _, row in gains):
+        return None
+    alert = Alert(
+        Level.AMBER,
+        "The recordings are too short, or the perturbation is too weak",
+        f"None of the {len(gains)} gains is known to within half of its size. At most combinations "
+        "of them are identified; they are listed under details.",
+        "The model is not wrong, but many controllers would have moved in this way.",
+        (
+            "Record more trials, or use a stronger or faster perturbation: impc plan shows how "
+            "many intervals would become narrow enough.",
+            "Compare groups by the combinations that are identified, or by measures of movement.",
+        ),
+    )
+    return Kind(
+        "The model explains the movement, but the recordings do not pin down its gains.",
+        "Gains that differ by much produce nearly the same movement. You may report the explained "
+        "variance, but no single gain.",
+        alert,
+        frozenset([GAIN, WEIGHTS]),
+    )
+
+
+def _structure(result: FitResult) -> Kind | None:
+    if not result.structures or not result.structures[0].refused:
+        return None
+    name = result.structures[0].structure.name
+    alert = Alert(
+        Level.AMBER,
+        f"The recordings reject the structure “{name}”",
+        "Other gains explain what its cost weights leave.",
+        "What the structure says about cost weights is not the person's.",
+        ("Report the gain without it, or try another structure.",),
+    )
+    return Kind(
+        f"The gain is identified, but the structure “{name}” does not explain it.",
+        "Do not report cost weights within this structure.",
+        alert,
+        frozenset([WEIGHTS]),
+    )
+
+
+_KINDS: tuple[Callable[[FitResult], Kind | None], ...] = (
+    _little,
+    _unfinished,
+    _limit,
+    _observer,
+    _body,
+    _noise,
+    _no_weights,
+    _structure,
+    _weak,
+    _fell,
+)
+
+
+def _may(result: FitResult) -> list[Claim]:
+    """What may be reported, with its numbers."""
+    no = forbidden(result)
+    if _little(result) is not None:
+        return [Claim("That this model does not explain the movement.",
+                      f"It explains {shares_text(result)}.")]  # fmt: skip
     if result.weights_test.rejected:
-        return "No cost weights explain this gain: nothing may be said of the subject's intent."
-    if summary is None or not summary.drawn:
-        return f"{text}: which weights are reported is a convention."
-    made = sum(item.made for item in summary.statements)
-    return (
-        f"{text}; {made} of {len(summary.statements)} statements on what costs more hold for all "
-        "of them, at 95 %."
-    )
+        claims = [Claim("A linear feedback follows the movement.",
+                        f"Its gain explains {result.gain_vaf:.1f} % of the variance, the nearest "
+                        f"that has cost weights {shares_text(result)}.")]  # fmt: skip
+    else:
+        claims = [Claim("The model follows the movement.", left_out_text(result))]
+    limit = given_limit(result)
+    if result.met and limit is not None and SHARE not in no:
+        without = unlimited_ratio(result)
+        claims.append(Claim("The limit matters." if without else "The limit is reached.",
+                            f"The command is at its limit for {saturation(result):.1f} % of the "
+                            f"time.{without}"))  # fmt: skip
+    found = result.limit_found
+    if found is not None:
+        ends = f"({limit_ends(found)})"
+        claims.append(
+            Claim(f"The limit is {number(found.value)} {found.unit} {ends}.",
+                  "Estimated from the movement, not only assumed.")
+        )  # fmt: skip
+    if GAIN not in no:
+        known = [name for name, row in named_gains(result) if row.certain]
+        claims.append(
+            Claim(f"The gain on {', '.join(dict.fromkeys(known))}, with intervals.",
+                  lasting_or_first(result))
+        )  # fmt: skip
+    count = len(decided(result))
+    if WEIGHTS not in no and count:
+        many = "One comparison" if count == 1 else f"{count} comparisons"
+        claims.append(Claim(f"{many} of cost, listed under Intent.",
+                            "They hold for all cost weights that fit the recordings."))  # fmt: skip
+    if result.falls:
+        claims.append(Claim("The number and times of the falls.", "; ".join(result.falls) + "."))
+    return claims
 
 
-def remarks(result: FitResult) -> tuple[str, ...]:
-    """What stands behind the verdict: how sure it is, and what was chosen."""
-    return (
-        *structure_sentences(result)[1:],
-        *_clipped(result),
-        *(_of_weights(result) if result.usable and not result.weights_test.rejected else ()),
-        _determined(result),
-        *result.fitted.doubts,
-        *_failed(result),
-        *result.person_sentences,
-    )
-
-
-def missing(settings: FitSettings, source: PlantSource) -> str:
-    """What was not given, and what that excludes, in one line; empty where nothing is missing."""
-    parts = []
-    if settings.u_max is None:
-        parts.append("u_max: without a limit of the command inverse MPC is inverse LQR")
-    typical = source.assumed()
-    own = [name for name in typical if name not in settings.free]
-    if own:
-        values = ", ".join(f"{name} {typical[name]}" for name in own)
-        parts.append(f"the subject's own {' and '.join(own)}: the gains are those of {values}")
-    return f"Not given: {'; '.join(parts)}." if parts else ""
-
-
-def limited(result: FitResult) -> bool:
-    """Whether the settings give a limit on any input."""
-    return bool(np.any(np.isfinite(result.given.bounds.u_max)))
-
-
-def bounded(result: FitResult) -> bool:
-    """Whether there is a limit on any input or state."""
-    bounds = result.given.bounds
-    sides = np.concatenate([bounds.u_min, bounds.u_max, bounds.x_min, bounds.x_max])
-    return bool(np.any(np.isfinite(sides)))
-
-
-def direction_name(direction: Array, names: tuple[str, ...]) -> str:
-    """A direction (n,) as a sum of parts called by their `names`, the largest first."""
-    order = np.argsort(-np.abs(direction), kind="stable")
-    parts = [
-        f"{direction[index]:+.2f} {names[index]}"
-        for index in order
-        if abs(direction[index]) >= _NAMED
-    ]
-    return " ".join(parts)
-
-
-def _clipped(result: FitResult) -> list[str]:
-    """In which trials the law of inverse MPC falls when it is merely clipped, and when."""
-    methods = {item.name: item for item in result.methods}
-    if "clipped_lqr" not in methods:
-        return []
-    falls = ", ".join(
-        f"{trial_name(result, index)} at {time:.1f} s"
-        for index, time in enumerate(methods["clipped_lqr"].fell)
-        if time is not None
-    )
-    if not falls:
-        return []
-    own = [time for time in methods["inverse_mpc"].fell if time is not None]
-    stands = "" if own else "; inverse MPC does not"
-    return [f"The same gain merely clipped at the bound falls: {falls}{stands}."]
-
-
-def _of_weights(result: FitResult) -> tuple[str, str]:
-    reading, plant = result.intent.reported, result.fitted.problem.plant
-    return dominant_sentence(reading, plant, np.array(result.intent.sizes)), _how_sure(result)
-
-
-def _failed(result: FitResult) -> tuple[str, ...]:
-    """The stages that failed, and why."""
-    return tuple(f"Not available, {stage}: {reason}." for stage, reason in result.failures.items())
-
-
-def _how_sure(result: FitResult) -> str:
-    summary = result.uncertainty.weights
-    drawn = (
-        ""
-        if summary is None or not summary.drawn
-        else f" Other gains that the recordings allow turn it by up to "
-        f"{summary.angle_of_gain:.0f} degrees at 95 %."
-    )
-    return (
-        f"Other weights with exactly the same behaviour turn that direction by up to "
-        f"{result.widest_angle:.0f} degrees: so far it was chosen by a rule and not by the "
-        f"subject (section 6).{drawn}"
-    )
-
-
-def _determined(result: FitResult) -> str:
-    found, covariance = result.identifiability, result.estimate.covariance
-    values = covariance.singular_values
-    count = int(np.count_nonzero(np.isfinite(covariance.deviations)))
-    identified = int(np.count_nonzero(covariance.identified))
-    entries = int(np.count_nonzero(covariance.individually_identified))
-    return (
-        f"Of the {len(values)} directions of the gain the recordings determine {count} above "
-        f"rounding and identify {identified}: their standard error is below {IDENTIFIED:g} of a "
-        f"natural gain. {entries} of its entries are individually identified. Of the "
-        f"{found.free} directions of the weights the recordings determine {found.rank}; the "
-        f"other {found.chosen} are a convention."
-    )
+def _may_not(result: FitResult) -> list[Claim]:
+    no, found = forbidden(result), result.identifiability
+    count = "1 trial" if len(result.trials) == 1 else f"{len(result.trials)} trials"
+    claims = []
+    if GAIN in no:
+        claims.append(Claim("Any gain.", "See the warning above."))
+    else:
+        unknown = [name for name, row in named_gains(result) if not row.certain]
+        if unknown:
+            claims.append(
+                Claim(f"The gain on {', '.join(dict.fromkeys(unknown))}, by itself.",
+                      "Its interval includes zero, or only combinations are identified.")
+            )  # fmt: skip
+    if WEIGHTS in no:
+        claims.append(Claim("Any cost weight, or comparison of costs.", "See the warning above."))
+    else:
+        claims += [
+            Claim("The matrix of cost weights, or one of its entries, as a property of the person.",
+                  f"{found.chosen} of its {found.free} dimensions are set by convention.")
+        ]  # fmt: skip
+    if SHARE in no or given_limit(result) is None or not result.met:
+        claims.append(Claim("The time at the limit, or that the limit matters.", no_limit(result)))
+    claims += [
+        Claim("That the person computes an optimal plan.",
+              "Any controller with this gain and this limit moves identically."),
+        Claim("Other tasks, people or perturbations.",
+              f"{count} of one person in one condition."),
+    ]  # fmt: skip
+    return claims

@@ -1,233 +1,278 @@
-"""The report of a plan: page, table as CSV, result.json, figures.
-
-See docs/planning.md.
-"""
+"""The page of a plan, and its files (docs/planning.md)."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from impc.model.plant import gain_unit
-from impc.reporting.document import Lines, Report, Section, Terms, Verdict
+from impc.assess.covariance import TWO_SIDED
+from impc.reporting.document import Block, Checks, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
-from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit, signal_words
-from impc.reporting.style import drawn, journal_style
-from impc.studies.fit.gain_findings import number_name
-from impc.studies.plan.figures import cost_weights_figure, experiments_figure
-from impc.studies.plan.sentences import plan_sentences
+from impc.reporting.shown_units import shown_unit
+from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, PHONE, RULE, new_figure
+from impc.studies.plan.sentences import (
+    expected,
+    listed,
+    plan_checks,
+    plan_copy,
+    plan_keys,
+    plan_verdict,
+    stated_as,
+    target,
+    weight_names,
+    widths,
+)
 from impc.studies.plan.study import spread
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from impc.reporting.provenance import Provenance
     from impc.studies.plan.study import Plan
 
-_PICTURES = (
-    Picture(
-        "cost_weights",
-        "How far each cost weight would be identified, over the amplitude of the perturbation",
-        "Half an interval of 95 %, as a factor of the cost weight: farther down is better, 1 is "
-        "exact. Each line is a dwell; the large ring marks the experiment above.",
-    ),
-    Picture(
-        "experiments",
-        "Share of the time at the limit, and of the trials that end in a fall",
-        "What the perturbation does to the person, over its amplitude; each line is a dwell.",
-    ),
+_TRIALS = Picture(
+    "trials",
+    "Width of the interval of each cost weight over the number of trials, and the target",
+    "How far a 95 % interval reaches beyond the assumed cost weight. Lower is better; to first "
+    "order. Dashed: the difference to be seen.",
 )
+_LINES = ((BLUE, "o", "-"), (GREEN, "s", "--"), (INK, "^", ":"), (MUTED, "D", "-."))
+# Lines of text next to a curve, of the height of an axis; beyond this many % nothing is drawn.
+_LINE, _MOST = 0.07, 1e4
 
 
 def plan_report(plan: Plan, provenance: Provenance) -> Report:
-    """Page, result.json, experiments.csv and figures."""
-    with journal_style():
-        figures = drawn(
-            {"cost_weights": cost_weights_figure(plan), "experiments": experiments_figure(plan)}
-        )
-    first, *rest = plan_sentences(plan)
-    sections = [
-        Section("1. The experiments", (*_PICTURES, _experiments(plan)), "Experiments"),
-        Section("2. What the best one would identify", _best(plan), "Best"),
-        Section("3. Groups", (_groups(plan),), "Groups"),
-        Section("4. The presumed person", _presumed(plan), "Person"),
-        Section(
-            "5. Versions",
-            (Markup("<code>{}</code>").format(provenance.command), provenance.all_versions),
-        ),
-    ]
+    """Page, result.json, tables and figure."""
+    count = plan.settings.trials
     return Report(
         "impc plan",
-        "What an experiment would identify",
-        (Verdict(first), Lines(rest)),
-        sections,
-        figures=figures,
+        "plan of an experiment",
+        plan_verdict(plan),
+        [
+            Section("Cost weights", [_cost_weights(plan), *_body(plan)]),
+            Section("Experiments", [_experiments(plan)]),
+            Section("Groups", [_groups(plan)]),
+            Section("Assumed person", [_person(plan)]),
+            Section("Checks", [Checks(plan_checks(plan))]),
+            Section("Provenance", [Terms(provenance.terms)]),
+        ],
+        meta=(
+            "Simulated before anyone is measured",
+            f"{count} trial{'s' * (count > 1)}",
+            f"{len(plan.outcomes)} experiments tried",
+        ),
+        hero=_TRIALS,
+        keys=plan_keys(plan),
+        figures={"trials": lambda narrow: _trials_figure(plan, narrow)},
+        copy=plan_copy(plan),
         data=_data(plan),
         provenance=provenance,
-        words=signal_words(plan.person.controller.plant),
     )
+
+
+def _trials_figure(plan: Plan, narrow: bool) -> Figure:
+    """The longer side of each interval over the number of trials."""
+    figure = new_figure(PHONE if narrow else HALF, 3.6)
+    ax = figure.subplots()
+    counts, sides = widths(plan)
+    with np.errstate(over="ignore"):
+        shares = np.clip(100 * np.expm1(sides), 1e-3, None)
+    shares[shares > _MOST] = np.nan
+    aim, planned = 100 * math.expm1(target(plan)), plan.settings.trials
+    known = [*shares[np.isfinite(shares)], aim]
+    low, high = math.log(min(known) / 1.3), math.log(max(known) * 1.4)
+    styles, least = list(itertools.islice(itertools.cycle(_LINES), len(shares.T))), -1.0
+    for values, (color, marker, line) in zip(shares.T, styles, strict=True):
+        ax.plot(counts, values, color=color, marker=marker, linestyle=line)
+    names = weight_names(plan)
+    for k in np.argsort(shares[-1])[: np.count_nonzero(np.isfinite(shares[-1]))]:
+        # A name at the right end of each curve, none over another.
+        least = max((math.log(shares[-1, k]) - low) / (high - low), least + _LINE)
+        place = float(counts[-1]), math.exp(low + least * (high - low))
+        ax.annotate(names[k], place, (7, 0), textcoords="offset points", va="center",
+                    color=styles[k][0])  # fmt: skip
+    ax.axhline(aim, color=INK, linewidth=1, linestyle=(0, (4, 3)))
+    ax.annotate(f"target {aim:g} %", (counts[0], aim), (0, 4), textcoords="offset points")
+    ax.axvline(planned, color=RULE, zorder=0)
+    ax.annotate("planned", (planned, math.exp(high)), (4, -12), textcoords="offset points",
+                color=MUTED)  # fmt: skip
+    ax.set_xscale("log")
+    ax.set_xticks(counts, [f"{count:g}" for count in counts], minor=False)
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.set_yscale("log")
+    ax.set_ylim(math.exp(low), math.exp(high))
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.set_title("95 % interval of a cost weight, up to \u00b1 (%)")
+    ax.set_xlabel("Trials of one person (count)")
+    return figure
 
 
 def _experiments(plan: Plan) -> Finding:
     """Every experiment and what it would identify, as factors of the cost weights (95 %)."""
-    rows: list[dict[str, Any]] = []
+    plant, names, rows = plan.person.controller.plant, plan.person.structure.unknowns, []
+    marks = {"A-optimal": plan.best, "D-optimal": plan.sharpest}
     for item in plan.outcomes:
+        ends, widest = np.full((len(names), 3), np.nan), math.nan
+        if item.expected is not None:
+            sides = [(one.low - one.value, one.high - one.value) for one in item.expected.intervals]
+            ends = np.column_stack([np.exp(sides), item.expected.deviations])
+            first_order = TWO_SIDED * ends[:, 2:]
+            longer = np.where(np.isfinite(sides), np.abs(sides), first_order)
+            with np.errstate(over="ignore"):
+                widest = float(100 * np.expm1(np.max(longer)))
         row: dict[str, Any] = {
             "amplitude": float(item.design.amplitude),
             "dwell": float(item.design.dwell),
+            "widest_interval_percent": widest,
             "falls_percent": 100 * float(item.falls),
             "at_the_limit_percent": 100 * float(item.at_limit),
+            "smallest_vaf_percent": float(np.min(item.vaf)),
+            "best": ", ".join(word for word, one in marks.items() if item is one),
         }
-        for index, name in enumerate(plan.person.structure.unknowns):
-            low, high, error = np.nan, np.nan, np.nan
-            if item.expected is not None:
-                interval = item.expected.intervals[index]
-                ends = interval.low, interval.high
-                low, high = (float(np.exp(end - interval.value)) for end in ends)
-                error = float(item.expected.deviations[index])
-            row |= {f"{name}_low": low, f"{name}_high": high, f"{name}_standard_error": error}
-        best = {"A-optimal": plan.best, "D-optimal": plan.sharpest}
-        row["best"] = ", ".join(word for word, one in best.items() if item is one)
+        for name, values in zip(names, ends, strict=True):
+            heads = (f"{name}_{end}" for end in ("low", "high", "standard_error"))
+            row |= dict(zip(heads, map(float, values), strict=True))
         rows.append(row)
-    caption = (
-        "Expected intervals of 95 %, as factors of the presumed cost weight, and standard errors "
-        "of its logarithm; dwell in s."
+    unit = shown_unit(plant, plant.disturbances[0])[1]
+    return Finding(
+        "experiments",
+        pd.DataFrame(rows),
+        "Widest interval: how far it reaches beyond the assumed cost weight; to first order where "
+        "it has no end. A-optimal: least mean variance, which is chosen. D-optimal: least joint "
+        "region.",
+        digits=3,
+        labels={
+            "amplitude": "Factor" if plan.settings.files else f"Amplitude ({unit})",
+            "dwell": "Held for (s)",
+            "smallest_vaf_percent": "Highest VAF (%)",
+        },
+        hidden=list(rows[0])[7:],
     )
-    return Finding("experiments", pd.DataFrame(rows), caption, digits=3)
 
 
-def _best(plan: Plan) -> list[Finding]:
-    expected, person = plan.best.expected, plan.person
-    if expected is None:
+def _cost_weights(plan: Plan) -> Finding:
+    found, person, fits = expected(plan), plan.person, plan.simulated
+    table = pd.DataFrame(
+        {
+            "cost_weight": weight_names(plan),
+            "feature": person.structure.unknowns,
+            "assumed": np.exp(person.cost_weights),
+            "low": [math.exp(item.low) for item in found.intervals],
+            "high": [math.exp(item.high) for item in found.intervals],
+            "interval": [stated_as(item) for item in found.intervals],
+            "standard_error_of_the_logarithm": np.array(found.deviations),
+        }
+    )
+    if fits is not None and len(fits.cost_weights):
+        table["in_simulated_fits"] = spread(fits.cost_weights)
+    hidden = ["feature", "standard_error_of_the_logarithm"]
+    if found.body is not None:
+        own = {"with_an_exact_body": found.body.exact,
+               "with_ten_times_the_trials": found.body.tenfold,
+               "with_any_number_of_trials": found.body.floor}  # fmt: skip
+        table = table.assign(**{name: np.array(values) for name, values in own.items()})
+        hidden += list(own)
+    return Finding(
+        "cost_weights",
+        table,
+        "Expected 95 % intervals of the best experiment, with one for the first command.",
+        digits=3,
+        labels={
+            "interval": "About the assumed",
+            "in_simulated_fits": "Scatter in simulated fits (log)",
+        },
+        hidden=hidden,
+    )
+
+
+def _body(plan: Plan) -> list[Block]:
+    """What measuring the body would help, the most helpful parameter first."""
+    found, problem = expected(plan), plan.best.problem
+    if found.body is None or problem is None:
         return []
-    plant, truth, fits = person.controller.plant, np.array(person.controller.K), plan.simulated
-    names, some = person.structure.unknowns, fits is not None and len(fits.cost_weights) > 0
-    scatter = spread(fits.cost_weights) if fits and some else np.full(len(names), np.nan)
-    cost_weights = pd.DataFrame(
-        {
-            "cost_weight_of": names,
-            "presumed": np.exp(person.cost_weights),
-            "low": [math.exp(item.low) for item in expected.intervals],
-            "high": [math.exp(item.high) for item in expected.intervals],
-            "standard_error_of_the_logarithm": np.array(expected.deviations),
-            "in_simulated_fits": scatter,
-        }
+    known, names = np.isfinite(found.deviations), plan.person.structure.unknowns
+    exact, tenfold = (
+        100 * float(np.mean(found.narrower(one)[known])) if np.any(known) else 0.0
+        for one in (found.body.exact, found.body.tenfold)
     )
-    with_one = "Cost weights, with one for the first command, 95 %."
-    body, known, problem = expected.body, [], plan.best.problem
-    if body is not None and problem is not None:
-        cost_weights["with_an_exact_body"] = np.array(body.exact)
-        cost_weights["with_ten_times_the_trials"] = np.array(body.tenfold)
-        cost_weights["with_any_number_of_trials"] = np.array(body.floor)
-        with_one += (
-            " The last three are standard errors too: if all parameters of the body were known "
-            "exactly, and with more trials of a body that is known as stated."
-        )
-        shares = 100 * expected.narrower(body.measured)
-        by = pd.DataFrame(shares, columns=[f"{name}_narrower_percent" for name in names])
-        by.insert(0, "parameter", body.names)
-        by.insert(1, "stated_percent", 100 * problem.parameter_units[problem.stated])
-        of_body = (
-            "By how much the interval of each cost weight would be narrower if this parameter of "
-            "the body were known exactly, and the others as stated; to first order."
-        )
-        known = [Finding("body", by, of_body, digits=2)]
-    places = [(control, state) for control in plant.controls for state in plant.states]
-    gains = pd.DataFrame(
-        {
-            "gain": [number_name(plant, f"K.{control}.{state}") for control, state in places],
-            "unit": [gain_unit(plant, control, state) for control, state in places],
-            "presumed": truth.ravel(),
-            "half_an_interval": 1.96 * np.ravel(expected.gain.entries),
-            "identified": np.ravel(expected.gain.individually_identified),
-        }
-    )
-    along = int(np.count_nonzero(expected.gain.identified))
-    caption = (
-        f"Gains fitted without a structure: {along} of {truth.size} directions would be identified "
-        "to a fifth of their natural size. Half an interval is that of 95 %."
-    )
+    shares = np.round(100 * found.narrower(found.body.measured), 1) + 0.0
+    heads = [f"{name}_narrower_percent" for name in names]
+    table = pd.DataFrame(shares, columns=heads)
+    table.insert(0, "parameter", found.body.names)
+    table.insert(1, "stated_percent", 100 * problem.parameter_units[problem.stated])
+    words = (f"{name} (%)" for name in weight_names(plan))
     return [
-        Finding("cost_weights", cost_weights, with_one, digits=3),
-        *known,
-        Finding("gain", gains, caption, digits=3),
+        Finding(
+            "body",
+            table.iloc[np.argsort(-np.nanmean(shares, axis=1), kind="stable")],
+            "Body: by how much each interval would be narrower if this parameter were known "
+            f"exactly. With an exactly known body the intervals would be {exact:.0f} % narrower on "
+            f"average, with ten times as many trials {tenfold:.0f} %.",
+            digits=2,
+            folded="What measuring each parameter of the body would help",
+            labels={"stated_percent": "Stated (%)", **dict(zip(heads, words, strict=True))},
+        ),
     ]
 
 
 def _groups(plan: Plan) -> Finding:
     settings = plan.settings
-    rows = [
-        (item.feature, item.deviation, *(100 * np.array(item.powers)), item.needed)
-        for item in plan.groups
-    ]
     powers = [f"power_with_{size}_a_group_percent" for size in settings.groups]
-    heads = ["cost_weight_of", "standard_deviation_within_a_group", *powers,
-             "persons_a_group_for_80_percent"]  # fmt: skip
-    caption = (
-        f"Two groups whose cost weight differs by {settings.difference:g} %, t-test of the "
-        f"logarithms at 5 %; persons within a group differ by {settings.between:g} %, "
-        "and estimates as the intervals above are wide."
-    )
-    return Finding("groups", pd.DataFrame(rows, columns=heads), caption, digits=3)
-
-
-def _presumed(plan: Plan) -> tuple[Terms, ...]:
-    person, plant = plan.person, plan.person.controller.plant
-    shown = [(name, *shown_unit(plant, name)) for name in plant.outputs]
-    tau = plan.settings.correlation
-    kind = f"correlated over {tau:g} s" if tau > 0 else "white"
-    bounds = person.controller.bounds
-    terms = [
-        (
-            "Cost weights",
-            [
-                f"{name}: {number(math.exp(float(value)))}"
-                for name, value in zip(person.structure.unknowns, person.cost_weights, strict=True)
-            ],
-        ),
-        (
-            f"Noise in the recorder, {kind}",
-            [
-                f"{name}: {number(factor * float(value))} {unit}"
-                for (name, factor, unit), value in zip(shown, person.deviation, strict=True)
-            ],
-        ),
-        (
-            "Limit",
-            [
-                f"{name}: {number(float(value))} {plant.unit(name)}"
-                for name, value in zip(plant.controls, bounds.u_max, strict=True)
-            ],
-        ),
-        ("Horizon", [f"{person.controller.horizon} samples of {plant.dt:g} s"]),
+    rows = [
+        (name, item.feature, item.deviation, *(100 * np.array(item.powers)), item.needed)
+        for item, name in zip(plan.groups, weight_names(plan), strict=True)
     ]
-    return (Terms(terms),)
+    heads = ["cost_weight", "feature", "standard_deviation_within_a_group", *powers,
+             "persons_a_group_for_80_percent"]  # fmt: skip
+    sizes = zip(powers, settings.groups, strict=True)
+    return Finding(
+        "groups",
+        pd.DataFrame(rows, columns=heads),
+        f"Power to see a difference of {settings.difference:g} % between two groups whose persons "
+        f"differ by {settings.between:g} % (t-test at 5 %).",
+        digits=3,
+        labels={
+            heads[2]: "SD in a group (log)",
+            heads[-1]: "Persons per group for 80 %",
+            **{key: f"{size} per group (%)" for key, size in sizes},
+        },
+        hidden=["feature"],
+    )
+
+
+def _person(plan: Plan) -> Terms:
+    person, controller = plan.person, plan.person.controller
+    plant, tau = controller.plant, plan.settings.correlation
+    kind = f"correlated over {tau:g} s" if tau > 0 else "uncorrelated"
+    limited = np.isfinite(controller.bounds.u_max)
+    names = tuple(np.array(plant.controls)[limited])
+    limit = listed(plan, names, controller.bounds.u_max[limited])
+    terms = [
+        ("Measurement noise", f"{listed(plan, plant.outputs, person.deviation)}; {kind}"),
+        ("Predicts ahead", f"{controller.horizon * plant.dt:g} s"),
+        ("Limit", limit or "none"),
+    ]
+    return Terms(terms)
 
 
 def _data(plan: Plan) -> dict[str, Any]:
-    person, expected, fits = plan.person, plan.best.expected, plan.simulated
+    person, found, fits = plan.person, expected(plan), plan.simulated
     names = person.structure.unknowns
-    found: dict[str, Any] = {
+    return {
         "best": asdict(plan.best.design),
         "sharpest": asdict(plan.sharpest.design),
-        "structure": person.structure.name,
         "presumed": dict(zip(names, np.exp(person.cost_weights), strict=True)),
-        "gain": {"presumed": person.controller.K},
-        "sentences": plan_sentences(plan),
-        "simulated": None,
+        "gain": {"presumed": person.controller.K, "deviation": found.gain.entries},
+        "limit_deviation": found.limits,
+        "simulated": None
+        if fits is None
+        else {"fits": len(fits.cost_weights), "failed": fits.failed, "inside": fits.inside(found)},
     }
-    if expected is not None:
-        found["gain"]["deviation"] = expected.gain.entries
-        found["limit_deviation"] = expected.limits
-    if fits is not None and expected is not None:
-        found["simulated"] = {
-            "fits": len(fits.cost_weights),
-            "failed": fits.failed,
-            "inside": dict(zip(names, fits.inside(expected), strict=True)),
-            "scatter": dict(zip(names, spread(fits.cost_weights), strict=True)),
-        }
-    return found

@@ -1,7 +1,4 @@
-"""What a plan says in sentences.
-
-See docs/planning.md.
-"""
+"""What a plan says: its verdict, its three numbers, and what was checked."""
 
 from __future__ import annotations
 
@@ -10,164 +7,214 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.covariance import TWO_SIDED
+from impc.assess.expected import MULTIPLES
+from impc.reporting.document import Check, Copy
+from impc.reporting.finding import Level
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit
-from impc.studies.plan.study import spread
+from impc.reporting.shown_units import shown_unit, signal_name, words_of
+from impc.reporting.verdict import Alert, Key, Verdict
+from impc.studies.fit.facts import with_unit
 
 if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.assess.expected import Expectation
     from impc.assess.weight_profiles import WeightInterval
-    from impc.studies.plan.designs import Design, Outcome
+    from impc.studies.plan.designs import Design
     from impc.studies.plan.study import Plan
 
-# Wider than this, from end to end of an interval, a cost weight is not called identified.
-_WIDE = math.log(100)
-# So many parameters of the body are named; a smaller share of a width is no floor.
-_NAMED, _FLOOR = 3, 0.1
-# Nearer to one on both sides, an interval is printed in percent.
-_NARROW = 1.5
+# Nearer to one on both sides, an interval is printed in percent; beyond this, as a factor.
+_NARROW, _FACTOR = 1.5, math.log(3)
+_HELD = 0.8  # Share of simulated fits whose cost weights should lie in the intervals
+
+
+def expected(plan: Plan) -> Expectation:
+    """What the best experiment would identify."""
+    assert plan.best.expected is not None  # `best_of` takes no other
+    return plan.best.expected
+
+
+def weight_names(plan: Plan) -> list[str]:
+    """The cost weights in words: "seat tilt", "trunk tilt - seat tilt"."""
+    person = plan.person
+    return [words_of(person.controller.plant, name) for name in person.structure.unknowns]
 
 
 def design_name(plan: Plan, design: Design) -> str:
-    """An experiment in words: "5 N m, each value held for 0.25 s"."""
+    """An experiment in words: "5 N m, held for 0.25 s"."""
     if math.isnan(design.dwell):
-        return f"the recorded perturbation times {design.amplitude:g}"
+        return f"{design.amplitude:g} times the recorded perturbation"
     plant = plan.person.controller.plant
-    unit = plant.unit(plant.disturbances[0])
-    return f"{design.amplitude:g} {unit}, each value held for {design.dwell:g} s"
+    factor, unit = shown_unit(plant, plant.disturbances[0])
+    amplitude = with_unit(number(factor * design.amplitude), unit)
+    return f"{amplitude}, held for {design.dwell:g} s"
+
+
+def listed(plan: Plan, names: tuple[str, ...], values: Array) -> str:
+    """Signals and their values: "seat tilt 0.1°, trunk tilt 0.2°"."""
+    plant, parts = plan.person.controller.plant, []
+    for name, value in zip(names, values, strict=True):
+        factor, unit = shown_unit(plant, name)
+        shown = with_unit(number(factor * float(value)), unit)
+        parts.append(f"{signal_name(plant, name)} {shown}")
+    return ", ".join(parts)
+
+
+def target(plan: Plan) -> float:
+    """What an interval has to stay within on both sides, of the logarithm of a cost weight."""
+    return math.log1p(plan.settings.difference / 100)
+
+
+def half(item: WeightInterval) -> float:
+    """The longer side of an interval, of the logarithm."""
+    return max(item.high - item.value, item.value - item.low)
+
+
+def widths(plan: Plan) -> tuple[Array, Array]:
+    """Numbers of trials (k,), and the longer side of each interval with so many (k, count)."""
+    found = expected(plan)
+    sides, errors = np.array([half(item) for item in found.intervals]), np.array(found.deviations)
+    usable = np.isfinite(sides) & np.isfinite(errors)
+    factors = np.where(usable, sides / np.where(usable, errors, 1.0), TWO_SIDED)
+    counts = plan.settings.trials * np.array(MULTIPLES)
+    kept = (counts >= 1) & (counts % 1 == 0)
+    return counts[kept], np.array(found.by_trials)[kept] * factors
+
+
+def trials_needed(plan: Plan) -> float:
+    """Least number of trials for which every interval is within the target; infinite if none."""
+    counts, sides = widths(plan)
+    worst = np.max(sides, axis=1)
+    if not worst[-1] <= target(plan):
+        return math.inf
+    at = np.interp(math.log(target(plan)), np.log(worst[::-1]), np.log(counts[::-1]))
+    needed = math.ceil(math.exp(at) - 1e-6)
+    short = np.any([half(item) > target(plan) for item in expected(plan).intervals])
+    return max(needed, plan.settings.trials + 1) if short else min(needed, plan.settings.trials)
 
 
 def stated_as(item: WeightInterval) -> str:
-    """An interval about the presumed value: "-7 to +8 %", "0.4 to 2.1 times", "0 to 3 times"."""
-    if math.isinf(item.high):
-        least = math.exp(item.low - item.value)
-        return "not at all" if least == 0 else f"{number(least, 2)} times and more"
+    """An interval about the assumed value: "-7 to +8 %", "0.4 to 2.1 times", "0 to 3 times"."""
     low, high = (math.exp(end - item.value) for end in (item.low, item.high))
+    if math.isinf(item.high):
+        return "not at all" if low == 0 else f"{number(low, 2)} times and more"
     if low > 1 / _NARROW and high < _NARROW:
-        return f"{100 * (low - 1):+.2g} to {100 * (high - 1):+.2g} %"
+        ends = [f"{100 * (end - 1):+.2g}".replace("-", "\u2212") for end in (low, high)]
+        return f"{ends[0]} to {ends[1]} %"
     return f"{number(low, 2)} to {number(high, 2)} times"
 
 
-def plan_sentences(plan: Plan) -> tuple[str, ...]:
-    """The answer first, then what stands behind it."""
-    best, settings = plan.best, plan.settings
-    count = len(plan.outcomes)
-    which = "The experiment" if count == 1 else f"The best of {count} experiments"
-    trials = "trial" if settings.trials == 1 else "trials"
-    length = "their recorded length" if settings.files else f"{settings.duration:g} s"
-    return (
-        f"{which}, {settings.trials} {trials} of {length}: {design_name(plan, best.design)}.",
-        _cost_weights(plan),
-        *_body(plan),
-        _limits(plan),
-        _how_it_goes(plan, best),
-        _groups(plan),
-        *_seen(plan),
-        "Computed for the presumed person, who senses without error, and for noise in the recorder "
-        "alone: noise in the loop, or a body farther from the plant than stated, makes all worse.",
+def plan_verdict(plan: Plan) -> Verdict:
+    """Whether the experiment is enough."""
+    found, aim = expected(plan), f"{plan.settings.difference:g} %"
+    sides, tried = [half(item) for item in found.intervals], len(plan.outcomes)
+    good, count, worst = sum(side <= target(plan) for side in sides), len(sides), max(sides)
+    weights = "cost weight" if count == 1 else "cost weights"
+    verb = f"{_experiment(plan)} identif{'ies' if plan.settings.trials == 1 else 'y'}"
+    which = f"best of {tried} experiments" if tried > 1 else "only experiment that was tried"
+    chosen = f"This is the {which}: {design_name(plan, plan.best.design)}."
+    if good == count:
+        close = f"a factor of {number(math.exp(worst), 2)}"
+        if worst < _FACTOR:
+            close = f"{number(100 * math.expm1(worst), 2)} %"
+        every = {1: "the", 2: "both"}.get(count, f"all {count}")
+        headline = f"{verb} {every} {weights} to within {close}."
+        return Verdict(Level.GREEN, headline, chosen, badge="Enough")
+    needed, steps = trials_needed(plan), []
+    more = f"{max(widths(plan)[0]):g} trials would not be enough."
+    if math.isfinite(needed):
+        more, steps = f"With {needed:.0f} trials all would be.", [f"Record {needed:.0f} trials."]
+    if found.body is not None:
+        steps.append("Measure the body better; the table of the body names the parameters.")
+    level, badge = (Level.AMBER, "Depends") if good else (Level.RED, "Not enough")
+    missed = "; ".join(
+        f"{name}: {stated_as(item)}"
+        for name, item, side in zip(weight_names(plan), found.intervals, sides, strict=True)
+        if side > target(plan)
     )
+    alert = Alert(
+        level,
+        "Some intervals are too wide" if good else "All intervals are too wide",
+        f"{missed[:1].upper()}{missed[1:]} (95 % intervals, as shares of the cost weight).",
+        f"A difference of {aim} in these cost weights would not be seen in one person.",
+        [*steps, "Try stronger or longer perturbations, more amplitudes and hold times.",
+         "Give fewer features a cost weight, or accept a larger difference."],
+    )  # fmt: skip
+    which = f"{good} of {count} {weights}" if good else "no cost weight"
+    headline = f"{verb} {which} to within {aim}."
+    return Verdict(level, headline, f"{more} {chosen}", [alert], badge=badge)
 
 
-def _cost_weights(plan: Plan) -> str:
-    expected = plan.best.expected
-    if expected is None:
-        return "Nothing is identified."
-    named = dict(zip(plan.person.structure.unknowns, expected.intervals, strict=True))
-    parts = [f"{name} {stated_as(item)}" for name, item in named.items()]
-    wide = [name for name, item in named.items() if item.high - item.low > _WIDE]
-    text = (
-        f"Beside the presumed cost weight, an interval of 95 % would be for {'; for '.join(parts)}."
+def _experiment(plan: Plan) -> str:
+    settings, name = plan.settings, design_name(plan, plan.best.design)
+    words = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
+    count, s = settings.trials, "" if settings.trials == 1 else "s"
+    many = words[count - 1] if count <= len(words) else str(count)
+    if settings.files:
+        return f"{many} trial{s} with {name}"
+    return f"{many} {settings.duration:g}-s trial{s} at {name.partition(',')[0]}"
+
+
+def plan_keys(plan: Plan) -> list[Key]:
+    """Trials needed, risk of a fall, time at the limit."""
+    settings, best, needed = plan.settings, plan.best, trials_needed(plan)
+    trials = f"{needed:.0f}" if math.isfinite(needed) else f"> {max(widths(plan)[0]):g}"
+    length = "as long as recorded" if settings.files else f"of {settings.duration:g} s"
+    within = f"for all cost weights to within {settings.difference:g} %"
+    simulated = f"in {max(settings.draws, settings.trials)} simulated trials"
+    peaks = listed(plan, plan.person.controller.plant.outputs, best.peaks)
+    return [
+        Key(trials, f"trials {length}", "trials needed", within),
+        Key(number(100 * best.falls), "%", "risk of a fall in a trial", simulated),
+        Key(number(100 * best.at_limit), "% of the time", "at the limit", f"largest {peaks}"),
+    ]
+
+
+def plan_checks(plan: Plan) -> list[Check]:
+    """What the plan takes for granted, and how far that was tested."""
+    found, fits, controller = expected(plan), plan.simulated, plan.person.controller
+    limit = ", ".join(
+        f"{signal_name(controller.plant, name)} to ±{number(100 * TWO_SIDED * error, 2)} %"
+        for name, error in zip(controller.plant.controls, map(float, found.limits), strict=True)
+        if math.isfinite(error)
     )
-    return f"{text} That says next to nothing of {', '.join(wide)}." if wide else text
+    tried, inside = "None: set fits = 100 in [plan] to fit simulated recordings.", math.nan
+    if fits is not None:
+        inside = float(np.mean(fits.inside(found))) if len(fits.cost_weights) else 0.0
+        tried = f"{100 * inside:.0f} % of the cost weights lay in their 95 % intervals in "
+        tried += f"{len(fits.cost_weights)} fits; {fits.failed} fits failed."
+    size, own = found.gain.entries.size, int(np.sum(found.gain.individually_identified))
+    good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
+    exact = "Taken as exact: state how well it is known in [plant.uncertainty]."
+    stated = "The intervals contain the stated uncertainty of the body."
+    falls = f"{100 * plan.best.falls:.0f} % of the simulated trials; {plan.settings.falls:g} % are "
+    free = f"Assumed. Without it {own} of {size} gains would be identified by themselves."
+    rows = [
+        (good, "Falls", f"{falls}accepted."),
+        (good if limit else note, "Limit", limit or "Never reached, or none is assumed."),
+        (good if found.body else doubt, "Body", stated if found.body else exact),
+        (note if fits is None else good if inside >= _HELD else doubt, "Simulated fits", tried),
+        (note, "Form of the cost", free),
+        (note, "Noise", "Of measurement alone; noise in muscles and senses widens intervals."),
+    ]
+    return [Check(*row) for row in rows]
 
 
-def _body(plan: Plan) -> tuple[str, ...]:
-    """What comes from the body, and what would help: to measure it, or to record more."""
-    expected = plan.best.expected
-    if expected is None:
-        return ()
-    if expected.body is None:
-        return (
-            "The body is taken as exact: these intervals contain noise, and not what is uncertain "
-            "of masses, lengths, delay, and limit ([plant.uncertainty] states it).",
-        )
-    body, names = expected.body, plan.person.structure.unknowns
-    known = np.isfinite(expected.deviations)
-    if not np.any(known):
-        return ("It contains the stated uncertainty of the body.",)
-    exact, tenfold, *measured = (
-        100 * float(np.mean(expected.narrower(one)[known]))
-        for one in (body.exact, body.tenfold, *body.measured)
-    )
-    best = sorted(zip(measured, body.names, strict=True), reverse=True)[:_NAMED]
-    (most, first), *others = [(f"{share:.0f} %", name) for share, name in best]
-    also = "".join(f", {name} by {share}" for share, name in others if share != "0 %")
-    least = np.where(known, expected.narrower(body.floor), 1.0)
-    worst = int(np.argmin(least))
-    trials = f"Ten times as many trials would narrow them by {tenfold:.0f} % on average"
-    if least[worst] < 1 - _FLOOR:
-        most_by = f"{100 * least[worst]:.0f} %"
-        trials += f"; no number of them narrows that of {names[worst]} by more than {most_by}"
-    return (
-        "These intervals contain the stated uncertainty of the body; if it were known exactly, "
-        f"they would be {exact:.0f} % narrower on average.",
-        f"Measuring {first} exactly would narrow them by {most}{also}. {trials}.",
-    )
-
-
-def _limits(plan: Plan) -> str:
-    expected, controller = plan.best.expected, plan.person.controller
-    if expected is None or not np.any(np.isfinite(controller.bounds.u_max)):
-        return "The presumed person has no limit of the command."
-    lines = []
-    for name, deviation in zip(controller.plant.controls, expected.limits, strict=True):
-        if np.isfinite(deviation):
-            lines.append(f"the limit of {name} to ±{number(196 * float(deviation), 2)} %")
-        else:
-            lines.append(f"nothing on the limit of {name}, which is never met")
-    return f"It would identify {'; '.join(lines)}."
-
-
-def _how_it_goes(plan: Plan, best: Outcome) -> str:
-    plant = plan.person.controller.plant
-    peaks = []
-    for name, value in zip(plant.outputs, best.peaks, strict=True):
-        factor, unit = shown_unit(plant, name)
-        peaks.append(f"{name} {number(factor * float(value), 2)} {unit}")
-    return (
-        f"The person falls in {100 * best.falls:.0f} % of {plan.settings.draws} simulated trials "
-        f"and stands at the limit for {100 * best.at_limit:.1f} % of the time; the largest motion: "
-        f"{', '.join(peaks)}. The noise leaves a VAF of at most {np.min(best.vaf):.1f} %."
-    )
-
-
-def _groups(plan: Plan) -> str:
+def plan_copy(plan: Plan) -> Copy | str:
+    """The sample size for a paper."""
     settings = plan.settings
-    needed = ", ".join(
-        f"{item.feature} {item.needed:.0f}"
+    needed = [
+        f"{item.needed:.0f} persons per group for the cost weight of {name}"
+        for item, name in zip(plan.groups, weight_names(plan), strict=True)
         if math.isfinite(item.needed)
-        else f"{item.feature} (no number is enough)"
-        for item in plan.groups
+    ]
+    if not needed:
+        return "No number of persons would show the difference."
+    return Copy(
+        f"The sample size was computed for one assumed person, simulated with "
+        f"{_experiment(plan).lower()}. Persons of a group were taken to differ by "
+        f"{settings.between:g} % (standard deviation of the logarithm of a cost weight), in "
+        "addition to the expected error of each estimate.",
+        f"To detect a difference of {settings.difference:g} % between two groups with a power of "
+        f"80 % (two-sided t-test, 5 %) takes {'; '.join(needed)}.",
     )
-    return (
-        f"To see a difference of {settings.difference:g} % between two groups, whose persons "
-        f"differ by {settings.between:g} % themselves, with a probability of 80 %, each group "
-        f"needs so many persons, by cost weight: {needed}."
-    )
-
-
-def _seen(plan: Plan) -> tuple[str, ...]:
-    fits, expected = plan.simulated, plan.best.expected
-    if fits is None or expected is None or len(fits.cost_weights) == 0:
-        return ()
-    held = fits.inside(expected)
-    names = plan.person.structure.unknowns
-    worst = int(np.argmin(held))
-    ratios = spread(fits.cost_weights) / np.array(expected.deviations)
-    known = ratios[np.isfinite(ratios)]
-    text = (
-        f"Of {len(fits.cost_weights)} fits of simulated recordings {100 * np.mean(held):.0f} % of "
-        f"the cost weights lay in these intervals ({100 * held[worst]:.0f} % of {names[worst]})"
-    )
-    if len(known):
-        text += f", and they scattered {known.min():.2f} to {known.max():.2f} times as foreseen"
-    return (f"{text}; {fits.failed} fits failed.",)

@@ -20,7 +20,7 @@ root: NaN, which says that curves differ more than frequencies do.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from impc.studies.reliability.measures import ComplexArray, Passband, TransferFunction
 
 #: Name of a measure -> what it is.
-MEASURES = {"rms": "root-mean-square about upright", "energy": "mean bandpass signal energy (2.1)"}
+MEASURES = {"rms": "sway (RMS about upright)", "energy": "energy in the band"}
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ class Trials:
     rate: float  # Samples per second
     # (subject, visit, condition) -> the trials analysed, in order
     cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
+    words: Mapping[str, str] = field(default_factory=dict)  # What outputs are called for readers
 
 
 @dataclass(frozen=True)

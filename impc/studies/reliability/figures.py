@@ -1,134 +1,154 @@
-"""Figures of a reliability study: counterparts of figures 2.3 to 2.6."""
+"""Figures of a reliability study."""
 
 from __future__ import annotations
 
+from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import scipy.signal
 
 from impc.reporting.shown_units import shown_angle
 from impc.reporting.style import (
     BLUE,
-    DOUBLE_COLUMN,
     FORBIDDEN,
     GREEN,
+    HALF,
     INK,
+    MUTED,
+    PHONE,
+    RULE,
     VERMILLION,
-    drawn,
-    journal_style,
+    WIDE,
     new_figure,
+    strip,
 )
+from impc.studies.reliability.verdict import BANDS, known, measure_name, shown_score, word_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from matplotlib.figure import Figure
 
+    from impc.reporting.document import Draw
     from impc.studies.reliability.analysis import Reliability, Trials
 
 _LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, ":"), (INK, "-."))
 
 
-def reliability_figures(trials: Trials, result: Reliability) -> dict[str, bytes]:
-    """Draw all figures: PNG and PDF by file name."""
-    subject, visit, condition = result.subjects[0], result.visits[0], result.conditions[0]
-    with journal_style():
-        figures = {
-            "visits": _visits(result),
-            "time-series": _time_series(trials),
-            "spectra": _spectra(trials, result),
-            "transfer-visits": _responses(
-                result, {f"visit {one}": (subject, one, condition) for one in result.visits}
-            ),
-            "transfer-subjects": _responses(
-                result, {f"subject {one}": (one, visit, condition) for one in result.subjects}
-            ),
-        }
-        return drawn(figures)
+def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
+    """How each figure is drawn, by name; one trial and several people are files alone."""
+    person, visit, condition = result.subjects[0], result.visits[0], result.conditions[0]
+    visits = {f"visit {one}": (person, one, condition) for one in result.visits}
+    people = {f"subject {one}": (one, visit, condition) for one in result.subjects}
+    found: dict[str, Draw] = {
+        "trial": partial(_trial, trials, result),
+        "transfer-visits": partial(_responses, trials, result, visits),
+        "transfer-subjects": partial(_responses, trials, result, people),
+    }
+    if known(result):
+        found["icc"] = partial(_icc, result, trials.words)
+        found["bland-altman"] = partial(_bland_altman, result, trials.words)
+    return found
 
 
-def _visits(result: Reliability) -> Figure:
-    """The root-mean-square score of every person, visit by visit, and the mean."""
-    shown = [item for item in result.measures if item.measure == "rms"]
-    factor, unit = shown_angle()
-    columns = len(result.outputs)
-    rows = -(-len(shown) // columns)
-    figure = new_figure(DOUBLE_COLUMN, 0.3 + 1.7 * rows)
-    axes = np.ravel(figure.subplots(rows, columns, squeeze=False, sharex=True))
-    order = sorted(shown, key=lambda item: result.conditions.index(item.condition))
-    across = np.arange(len(result.visits))
-    for ax, item in zip(axes, order, strict=False):
-        scores = factor * item.scores
-        for person in scores:
-            ax.plot(across, person, color=BLUE, linewidth=0.6, marker="o", markersize=2.5)
-        ax.plot(across, pd.DataFrame(scores).mean(), color=INK, linewidth=2.0)
-        ax.set_title(f"{item.output}, {item.condition}", loc="left")
-        ax.set_ylabel(f"root-mean-square ({unit})")
-        ax.set_xticks(across, result.visits)
-        ax.set_xlim(-0.3, len(across) - 0.7)
-    for ax in axes[-columns:]:
-        ax.set_xlabel("visit (-)")
+def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
+    """Every ICC with its interval over the bands from poor to excellent."""
+    items = [item for item in known(result) if item.measure == "rms" or not narrow]
+    figure = new_figure(PHONE if narrow else HALF, 0.9 + 0.29 * len(items))
+    ax, labels, name = figure.subplots(), [], ""
+    least = -0.5 if min(item.icc.low for item in items if item.icc) < 0 else 0.0
+    ends = [least, *(most for most, _ in BANDS[:-1]), 1.0]
+    for place, (low, high) in enumerate(pairwise(ends)):
+        if place % 2 == 0:
+            ax.axvspan(low, high, color=RULE, alpha=0.55, linewidth=0, zorder=0)
+        ax.text((max(low, 0.0) + high) / 2, -0.9, BANDS[place][1], ha="center", color=MUTED,
+                fontsize=8.5 if narrow else 10)  # fmt: skip
+    for at, item in enumerate(items):
+        assert item.icc is not None
+        color, marker = (BLUE, "o") if item.measure == "rms" else (MUTED, "s")
+        value, low, high = np.clip(item.icc[:3], least, 1.0)
+        ax.plot([low, high], [at, at], color=color, linewidth=1.8)
+        ax.plot(value, at, marker, color=color)
+        before, name = name, measure_name(item, words)
+        labels.append(item.condition if name == before else f"{name}, {item.condition}".strip(", "))
+    ax.set_yticks(range(len(labels)), labels)
+    ax.set(ylim=(len(items) - 0.4, -1.3), xlim=(least, 1.0))
+    ax.set_xlabel("ICC(A,k) between visits, 95 % CI (-)", loc="left")
+    ax.xaxis.set_label_position("top")
+    ax.tick_params(axis="y", length=0)
     return figure
 
 
-def _time_series(trials: Trials) -> Figure:
-    """Figure 2.3: input and outputs of one trial."""
-    trial = next(iter(trials.cells.values()))[0]
-    time = np.arange(trial.samples) / trials.rate
-    rows = 1 + len(trials.outputs)
-    figure = new_figure(DOUBLE_COLUMN, 1.2 * rows + 0.4)
-    axes = figure.subplots(rows, 1, sharex=True)
-    factor, unit = shown_angle()
-    axes[0].step(time, trial.disturbance[:, 0], where="post", color=INK, linewidth=0.9)
-    axes[0].set_ylabel("perturbation\n(N m)")
-    for ax, name, values in zip(axes[1:], trials.outputs, trial.outputs.T, strict=True):
-        ax.plot(time, factor * values, color=BLUE, linewidth=1.0)
-        ax.set_ylabel(f"{name}\n({unit})")
-    axes[-1].set_xlabel("time (s)")
-    for place, ax in enumerate(axes):
-        ax.set_title(f"({'ABCDEFG'[place]})", loc="left")
+def _bland_altman(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
+    """Difference of first and last visit over their mean, person by person."""
+    items = [item for item in known(result) if item.measure == "rms"]
+    columns = 2 if narrow else max(len(result.conditions), 2)
+    rows = -(-len(items) // columns)
+    figure = new_figure(PHONE if narrow else WIDE, 0.5 + 1.7 * rows)
+    axes = np.ravel(figure.subplots(rows, columns, squeeze=False, sharey="row"))
+    for ax in axes[len(items) :]:
+        ax.set_visible(False)
+    for ax, item in zip(axes, items, strict=False):
+        factor, unit = shown_score(item)
+        first, last = factor * item.scores[:, 0], factor * item.scores[:, -1]
+        mean, reach = float(np.nanmean(last - first)), 1.96 * np.nanstd(last - first, ddof=1)
+        strip(ax, f"{measure_name(item, words)}, {item.condition} ({unit})")
+        ax.axhspan(mean - reach, mean + reach, color=RULE, alpha=0.6, linewidth=0, zorder=0)
+        ax.axhline(mean, color=INK, linewidth=1.0)
+        ax.plot((first + last) / 2, last - first, "o", color=BLUE, markersize=4)
+        ax.set_xlabel(f"Mean of both visits ({unit})")
     return figure
 
 
-def _spectra(trials: Trials, result: Reliability) -> Figure:
-    """Figure 2.4: power of input and outputs of one trial, the passband shaded."""
+def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
+    """Perturbation and outputs of one trial, over time and as power."""
     trial = next(iter(trials.cells.values()))[0]
-    figure = new_figure(DOUBLE_COLUMN, 2.6)
-    axes = figure.subplots(1, 1 + len(result.outputs))
-    excited = result.band.excited
     factor, angle = shown_angle()
-    signals = [("perturbation", trial.disturbance[:, 0], "N²m²/Hz")]
-    for name, values in zip(result.outputs, trial.outputs.T, strict=True):
-        signals.append((name, factor * values, f"{angle}²/Hz"))
-    for ax, (name, values, unit) in zip(axes, signals, strict=True):
+    signals = [("perturbation torque", trial.disturbance[:, 0], "N m")]
+    for name, values in zip(trials.outputs, trial.outputs.T, strict=True):
+        signals.append((word_of(name, trials.words), factor * values, angle))
+    figure = new_figure(WIDE, 0.5 + 1.5 * len(signals))
+    axes = figure.subplots(len(signals), 2, squeeze=False, sharex="col")
+    time = np.arange(trial.samples) / trials.rate
+    for (left, right), (name, values, unit) in zip(axes, signals, strict=True):
+        strip(left, f"{name[:1].upper()}{name[1:]} ({unit})")
+        left.plot(time, values, color=BLUE, linewidth=1.0)
         frequency, power = scipy.signal.periodogram(values, trials.rate, detrend=False)
-        inside = excited[excited < len(power)]
-        ax.axvspan(result.band.low, result.band.high, color=FORBIDDEN, zorder=0)
-        ax.loglog(
-            frequency[inside], power[inside], color=BLUE, marker=".", markersize=2, linewidth=0.6
-        )
-        ax.set_xlabel("frequency (Hz)")
-        ax.set_ylabel(f"{name} ({unit})")
+        inside = result.band.excited[result.band.excited < len(power)]
+        right.set_title(f"Power of {name} (({unit})²/Hz)")
+        right.axvspan(result.band.low, result.band.high, color=FORBIDDEN, linewidth=0, zorder=0)
+        right.loglog(frequency[inside], power[inside], ".-", color=BLUE, linewidth=0.6)
+    axes[-1, -1].set_xlabel("Frequency (Hz)")
+    axes[-1, 0].set_xlabel("Time (s)")
     return figure
 
 
-def _responses(result: Reliability, cells: dict[str, tuple[str, str, str]]) -> Figure:
-    """Figures 2.5 and 2.6: amplitude and phase of the averaged estimates of four cells."""
-    figure = new_figure(DOUBLE_COLUMN, 3.6)
-    axes = figure.subplots(2, len(result.outputs), sharex=True, squeeze=False)
+def _responses(
+    trials: Trials, result: Reliability, cells: dict[str, tuple[str, str, str]], narrow: bool
+) -> Figure:
+    """Size and phase of the averaged responses of up to four cells; no phase without coherence."""
+    outputs = result.outputs[: 1 if narrow else None]
+    figure = new_figure(PHONE if narrow else WIDE, 3.4)
+    axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False)
     factor, unit = shown_angle()
     for (color, line), (label, key) in zip(_LINES, cells.items(), strict=False):
         found = result.responses.get(key)
         if found is None:
             continue
         style: Any = {"color": color, "linestyle": line, "label": label}
-        for (above, below), response in zip(axes.T, factor * found.response.T, strict=True):
+        for index, (above, below) in enumerate(axes.T):
+            response, seen = factor * found.response[:, index], found.coherence[:, index]
+            clear = seen >= 1 - 0.05 ** (1 / max(len(trials.cells[key]) - 1, 1e-9))  # chance
+            phase = np.full(len(response), np.nan)
+            phase[clear] = np.degrees(np.unwrap(np.angle(response[clear])))
             above.loglog(found.frequency, np.abs(response), **style)
-            below.semilogx(found.frequency, np.degrees(np.unwrap(np.angle(response))), **style)
-    for index, name in enumerate(result.outputs):
-        axes[0, index].set_title(f"({'AB'[index % 2]}) {name}", loc="left")
-        axes[1, index].set_xlabel("frequency (Hz)")
-        axes[0, index].set_ylabel(f"amplitude ({unit}/(N m))")
-        axes[1, index].set_ylabel("phase (deg)")
+            below.semilogx(found.frequency, phase, **style)
+    for (above, below), output in zip(axes.T, outputs, strict=True):
+        name = word_of(output, trials.words)
+        above.set_title(f"{name[:1].upper()}{name[1:]}, size ({unit}/(N m))")
+        below.set_title("Phase (°)")
+        below.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend(loc="lower left")
     return figure

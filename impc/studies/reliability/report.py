@@ -1,217 +1,271 @@
-"""The report of a reliability study: page, tables as CSV, result.json, figures.
-
-Its tables are counterparts of tables 2.2 to 2.6.
-"""
+"""The report of a reliability study: page, tables, result.json, figures."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
-from markupsafe import Markup
 
-from impc.reporting.document import Lines, Report, Section, Verdict
-from impc.reporting.finding import Finding, Picture
+from impc.assess.several_tests import holm
+from impc.errors import DataError
+from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
+from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
+from impc.reporting.rendering import number
+from impc.reporting.verdict import Key
 from impc.studies.reliability.analysis import MEASURES
+from impc.studies.reliability.anova import learning_trend
 from impc.studies.reliability.figures import reliability_figures
-from impc.studies.reliability.verdict import QUOTED, answer, findings, interval_band, shown_score
+from impc.studies.reliability.icc import icc
+from impc.studies.reliability.verdict import (
+    change_text,
+    icc_text,
+    interval_band,
+    known,
+    lowest,
+    measure_name,
+    reliability_verdict,
+    shown_score,
+    word_of,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
     from impc.files.digests import Inputs
+    from impc.reporting.document import Block
     from impc.studies.reliability.analysis import MeasureResult, Reliability, Trials
 
-_TABLES = {
-    "1. Between visits": ("icc-rms", "icc-energy", "cmc"),
-    "2. Over visits": ("visits-rms", "visits-energy", "pairs", "dissertation"),
-    "3. Where the variance is": ("components-rms", "components-energy"),
-}
-_VISIT_TABLES = {"rms": "2.5", "energy": "2.6"}
-_PICTURES = (
-    Picture(
-        "time-series",
-        "Perturbation and angles of one trial",
-        "Counterpart of figure 2.3: one trial.",
-    ),
-    Picture(
-        "spectra",
-        "Power of perturbation and angles",
-        "Counterpart of figure 2.4: power at the excited frequencies; the passband is shaded.",
-    ),
-    Picture(
-        "transfer-visits",
-        "Transfer functions of one subject over visits",
-        "Counterpart of figure 2.5: one subject and condition, every visit.",
-    ),
-    Picture(
-        "transfer-subjects",
-        "Transfer functions of several subjects",
-        "Counterpart of figure 2.6: one condition and visit, several subjects.",
-    ),
-)
-_VISITS = Picture(
-    "visits",
-    "Root-mean-square of every person at every visit, one line a person",
-    "A line a person, thick the mean: where lines keep their order and their height from visit to "
-    "visit, the test is reliable.",
+_HERO = Picture(
+    "icc", "ICC of every measure with its interval, over bands from poor to excellent",
+    "One is perfect. A measure is reliable where the whole line lies in good or excellent. Blue: "
+    "sway (RMS); grey: energy in the band of the perturbation.",
+)  # fmt: skip
+_BLAND_ALTMAN = Picture(
+    "bland-altman", "Bland-Altman plot: difference of first and last visit over their mean",
+    "A dot each person: last visit minus first (upwards) over the mean of both. Line: mean; grey: "
+    "95 % limits of agreement. A change below the smallest detectable change is no more than the "
+    "scatter of the test.",
+)  # fmt: skip
+_RESPONSES = Picture(
+    "transfer-visits", "Responses of one person at every visit",
+    "One person and condition, each visit, mean over trials. The phase is left out where coherence "
+    "is not above that of chance (95 %).",
+)  # fmt: skip
+_METHODS = (
+    "Reliability was assessed on {size} people, visits and trials. The score of a visit is the "
+    "mean over its trials of the root mean square of a tilt about upright (sway), or of its energy "
+    "from {low} to {high} Hz. Agreement between visits: ICC(A,k) of McGraw and Wong (1996) with "
+    "the generalised 95 % interval of Tian and Cappelleri (2004). The smallest detectable change "
+    "(95 %) is of single visits, with Student's t."
 )
 
 
 def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
     """Page, result.json, tables and figures; they name the `command` and its `inputs`."""
-    tables = reliability_findings(result)
-    found = [
-        Markup("<strong>{}:</strong> {} ({})").format(
-            "Found" if item.found else "Not found", item.statement, item.numbers
+    words, tables, band = trials.words, reliability_findings(trials, result), result.band
+    people, visits = len(result.subjects), len(result.visits)
+    size = f"{people} × {visits} × {max(map(len, trials.cells.values()))}"
+    sways = [item for item in known(result) if item.measure == "rms"]
+    keys = [Key(size, "", "people × visits × trials")]
+    copied: Copy | str = "There is no reliability to copy."
+    provenance = Provenance(command=command, inputs=inputs)
+    ends = {"low": number(band.low), "high": number(band.high)}
+    recordings = (
+        f"{sum(map(len, trials.cells.values()))} trials of {people} people; perturbed from "
+        "{low} to {high} Hz".format(**ends)
+    )
+    sections: dict[str, list[Block]] = {
+        "Conditions": [tables["conditions"]] if len(result.conditions) > 1 else [],
+        "Response to the perturbation": [_RESPONSES, tables["cmc"]],
+        "Visits": [one for name, one in tables.items()
+                   if name.startswith(("visits", "components")) and one.rows],
+        "Checks": [Checks(_checks(result, words))],
+        "Provenance": [Terms([("Recordings", recordings), *provenance.terms])],
+    }  # fmt: skip
+    if sways:
+        keys = [*_keys(sways, words), *keys]
+        results = "; ".join(
+            f"{measure_name(item, words)} {item.condition}: {icc_text(item)}, smallest detectable "
+            f"change {change_text(item)}"
+            for item in sways
         )
-        for item in findings(result)
-    ]
-    said, band = answer(result), result.band
-    summary = (
-        f"{len(result.subjects)} subjects, {len(result.visits)} visits, conditions "
-        f"{', '.join(result.conditions)}; passband {band.low:.2f} to {band.high:.2f} Hz, "
-        f"{len(band.excited)} excited frequencies."
-    )
-    # One visit has no reliability: a table of dashes says less than the sentence above it.
-    shown = _TABLES if len(result.visits) > 1 else {"1. The visit": ("visits-rms", "visits-energy")}
-    blocks = {title: [tables.pop(name) for name in names] for title, names in shown.items()}
-    first, *others = blocks
-    sections = [
-        Section(first, [_VISITS, *blocks[first]]),
-        *(Section(title, blocks[title]) for title in others),
-        Section("4. Pictures", _PICTURES),
-        Section("5. The dissertation's findings, looked for here", (Lines(found),), folded=True),
-        Section("6. Versions", (Markup("<code>{}</code>").format(command),), folded=True),
-    ]
+        copied = Copy(_METHODS.format(size=size, **ends), f"{results[0].upper()}{results[1:]}.")
+        own: list[Block] = [tables["icc-rms"], tables["icc-energy"]]
+        sections = {"ICC": own, "Change of one person": [_BLAND_ALTMAN], **sections}
     return Report(
-        "impc reliability",
-        "Reliability of a test",
-        (Verdict(said[0]), *((Lines(said[1:]),) if said[1:] else ()), summary, *result.notes),
-        sections,
+        "impc reliability", "reliability report", reliability_verdict(result, words),
+        [Section(title, blocks) for title, blocks in sections.items() if blocks],
+        meta=("Reliability", f"{people} people", f"{visits} visits", ", ".join(result.conditions)),
+        hero=_HERO if sways else None,
+        keys=keys,
         figures=reliability_figures(trials, result),
-        beside=list(tables.values()),
-        data={
-            "passband": {"low": band.low, "high": band.high},
-            "dissertation": [item._asdict() for item in findings(result)],
-            "notes": result.notes,
-        },
-        provenance=Provenance(command=command, inputs=inputs),
-        words=[(name, "A condition of this study.") for name in result.conditions],
-    )
+        copy=copied,
+        beside=[] if sways else [one for name, one in tables.items() if name[:4] == "icc-"],
+        data={"passband": {"low": band.low, "high": band.high}, "notes": result.notes},
+        provenance=provenance,
+    )  # fmt: skip
 
 
-def reliability_findings(result: Reliability) -> dict[str, Finding]:
+def _keys(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Key]:
+    """The lowest ICC, and the smallest change of a person that shows."""
+    least = lowest(sways)
+    value, _, interval = icc_text(least).removeprefix("ICC ").partition(" ")
+    change, _, unit = change_text(sways[0]).partition(" ")
+    return [
+        Key(value, "ICC", f"lowest: {measure_name(least, words)}, {least.condition}",
+            f"{interval.strip('()')}; ICC(A,k), generalised interval"),
+        Key(change, unit, "smallest detectable change of one person",
+            f"{measure_name(sways[0], words)}, {sways[0].condition}"),
+    ]  # fmt: skip
+
+
+def _checks(result: Reliability, words: Mapping[str, str]) -> list[Check]:
+    """Missing visits, learning, and what was cut."""
+    notes = dict.fromkeys(note for item in result.measures for note in item.notes)
+    lacking = "; ".join([*notes, *result.notes])
+    found = [Check(Level.AMBER if lacking else Level.GREEN, "Complete",
+                   f"{lacking or 'Every person has every visit and trial'}.")]  # fmt: skip
+    tests = [item for item in known(result) if item.measure == "rms" and item.trend is not None]
+    if tests:
+        p = holm(np.array([item.trend.p for item in tests if item.trend]))
+        changed = [f"{measure_name(item, words)}, {item.condition}"
+                   for item, one in zip(tests, p, strict=True) if one <= 0.05]  # fmt: skip
+        said = f"Sway neither rises nor falls over the visits (least Holm p {number(min(p), 2)})."
+        if changed:
+            said = f"Sway changes from visit to visit: {'; '.join(changed)}."
+        found.append(Check(Level.AMBER if changed else Level.GREEN, "Learning", said))
+    return found
+
+
+def reliability_findings(trials: Trials, result: Reliability) -> dict[str, Finding]:
     """All findings by name."""
-    found = [_correlations(result), _pairs(result), _quoted()]
+    words = trials.words
+    found = [_correlations(result, words), _conditions(result, words)]
     for measure in MEASURES:
         own = [item for item in result.measures if item.measure == measure]
-        found += [_icc(own, measure), _visits(own, measure, result), _components(own, measure)]
+        own.sort(key=lambda item: result.outputs.index(item.output))
+        found += [_icc(measure, own, words), _visits(measure, own, words, result.visits),
+                  _components(measure, own, words)]  # fmt: skip
     return {item.name: item for item in found}
 
 
-def _icc(own: Sequence[MeasureResult], measure: str) -> Finding:
+def _table(
+    name: str, rows: Sequence[Mapping[str, Any]], caption: str, folded: str = "", **labels: str
+) -> Finding:
+    """A finding whose code names and empty notes stand in the files alone."""
+    table = pd.DataFrame(rows)
+    hidden = ["output", *(["notes"] if "notes" in table and not table["notes"].any() else [])]
+    return Finding(name, table, caption, folded=folded, digits=3, labels=labels, hidden=hidden)
+
+
+def _row(item: MeasureResult, words: Mapping[str, str], **shown: float) -> dict[str, Any]:
+    """Of the columns that all have, and numbers in the unit in which a score is shown."""
+    factor, unit = shown_score(item)
+    row = {"measure": measure_name(item, words), "output": item.output}
+    scaled: dict[str, Any] = {name: factor * value for name, value in shown.items()}
+    return row | {"condition": item.condition} | (scaled | {"unit": unit} if shown else {})
+
+
+def _icc(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -> Finding:
     rows = []
     for item in own:
-        factor, unit = shown_score(item)
-        row: dict[str, Any] = {"condition": item.condition, "output": item.output}
+        row = _row(item, words)
         if item.icc is not None and item.error is not None:
-            value, low, high, subjects, _ = item.icc
-            row |= {"icc": value, "low": low, "high": high}
-            row |= {"reliability": interval_band(low, high)}
-            row |= {"sem": factor * item.error.sem, "mdc": factor * item.error.mdc}
-            row |= {"unit": unit, "subjects": subjects}
+            (value, low, high, people, _), other = item.icc, icc(item.scores, "A,k")
+            row |= {"icc": value, "low": low, "high": high, "low_f": other.low}
+            row |= {"high_f": other.high, "reliability": interval_band(low, high)}
+            row |= _row(item, words, sem=item.error.sem, mdc=item.error.mdc) | {"people": people}
         rows.append(row | {"notes": "; ".join(item.notes)})
     caption = (
-        f"Counterpart of table {'2.2' if measure == 'rms' else '2.3'}: between-visit reliability "
-        f"of {MEASURES[measure]}, ICC(A,k) of the mean over visits with its generalised 95 % "
-        "interval, which allows for few visits that differ; standard error of measurement (SEM) "
-        "and minimal detectable change (MDC, 95 %) of the score of a single visit. The word is "
-        "that of the whole interval."
+        "ICC(A,k), agreement of the mean over visits, with two 95 % intervals: generalised (Tian "
+        "and Cappelleri 2004), which the page goes by, and F (McGraw and Wong 1996), too narrow "
+        "where few visits differ. SEM and smallest detectable change are of a single visit."
     )
-    return Finding(f"icc-{measure}", pd.DataFrame(rows), caption, digits=3)
+    labels = {"low": "Low (generalised)", "high": "High (generalised)", "low_f": "Low (F)"}
+    labels |= {"icc": "ICC", "high_f": "High (F)", "sem": "SEM"}
+    folded = "" if measure == "rms" else "ICC of the band energy"
+    mdc = "Smallest detectable change"
+    return _table(f"icc-{measure}", rows, caption, folded, mdc=mdc, **labels)
 
 
-def _visits(own: Sequence[MeasureResult], measure: str, result: Reliability) -> Finding:
+def _visits(
+    measure: str, own: Sequence[MeasureResult], words: Mapping[str, str], visits: Sequence[str]
+) -> Finding:
     rows = []
     for item in own:
-        factor, unit = shown_score(item)
-        row: dict[str, Any] = {"condition": item.condition, "output": item.output, "unit": unit}
-        for visit, column in zip(result.visits, (factor * item.scores).T, strict=True):
-            row[f"mean_visit_{visit}"], row[f"sd_visit_{visit}"] = _mean_sd(column)
+        spread: dict[str, float] = {}
+        for visit, column in zip(visits, item.scores.T, strict=True):
+            mean, sd = _mean_sd(column)
+            spread |= {f"mean_visit_{visit}": mean, f"sd_visit_{visit}": sd}
+        row = _row(item, words, **spread)
         if item.anova is not None:
             row |= {"F": item.anova.F, "p": item.anova.p}
             row |= {"p_greenhouse_geisser": item.anova.p_corrected}
         if item.trend is not None:
-            heads = ("change_per_visit", "change_low", "change_high", "p_change")
             slope, low, high, p = item.trend
-            row |= zip(heads, (factor * slope, factor * low, factor * high, p), strict=True)
+            row |= _row(item, words, change_per_visit=slope, low=low, high=high) | {"p_change": p}
         rows.append(row)
     caption = (
-        f"Counterpart of table {_VISIT_TABLES[measure]}: {MEASURES[measure]} across visits, mean "
-        "and SD of the subjects; repeated-measures analysis of variance, uncorrected and after "
-        "Greenhouse and Geisser; change from visit to visit with its 95 % interval."
+        "Mean and SD of the people; analysis of variance over visits, uncorrected and after "
+        "Greenhouse and Geisser; change per visit with its 95 % CI."
     )
-    return Finding(f"visits-{measure}", pd.DataFrame(rows), caption, digits=3)
+    return _table(f"visits-{measure}", rows, caption, f"Every visit: {MEASURES[measure]}")
 
 
-def _components(own: Sequence[MeasureResult], measure: str) -> Finding:
+def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
+    """Every condition against the first, person by person, over all visits."""
+    rows, first = [], result.conditions[0]
+    for output in result.outputs:
+        items = [one for one in result.measures if (one.measure, one.output) == ("rms", output)]
+        means = [pd.DataFrame(one.scores).mean(axis=1).to_numpy(float) for one in items]
+        for item, own in zip(items[1:], means[1:], strict=True):
+            try:
+                change, low, high, p = learning_trend(np.column_stack([means[0], own]))
+            except DataError:
+                change, low, high, p = (np.nan,) * 4
+            mean = float(np.nanmean(own))
+            row = _row(item, words, mean=mean, difference=change, low=low, high=high)
+            rows.append(row | {"against": first, "p": p})
+    for row, corrected in zip(rows, holm(np.array([row["p"] for row in rows])), strict=True):
+        row["p_holm"] = float(corrected)
+    caption = (
+        "Sway in each condition minus the first, means over visits, paired t by person with 95 % "
+        "CI; p (Holm) is corrected over all rows."
+    )
+    return _table("conditions", rows, caption, p_holm="p (Holm)")
+
+
+def _components(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -> Finding:
     rows = []
     for item in own:
         factor, unit = shown_score(item)
         for name, *values in item.components:
-            shown = (factor**2 * float(one) for one in values)
-            rows.append((item.condition, item.output, f"({unit})²", f"{name}s", *shown))
-    heads = ["condition", "output", "unit", "variance_of", "value", "low", "high"]
-    table = pd.DataFrame(rows, columns=heads) if rows else pd.DataFrame()
-    caption = f"Variance of subjects, visits and trials behind {MEASURES[measure]}, 95 % intervals."
-    return Finding(f"components-{measure}", table, caption, digits=3)
+            value, low, high = factor**2 * np.array(values)
+            numbers = {"value": value, "low": low, "high": high, "unit": f"({unit})²"}
+            rows.append(_row(item, words) | {"variance_of": f"{name}s", **numbers})
+    caption = "Variance of people, visits and trials, with 95 % CI."
+    return _table(f"components-{measure}", rows, caption, f"Components: {MEASURES[measure]}")
 
 
-def _correlations(result: Reliability) -> Finding:
-    rows = [
-        (item.condition, item.output, *_mean_sd(item.within), *_mean_sd(item.between),
-         item.undefined)
-        for item in result.cmc
-    ]  # fmt: skip
-    heads = ["condition", "output", "within_visits", "sd_within", "between_visits", "sd_between",
-             "undefined"]  # fmt: skip
+def _correlations(result: Reliability, words: Mapping[str, str]) -> Finding:
+    rows: list[dict[str, Any]] = []
+    for item in result.cmc:
+        (within, sd_within), (between, sd_between) = map(_mean_sd, (item.within, item.between))
+        rows.append({
+            "signal": word_of(item.output, words), "output": item.output,
+            "condition": item.condition, "within_visits": within, "sd_within": sd_within,
+            "between_visits": between, "sd_between": sd_between, "undefined": item.undefined,
+        })  # fmt: skip
     caption = (
-        "Counterpart of table 2.4: coefficient of multiple correlation of the transfer functions "
-        "from perturbation to angle, mean and SD over subjects."
+        "Coefficient of multiple correlation of the responses within and between visits (1: the "
+        "same curves), mean and SD of the people; undefined: people without one."
     )
-    return Finding("cmc", pd.DataFrame(rows, columns=heads), caption, digits=3)
-
-
-def _pairs(result: Reliability) -> Finding:
-    rows = []
-    for item in result.measures:
-        factor, unit = shown_score(item)
-        for first, second, difference, *p in item.pairs:
-            visits = f"{second} - {first}"
-            rows.append((item.condition, item.output, MEASURES[item.measure], visits,
-                         factor * difference, unit, *p))  # fmt: skip
-    heads = ["condition", "output", "measure", "visits", "difference", "unit", "p", "p_holm"]
-    caption = "Paired t between visits, without and with Holm's correction."
-    return Finding("pairs", pd.DataFrame(rows, columns=heads), caption, digits=3)
-
-
-def _quoted() -> Finding:
-    rows = [
-        (_VISIT_TABLES[measure], MEASURES[measure], condition, *p)
-        for measure, conditions in QUOTED.items()
-        for condition, p in conditions.items()
-    ]
-    heads = ["table", "measure", "condition", "p_lower_body", "p_upper_body"]
-    caption = (
-        "Quoted from the dissertation, of its own subjects and not of these: the p-values of its "
-        "tables 2.5 and 2.6 that survive."
-    )
-    return Finding("dissertation", pd.DataFrame(rows, columns=heads), caption)
+    return _table("cmc", rows, caption, "Agreement of the responses in numbers")
 
 
 def _mean_sd(values: Array) -> tuple[float, float]:
-    known = pd.Series(values)
-    return float(known.mean()), float(known.std())
+    scores = pd.Series(values)
+    return float(scores.mean()), float(scores.std())

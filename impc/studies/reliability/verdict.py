@@ -1,39 +1,37 @@
-"""The answer that a test's users ask for: is it reliable, in which measure, and what change shows.
+"""Whether a test is reliable, in which measure, and which change of one person is more than chance.
 
-A word for an ICC (Cicchetti 1994) is that of its whole 95 % interval: where its ends have different
-words the study does not say, however high the estimate (docs/reliability.md).
-
-The dissertation's findings of chapter 2, each looked for in a study; and its own p-values.
-
-The lower body is the first output, the upper body the second, as in the dissertation.
+A measure is called reliable where the lower end of its ICC's 95 % interval is good or better by
+Cicchetti's (1994) words, however high the estimate (docs/reliability.md).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.reporting.finding import Level
+from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_angle
-from impc.studies.reliability.analysis import MEASURES
+from impc.reporting.verdict import Alert, Claim, Verdict
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from impc.studies.reliability.analysis import MeasureResult, Reliability
 
-_BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
-
-
-def band_of(value: float) -> str:
-    """Cicchetti's (1994) word for a reliability of that `value`."""
-    if np.isnan(value):
-        return "not defined"
-    return next(word for limit, word in _BANDS if value < limit)
+#: Ends and words of an ICC.
+BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
+_GOOD = 0.60
+_COUNTS = {2: "both", 3: "all three", 4: "all four"}
 
 
 def interval_band(low: float, high: float) -> str:
-    """The word for an interval from `low` to `high`; of both ends where they differ."""
-    ends = band_of(low), band_of(high)
-    return ends[0] if ends[0] == ends[1] else f"not identified: {ends[0]} to {ends[1]}"
+    """The word for an interval from `low` to `high`; those of both ends where they differ."""
+    first, last = (
+        next((word for most, word in BANDS if end < most), "not defined") for end in (low, high)
+    )
+    return first if first == last else f"{first} to {last}"
 
 
 def shown_score(item: MeasureResult) -> tuple[float, str]:
@@ -42,109 +40,119 @@ def shown_score(item: MeasureResult) -> tuple[float, str]:
     return (factor, unit) if item.measure == "rms" else (factor**2, f"{unit}²")
 
 
-def answer(result: Reliability) -> tuple[str, ...]:
-    """Sentences, the first of which says whether the test is reliable."""
-    if len(result.visits) < 2:
-        return (
-            "Whether the test is reliable cannot be said of one visit: measure the same people "
-            "again, at least once, in the same conditions.",
-        )
-    known = [(item, item.icc) for item in result.measures if item.icc is not None]
-    if not known:
-        return (
-            "Whether the test is reliable cannot be said: no measure has a full set of scores.",
-        )
-    named: dict[str, list[str]] = {}
-    for item, found in known:
-        one = f"{MEASURES[item.measure]} of {item.output}, {item.condition}"
-        named.setdefault(interval_band(found.low, found.high).partition(":")[0], []).append(one)
-    lines = [
-        f"Reliability between visits is {word} for {'; '.join(named[word])}."
-        for _, word in reversed(_BANDS)
-        if word in named
-    ]
-    if "not identified" in named:
-        lines.append(
-            f"For {'; '.join(named['not identified'])} {len(result.subjects)} subjects and "
-            f"{len(result.visits)} visits do not decide: the interval reaches from one word to "
-            "another. More subjects or visits narrow it."
-        )
-    # What a single person's score must change by, of the first measure in each condition.
-    first = known[0][0].measure
-    changes = []
-    for item, _ in known:
-        if item.measure == first and item.error is not None:
-            factor, unit = shown_score(item)
-            changes.append(
-                f"{factor * item.error.mdc:.2g} {unit} ({item.output}, {item.condition})"
-            )
-    if changes:
-        lines.append(
-            f"A change of one person's {MEASURES[first]} between two visits is more than the "
-            f"test's own scatter, at 95 %, from: {'; '.join(changes)}."
-        )
-    return tuple(lines)
+def word_of(output: str, words: Mapping[str, str]) -> str:
+    """An output in words."""
+    return words.get(output, output.replace("_", " "))
 
 
-#: p-values of tables 2.5 (RMS) and 2.6 (energy) that survive in the text, lower and upper body.
-#: They are the dissertation's, of its own thirty subjects, and are never compared with as truth.
-QUOTED = {
-    "rms": {"EO": (0.05, 0.29), "EC": (0.14, 0.66), "VIB": (0.02, 0.71)},
-    "energy": {"EO": (0.06, 0.37), "EC": (0.44, 0.57), "VIB": (0.05, 0.70)},
-}
+def measure_name(item: MeasureResult, words: Mapping[str, str]) -> str:
+    """A measure of a signal: the RMS of a tilt is called its sway."""
+    signal = word_of(item.output, words)
+    if item.measure == "energy":
+        return f"band energy of {signal}"
+    return f"{signal[:-5]} sway" if signal.endswith(" tilt") else f"RMS of {signal}"
 
 
-class Finding(NamedTuple):
-    """A statement of the dissertation, and what this study says of it."""
+def icc_text(item: MeasureResult) -> str:
+    """An ICC with its interval."""
+    assert item.icc is not None
+    value, low, high = (f"{end:.2f}".replace("-", "\u2212") for end in item.icc[:3])
+    return f"ICC {value} (95 % CI {low} to {high})"
 
-    statement: str  # Of the dissertation, chapter 2
-    found: bool  # Whether it holds here
-    numbers: str  # Those of this study
+
+def change_text(item: MeasureResult) -> str:
+    """The smallest detectable change of a person, in the shown unit."""
+    factor, unit = shown_score(item)
+    return "-" if item.error is None else f"{number(factor * item.error.mdc)} {unit}"
 
 
-def findings(result: Reliability) -> tuple[Finding, ...]:
-    """Excellent between visits; lower body above upper; within visits above between."""
-    values = {
-        (item.measure, item.output, item.condition): item.icc.value
-        for item in result.measures
-        if item.icc is not None
-    }
-    verdicts = []
-    if values:
-        least = min(values.values())
-        verdicts.append(
-            Finding(
-                "Between-visit reliability is excellent (ICC of 0.75 or more) for every measure.",
-                least >= 0.75,
-                f"least ICC {least:.2f}, {band_of(least)}",
-            )
-        )
-    if len(result.outputs) > 1 and values:
-        lower, upper = (
-            float(np.mean([value for key, value in values.items() if key[1] == name]))
-            for name in result.outputs[:2]
-        )
-        verdicts.append(
-            Finding(
-                "The lower body is more reliable than the upper body.",
-                lower > upper,
-                f"mean ICC {lower:.2f} ({result.outputs[0]}) and {upper:.2f} ({result.outputs[1]})",
-            )
-        )
-    pairs = np.array(
-        [
-            (np.nanmean(item.within), np.nanmean(item.between))
-            for item in result.cmc
-            if np.any(np.isfinite(item.within)) and np.any(np.isfinite(item.between))
-        ]
+def known(result: Reliability) -> list[MeasureResult]:
+    """Measures with an ICC, the RMS first, those of one signal together."""
+    found = [item for item in result.measures if item.icc is not None]
+    order = result.outputs.index
+    return sorted(found, key=lambda item: (item.measure != "rms", order(item.output)))
+
+
+def _reaches(item: MeasureResult, *, low: bool = True) -> bool:
+    """Whether the lower or the upper end of its interval is good or better."""
+    return item.icc is not None and (item.icc.low if low else item.icc.high) >= _GOOD
+
+
+def reliability_verdict(result: Reliability, words: Mapping[str, str]) -> Verdict:
+    """The verdict of a study."""
+    sways = [item for item in known(result) if item.measure == "rms"]
+    people, visits = len(result.subjects), len(result.visits)
+    if not sways:
+        headline = "These recordings cannot show whether the test is reliable."
+        said = ("No person has a full set of scores at two visits: measure the same people again, "
+                "in the same conditions.")  # fmt: skip
+        return Verdict(Level.AMBER, headline, said, badge="Undecided")
+    good, least = sum(map(_reaches, sways)), lowest(sways)
+    sentence = (
+        "A measure is called reliable where the 95 % CI of its ICC begins at 0.60 or above. The "
+        f"lowest: {icc_text(least)}, {measure_name(least, words)}, {least.condition}."
     )
-    if len(pairs):
-        within, between = pairs.T
-        verdicts.append(
-            Finding(
-                "Transfer functions agree better within a visit than between visits (CMC).",
-                bool(np.all(within > between)),
-                f"mean CMC {within.mean():.3f} within, {between.mean():.3f} between",
-            )
-        )
-    return tuple(verdicts)
+    level, badge, headline = Level.AMBER, "Reliable in part", _headline(sways, words)
+    if good == len(sways):
+        level, badge = Level.GREEN, "Reliable"
+    elif not good and any(_reaches(item, low=False) for item in sways):
+        badge = "Undecided"
+        headline = f"{people} people and {visits} visits do not show whether sway is reliable."
+    elif not good:
+        level, badge = Level.RED, "Not reliable"
+    bad = [item for item in known(result) if not _reaches(item)]
+    alert = Alert(
+        Level.AMBER, "Not every measure is shown to be reliable",
+        f"In {len(bad)} of {len(known(result))} cases the interval of the ICC begins below 0.60.",
+        "In these the order of the people may be another at the next visit. A wide interval says "
+        f"that {people} people and {visits} visits are too few.",
+        ("Measure more people, or each at more visits.",
+         "Average over more trials or visits before people are compared."),
+    )  # fmt: skip
+    others = Claim("That the test suits other people, tasks or intervals between visits.",
+                   "An ICC is of these people: it falls where people differ less.")  # fmt: skip
+    may = _claims([item for item in known(result) if _reaches(item)], words)
+    alerts = [] if level is Level.GREEN else [alert]
+    return Verdict(level, headline, sentence, alerts, may, [*_claims(bad, words), others], badge)
+
+
+def lowest(items: Sequence[MeasureResult]) -> MeasureResult:
+    """The measure whose interval begins lowest."""
+    return min(items, key=lambda item: np.nan_to_num(item.icc.low if item.icc else 1, nan=-np.inf))
+
+
+def _by_name(
+    items: Sequence[MeasureResult], words: Mapping[str, str]
+) -> dict[str, list[MeasureResult]]:
+    found: dict[str, list[MeasureResult]] = {}
+    for item in items:
+        found.setdefault(measure_name(item, words), []).append(item)
+    return found
+
+
+def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
+    """Which signal is reliable in which conditions; the reliable ones first."""
+    parts: dict[str, list[str]] = {}
+    for name, own in _by_name(sways, words).items():
+        good = [item.condition for item in own if _reaches(item)]
+        where = f" in {' and '.join(good)}"
+        if len(good) == len(own):
+            where = f" in {_COUNTS.get(len(own), 'all')} conditions" if len(own) > 1 else ""
+        open_still = any(_reaches(item, low=False) for item in own)
+        no = "not shown to be reliable" if open_still else "not reliable"
+        parts.setdefault(f"reliable{where}" if good else no, []).append(name)
+    said = "; ".join(
+        f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} {what}"
+        for what, names in sorted(parts.items(), key=lambda item: item[0][:3] == "not")
+    )
+    return f"{said[:1].upper()}{said[1:]}."
+
+
+def _claims(items: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Claim]:
+    """One a measure, with its conditions."""
+    found = []
+    for name, own in _by_name(items, words).items():
+        text = ", ".join([name, *(item.condition for item in own if item.condition)])
+        each = "; ".join(f"{item.condition} {icc_text(item)}".strip() for item in own)
+        found.append(Claim(f"{text[:1].upper()}{text[1:]}.", f"{each}."))
+    return found

@@ -1,19 +1,21 @@
-"""The report of `impc key-parameters`: page, table, result.json, figure of the solution space."""
+"""The report of `impc key-parameters`: page, tables, result.json, the solution space."""
 
 from __future__ import annotations
 
-from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from impc.reporting.document import Details, Lines, Report, Section, Verdict
-from impc.reporting.finding import Finding, Picture
+from impc.reporting.document import Copy, Report, Section, Terms
+from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, HALF, MUTED, PAPER, PHONE, new_figure
+from impc.reporting.verdict import Claim, Key, Verdict
 from impc.studies.selection.key_parameters import between_visits
-from impc.studies.selection.report import command_section, names_of
+from impc.studies.selection.report import names_of, said
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,53 +29,63 @@ if TYPE_CHECKING:
 def key_report(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs
 ) -> Report:
-    """Page, result.json, table and figure of `impc key-parameters`, with `command` and `inputs`."""
-    chosen = names_of(model, found.chosen) if found.chosen else "none: no subset passes all filters"
-    findings = [
-        f"{len(found.selection.subsets)} subsets of {found.selection.size} parameters have "
-        f"variances of at most {found.selection.bound:g} for every subject and visit, if the other "
-        "parameters are exactly typical; so does every fit of a subset assume.",
-        "A subset is kept when it also explains the recordings and is reliable between visits.",
-    ]
-    caption = (
-        "Counterpart of figure 5.3: subsets in the space of reliability and goodness of fit; "
-        "filled ones pass all filters."
+    """The report of `impc key-parameters`."""
+    names, count, subsets = names_of(model, found.chosen), len(found.chosen), found.selection
+    best = found.candidates[0] if found.candidates else None
+    icc = "-" if best is None else number(best.reliability, 2)
+    limits = f"at most {subsets.bound:g} in every subject and visit"
+    filters = (
+        f"{len(subsets.subsets)} subsets of {subsets.size} parameters have a variance of {limits} "
+        f"(unit: half the search range, squared); {sum(one.kept for one in found.candidates)} of "
+        "those refitted also explain the movement and are reliable between visits."
     )
-    with journal_style():
-        figures = drawn({"solution-space": _solution_figure(found)})
+    copied: Copy | str = "There is nothing to copy: no subset passes all filters."
+    headline = "No set of parameters is precise, reliable and explains the movement."
+    verdict = Verdict(Level.AMBER, headline, "Report no parameter of this model as reliable.")
+    if best is not None and count:
+        headline = f"{count} of {model.size} parameters are key parameters"
+        why = "Their values were assumed, and the intervals take them as exact."
+        verdict = Verdict(
+            Level.AMBER, f"{headline}, if the others are as assumed.", f"They are {names}.",
+            may=[Claim(f"{names[:1].upper()}{names[1:]} as key parameters.", filters)],
+            may_not=[Claim("The other parameters, or values without the assumed ones.", why)],
+        )  # fmt: skip
+        copied = Copy(
+            f"Subsets of {model.size} parameters were kept if their variances are {limits}, they "
+            "explain the recordings, and are reliable between visits (ICC(A,k)). The others were "
+            "fixed at assumed values.",
+            f"Key parameters: {names} (ICC at least {icc}, VAF {number(best.vaf)} %).",
+        )
+    provenance = Provenance(command=command, inputs=inputs)
+    people, visits = found.nominal.shape[1:]
     return Report(
-        "impc: Key parameters",
-        "Key parameters",
-        (Verdict(f"Key parameters: {chosen}."), Lines(findings)),
+        "impc: key parameters", "key parameter report", verdict,
         [
-            Section("1. Estimates", (_estimates(model, found),), "Estimates", together=True),
-            Section(
-                "2. Subsets and filters",
-                (
-                    Picture("solution-space", caption, caption),
-                    Details("Every subset", (_candidates(model, found), _sweep(model, found))),
-                ),
-                "Subsets",
-            ),
-            command_section(command),
+            Section("Estimates", [_estimates(model, found)]),
+            Section("Subsets", [filters, _candidates(model, found)]),
+            Section("Provenance", [Terms(provenance.terms)]),
         ],
-        figures=figures,
+        meta=["Key parameters", f"{people} subjects", f"{visits} visits", provenance.made[:10]],
+        hero=Picture("solution-space", "Subsets by reliability and movement explained",
+                     "Each mark is a subset of parameters; filled: it passes all filters."),
+        keys=[
+            Key(str(count), f"of {model.size}", "key parameters", names),
+            Key(str(model.size - count), f"of {model.size}", "parameters fixed", "as assumed"),
+            Key(icc, "", "lowest ICC of the best subset", "ICC(A,k) between visits"),
+        ],
+        figures={"solution-space": partial(_draw, found)},
+        copy=copied,
         data={
             "chosen": model.named(found.chosen),
-            "size": found.selection.size,
-            "subsets": len(found.selection.subsets),
+            "size": subsets.size,
+            "subsets": len(subsets.subsets),
             "sweep": [
-                {
-                    "bound": item.bound,
-                    "size": item.size,
-                    "subsets": [model.named(subset) for subset in item.subsets],
-                }
-                for item in found.sweep
+                {"bound": one.bound, "size": one.size, "subsets": [*map(model.named, one.subsets)]}
+                for one in found.sweep
             ],
         },
-        provenance=Provenance(command=command, inputs=inputs),
-        words=model.words,
-    )
+        provenance=provenance,
+    )  # fmt: skip
 
 
 def _candidates(model: ParametricModel, found: KeyParameters) -> Finding:
@@ -83,71 +95,48 @@ def _candidates(model: ParametricModel, found: KeyParameters) -> Finding:
         for item in found.candidates
     ]  # fmt: skip
     heads = ["subset", "largest_variance", "mean_vaf_percent", "least_icc", "pathways", "kept"]
-    caption = "Subsets and the filters that they pass, best first."
-    return Finding("candidates", pd.DataFrame(rows, columns=heads), caption)
+    labels = {"mean_vaf_percent": "Mean VAF (%)", "least_icc": "Lowest ICC"}
+    table = pd.DataFrame(rows, columns=heads)
+    return Finding("candidates", table, "Subsets, best first.", labels=labels)
 
 
 def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
-    """Counterpart of tables 5.3 and 5.4: mean and SD over subjects, physical units."""
-    places = {index: place for place, index in enumerate(found.chosen)}
+    """Mean and SD over subjects, in physical units."""
     rows: list[dict[str, Any]] = []
-    for index, name in enumerate(model.names):
+    for index in range(model.size):
         fits = [("all", found.nominal[index])]
-        if index in places:
-            fits.append(("chosen", found.estimates[places[index]]))
+        if index in found.chosen:
+            fits.append(("chosen", found.estimates[found.chosen.index(index)]))
         for free, values in fits:
-            row: dict[str, Any] = {"parameter": name, "unit": model.units[index], "free": free}
-            row["mean"], row["sd"] = _mean_sd(values)
+            row: dict[str, Any] = {"parameter": said(model, index), "unit": model.units[index]}
+            row |= {"free": free, **_mean_sd(values, "")}
             if free == "chosen":
                 for visit, own in enumerate(values.T, start=1):
-                    row[f"mean_visit_{visit}"], row[f"sd_visit_{visit}"] = _mean_sd(own)
+                    row |= _mean_sd(own, f"_visit_{visit}")
             icc = between_visits(values)
             ends = (np.nan,) * 3 if icc is None else (icc.value, icc.low, icc.high)
             rows.append(row | dict(zip(("icc", "icc_low", "icc_high"), ends, strict=True)))
     caption = (
-        "Estimates, mean and SD over subjects, with all parameters free and with the chosen ones; "
+        "Mean and SD over subjects, with all parameters free and with the chosen ones alone; "
         "ICC(A,k) between visits with its 95 % interval."
     )
-    return Finding("estimates", pd.DataFrame(rows), caption, digits=3)
+    labels = {"icc": "ICC", "icc_low": "95 % CI low", "icc_high": "95 % CI high", "sd": "SD"}
+    labels |= {f"sd_visit_{k}": f"SD visit {k}" for k in range(1, found.nominal.shape[2] + 1)}
+    return Finding("estimates", pd.DataFrame(rows), caption, labels=labels, digits=3)
 
 
-def _mean_sd(values: Array) -> tuple[float, float]:
+def _mean_sd(values: Array, visit: str) -> dict[str, float]:
     spread = float(np.nanstd(values, ddof=1)) if values.size > 1 else np.nan
-    return float(np.nanmean(values)), spread
+    return {f"mean{visit}": float(np.nanmean(values)), f"sd{visit}": spread}
 
 
-def _sweep(model: ParametricModel, found: KeyParameters) -> Finding:
-    """How the first filter depends on its bound, and which parameters its subsets have."""
-    rows = []
-    for item in found.sweep:
-        inside = Counter(index for subset in item.subsets for index in subset)
-        counts = ", ".join(f"{model.names[index]} {inside[index]}" for index in sorted(inside))
-        rows.append((item.bound, item.size, len(item.subsets), counts))
-    heads = ["variance_bound", "size", "subsets", "in_how_many_of_them"]
-    caption = "The first filter, for every subject and visit at once (5.5)."
-    return Finding("sweep", pd.DataFrame(rows, columns=heads), caption)
-
-
-def _solution_figure(found: KeyParameters) -> Figure:
-    figure = new_figure(DOUBLE_COLUMN, 2.8)
+def _draw(found: KeyParameters, narrow: bool) -> Figure:
+    figure = new_figure(PHONE if narrow else HALF, 3.2)
     ax = figure.subplots()
-    markers = {item.diversity: "osD^v"[min(item.diversity, 5) - 1] for item in found.candidates}
+    ax.set_title("Movement explained, mean VAF (%)")
     for item in found.candidates:
-        ax.plot(
-            item.reliability,
-            item.vaf,
-            marker=markers[item.diversity],
-            color=BLUE if item.kept else INK,
-            markerfacecolor=BLUE if item.kept else "white",
-            linestyle="none",
-        )
-    for diversity in sorted(markers):
-        ax.plot(
-            [], [], marker=markers[diversity], color=INK, linestyle="none",
-            markerfacecolor="white", label=f"{diversity} pathways",
-        )  # fmt: skip
-    ax.set_xlabel("reliability, least ICC(A,k) (-)")
-    ax.set_ylabel("mean VAF (%)")
-    if found.candidates:
-        ax.legend(loc="best")
+        colour = BLUE if item.kept else MUTED
+        ax.plot(item.reliability, item.vaf, "o", color=colour, markersize=8,
+                markerfacecolor=BLUE if item.kept else PAPER)  # fmt: skip
+    ax.set_xlabel("Lowest reliability of the subset, ICC(A,k) (-)")
     return figure

@@ -1,19 +1,22 @@
-"""The report of a selection: page, tables as CSV, result.json, figure."""
+"""The report of a selection: page, tables, result.json, and a forest of all parameters."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
+import scipy.stats
 
 from impc.files.disk import truth_beside
-from impc.reporting.document import Lines, Report, Section, Verdict
-from impc.reporting.finding import Finding, Picture
+from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
+from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.style import BLUE, DOUBLE_COLUMN, INK, drawn, journal_style, new_figure
+from impc.reporting.rendering import number
+from impc.reporting.style import BLUE, HALF, MUTED, PHONE, RECORDED, RULE, new_figure
+from impc.reporting.verdict import Alert, Claim, Key, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,6 +31,61 @@ if TYPE_CHECKING:
     from impc.studies.selection.model import ParametricModel
 
 _OPEN = "not determined"
+_POOR, _AT_LIMIT = 50.0, 0.1  # % of the movement; of a range, in the figure
+_BIAS, _WIDTH = "bias_percent_of_the_range", "width_percent_of_the_range"
+_LABELS = {
+    "low": "95 % CI low", "high": "95 % CI high", "sd": "SD between people", "value": "Estimate",
+    _WIDTH: "95 % CI width (% of range)", _BIAS: "Bias from fixing (% of range)",
+}  # fmt: skip
+_CAPTION = (
+    "Blue: identifiable, with 95 % intervals that allow for people who differ in the others. Grey "
+    "dots: fitted with all others, not identifiable; grey bars: assumed value and SD between "
+    "people. One mark a subject; arrows: at a limit of the search."
+)
+_BY_SUBJECT = (
+    "Estimates with 95 % intervals that allow for the SD between people in the fixed parameters; "
+    "others exact: bootstrap intervals as if those were exactly as assumed. Bias: to first order, "
+    "root of the sum of squares over the fixed parameters, each one SD off."
+)
+_METHODS = (
+    "A model with {size} parameters was fitted to recordings of {people} subjects by least squares "
+    "within search limits. Chosen was the largest subset whose variances, by the Fisher "
+    "information, are at most {bound:g} in each subject (unit: half the search range, squared). "
+    "The others were fixed at assumed values; 95 % intervals allow for their SD between people."
+)
+
+
+class _Facts(NamedTuple):
+    """What verdict, checks and the text for a paper share."""
+
+    names: str  # Of the identifiable parameters
+    free: str  # How many they are
+    fixed: int
+    worst: str  # The parameter that fixing the others may bias most
+    bias: str  # By how much, % of its search range
+    shift: str  # Both in words
+    kept: bool  # Whether no interval is wider than required
+    stuck: str  # Which estimates are at a limit of the search; empty where none is
+    vaf: str
+    poor: bool
+
+
+def _facts(model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> _Facts:
+    chosen, fixed = found.chosen.values(), model.size - len(found.free)
+    worst = table.sort_values(_BIAS).to_dict("records")[-1]
+    bias = number(worst[_BIAS])
+    narrow = all(np.all(one.known.variance <= found.bound) for one in chosen)
+    ends = Counter(table.loc[table["note"].str.contains("estimate at"), "parameter"])
+    every = float(np.mean([np.mean(one.fit.vaf) for one in found.nominal.values()]))
+    least = float(np.mean([np.mean(one.refit.vaf) for one in chosen]))
+    return _Facts(
+        names_of(model, found.free), f"{len(found.free)} of {model.size} parameters", fixed,
+        worst["parameter"], bias, f"{bias} % of the search range ({worst['parameter']})",
+        not fixed or narrow, ", ".join(f"{name} in {one} of {len(chosen)}"
+                                       for name, one in ends.items()),
+        f"{number(every)} % with all parameters, {number(least)} % with the identifiable ones",
+        every < _POOR,
+    )  # fmt: skip
 
 
 def selection_report(
@@ -37,211 +95,215 @@ def selection_report(
     inputs: Inputs,
     truths: Mapping[str, Array],
 ) -> Report:
-    """Page, result.json, tables and figure of `impc select`; they name `command` and `inputs`.
-
-    `truths` has the true parameters (k,) of simulated subjects.
-    """
-    caption = (
-        "Widths of the 95 % intervals of the chosen parameters, relative to their ranges, the "
-        "others uncertain as they are between people: a point a subject, a bar at the mean."
-    )
-    picture = Picture("intervals", caption, caption)
-    intervals = _intervals(model, found, truths)
-    said = _compared(intervals)
-    with journal_style():
-        figures = drawn({"intervals": _interval_figure(model, found)})
+    """The report of `impc select`; `truths` has the parameters (k,) of simulated subjects."""
+    table = _intervals(model, found, truths)
+    facts, truth = _facts(model, found, table), _truth(table)
+    fixed, people, size = facts.fixed, len(found.chosen), model.size
+    provenance = Provenance(command=command, inputs=inputs)
+    copied: Copy | str = "There is nothing to copy: the model does not explain the movement."
+    if not facts.poor:
+        results = f"{facts.free} were identifiable together ({facts.names}). VAF: {facts.vaf}."
+        if fixed:
+            results += f" Fixing the others may bias an estimate by up to {facts.shift}."
+        copied = Copy(_METHODS.format(size=size, people=people, bound=found.bound), results)
     return Report(
-        "impc: Sensitive parameters",
-        "Sensitive parameters",
-        (Verdict(_verdict(model, found)), Lines([*said, *_findings(model, found)])),
+        "impc: parameters that can be estimated", "parameter report", _verdict(facts),
         [
-            Section("1. Estimates", (picture, intervals), "Estimates"),
-            Section("2. Methods of selection", (_methods(model, found),), "Methods"),
-            Section(
-                "3. Subsets and directions",
-                (_sweep(model, found), _ranks(model, found)),
-                "Subsets",
-                folded=True,
-            ),
-            command_section(command),
+            Section("Parameters", [
+                Finding("parameters", _by_parameter(model, found, table),
+                        "Medians over subjects, and the largest bias.", labels=_LABELS,
+                        hidden=() if any(model.meanings) else ["symbol"], digits=3),
+                Finding("intervals", table, _BY_SUBJECT, folded="Every subject, in numbers",
+                        labels=_LABELS, hidden=["symbol"]),
+            ]),
+            Section("Checks", [Checks([*_checks(model, found, facts), *truth])]),
+            Section("Provenance", [Terms(provenance.terms)]),
         ],
-        figures=figures,
-        data=_data(model, found) | {"truth": said[0] if said else None},
-        provenance=Provenance(command=command, inputs=inputs),
-        words=model.words,
-    )
+        meta=["Selection of parameters", f"{people} subjects", provenance.made[:10]],
+        hero=Picture("parameters", "Estimates of all parameters in their search ranges", _CAPTION),
+        keys=[
+            Key(str(len(found.free)), f"of {size}", "parameters identifiable", facts.names),
+            Key(str(fixed), f"of {size}", "parameters fixed", "at assumed values"),
+            Key(facts.bias if fixed else "0", "% of the search range", "largest bias from fixing",
+                facts.worst if fixed else ""),
+        ],
+        figures={"parameters": partial(_forest, model, found)},
+        copy=copied,
+        data=_data(model, found) | {"truth": truth[0].text if truth else None},
+        provenance=provenance,
+    )  # fmt: skip
 
 
-def command_section(command: str) -> Section:
-    """The last section of a selection: the `command` that made it."""
-    return Section("Made by", (Markup("<code>{}</code>").format(command),), folded=True)
-
-
-def _methods(model: ParametricModel, found: StudySelection) -> Finding:
-    """What each method selects, and what it costs."""
-    vaf = np.mean([np.mean(item.refit.vaf) for item in found.chosen.values()])
-    full = np.mean([np.mean(item.fit.vaf) for item in found.nominal.values()])
-    rows = [
-        ("all parameters", f"all {model.size}", float(full), np.nan),
-        ("information (FIM)", names_of(model, found.free), float(vaf), found.seconds["fim"]),
+def _verdict(facts: _Facts) -> Verdict:
+    if facts.poor:
+        headline = "The model explains less than half of this movement."
+        return Verdict(Level.RED, headline, "Its parameters say nothing about these subjects.")
+    fixed, kept, stuck = facts.fixed, facts.kept, facts.stuck
+    condition = f", if the other {fixed} {'is' if fixed == 1 else 'are'} as assumed" * bool(fixed)
+    shifted = " If a fixed parameter is wrong, so are these." * (not kept)
+    alert = Alert(
+        Level.AMBER, "The estimates depend on parameters that were fixed",
+        f"Fixing the other {fixed} may shift an estimate by up to {facts.shift}.",
+        "A subject who differs from the assumed values gets a wrong estimate. The intervals of "
+        "this page contain this error; those of a fit with exact values do not.",
+        ["Report the assumed values, and the intervals of this page.",
+         "Measure fixed parameters in another experiment, or use a richer movement of the target."],
+    )  # fmt: skip
+    may = [Claim(f"{facts.free} are identifiable together.", f"{facts.names}."),
+           Claim("Their estimates, with the assumed values of the others.",
+                 "With the intervals of this page.")]  # fmt: skip
+    may_not = [
+        (fixed, "The fixed parameters.", "Their values are assumed, not estimated."),
+        (
+            not kept,
+            "Differences between subjects.",
+            f"Fixing may shift estimates by {facts.shift}.",
+        ),
+        (stuck, "Estimates at a limit of the search.", f"{stuck} subjects."),
+        (True, "That other parameters have no effect.", "The recordings cannot separate them."),
     ]
-    for label, key in (("LASSO, proximal", "lasso"), ("LASSO, Table C.1", "nelder_mead")):
-        fits = [getattr(item, key) for item in found.chosen.values()]
-        known = [item for item in fits if item is not None and item.refit is not None]
-        if known:
-            share = float(np.mean([np.mean(item.refit.vaf) for item in known]))
-            chosen = Counter(item.selected for item in known).most_common(1)[0][0]
-            rows.append((label, names_of(model, chosen), share, found.seconds[key]))
-    heads = ["method", "selected", "mean_vaf_percent", "seconds_a_subject"]
-    return Finding("methods", pd.DataFrame(rows, columns=heads), "Methods of selection.")
+    return Verdict(
+        Level.GREEN if kept and not stuck else Level.AMBER,
+        f"{facts.free} can be estimated{condition}.",
+        f"The recordings identify {facts.names} together.{shifted}",
+        [] if kept else [alert], may, [Claim(text, why) for there, text, why in may_not if there],
+    )  # fmt: skip
 
 
-def _findings(model: ParametricModel, found: StudySelection) -> list[str]:
-    ranks = [item.information.rank for item in found.nominal.values()]
-    seen = f"{min(ranks)} to {max(ranks)}" if min(ranks) < max(ranks) else f"{ranks[0]}"
+def _checks(model: ParametricModel, found: StudySelection, facts: _Facts) -> list[Check]:
     scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
-    both = sorted(set(found.free) & set(found.lasso))
-    stuck = Counter(index for item in found.chosen.values() for index in item.known.fit.at_bound)
+    together = " ".join(
+        f"Scaling {names_of(model, [model.names.index(name) for name in names])} together changes "
+        "the outputs by less than their noise."
+        for names in scalings
+    )
+    good, doubt = Level.GREEN, Level.AMBER
     return [
-        *(
-            f"The estimate of {model.names[index]} ends at a bound in {stuck[index]} of "
-            f"{len(found.chosen)} subjects, where its interval is one-sided or its whole range."
-            for index in found.free
-            if stuck[index]
-        ),
-        f"Of {model.size} parameters {seen} directions are identifiable.",
-        *(
-            f"Scaling {', '.join(names)} together changes the outputs by less than their noise."
-            for names in scalings
-        ),
-        f"Selected by LASSO: {names_of(model, found.lasso) or 'none'}.",
-        f"In common: {names_of(model, both) or 'none'}.",
-    ]
-
-
-def _ranks(model: ParametricModel, found: StudySelection) -> Finding:
-    rows = [
-        (subject, item.information.rank, float(np.mean(item.fit.vaf)),
-         names_of(model, item.fit.at_bound), "; ".join(one.sentence for one in item.unseen))
-        for subject, item in found.nominal.items()
+        Check(good if facts.kept else doubt, "Bias from fixing",
+              f"Up to {facts.shift}, if each fixed parameter is one SD between people off. The "
+              "intervals allow for it." if facts.fixed else "No parameter is fixed."),
+        Check(doubt if facts.stuck else good, "Search limits",
+              f"At a limit of the search: {facts.stuck or 'no estimate'}."),
+        Check(Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
+        *([Check(Level.NOTE, "Combinations", together)] if together else []),
+        Check(Level.NOTE, "Another method", f"LASSO selects {names_of(model, found.lasso)}."),
     ]  # fmt: skip
-    heads = ["subject", "rank", "vaf_percent", "at_a_bound", "directions_that_are_not_seen"]
-    caption = "Identifiability, before any selection."
-    return Finding("identifiability", pd.DataFrame(rows, columns=heads), caption)
 
 
-def _sweep(model: ParametricModel, found: StudySelection) -> Finding:
-    rows = []
-    for index, selection in enumerate(found.worst_case):
-        sizes = [item.sweep[index].size for item in found.nominal.values()]
-        best = names_of(model, selection.subsets[0]) if selection.subsets else ""
-        rows.append((selection.bound, min(sizes), max(sizes), selection.size,
-                     len(selection.subsets), best))  # fmt: skip
-    heads = ["variance_bound", "least_size_of_a_subject", "largest_size_of_a_subject",
-             "size_all_at_once", "subsets", "best"]  # fmt: skip
-    return Finding("sweep", pd.DataFrame(rows, columns=heads), "Largest feasible subsets (5.5).")
+def _by_parameter(
+    model: ParametricModel, found: StudySelection, intervals: pd.DataFrame
+) -> pd.DataFrame:
+    table = pd.DataFrame({
+        "parameter": [said(model, index) for index in range(model.size)], "symbol": model.names,
+        "unit": model.units, "assumed": model.typical, "sd": model.deviation,
+    }).iloc[_ordered(model, found)]  # fmt: skip
+    kinds = {"value": "median", _WIDTH: "median", _BIAS: "max"}
+    return table.join(intervals.groupby("symbol").agg(kinds), on="symbol")
 
 
 def _intervals(
     model: ParametricModel, found: StudySelection, truths: Mapping[str, Array]
-) -> Finding:
+) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
-    for place, index in enumerate(found.free):
-        for subject, item in found.chosen.items():
+    for subject, item in found.chosen.items():
+        bias = _bias(model, found, subject)
+        for place, index in enumerate(found.free):
+            low, high = float(item.known.low[place]), float(item.known.high[place])
             row: dict[str, Any] = {
-                "subject": subject, "parameter": model.names[index], "unit": model.units[index],
+                "subject": subject, "parameter": said(model, index), "symbol": model.names[index],
+                "unit": model.units[index], "value": float(item.known.value[place]), "low": low,
+                "high": high, "note": _note(model, index, item.known, low, high),
+                _WIDTH: 50 * (high - low) / model.gain[index], _BIAS: bias[place],
             }  # fmt: skip
-            own, exact = item.known, item.exact
             for name in ("value", "low", "high"):
-                row[name] = float(getattr(own, name)[place])
-            row["note"] = _note(model, index, own, row["low"], row["high"])
-            row["width_percent_of_the_range"] = 50 * (row["high"] - row["low"]) / model.gain[index]
-            for name in ("value", "low", "high"):
-                row[f"others_exact_{name}"] = float(getattr(exact, name)[place])
+                row[f"others_exact_{name}"] = float(getattr(item.exact, name)[place])
             if subject in truths:
                 row["truth"] = float(truths[subject][index])
-                row["inside"] = row["low"] <= row["truth"] <= row["high"]
+                row["inside"] = low <= row["truth"] <= high
             rows.append(row)
-    caption = (
-        "The chosen parameters of each subject with 95 % intervals, the others uncertain as they "
-        "are between people; and, others exact, with 95 % bootstrap intervals if each of the "
-        "others had exactly its typical value, which holds for nobody."
-    )
-    return Finding("intervals", pd.DataFrame(rows), caption)
+    return pd.DataFrame(rows)
+
+
+def _bias(model: ParametricModel, found: StudySelection, subject: str) -> Array:
+    """Of each estimate, to first order, if all others are one SD off; % of its range (free,)."""
+    F, free = np.asarray(found.nominal[subject].information.F), list(found.free)
+    rest = [index for index in range(model.size) if index not in free]
+    moved = np.linalg.solve(F[np.ix_(free, free)], F[np.ix_(free, rest)])
+    return np.asarray(50 * np.linalg.norm(moved * (model.deviation / model.gain)[rest], axis=1))
 
 
 def _note(model: ParametricModel, index: int, item: PriorFit, low: float, high: float) -> str:
-    """What the bounds of a parameter do to its interval."""
+    """What the search limits of a parameter do to its interval."""
     ends = {"lower": low <= model.low[index], "upper": high >= model.high[index]}
     if all(ends.values()):
         return _OPEN
     at = "estimate at its" if index in item.fit.at_bound else "ends at the"
-    return "".join(f"one-sided: {at} {name} bound" for name, here in ends.items() if here)
-
-
-def _verdict(model: ParametricModel, found: StudySelection) -> str:
-    """What is identified if the parameters that were not chosen were exact, and as they are."""
-    names = model.named(found.free)
-    chosen = f"{len(names)} of the {model.size} parameters together: {', '.join(names)}"
-    rest = [k for k in range(model.size) if k not in found.free and model.deviation[k] > 0]
-    if not rest:
-        exact = ", the others being exactly typical" * (len(names) < model.size)
-        return f"The recordings identify {chosen}{exact}."
-    within = np.sum([one.known.variance <= found.bound for one in found.chosen.values()], axis=0)
-    parts = ", ".join(f"{name} in {count}" for name, count in zip(names, within, strict=True))
-    quarter = np.allclose(model.deviation[rest], model.gain[rest] / 2)
-    return (
-        f"If the other {len(rest)} parameters were exactly typical, the recordings would identify "
-        f"{chosen}. Taken as typical, give or take "
-        f"{'a quarter of their range' if quarter else 'their deviation between people'}, which the "
-        f"intervals contain, they leave identified {parts} of {len(found.chosen)} subjects."
-    )
+    return "".join(f"one-sided: {at} {name} limit" for name, here in ends.items() if here)
 
 
 def read_truths(folder: Path, model: ParametricModel) -> dict[str, Array]:
     """True parameters (k,) by subject and visit, from the truth.json of a study's `folder`."""
-    said = truth_beside(folder)
+    known = truth_beside(folder)
     try:
         return {
             subject: np.array([values[name] for name in model.names], dtype=np.float64)
-            for subject, values in said["recordings"].items()
+            for subject, values in known["recordings"].items()
         }
     except (AttributeError, KeyError, TypeError, ValueError):  # none, or another program's file
         return {}
 
 
-def _compared(intervals: Finding) -> list[str]:
-    """How many true values lie inside their `intervals`, where truths are known."""
-    table = intervals.table
-    if table is None or "truth" not in table:
+def _truth(table: pd.DataFrame) -> list[Check]:
+    """How many true values lie inside their intervals, where they are known."""
+    if "truth" not in table:
         return []
     known = table.dropna(subset=["truth"])
     exact = known["truth"].between(known["others_exact_low"], known["others_exact_high"])
-    return [
-        f"The recordings are simulated: {known['inside'].sum()} of the {len(known)} true values "
-        f"lie inside their 95 % intervals, {(known['note'] == _OPEN).sum()} of which are whole "
-        f"ranges; {exact.sum()} if the other parameters are taken as exactly typical."
-    ]
+    few = known["inside"].sum() < scipy.stats.binom.ppf(0.01, len(known), 0.95)
+    return [Check(
+        Level.AMBER if few else Level.GREEN, "Known truth (simulation)",
+        f"True value inside the interval: {known['inside'].sum()} of {len(known)}; "
+        f"{exact.sum()} of {len(known)} if the fixed parameters are taken as exact.",
+    )]  # fmt: skip
 
 
-def _interval_figure(model: ParametricModel, found: StudySelection) -> Figure:
-    figure = new_figure(DOUBLE_COLUMN, 2.4)
+def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figure:
+    """All parameters in their search ranges, the identifiable ones first."""
+    order, people = _ordered(model, found), len(found.chosen)
+    figure = new_figure(PHONE if narrow else HALF, 0.8 + (0.47 if narrow else 0.34) * len(order))
     ax = figure.subplots()
-    for place, index in enumerate(found.free):
-        known = [item.known for item in found.chosen.values()]
-        widths = np.array([item.high[place] - item.low[place] for item in known])
-        shown = 100 * widths / (2 * model.gain[index])
-        spread = place + np.linspace(-0.2, 0.2, len(shown)) if len(shown) > 1 else [place]
-        ax.plot(spread, shown, linestyle="none", marker="o", color=BLUE, markerfacecolor="white")
-        ax.hlines(shown.mean(), place - 0.3, place + 0.3, color=INK, linewidth=1.5)
-    ax.set_xticks(range(len(found.free)), [model.names[index] for index in found.free])
-    ax.set_ylabel("interval (% of the range)")
-    ax.set_ylim(bottom=0)
+    for row, index in enumerate(order):
+        free, scale = index in found.free, 50 / model.gain[index]
+        colour = BLUE if free else MUTED
+        if not free:
+            middle, sd = model.typical[index] - model.low[index], model.deviation[index]
+            ends = np.clip([scale * (middle - sd), scale * (middle + sd)], 0, 100)
+            ax.plot(ends, [row, row], color=RECORDED, linewidth=4.5)
+        for k, (name, item) in enumerate(found.chosen.items()):
+            height = row + 0.5 * (k + 0.5) / people - 0.25
+            values = [found.nominal[name].fit.theta[index]]
+            if free:
+                place, known = found.free.index(index), item.known
+                values = [one[place] for one in (known.value, known.low, known.high)]
+            x, *ends = scale * (np.array(values) - model.low[index])
+            ax.plot(ends, [height] * len(ends), color=BLUE)
+            mark = "<" if x < _AT_LIMIT else ">" if x > 100 - _AT_LIMIT else "o"
+            ax.plot(x, height, mark, color=colour, clip_on=False)
+        x, y, side = (0, row - 0.4, "left") if narrow else (-5, row, "right")
+        ax.text(x, y, said(model, index), color=colour, va="center", ha=side)
+    ax.vlines([0, 100], -0.5, len(order) - 0.5, color=RULE, linewidth=0.8, zorder=0)
+    ax.set(xlim=(-4, 104), ylim=(len(order) - 0.5, -0.7), yticks=[])
+    ax.set_xlabel("Position in the search range (%)")
+    ax.spines["left"].set_visible(False)
     return figure
 
 
+def _ordered(model: ParametricModel, found: StudySelection) -> list[int]:
+    return [*found.free, *(index for index in range(model.size) if index not in found.free)]
+
+
 def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
-    names, chosen = model.named, found.chosen.items()
+    names, chosen, nominal = model.named, found.chosen.items(), found.nominal.items()
     lasso = {key: item.lasso.refit for key, item in chosen}
     tables = {key: item.nelder_mead for key, item in chosen if item.nelder_mead is not None}
     return {
@@ -251,18 +313,14 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
             "nelder_mead": {key: names(item.selected) for key, item in tables.items()},
         },
         "common": names(sorted(set(found.free) & set(found.lasso))),
-        "intersection": [names(subset) for subset in found.intersection],
         "deviation": dict(zip(model.names, model.deviation, strict=True)),
+        "seconds": dict(found.seconds),
         "vaf": {
-            "nominal": {key: item.fit.vaf for key, item in found.nominal.items()},
+            "nominal": {key: item.fit.vaf for key, item in nominal},
             "fim": {key: item.refit.vaf for key, item in chosen},
             "lasso": {key: None if fit is None else fit.vaf for key, fit in lasso.items()},
         },
-        "unseen_scalings": {key: item.scalings for key, item in found.nominal.items()},
-        "unseen": {
-            key: [direction.shares for direction in item.unseen]
-            for key, item in found.nominal.items()
-        },
+        "unseen_scalings": {key: item.scalings for key, item in nominal},
         "subsets": [
             {"bound": item.bound, "subsets": [names(subset) for subset in item.subsets]}
             for item in found.worst_case
@@ -270,6 +328,12 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
     }
 
 
+def said(model: ParametricModel, index: int) -> str:
+    """A parameter in words, or its name."""
+    meaning = model.meanings[index] if model.meanings else ""
+    return meaning or model.names[index].replace("_", " ")
+
+
 def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
-    """Names of a subset, with commas."""
-    return ", ".join(model.named(subset))
+    """The parameters of a subset in words, with commas."""
+    return ", ".join(said(model, index) for index in subset)

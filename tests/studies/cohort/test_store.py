@@ -107,7 +107,9 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
     assert (found["units"], found["fitted"], found["failed"]) == (2, 2, {})
     assert found["failed_replicates"] == {name: {"2": REASON} for name in NAMES}
     assert found["digests"] == DIGESTS
-    assert "2 failed" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "4 of 6 " in page
+    assert "2 failed" in page
     assert (tmp_path / "units" / NAMES[0] / "replicate-0001-failed.json").exists()
     # Done later: the reason goes.
     again = run_and_report(tmp_path, monkeypatch, refusing, lambda *_: replicate_of(7))
@@ -153,7 +155,7 @@ def test_no_unit_fitted_is_a_report_of_reasons(
 ) -> None:
     failures = run_and_report(tmp_path, monkeypatch, refusing, refusing)
     assert failures.lines == [f"{name}: {REASON}" for name in NAMES]
-    assert "0 of 2 units" in (tmp_path / "report.html").read_text()
+    assert "No fit of this study can be used." in (tmp_path / "report.html").read_text()
     assert json.loads((tmp_path / "result.json").read_text())["fitted"] == 0
 
 

@@ -178,10 +178,9 @@ def test_the_command(tmp_path: Path) -> None:
     done = runner.invoke(main, ["compare", *files, *arguments, "--out", str(out)])
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
-    pictures = {"comparison.png", "comparison.pdf", "trajectories.png", "trajectories.pdf"}
     tables = {"gain.csv", "weights.csv", "methods.csv", "trajectories.csv",
               "tables.xlsx"}  # fmt: skip
-    assert names == {"report.html", "result.json", ".impc", *tables, *pictures}
+    assert names == {"report.html", "result.json", ".impc", "figures", *tables}
     found = json.loads((out / "result.json").read_text())["methods"]
     assert list(found) == list(compared_methods())
     with (out / "methods.csv").open() as stream:
@@ -199,14 +198,15 @@ def test_the_command(tmp_path: Path) -> None:
         if method["Q"] is not None:
             first = weights.query("matrix == 'Q' and method == @name").iloc[0]
             assert first["value"] == method["Q"][0][0]
-    trial = sway.query("trial == 2")
-    left = trial.theta1_recorded - trial.theta1_inverse_mpc
-    share = 100 * (1 - np.sum(left**2) / np.sum(trial.theta1_recorded**2))
+    trial = sway.query("trial == 'trial_2.csv'")
+    left = trial.theta1_recorded_deg - trial.theta1_inverse_mpc_deg
+    share = 100 * (1 - np.sum(left**2) / np.sum(trial.theta1_recorded_deg**2))
     assert share == pytest.approx(found["inverse_mpc"]["trial_vaf"][1][0])
     page = (out / "report.html").read_text()
     assert not re.search("https?:", page)
-    assert "inverse LQR, LMI" in page
-    assert "inverse MPC, direct (3.6)" in done.stdout
+    assert "No limit, inverse LQR (exact)" in page
+    assert "With limit, inverse MPC" in done.stdout
+    assert max(map(len, done.stdout.split("Open ")[0].splitlines())) <= 100
 
 
 def test_a_printed_estimate_says_what_speaks_against_it(

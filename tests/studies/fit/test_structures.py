@@ -18,13 +18,18 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.weights import Weights
 from impc.reporting.document import Report
+from impc.reporting.finding import Level
+from impc.reporting.verdict import Verdict
 from impc.studies.fit.asked import fit_structures
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
-from impc.studies.fit.structure_words import structure_sentences
-from impc.studies.fit.structures import structure_data, structure_section
+from impc.studies.fit.structures import (
+    structure_data,
+    structure_section,
+    structure_sentences,
+)
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
-from impc.studies.fit.verdict import verdict
+from impc.studies.fit.verdict import fit_verdict
 
 TABLE: dict[str, Any] = {
     "horizon": 8,
@@ -57,23 +62,20 @@ def fitted(cross: float) -> FitResult:
 def test_statements_within_a_structure_that_holds() -> None:
     result = fitted(0.0)
     lines = structure_sentences(result)
-    assert lines[0].startswith("Within the structure “one by one”, which the recordings do not")
-    ratio = next(item for item in result.structures[0].ratios if item.first == "x[0]")
-    sentence = next(line for line in lines if "costs" in line and "times as much as" in line)
-    assert sentence.startswith("Within it ")
+    assert lines[0].startswith("The structure “one by one” is not rejected (p")
+    assert any("identify 5 combinations" in line for line in lines)
+    found = result.structures[0]
+    ratio = next(item for item in found.ratios if item.first == "x[0]")
     assert ratio.interval.low < ratio.interval.value < ratio.interval.high
-    assert any(line.startswith("Of its 5 unknowns the recordings identify 5") for line in lines)
-    assert any("would have been refused with a probability of" in line for line in lines)
     truth = {"x[0]": 4.0, "x[1]": 5.0, "x[2]": 1.0, "x[3]": 1.0, "force2": 1.0}
     held = [
-        item.holds(np.log(truth[name]))
-        for name, item in zip(truth, result.structures[0].intervals, strict=True)
+        item.holds(np.log(truth[name])) for name, item in zip(truth, found.intervals, strict=True)
     ]
     assert sum(held) >= 4  # of 95 % each
 
 
 @pytest.mark.full
-def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
+def test_a_cost_weight_of_zero_makes_the_intervals_less_sure() -> None:
     result = fitted(0.0)
     found = result.structures[0]
     assert found.estimate is not None
@@ -86,34 +88,39 @@ def test_a_price_of_zero_makes_the_intervals_less_sure() -> None:
 
 
 @pytest.mark.full
-def test_a_refusal_may_be_the_fault_of_the_model() -> None:
+def test_a_rejection_may_be_the_fault_of_the_model() -> None:
     result = fitted(0.5)
-    assert not any("not be the structure's fault" in line for line in structure_sentences(result))
+    assert not any("error of the body model" in line for line in structure_sentences(result))
     wrong = (LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=()),)
-    lines = structure_sentences(replace(result, lack=wrong))
-    assert lines[1].endswith("the refusal may not be the structure's fault.")
+    assert "error of the body model" in structure_sentences(replace(result, lack=wrong))[1]
     whole = replace(fitted(0.0), lack=wrong)
-    assert not any("not be the structure's fault" in line for line in structure_sentences(whole))
+    assert not any("error of the body model" in line for line in structure_sentences(whole))
 
 
 @pytest.mark.full
-def test_a_structure_that_does_not_hold_is_refused_first() -> None:
+def test_a_structure_that_does_not_hold_is_rejected_first() -> None:
     result = fitted(0.5)
     assert result.structures[0].refused
-    first = structure_sentences(result)[0]
-    assert first.startswith("The recordings refuse the structure “one by one”")
-    assert not any("times as much" in line for line in structure_sentences(result))
-    assert verdict(result) == first
+    lines = structure_sentences(result)
+    assert lines[0].startswith("The structure “one by one” is rejected")
+    assert not any("combinations" in line for line in lines)
+    assert any(
+        "rejects" in one.title or "reject the" in one.title for one in fit_verdict(result).alerts
+    )
 
 
 @pytest.mark.full
 def test_the_section_has_every_structure() -> None:
     result = fitted(0.0)
     section = structure_section(result)
-    found = {item.name: item for item in Report("", "", (), [section]).findings()}
+    found = {
+        item.name: item
+        for item in Report("", "", Verdict(Level.NOTE, "", ""), [section]).findings()
+    }
     side_by_side = found["structures"].rows
     assert [row[0] for row in side_by_side] == ["weights of any kind", "one by one", "positions"]
-    assert side_by_side[2][-1] == "refuse it"  # no cost weight on speeds
+    assert side_by_side[2][-1] == "rejected"  # no cost weight on speeds
+    assert {"structure_ratios", "structure_power"} < set(found)
     kept = structure_data(result)
     assert [item["name"] for item in kept] == ["one by one", "positions"]
     assert len(found["structure_cost_weights"].rows) == 5

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from impc.studies.fit.gain_findings import read_truth, truth_finding, truth_sentence
+from impc.studies.fit.findings import gain_finding, read_truth, truth_sentence
 from tests.studies.fit.test_verdict import fitted
 
 if TYPE_CHECKING:
@@ -33,11 +33,11 @@ def test_inside_and_outside_are_counted_and_the_farthest_is_named() -> None:
     identified = truth_sentence(result, beyond)
     assert "0 of the 2 entries" in identified
     assert identified.endswith(
-        f"farthest off is the gain of speed, {speed[0]:.4g} to {speed[1]:.4g} where the truth is "
+        f"farthest off is the gain on speed, {speed[0]:.4g} to {speed[1]:.4g} where the truth is "
         f"{beyond[0, 1]:.4g}."
     )
-    rows = truth_finding(result, np.array([[place[1] + 0.1, np.mean(speed)]])).rows
-    assert [row[0] for row in rows] == ["gain of place", "gain of speed"]
+    rows = gain_finding(result, np.array([[place[1] + 0.1, np.mean(speed)]])).rows
+    assert [row[0] for row in rows] == ["place of the cart", "speed"]
     assert [row[-1] for row in rows] == ["no", "yes"]
 
 

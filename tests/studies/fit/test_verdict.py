@@ -1,7 +1,8 @@
-"""The first sentence of a fit's page: what forbids most comes first."""
+"""What a fit allows to be said, on its page and in the values behind it."""
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -17,19 +18,22 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
-from impc.reporting.shown_units import angles_in, signal_words
-from impc.studies.charts import methods_chart, weights_chart
+from impc.reporting.document import Copy
+from impc.reporting.finding import Level
+from impc.reporting.provenance import Provenance
+from impc.reporting.shown_units import angles_in
+from impc.reporting.style import page_style
+from impc.studies.charts import trajectories
 from impc.studies.fit.body_words import added_sentence
-from impc.studies.fit.figures import trajectory_figure
-from impc.studies.fit.interval_figures import gain_figure, shown_statements, statements_figure
-from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.facts import named_gains
+from impc.studies.fit.figures import movement_figure, shown_window, statements_figure
+from impc.studies.fit.report import fallen_report, fit_report
+from impc.studies.fit.result import FittedParameter
+from impc.studies.fit.settings import FitSettings, missing
 from impc.studies.fit.subject import fit_problem, fit_recordings, stages
-from impc.studies.fit.verdict import abstract, missing, verdict
+from impc.studies.fit.verdict import GAIN, WEIGHTS, fit_verdict, forbidden
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from impc.arrays import Array
     from impc.studies.fit.result import FitResult
 
 SEED = 20264
@@ -59,40 +63,74 @@ def fitted(limit: float) -> FitResult:
     return result
 
 
+def explained(limit: float = 1.0) -> FitResult:
+    """A fit that nothing speaks against, whatever the test of the model found."""
+    return replace(fitted(limit), lack=(None,))
+
+
 def test_a_fit_that_nothing_speaks_against() -> None:
-    result = replace(fitted(1.0), lack=(None,))
-    assert verdict(result).startswith("Inverse MPC explains the recordings inside the bound")
-    lines = abstract(result)
-    assert 3 <= len(lines) <= 6
-    assert (
-        "looks 0.5 s ahead (5 samples), limited to 1 m/s^2 of pull (pull of the rope)" in lines[0]
-    )
-    assert f"{result.inverse_mpc.vaf[0]:.2f} % of place (place of the cart) (VAF)" in lines[2]
-    share = 100 * result.trials[0].saturated
-    assert share > 5
-    assert f"at its bound for {share:.1f} % of the time" in lines[3]
-    assert signal_words(result.given.plant) == (
-        ("place", "Place of the cart, in m."), ("pull", "Pull of the rope, in m/s^2.")
-    )  # fmt: skip
+    result = explained()
+    verdict = fit_verdict(result)
+    assert (verdict.level, list(verdict.alerts)) == (Level.GREEN, [])
+    assert "1 m/s^2 explains this movement" in verdict.headline
+    share = f"{100 * result.trials[0].saturated:.1f} %"
+    assert any(share in claim.why for claim in verdict.may)
+    report = fit_report(result, Provenance())
+    assert isinstance(report.copy, Copy)
+    assert share in report.copy.results
+    for row in (row for _, row in named_gains(result) if row.certain):
+        assert row.ends in report.copy.results
+    assert max(map(len, verdict.text().splitlines())) <= 100
 
 
-def test_an_error_of_the_model_is_said_first() -> None:
-    plain = fitted(1.0)
+def test_an_error_of_the_model_forbids_gains() -> None:
     alarm = LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=())
-    other = replace(plain, lack=(alarm,))
-    assert "is not that of the model" in verdict(other)
-    (said,) = other.warnings
-    assert "A delay of the command of 100 ± 10 ms explains most of it (p < 0.0001)" in said
-    assert added_sentence(replace(other, lack=(alarm, None))).startswith("A first fit left what")
+    result = replace(fitted(1.0), lack=(alarm,))
+    verdict = fit_verdict(result)
+    assert verdict.level is Level.AMBER
+    assert "a delay of the command of 100 ± 10 ms (p < 0.0001)" in verdict.alerts[0].found
+    assert forbidden(result) == {GAIN, WEIGHTS}
+    assert not any("gain on" in claim.text for claim in verdict.may)
+    report = fit_report(result, Provenance())
+    assert isinstance(report.copy, str)
+    page = report.page()
+    # The numbers stand in a part that says so, and nowhere before it.
+    assert "(do not report)" in page.partition('id="feedback-gain"')[2][:900]
+    assert added_sentence(replace(result, lack=(alarm, None))).startswith("The residuals of a")
 
 
 @pytest.mark.full
 def test_no_limit_and_a_limit_that_is_not_reached() -> None:
-    assert "No limit of the command or of a state was given" in verdict(
-        replace(fitted(np.inf), lack=(None,))
-    )
-    assert "without a limit" in abstract(fitted(np.inf))[0]
-    assert "No bound is ever active" in verdict(replace(fitted(50.0), lack=(None,)))
+    for limit, words in ((np.inf, "no limit was given"), (50.0, "never reached")):
+        verdict = fit_verdict(explained(limit))
+        assert verdict.level is Level.GREEN
+        assert words in verdict.headline
+        assert verdict.alerts[0].level is Level.NOTE
+
+
+def test_a_fall_is_said_and_counted() -> None:
+    falls = ("trial_2.csv: the subject fell at 5.1 s",)
+    verdict = fit_verdict(replace(explained(), falls=falls))
+    assert verdict.level is Level.AMBER
+    assert "1 of 2 trials" in verdict.headline
+    page = fallen_report(falls, Provenance()).page()
+    assert "fell in every trial" in page
+    assert "the subject fell at 5.1\u00a0s" in page
+
+
+def test_a_limit_that_the_recordings_contradict() -> None:
+    """A limit found far from the given one; near it, or within what was stated, it is none."""
+    alarm = LackOfFit((ModelError("limit", 1e-5, 11.5, -0.3, 0.01),), alarm=True, untestable=())
+    result = explained()
+    added = replace(result, lack=(alarm, None))
+    names = tuple(result.given.plant.controls)
+    for value, level in ((0.7, Level.AMBER), (1.002, Level.GREEN)):
+        item = FittedParameter(f"u_max.{names[0]}", 1.0, value, 5e-4, 0.3, 0.0)
+        found = fit_verdict(replace(added, parameters=(item,)))
+        assert found.level is level
+        assert ("probably wrong" in found.headline) == (level is Level.AMBER)
+    close = FittedParameter(f"u_max.{names[0]}", 1.0, 0.95, 5e-4, 0.05, 0.0)
+    assert fit_verdict(replace(result, parameters=(close,))).level is Level.GREEN
 
 
 def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
@@ -106,12 +144,6 @@ def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
     assert missing(FitSettings(u_max=6.0), cursor) == ""
 
 
-def bars(ax: Axes) -> list[Array]:
-    """Both ends of each line, from below to above on the page."""
-    found = [np.asarray(line.get_xdata(), dtype=np.float64) for line in ax.lines]
-    return [ends for ends in found if len(ends) == 2]
-
-
 def test_angles_are_shown_as_is_asked() -> None:
     """In the figures of a fit whose output is an angle."""
     result = fitted(1.0)
@@ -119,66 +151,59 @@ def test_angles_are_shown_as_is_asked() -> None:
     shown = replace(result, fitted=replace(
         result.fitted, problem=replace(result.fitted.problem, plant=turned)
     ))  # fmt: skip
-    for angles, label, factor in (("degrees", "deg", 180 / np.pi), ("radians", "rad", 1.0)):
-        with angles_in(angles):
-            ax = trajectory_figure(shown, 0).axes[0]
-        assert ax.get_ylabel() == f"place ({label})"
-        (line, _) = ax.lines
-        recorded = factor * result.given.recordings[0].outputs[:, 0]
+    for angles, label, factor in (("degrees", "°", 180 / np.pi), ("radians", "rad", 1.0)):
+        with angles_in(angles), page_style():
+            ax = movement_figure(shown, 0, narrow=False).axes[0]
+        assert ax.get_title(loc="left") == f"Place of the cart ({label})"
+        line = next(line for line in ax.lines if line.get_label() == "recorded")
+        window = shown_window(shown, 0, 10.0)
+        recorded = factor * result.given.recordings[0].outputs[window, 0]
         np.testing.assert_allclose(np.asarray(line.get_ydata()), recorded)
 
 
 def test_curves_of_the_page_are_those_of_the_fit() -> None:
     result = fitted(1.0)
-    data = methods_chart(result.given, result.methods[::-1], 0)
-    assert [one["label"] for one in data["curves"]][:2] == ["recorded", "inverse MPC, direct (3.6)"]
-    place, pull = data["panels"]
-    assert (place["label"], pull["label"], pull["bounds"]) == ("place (m)", "pull (m/s^2)", [-1, 1])
+    data = trajectories(result.given, result.methods[::-1], {0: "Trial 1"})
+    assert data["curves"][0]["label"] == "recorded"
+    (trial,) = data["trials"]
+    place, pull = trial["panels"]
+    assert (place["limits"], pull["limits"]) == ([], [-1, 1])
     recorded, run = result.given.recordings[0].outputs[:, 0], result.inverse_mpc.runs[0]
     # Five digits are kept.
     np.testing.assert_allclose(place["curves"][0], recorded, rtol=1e-4)
     np.testing.assert_allclose(place["curves"][1], run.x[:, 0][: len(recorded)], rtol=1e-4)
     assert pull["curves"][0] == [None] * len(recorded)
     np.testing.assert_allclose(pull["curves"][1][:-1], run.u[:, 0][: len(recorded) - 1], rtol=1e-4)
-    assert len({len(one) for panel in data["panels"] for one in panel["curves"]}) == 1
+    assert len({len(one) for panel in trial["panels"] for one in panel["curves"]}) == 1
 
 
-def test_weights_of_the_slider_move_prices_and_nothing_else() -> None:
+def test_bars_are_the_ranges_of_the_comparisons() -> None:
     result = fitted(1.0)
-    data = weights_chart(result.fitted.problem, result.intent)
-    # Of this cart, a double integrator, only the mixed cost weight is free: from 0 to 0.93,
-    # measured.
-    cost_weights = np.array([one["cost_weights"] for one in data["positions"]])
+    (ax,) = statements_figure(result, narrow=False).axes
+    shown = sorted(result.compared, key=lambda item: not item.made)
+    ends = [np.asarray(line.get_xdata()) for line in ax.lines]
     np.testing.assert_allclose(
-        cost_weights, np.tile(cost_weights[0], (len(cost_weights), 1)), rtol=1e-9
+        [one for one in ends if np.ptp(one)][: len(shown)],
+        [[item.low, item.high] for item in shown],
     )
-    assert data["mixed"] == ["place with speed"]
-    mixed = np.array([one["mixed"] for one in data["positions"]])
-    assert np.ptp(mixed) > 0.9
-    assert len(cost_weights) == 4 * len(result.intent.readings) - 3
-    for one in data["positions"]:
-        for panel, values in zip(data["panels"], one["panels"], strict=True):
-            np.testing.assert_allclose(values, panel["curves"][0], rtol=1e-4, atol=1e-9)
-
-
-def test_bars_are_the_intervals() -> None:
-    result = fitted(1.0)
-    (ax,) = gain_figure(result).axes
-    sizes = dict(zip(result.given.plant.states, result.intent.sizes, strict=True))
-    first = {item.name: item for item in reversed(result.uncertainty.intervals)}
-    for bar, (name, size) in zip(bars(ax), sizes.items(), strict=False):
-        item = first[f"K.pull.{name}"]
-        np.testing.assert_allclose(bar, [size * item.low, size * item.high])
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["place", "speed"]
-    shown = shown_statements(result)
-    (ax,) = statements_figure(result).axes
-    ends = np.array([[item.low, item.high] for item in shown])
-    np.testing.assert_allclose(bars(ax)[: len(shown)], ends)
 
 
 @pytest.mark.parametrize("vaf", [40.0, 60.0])
 def test_little_is_called_little(vaf: float) -> None:
-    plain = replace(fitted(1.0), lack=(None,))
+    plain = explained()
     poor = replace(plain.inverse_mpc, vaf=np.array([vaf]))
     result = replace(plain, methods=(*plain.methods[:-1], poor))
-    assert verdict(result).startswith("The fitted controller explains less than half") == (vaf < 50)
+    verdict = fit_verdict(result)
+    assert (verdict.level is Level.RED) == (vaf < 50)
+    assert ("less than half" in verdict.headline) == (vaf < 50)
+
+
+def test_every_page_of_a_fit_has_its_parts() -> None:
+    """One heading of the first order, a text for each picture, no address, little weight."""
+    page = fit_report(fitted(1.0), Provenance(), np.array([[2.0, 1.0]])).page()
+    assert page.count("<h1") == 1
+    pictures = re.findall(r"<svg class.*?>(.*?)</title>", page, flags=re.DOTALL)
+    assert len(pictures) > 6
+    assert all(text.startswith("<title") and len(text) > 30 for text in pictures)
+    assert not re.search(r"https?://", page)
+    assert len(page) < 800_000

@@ -18,9 +18,20 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.structure import Structure
+from impc.reporting.finding import Level
+from impc.reporting.provenance import Provenance
 from impc.studies.fit.settings import FitSettings, StructureSettings
 from impc.studies.plan.designs import Design, Person, try_design
-from impc.studies.plan.sentences import plan_sentences
+from impc.studies.plan.report import plan_report
+from impc.studies.plan.sentences import (
+    half,
+    plan_checks,
+    plan_copy,
+    plan_verdict,
+    target,
+    trials_needed,
+    widths,
+)
 from impc.studies.plan.settings import (
     PlanSettings,
     assumed_cost_weights,
@@ -122,23 +133,46 @@ def test_a_body_that_is_loosely_known_needs_more_persons_and_is_worth_measuring(
     for known, other in zip(exact.groups, loose.groups, strict=True):
         assert other.needed > known.needed
         assert other.deviation > known.deviation
-    said = " ".join(plan_sentences(exact))
-    assert "The body is taken as exact" in said
-    assert "Measuring" not in said
-    said = " ".join(plan_sentences(loose))
-    assert "contain the stated uncertainty of the body" in said
-    assert (
-        "Measuring force exactly would narrow them by" in said or "Measuring u_max.force1" in said
-    )
-    assert "no number of them narrows that of x[" in said
+    levels = [{check.name: check.level for check in plan_checks(one)} for one in (exact, loose)]
+    assert [found["Body"] for found in levels] == [Level.AMBER, Level.GREEN]
+    assert plan_verdict(exact).words == "Enough"
+    assert plan_verdict(loose).words in ("Depends", "Not enough")
+    assert any("table of the body" in step for step in plan_verdict(loose).alerts[0].todo)
+    tables = {item.name: item.rows for item in plan_report(loose, Provenance()).findings()}
+    assert [row[0] for row in tables["body"]] in (
+        ["force", "u_max.force1"], ["u_max.force1", "force"]
+    )  # fmt: skip
+    assert float(tables["body"][0][2]) + float(tables["body"][0][3]) >= float(
+        tables["body"][1][2]
+    ) + float(tables["body"][1][3])
+
+
+def test_trials_that_are_needed_are_enough() -> None:
+    """With as many trials as are said to be needed the answer is yes, with one less it is not."""
+    noisy = replace(person(), deviation=np.array([0.1]))
+    one = replace(SETTINGS, amplitude=[0.8], dwell=[2.0], difference=15.0)
+    plan = make_plan(noisy, one, perturbation)
+    assert plan_verdict(plan).words != "Enough"
+    needed = trials_needed(plan)
+    assert 1 < needed < 10
+    counts, sides = widths(plan)
+    assert list(counts) == [1, 2, 4, 10]
+    # An exact body: errors fall with the root of the number of trials.
+    np.testing.assert_allclose(sides[0] / sides[2], 2.0, rtol=1e-6)
+    for trials, words in ((needed, "Enough"), (max(needed // 2, 1), "Depends Not enough")):
+        again = make_plan(noisy, replace(one, trials=int(trials)), perturbation)
+        assert plan_verdict(again).words in words
+    assert again.best.expected is not None
+    wide = max(half(item) for item in again.best.expected.intervals)
+    assert wide > target(plan)
 
 
 def test_who_is_compared_by_a_weight_without_an_end_is_told_so() -> None:
     noisy = replace(person(), deviation=np.array([30.0]))
     plan = make_plan(noisy, replace(SETTINGS, amplitude=[0.4], dwell=[1.0]), perturbation)
     assert np.isinf([item.needed for item in plan.groups]).all()
-    said = " ".join(plan_sentences(plan))
-    assert "x[0] (no number is enough), x[1] (no number is enough)." in said
+    assert plan_copy(plan) == "No number of persons would show the difference."
+    assert plan_verdict(plan).level is Level.RED
 
 
 def test_fits_are_of_bodies_as_uncertain_as_stated() -> None:

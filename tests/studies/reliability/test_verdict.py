@@ -6,59 +6,98 @@ import numpy as np
 import pytest
 
 from impc.arrays import Array, frozen
-from impc.studies.reliability.analysis import MeasureResult, Reliability
+from impc.model.recordings import Recording
+from impc.reporting.finding import Level
+from impc.studies.reliability.analysis import MeasureResult, Reliability, Trials
 from impc.studies.reliability.icc import icc, measurement_error
 from impc.studies.reliability.measures import Passband
-from impc.studies.reliability.verdict import answer, interval_band
+from impc.studies.reliability.report import reliability_findings
+from impc.studies.reliability.verdict import change_text, interval_band, reliability_verdict
+
+WORDS = {"theta1": "seat tilt", "theta2": "trunk tilt"}
 
 
-def study(scores: Array, outputs: int = 1) -> Reliability:
-    """RMS in radians of `outputs` outputs, all with these scores (subjects, visits)."""
-    subjects, visits = scores.shape
+def study(*scores: Array) -> Reliability:
+    """RMS in radians, scores (subjects, visits) of one output each."""
+    subjects, visits = scores[0].shape
     measures = tuple(
         MeasureResult(
-            "rms", f"theta{number + 1}", "EO", frozen(scores),
-            icc(scores, "A,k", method="generalised") if visits > 1 else None,
-            measurement_error(scores) if visits > 1 else None,
+            "rms", f"theta{number + 1}", "EO", frozen(one),
+            icc(one, "A,k", method="generalised") if visits > 1 else None,
+            measurement_error(one) if visits > 1 else None,
         )
-        for number in range(outputs)
+        for number, one in enumerate(scores)
     )  # fmt: skip
     names = [tuple(str(k + 1) for k in range(count)) for count in (subjects, visits)]
     band = Passband(0.1, 0.5, np.array([1, 5]))
-    return Reliability(names[0], names[1], ("EO",), ("theta1",), band, measures, (), {}, ())
+    outputs = tuple(WORDS)[: len(scores)]
+    return Reliability(names[0], names[1], ("EO",), outputs, band, measures, (), {}, ())
 
 
-def scores(subjects: int, visits: int, spread: float) -> Array:
+def scores(subjects: int, visits: int, spread: float, differ: float = 0.02) -> Array:
     rng = np.random.default_rng(3)
-    person = 0.05 + 0.02 * rng.standard_normal((subjects, 1))
+    person = 0.05 + differ * rng.standard_normal((subjects, 1))
     return np.asarray(person + spread * rng.standard_normal((subjects, visits)))
 
 
 @pytest.mark.parametrize(
     ("low", "high", "word"),
-    [(0.8, 0.9, "excellent"), (0.61, 0.7, "good"),
-     (-3.22, 0.95, "not identified: poor to excellent"),
-     (0.7, 0.8, "not identified: good to excellent"), (-1, 0.3, "poor")],
+    [(0.8, 0.9, "excellent"), (0.61, 0.7, "good"), (-3.22, 0.95, "poor to excellent"),
+     (0.7, 0.8, "good to excellent"), (-1, 0.3, "poor"), (np.nan, np.nan, "not defined")],
 )  # fmt: skip
 def test_a_word_is_that_of_the_interval(low: float, high: float, word: str) -> None:
     assert interval_band(low, high) == word
 
 
 def test_a_reliable_test_is_called_so_with_the_change_that_shows() -> None:
+    result = study(scores(30, 3, 0.002))
+    found = reliability_verdict(result, WORDS)
+    assert (found.level, found.headline) == (Level.GREEN, "Seat sway is reliable.")
+    assert not found.alerts
     made = scores(30, 3, 0.002)
-    lines = answer(study(made))
-    assert lines[0] == (
-        "Reliability between visits is excellent for root-mean-square about upright of theta1, EO."
-    )
     change = 1.96 * np.sqrt(2) * np.degrees(np.sqrt(np.mean(np.var(made, axis=1, ddof=1))))
-    shown = float(lines[1].split("from: ")[1].split(" deg")[0])
-    assert shown == pytest.approx(change, rel=0.1)
+    value, unit = change_text(result.measures[0]).split()
+    assert float(value) == pytest.approx(change, rel=0.1)
+    assert unit == "°"
 
 
-def test_few_subjects_tell_nothing_however_high_the_estimate() -> None:
+def test_the_badge_goes_by_the_lower_end() -> None:
+    """Reliable in one signal; in the other people do not differ."""
+    found = reliability_verdict(study(scores(30, 3, 0.002), scores(30, 3, 0.02, 0.0)), WORDS)
+    assert found.level is Level.AMBER
+    assert found.headline.startswith("Seat sway is reliable; trunk sway is not")
+    assert [claim.text for claim in found.may] == ["Seat sway, EO."]
+    assert found.may_not[0].text == "Trunk sway, EO."
+
+
+def test_no_reliability_is_red() -> None:
+    rng = np.random.default_rng(0)
+    found = reliability_verdict(study(0.05 + 0.02 * rng.standard_normal((200, 2))), WORDS)
+    assert (found.level, found.headline) == (Level.RED, "Seat sway is not reliable.")
+
+
+def test_few_subjects_decide_nothing_however_high_the_estimate() -> None:
     made = scores(4, 2, 0.01)
-    found = icc(made, "A,k", method="generalised")
-    assert found.value > 0.6
-    lines = answer(study(made))
-    assert "4 subjects and 2 visits do not decide" in lines[0]
-    assert not any("is excellent" in line or "is good" in line for line in lines)
+    assert icc(made, "A,k", method="generalised").value > 0.6
+    found = reliability_verdict(study(made), WORDS)
+    assert (found.level, found.badge) == (Level.AMBER, "Undecided")
+    assert found.headline.startswith("4 people and 2 visits do not show")
+
+
+def test_one_visit_shows_nothing() -> None:
+    found = reliability_verdict(study(scores(4, 1, 0.01)), WORDS)
+    assert (found.badge, found.may) == ("Undecided", ())
+
+
+def test_both_intervals_stand_in_columns_of_their_own() -> None:
+    made = scores(10, 3, 0.01)
+    none: dict[tuple[str, str, str], tuple[Recording, ...]] = {}
+    trials = Trials(("theta1",), 100.0, none, WORDS)
+    found = reliability_findings(trials, study(made))["icc-rms"]
+    assert found.table is not None
+    row = found.table.iloc[0]
+    for ends, method in ((("low", "high"), "generalised"), (("low_f", "high_f"), "F")):
+        expected = icc(made, "A,k", method=method)  # type: ignore[arg-type]
+        assert tuple(row[list(ends)]) == pytest.approx((expected.low, expected.high))
+    assert "Low (generalised)" in found.heads
+    assert "output" not in found.shown  # its code name

@@ -141,7 +141,12 @@ def test_head_tracking_from_files_to_files(tmp_path: Path) -> None:
     (scalings,) = found["unseen_scalings"].values()
     assert ["Kvis", "Kvcr", "Kccr", "B", "K"] in scalings
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Scaling Kvis, Kvcr, Kccr, B, K together" in page
+    words = "visual gain, vestibular gain, proprioceptive gain, intrinsic damping"
+    assert f"Scaling {words}, intrinsic stiffness together" in page
+    assert found["verdict"]["level"] == "amber"
+    bias = found["findings"]["parameters"]["table"]["bias_percent_of_the_range"]
+    largest = max(one for one in bias if one is not None)
+    assert f"up to {largest:.3g} % of the" in found["verdict"]["alerts"][0]["found"]
 
 
 MINE = ("--model", "tests.studies.selection.dosing:blood_model")
@@ -190,7 +195,10 @@ def test_a_model_from_another_field(tmp_path: Path) -> None:
     study = blood_study(tmp_path, 5, 2)
     done = run("select", str(study), *MINE, "--out", str(tmp_path / "select"), "--workers", "1")
     assert done.exit_code == 0, done.stderr
-    assert "information: ka, ke, V" in done.stdout
+    found = json.loads((tmp_path / "select" / "result.json").read_text())
+    assert found["selected"]["fim"] == ["ka", "ke", "V"]
+    assert found["verdict"]["headline"] == "3 of 3 parameters can be estimated."
+    assert found["verdict"]["headline"] in done.stdout
     done = run(
         "key-parameters", str(study), *MINE, "--out", str(tmp_path / "key"), "--workers", "1"
     )

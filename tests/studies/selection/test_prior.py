@@ -101,11 +101,11 @@ def test_an_estimate_at_its_bound_has_a_one_sided_interval() -> None:
     assert found.high[0] == 1
     assert 0.8 < found.low[0] < 0.97
     ends = float(found.low[0]), float(found.high[0])
-    assert _note(model, 0, found, *ends) == "one-sided: estimate at its upper bound"
+    assert _note(model, 0, found, *ends) == "one-sided: estimate at its upper limit"
     assert _note(model, 0, found, -0.9, 0.9) == ""
     assert _note(model, 0, found, -1.0, 1.0) == "not determined"
     inner = replace(found, fit=replace(found.fit, at_bound=()))
-    assert _note(model, 0, inner, -1.0, 0.2) == "one-sided: ends at the lower bound"
+    assert _note(model, 0, inner, -1.0, 0.2) == "one-sided: ends at the lower limit"
 
 
 def test_a_parameter_without_effect_is_not_determined() -> None:
@@ -129,7 +129,7 @@ def test_deviations_are_checked_and_default_to_a_quarter_of_the_range() -> None:
 
 
 def test_truth_beside_simulated_recordings_is_compared(tmp_path: Path) -> None:
-    """One person: the command's line, the table and result.json."""
+    """One person: the check, the table and result.json."""
     study, out = blood_study(tmp_path, 1, 1), tmp_path / "out"
     truth = {"1 visit 1": {"ka": 1.0, "ke": 0.1, "V": 1e3}}
     (tmp_path / "truth.json").write_text(json.dumps({"recordings": truth}))
@@ -137,11 +137,12 @@ def test_truth_beside_simulated_recordings_is_compared(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, command)
     assert done.exit_code == 0, done.output
     found = json.loads((out / "result.json").read_text())
+    page = (out / "report.html").read_text()
     table = found["findings"]["intervals"]["table"]
     assert table["truth"][2] == 1e3
     assert not table["inside"][2]
-    assert f"{sum(table['inside'])} of the 3 true values" in found["truth"]
-    assert found["truth"] in done.stdout
+    assert f"inside the interval: {sum(table['inside'])} of 3;" in found["truth"]
+    assert f"true value inside the interval: {sum(table['inside'])} of 3" in page.lower()
 
 
 def test_truths_of_others_are_left_alone(tmp_path: Path) -> None:

@@ -1,0 +1,182 @@
+"""Are verdicts right? Simulated subjects of nine kinds, and what their pages would say.
+
+    python -m experiments.verdicts --seeds 10
+
+Each kind is a cart (`experiments.coverage`) whose recordings are made so that one verdict is right.
+A line a kind: how many verdicts were right, and which others came out. Below them: how many of the
+gains that may be reported, and of the comparisons of cost, are true.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import impc
+from experiments.coverage import cart
+from impc.checking import replace
+from impc.model.riccati import solve_lqr
+from impc.reporting.finding import Level
+from impc.studies.fit.facts import decided, named_gains
+from impc.studies.fit.subject import fit_problem, fit_recordings
+from impc.studies.fit.verdict import GAIN, WEIGHTS, fallen_verdict, fit_verdict, forbidden
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.studies.fit.result import FitResult
+
+_LIMIT, _HORIZON, _SAMPLES, _TRIALS = 1.0, 10, 900, 2
+_WEIGHTS = np.array([[4.0, 0.8], [0.8, 1.0]])
+_NOISE, _FAR = 0.003, 3.0
+
+
+@dataclass(frozen=True)
+class Made:
+    """A fit of a simulated subject, and its true gain where it has one."""
+
+    result: FitResult
+    gain: Array | None
+
+
+def _pushes(rng: np.random.Generator, size: float, samples: int = _SAMPLES) -> Array:
+    return size * np.repeat(rng.choice([-1.0, 0.0, 1.0], samples // 10), 10)
+
+
+def subject(
+    seed: int,
+    *,
+    size: float = 0.75,
+    limit: float = _LIMIT,
+    unknown: float = 0.0,
+    noise: float = _NOISE,
+    wander: float = 0.0,
+    plant: impc.Plant | None = None,
+    gain: Array | None = None,
+    samples: int = _SAMPLES,
+    settle: float = 1.0,
+) -> Made:
+    """A cart with such a perturbation and limit; `unknown` pushes that are not recorded."""
+    rng, known = np.random.default_rng(seed), cart()
+    body = plant or known
+    weights = impc.Weights(_WEIGHTS, 1)
+    bounds = impc.Bounds(body, u_min=-limit, u_max=limit)
+    law = impc.Controller(body, weights, bounds, _HORIZON, terminal_set=False)
+    true = np.array(solve_lqr(body, weights).K) if gain is None else gain
+    trials: list[impc.Recording] = []
+    while len(trials) < _TRIALS:
+        push = _pushes(rng, size, samples)
+        pushed = push + unknown * rng.standard_normal(samples)
+        y = _linear(body, gain, pushed) if gain is not None else _moved(law, pushed)
+        if not np.all(np.abs(y) < _FAR):  # it fell: once more
+            continue
+        own = wander * np.cumsum(rng.standard_normal((samples, 1)), axis=0)
+        y = y + noise * rng.standard_normal(y.shape) + own - own.mean()
+        label = impc.Label(trial=str(len(trials) + 1))
+        trials.append(impc.Recording(known, y, push, label=label))
+    settings = impc.FitSettings(horizon=_HORIZON, u_max=_LIMIT, settle=settle)
+    problem = fit_problem(known, trials, settings)
+    return Made(fit_recordings(problem, settings), true)
+
+
+def _moved(law: impc.Controller, push: Array) -> Array:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return np.asarray(law.simulate([0, 0], disturbance=push).x[: len(push), :1])
+
+
+def _linear(plant: impc.Plant, gain: Array, push: Array) -> Array:
+    """Outputs of u = -Kx without a limit."""
+    x = np.zeros((len(push), plant.n))
+    for k in range(len(push) - 1):
+        x[k + 1] = plant.A @ x[k] - plant.B @ (gain @ x[k]) + plant.E[:, 0] * push[k]
+    return x[:, :1]
+
+
+def _softer(share: float) -> impc.Plant:
+    plant = cart()
+    return replace(plant, A=plant.A + share * (plant.A - np.eye(2)) * np.array([[0, 0], [1, 1]]))
+
+
+def _fell(seed: int) -> Made:
+    made = subject(seed)
+    return replace(made, result=replace(made.result, falls=("trial 3: fell at 5.1 s",)))
+
+
+#: Kind -> how its subject is made, its level, and words that its headline has.
+KINDS: dict[str, tuple[Callable[[int], Made], Level, str]] = {
+    "explained": (subject, Level.GREEN, "explains this movement"),
+    "limit": (lambda seed: subject(seed, limit=0.7), Level.AMBER, "probably wrong"),
+    "noise in the loop": (lambda seed: subject(seed, unknown=1.0), Level.AMBER, "noise"),
+    "half": (lambda seed: subject(seed, wander=0.05), Level.RED, "less than half"),
+    "no weights": (
+        lambda seed: subject(seed, size=0.15, gain=np.array([[1.5, 0.2]]), noise=3e-4),
+        Level.AMBER,
+        "no cost weights",
+    ),
+    "body": (lambda seed: subject(seed, plant=_softer(1.0)), Level.AMBER, "body"),
+    "fell": (_fell, Level.AMBER, "fell"),
+    "never reached": (lambda seed: subject(seed, size=0.15), Level.GREEN, "never reached"),
+    "weak": (
+        lambda seed: subject(seed, size=0.3, noise=0.015, samples=30, settle=0.2),
+        Level.AMBER,
+        "pin down",
+    ),
+}  # fmt: skip
+
+
+def _true_statements(result: FitResult) -> tuple[int, int]:
+    """True and all of the decided comparisons."""
+    states, sizes = result.given.plant.states, np.array(result.intent.sizes)
+    true = made = 0
+    for item in decided(result):
+        i, j = states.index(item.first), states.index(item.second)
+        scaled = _WEIGHTS * np.outer(sizes, sizes)
+        value = scaled[i, i] - scaled[j, j] if item.kind == "order" else scaled[i, j]
+        made += 1
+        true += int((value > 0) == item.holds)
+    return true, made
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS))
+    given = parser.parse_args()
+    inside = gains = true = made = 0
+    for name in given.kinds:
+        make, level, words = KINDS[name]
+        right, wrong = 0, Counter[str]()
+        for seed in range(given.seeds):
+            one = make(seed)
+            verdict = fit_verdict(one.result)
+            fits = verdict.level is level and words in verdict.headline
+            right += fits
+            if not fits:
+                wrong[f"{verdict.level.value}: {verdict.headline}"] += 1
+            no = forbidden(one.result)
+            if GAIN not in no and one.gain is not None:
+                for truth, (_, row) in zip(one.gain.ravel(), named_gains(one.result), strict=False):
+                    gains += row.identified
+                    inside += bool(
+                        row.identified and row.interval.low <= truth <= row.interval.high
+                    )
+            if WEIGHTS not in no and name != "body":
+                found = _true_statements(one.result)
+                true, made = true + found[0], made + found[1]
+        others = "; ".join(f"{count} {text}" for text, count in wrong.items())
+        print(f"{name:<20}{right} of {given.seeds}  {others}", flush=True)
+    fallen = fallen_verdict(("trial 1: fell at 3.2 s",))
+    print(f"{'fell in all':<20}{fallen.level.value}: {fallen.headline}")
+    print(f"gains that may be reported: {inside} of {gains} intervals hold the truth")
+    print(f"comparisons of cost that may be reported: {true} of {made} are true")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""What other limits of the command would leave unexplained: a curve, each point fitted anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array, Frozen, frozen
+from impc.assess.input_limits import with_limit
+from impc.assess.variance_accounted_for import vaf
+from impc.errors import SolverError, WeightsError
+from impc.inverse.gain_search import refine_gain
+from impc.inverse.problem import simulated
+
+if TYPE_CHECKING:
+    from impc.inverse.estimates import Estimate
+    from impc.inverse.problem import Problem
+
+# Of the limit, outwards from it in both directions: each starts from its neighbour.
+_BELOW, _ABOVE = (0.92, 0.8, 0.65), (1.1, 1.35, 1.8)
+_EVALUATIONS = 12
+
+
+@dataclass(frozen=True)
+class LimitCurve(Frozen):
+    """Unexplained variance against the limit of one control."""
+
+    control: str
+    given: float  # The limit of the fit
+    limits: Array  # In the unit of the control (t,), ascending
+    unexplained: Array  # 100 - VAF, % (t, p); NaN where no gain was found
+
+
+def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
+    """Around the limit of a fit, where the command reaches it; None where it does not."""
+    problem = fitted.problem.with_body_fixed()
+    limit = float(problem.bounds.u_max[control])
+    if not np.isfinite(limit) or problem.bounds.u_min[control] != -limit or problem.plant.commands:
+        return None
+    start = problem, np.array(fitted.gain), np.array(fitted.metric)
+    points = {limit: _unexplained(*start)}
+    for side in (_BELOW, _ABOVE):
+        here = start
+        for share in side:
+            try:
+                found = refine_gain(
+                    with_limit(here[0], share * limit, control),
+                    *here[1:],
+                    max_evaluations=_EVALUATIONS,
+                    prior=1.0,
+                )
+            except (SolverError, WeightsError):  # no gain near balances with so little
+                points[share * limit] = np.full(len(problem.plant.outputs), np.nan)
+                break
+            here = found.problem, np.array(found.K), np.array(found.S)
+            points[share * limit] = _unexplained(*here)
+    limits = sorted(points)
+    name = problem.plant.controls[control]
+    return LimitCurve(name, limit, frozen(limits), frozen([points[one] for one in limits]))
+
+
+def _unexplained(problem: Problem, gain: Array, metric: Array) -> Array:
+    """100 - VAF, % (p,)."""
+    recorded = np.concatenate([trial.without_offset for trial in problem.recordings])
+    runs = simulated(problem, gain, metric)
+    modelled = np.concatenate([run.x for run in runs]) @ problem.plant.C.T
+    if not all(run.complete for run in runs):
+        return np.full(recorded.shape[1], np.nan)
+    return np.asarray(100 - vaf(recorded, modelled))

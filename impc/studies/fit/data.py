@@ -1,0 +1,177 @@
+"""What result.json has of a fit in addition to its verdict and findings (docs/results.md).
+
+    vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of left-out trials
+    states, controls, outputs, disturbances  names, in the order of every array below
+    units.<signal>                           where the plant says them
+    body                                     "nonlinear" or "linear"
+    solver                                   what solved the quadratic programs
+    usable                                   whether half of every recorded signal is explained
+    K                                        the gain that the recordings identify
+    estimate                                 standard errors of K and of its directions, and which
+                                             of them are identified
+    Q, R, P, S, weights_gain                 the weights whose gain comes nearest, at R[0][0] = 1
+    weights_rule                             which of all weights with that gain Q and R are
+    weights_test                             whether any weights explain K: statistic, freedom,
+                                             p_value, rejected, return_difference
+    terminal_set, doubts                     of the fitted controller; sentences
+    horizon, bounds                          as given
+    lack_of_fit                              of the first fit and, where something was added, of the
+                                             last: alarm, and errors with probability and size
+    failures.<stage>                         why the stage has no result
+    ceiling                                  VAF that repeats with the perturbation, low, high, %
+    limit                                    given, value, low, high, where it was estimated
+    lasting                                  command for a lasting output of 1, with its interval
+    falls                                    trials that ended in a fall, and when
+    intent                                   eigenvalues (ascending), dominant, weights of each rule
+    structures                               weights and gain of each that was named
+    person                                   of [fit.observer]: K, levels with intervals, models
+                                             with log_likelihood and aic, whiteness, errors ahead
+    identifiability                          rank, free, chosen, singular_values
+    aim                                      targets, samples that they are known ahead, rates (1/s)
+                                             of lasting disturbances, offsets (SI), commands
+    trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
+    methods.<name>                           as in every result (docs/results.md)
+    truth                                    K of a truth.json beside the recordings, or null
+    plant, settings, files, versions, made
+
+Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.assess.intent_statements import dominant_sentence
+from impc.assess.lasting_response import lasting_responses
+from impc.studies.fit.aim import aim_data
+from impc.studies.fit.settings import plain_settings
+from impc.studies.fit.structures import structure_data
+from impc.studies.methods_table import methods_data
+
+if TYPE_CHECKING:
+    from impc.reporting.provenance import Provenance
+    from impc.studies.fit.result import FitResult
+
+
+def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
+    """What result.json has beside the findings."""
+    plant, found = result.fitted.problem.plant, result.identifiability
+    return _controller(result) | {
+        "estimate": _estimate(result),
+        "limit": None if result.limit_found is None else result.limit_found._asdict(),
+        "lasting": [asdict(one) for one in lasting_responses(result.estimate)],
+        "falls": result.falls,
+        "intent": _intent(result),
+        "identifiability": {
+            "rank": found.rank,
+            "free": found.free,
+            "chosen": found.chosen,
+            "singular_values": found.singular_values,
+        },
+        "trials": [_trial(result, index) for index in range(len(result.trials))],
+        "methods": methods_data(result.methods),
+        "structures": structure_data(result),
+        "aim": aim_data(result),
+        "person": None if result.person is None else result.person.data(),
+        "plant": {
+            "name": provenance.plant_name,
+            "arguments": dict(provenance.plant_arguments),
+            **{name: getattr(plant, name) for name in ("A", "B", "E", "C", "dt")},
+        },
+        "settings": plain_settings(result.settings),
+        "ceiling": None if result.ceiling is None else asdict(result.ceiling),
+        "seconds": result.seconds,
+    }
+
+
+def _controller(result: FitResult) -> dict[str, Any]:
+    plant, fitted = result.fitted.problem.plant, result.fitted
+    weights, bounds = result.intent.reported.weights, result.given.bounds
+    held = np.array([item.vaf for item in result.held_out])
+    left_out = np.mean(held, axis=0) if len(held) else [None] * len(plant.outputs)
+    return {
+        "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
+        "held_out_vaf": dict(zip(plant.outputs, left_out, strict=True)),
+        **{name: getattr(plant, name) for name in ("states", "controls", "outputs")},
+        "disturbances": plant.disturbances,
+        "units": dict(plant.units),
+        "usable": result.usable,
+        "K": result.estimate.K,
+        "S": fitted.metric * (weights.R[0, 0] / fitted.stage_weights.R[0, 0]),
+        "Q": weights.Q,
+        "R": weights.R,
+        "weights_gain": fitted.gain,
+        "weights_rule": result.intent.reported.rule,
+        "P": result.reported_P,
+        "weights_test": {**asdict(result.weights_test), "rejected": result.weights_test.rejected},
+        "terminal_set": bool(fitted.problem.terminal_set),
+        "doubts": fitted.doubts,
+        "failures": dict(result.failures),
+        "lack_of_fit": [None if one is None else asdict(one) for one in result.lack],
+        "horizon": fitted.problem.horizon,
+        "body": plant.moves,
+        "solver": fitted.problem.solver,
+        "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
+    }
+
+
+def _intent(result: FitResult) -> dict[str, Any]:
+    found, reported = result.intent, result.intent.reported
+    return {
+        "eigenvalues": reported.eigenvalues,
+        "vectors": reported.vectors,
+        "dominant": reported.dominant,
+        "sentence": dominant_sentence(reported, result.fitted.problem.plant, np.array(found.sizes)),
+        "widest_angle": result.widest_angle,
+        "state_sizes": found.sizes,
+        "readings": [
+            {
+                "rule": item.rule,
+                "Q": item.weights.Q,
+                "R": item.weights.R,
+                "condition_number": item.condition,
+                "dominant": item.dominant,
+                "angle": item.angle,
+            }
+            for item in found.readings
+        ],
+    }
+
+
+def _estimate(result: FitResult) -> dict[str, Any]:
+    estimate, covariance = result.estimate, result.estimate.covariance
+    return {
+        "S": estimate.S,
+        "misfit": estimate.misfit,
+        "standard_errors": covariance.entries,
+        "standard_errors_exact_body": None if estimate.exact is None else estimate.exact.entries,
+        "identified": covariance.individually_identified,
+        "singular_values": covariance.singular_values,
+        "directions": covariance.directions,
+        "direction_standard_errors": covariance.deviations,
+        "identified_directions": covariance.identified,
+        "natural_coordinates": covariance.T,
+        "natural_inputs": covariance.G,
+    }
+
+
+def _trial(result: FitResult, index: int) -> dict[str, Any]:
+    trial, found = result.given.recordings[index], result.trials[index]
+    held = result.held_out[index] if result.held_out else None
+    return {
+        **asdict(trial.label),
+        "samples": trial.samples,
+        "missing": int(np.isnan(trial.outputs).any(axis=1).sum()),
+        "findings": trial.findings,
+        "vaf": found.vaf,
+        "centred_vaf": found.centred_vaf,
+        "whiteness": found.whiteness,
+        "rms_residual": found.rms,
+        "saturated": found.saturated,
+        "x0": result.fitted.problem.recordings[index].x0,
+        "held_out_vaf": None if held is None else held.vaf,
+        "held_out_centred_vaf": None if held is None else held.centred_vaf,
+    }

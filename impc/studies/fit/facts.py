@@ -1,0 +1,225 @@
+"""Numbers of a fit in words: what verdict, sections, checks and the text for a paper share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from impc.assess.lasting_response import follows_command
+from impc.reporting.rendering import fixed, number
+from impc.reporting.shown_units import shown_unit, signal_name
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+    from impc.assess.intent_statements import Statement
+    from impc.assess.printed_gain import Interval
+    from impc.model.plant import Plant
+    from impc.studies.fit.result import FitResult, LimitFound
+
+_BEST = "inverse_lqr_output"
+
+
+class GainRow(NamedTuple):
+    """An entry of the gain as a reader meets it: the command against one unit of a state."""
+
+    state: str  # Its words
+    control: str
+    per: str  # "1° of seat tilt"
+    unit: str  # Of the command
+    value: float
+    low: float
+    high: float
+    interval: Interval  # As the plant has it
+    inner: bool  # Of a state of nerves or muscles, whose gain means nothing by itself
+
+    @property
+    def ends(self) -> str:
+        """Its interval in words."""
+        return between(self.low, self.high)
+
+    @property
+    def identified(self) -> bool:
+        """Whether it is identified by itself."""
+        return self.interval.identified
+
+    @property
+    def certain(self) -> bool:
+        """Whether it may be reported: identified, and its interval excludes zero."""
+        return self.identified and self.interval.excludes_zero
+
+
+def between(low: float, high: float) -> str:
+    """Both ends of an interval, to as many digits as tell them apart."""
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return "not determined"
+    size = max(abs(low), abs(high), 1e-300)
+    digits = int(np.clip(1 + np.ceil(np.log10(size / max(high - low, 1e-6 * size))), 3, 5))
+    return f"{fixed(low, digits)} to {fixed(high, digits)}"
+
+
+def limit_ends(found: LimitFound) -> str:
+    """How well an estimated limit is known."""
+    ends = between(found.low, found.high)
+    return f"95 % CI {ends}" if found.fitted else f"of the limits tried, from {ends}"
+
+
+def with_unit(value: str, unit: str) -> str:
+    """A number with its unit: "1°", "1 N m", "1"."""
+    return f"{value}{unit}" if unit[:1] == "°" else value if unit == "-" else f"{value} {unit}"
+
+
+def one_of(unit: str) -> str:
+    """One of a unit."""
+    return with_unit("1", unit)
+
+
+def gain_rows(result: FitResult) -> list[GainRow]:
+    """Every entry of the gain, row by row, in shown units."""
+    plant, found = result.given.plant, result.preferred
+    inner, rows = follows_command(result.fitted.problem.plant), []
+    for control in plant.controls:
+        scale, unit = shown_unit(plant, control)
+        for state, own in zip(plant.states, inner, strict=True):
+            item = found.get(f"K.{control}.{state}")
+            if item is None:
+                continue
+            factor, of = shown_unit(plant, state)
+            ratio, words = scale / factor, signal_name(plant, state)
+            per = f"{one_of(of)} of {words}"
+            value = np.nan if item.value is None else ratio * item.value
+            ends = ratio * item.low, ratio * item.high
+            name = signal_name(plant, control)
+            rows.append(GainRow(words, name, per, unit, value, *ends, item, bool(own)))
+    return rows
+
+
+def named_gains(result: FitResult) -> list[tuple[str, GainRow]]:
+    """The entries that mean something by themselves, with their names."""
+    several = result.given.plant.m > 1
+    rows = [row for row in gain_rows(result) if not row.inner] or gain_rows(result)
+    return [(f"{row.state} by {row.control}" if several else row.state, row) for row in rows]
+
+
+def first_gain(result: FitResult) -> GainRow | None:
+    """The entry that a reader sees first: of the first output, else of any that is identified."""
+    rows = [row for _, row in named_gains(result) if row.certain]
+    return rows[0] if rows else None
+
+
+def lasting_or_first(result: FitResult) -> str:
+    """One gain with its interval, as an example."""
+    row = first_gain(result)
+    if row is None:
+        return ""
+    return f"For example {number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})."
+
+
+def limits(plant: Plant, low: Array, high: Array) -> list[str]:
+    """The limits of these bounds (m,) in words, of the controls that have one."""
+    found = []
+    for k, name in enumerate(plant.controls):
+        factor, unit = shown_unit(plant, name)
+        if np.isfinite(high[k]):
+            of = f" of {signal_name(plant, name)}" if plant.m > 1 else ""
+            found.append(f"{with_unit(number(float(factor * high[k]), 4), unit)}{of}")
+        elif np.isfinite(low[k]):
+            found.append(f"{with_unit(number(float(factor * low[k]), 4), unit)} downwards")
+    return found
+
+
+def given_limit(result: FitResult) -> str | None:
+    """The limit that was given, "6 N m"; None where there is none."""
+    plant, bounds = result.given.plant, result.given.bounds
+    parts = limits(plant, np.array(bounds.u_min), np.array(bounds.u_max))
+    most = dict(zip(plant.states, bounds.x_max, strict=True))
+    for name in plant.commands:
+        if np.isfinite(most[name]):
+            factor, unit = shown_unit(plant, name)
+            parts.insert(0, f"{number(float(factor * most[name]), 4)} {unit}")
+    if not parts and any(np.isfinite(value) for value in most.values()):
+        return "a state"
+    return " and ".join(parts) or None
+
+
+def amount(result: FitResult, values: Array) -> str:
+    """The first command of (m,) with its unit."""
+    plant = result.given.plant
+    factor, unit = shown_unit(plant, plant.controls[0])
+    return f"{number(float(factor * values[0]))} {unit}"
+
+
+def saturation(result: FitResult) -> float:
+    """% of the time at the limit."""
+    return 100 * result.saturated
+
+
+def shares(result: FitResult, values: Array, digits: int = 2) -> str:
+    """Shares (p,) with the outputs they are of: 99.99 % (seat tilt) and 99.98 % (trunk tilt)."""
+    plant = result.given.plant
+    parts = [
+        f"{value:.{digits}f} % ({signal_name(plant, name)})" if np.isfinite(value)
+        else f"no number ({signal_name(plant, name)}; a simulation does not reach the end)"
+        for name, value in zip(plant.outputs, values, strict=True)
+    ]  # fmt: skip
+    return " and ".join(parts)
+
+
+def held_out(result: FitResult) -> Array | None:
+    """Mean VAF of left-out trials (p,)."""
+    held = [one.vaf for one in result.held_out]
+    return np.mean(held, axis=0) if held else None
+
+
+def left_out_text(result: FitResult) -> str:
+    """How much is explained, of left-out trials where there are any."""
+    held = held_out(result)
+    if held is None:
+        return f"{shares(result, result.inverse_mpc.vaf)} of the variance, in fitted trials."
+    return f"{shares(result, held)} of the variance in left-out trials."
+
+
+def shares_text(result: FitResult) -> str:
+    """The same of the fitted trials."""
+    return f"{shares(result, result.inverse_mpc.vaf, 0)} of the variance"
+
+
+def unlimited_ratio(result: FitResult) -> str:
+    """How much more the best model without a limit leaves; empty where it does not matter."""
+    methods = {item.name: item for item in result.methods}
+    other, own = methods.get(_BEST), result.inverse_mpc
+    if other is None or np.any(np.isnan(other.vaf)):
+        return ""
+    ratios = (100 - other.vaf) / np.maximum(100 - own.vaf, 1e-9)
+    place = int(np.argmax(ratios))
+    if ratios[place] < 1.05:
+        return ""
+    name = signal_name(result.given.plant, result.given.plant.outputs[place])
+    much = number(float(ratios[place]), 2)
+    return f" Without a limit, {much} times as much variance of the {name} is left unexplained."
+
+
+def no_limit(result: FitResult) -> str:
+    """Why nothing may be said about the limit."""
+    limit = given_limit(result)
+    if limit is None:
+        return "No limit was given."
+    if not result.met:
+        return "It was never reached."
+    return f"The limit of {limit} is in doubt."
+
+
+def decided(result: FitResult) -> list[Statement]:
+    """Comparisons of cost that hold for all weights and gains that the recordings allow."""
+    summary = result.uncertainty.weights
+    return [] if summary is None else [item for item in summary.statements if item.made]
+
+
+def statement_text(plant: Plant, item: Statement) -> str:
+    """A comparison in words, as it holds."""
+    one, other = signal_name(plant, item.first), signal_name(plant, item.second)
+    more = "less" if item.holds is False else "more"
+    if item.kind == "order":
+        return f"A typical {one} costs {more} than a typical {other}."
+    pair = f"{one[:1].upper()}{one[1:]} and {other}"
+    return f"{pair} of the same sign cost {more} than of opposite signs."

@@ -1,0 +1,479 @@
+"""The tables of a fit: gain, trials, weights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from impc.assess.covariance import IDENTIFIED, TWO_SIDED
+from impc.assess.printed_gain import entry_names
+from impc.assess.variance_accounted_for import verdict
+from impc.files.disk import truth_beside
+from impc.model.plant import UNKNOWN, gain_unit
+from impc.reporting.finding import Finding, table_of
+from impc.reporting.rendering import number
+from impc.reporting.shown_units import shown_unit, signal_name
+from impc.studies.fit.aim import aim_data
+from impc.studies.fit.body_words import parameter_words
+from impc.studies.fit.facts import gain_rows, named_gains, statement_text
+from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.methods_table import trajectory_table, weight_entries
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from impc.arrays import Array
+    from impc.assess.intent_statements import Statement
+    from impc.assess.printed_gain import Interval
+    from impc.model.plant import Plant
+    from impc.studies.fit.result import FitResult
+
+# Parts of a direction below this are not named.
+_NAMED = 0.15
+# Intervals by other methods than that of low and high.
+_OTHER = ("block", "profile")
+
+
+def per_unit_finding(result: FitResult) -> Finding:
+    """The command against one shown unit of each state that means something by itself."""
+    several = result.given.plant.m > 1
+    table = table_of(
+        [row for _, row in named_gains(result)],
+        {
+            "for_every": lambda row: row.per,
+            **({"by": lambda row: row.control} if several else {}),
+            "opposing_command": lambda row: float(row.value),
+            "low": lambda row: float(row.low),
+            "high": lambda row: float(row.high),
+            "unit": lambda row: row.unit,
+            "identified": lambda row: row.identified,
+        },
+    )
+    inner = [row for row in gain_rows(result) if row.inner]
+    known = sum(row.identified for row in inner)
+    of_inner = (
+        f" The gains on {len(inner)} states of nerves and muscles, {known} of them identified, "
+        "mean nothing one by one; they stand under details."
+        if inner
+        else ""
+    )
+    labels = {"for_every": "For every ...", "low": "95 % CI, low", "high": "95 % CI, high"}
+    caption = f"Identified: the recordings determine this number by itself.{of_inner}"
+    return Finding("gain_per_unit", table, caption, labels=labels, digits=3)
+
+
+def gain_finding(result: FitResult, truth: Array | None = None) -> Finding:
+    """Every number with its intervals, in SI units, beside the gain of the weights."""
+    uncertainty, plant = result.uncertainty, result.fitted.problem.plant
+    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
+    found = {(item.name, item.method): item for item in uncertainty.intervals}
+    units, rows, alone = number_units(plant), [], result.estimate.exact
+    deviations = np.zeros(0) if alone is None else np.ravel(alone.entries)
+    exact = dict(zip(entry_names(plant), deviations, strict=False))
+    true = {} if truth is None else dict(zip(entry_names(plant), truth.ravel(), strict=True))
+    for name, item in result.preferred.items():
+        row = {
+            "number": number_name(plant, name),
+            "unit": units.get(name, UNKNOWN),
+            "value": np.nan if item.value is None else float(item.value),
+            "low": float(item.low),
+            "high": float(item.high),
+            "identified": item.identified,
+            "excludes_zero": item.excludes_zero,
+        }
+        if alone is not None:
+            half, middle = TWO_SIDED * exact.get(name, np.nan), (item.low + item.high) / 2
+            row |= {"exact_body_low": middle - half, "exact_body_high": middle + half}
+        for method in _OTHER:
+            other = found.get((name, method))
+            if any(key == method for _, key in found):
+                row[f"{method}_low"] = np.nan if other is None else float(other.low)
+                row[f"{method}_high"] = np.nan if other is None else float(other.high)
+        row["gain_of_the_weights"] = float(of_weights.get(name, np.nan))
+        if true:
+            value = float(true.get(name, np.nan))
+            row |= {"true_value": value, "inside": bool(item.low <= value <= item.high)}
+        rows.append(row)
+    level = 100 * uncertainty.intervals[0].level if rows else 95
+    exact_words = (
+        " Exact body: the interval if the body were known exactly as it was found." if exact else ""
+    )
+    return Finding(
+        "gain",
+        pd.DataFrame(rows),
+        f"The gain K of u = -K x with {level:.0f} % intervals, which allow for autocorrelated "
+        "residuals. An entry that is not identified can only be told apart from others in "
+        f"combinations.{exact_words} The gain of the weights is that of the reported cost weights.",
+        hidden=("gain_of_the_weights",),
+        labels={"number": "Gain on"},
+    )
+
+
+def direction_finding(result: FitResult) -> Finding:
+    """Combinations of entries that the recordings determine, best first."""
+    plant, covariance = result.fitted.problem.plant, result.estimate.covariance
+    words = [signal_name(plant, state) for state in plant.states]
+    names = tuple(
+        word if plant.m == 1 else f"{word} to {signal_name(plant, control)}"
+        for control in plant.controls
+        for word in words
+    )
+    back = np.kron(np.array(covariance.G), np.linalg.inv(covariance.T).T)
+    moved = (covariance.directions @ back.T) * np.tile(np.array(result.intent.sizes), plant.m)
+    values, deviations = covariance.singular_values, covariance.deviations
+    table = table_of(
+        range(len(values)),
+        {
+            "direction": lambda k: direction_name(moved[k] / np.linalg.norm(moved[k]), names),
+            "relative_singular_value": lambda k: float(values[k] / values[0]),
+            "standard_error": lambda k: float(deviations[k]),
+            "identified": lambda k: bool(deviations[k] < IDENTIFIED),
+        },
+    )
+    caption = (
+        "Combinations of entries of the gain, best determined first, as commands at typical "
+        "states. The standard error is relative to the largest gain that is optimal: 1 means "
+        f"practically unknown, above {IDENTIFIED:g} not identified."
+    )
+    return Finding("directions", table, caption, digits=2)
+
+
+def direction_name(direction: Array, names: tuple[str, ...]) -> str:
+    """A direction (n,) as a sum of parts called by their `names`, the largest first."""
+    order = np.argsort(-np.abs(direction), kind="stable")
+    parts = [f"{direction[k]:+.2f} {names[k]}" for k in order if abs(direction[k]) >= _NAMED]
+    return " ".join(parts)
+
+
+def parameter_findings(result: FitResult) -> list[Finding]:
+    """Physical parameters that were fitted with the gain, where there are any."""
+    if not result.parameters:
+        return []
+    table = table_of(
+        result.parameters,
+        {
+            "parameter": lambda item: item.name,
+            "nominal": lambda item: float(item.nominal),
+            "fitted": lambda item: float(item.value),
+            "standard_error": lambda item: float(item.deviation),
+            "stated_deviation": lambda item: np.nan if item.stated is None else item.stated,
+            "moved_by_deviations": lambda item: float(item.pull),
+            "share_of_the_gains_variance_percent": lambda item: 100 * float(item.share),
+            "identified": lambda item: item.determined,
+        },
+    )
+    caption = (
+        "Physical parameters fitted with the gain, in SI units. One with a stated deviation keeps "
+        "to its nominal value as far as that says; its share is by how much the variance of the "
+        "gain would fall if it were measured exactly. One without is free."
+        f"{parameter_words(result)}"
+    )
+    return [Finding("parameters", table, caption)]
+
+
+def limit_findings(result: FitResult) -> list[Finding]:
+    """The limit of each command, other horizons and the curve of limits, where computed."""
+    found, plant = [], result.given.plant
+    if result.uncertainty.limits:
+        table = table_of(
+            zip(plant.controls, result.uncertainty.limits, strict=False),
+            {
+                "input": lambda pair: signal_name(plant, pair[0]),
+                "limit": lambda pair: np.nan if pair[1].value is None else float(pair[1].value),
+                "low": lambda pair: float(pair[1].low),
+                "high": lambda pair: float(pair[1].high),
+                "distance_of_no_limit": lambda pair: float(pair[1].against_none),
+                "threshold": lambda pair: float(pair[1].quantile),
+            },
+        )
+        found.append(Finding("limits", table, "Limits of the command as unknowns, 95 %."))
+    if result.uncertainty.alternatives:
+        first = result.uncertainty.alternatives[0]
+        table = table_of(
+            result.uncertainty.alternatives,
+            {
+                "fit": lambda item: item.name,
+                "horizon": lambda item: int(item.horizon),
+                "aic_above_the_least": lambda item: float(item.aic),
+                "left_out_vaf": lambda item: float(item.held_out),
+                "the_recordings_say": lambda item: "" if item is first else verdict(first, item),
+            },
+        )
+        caption = (
+            "The same recordings with other horizons and without limit. AIC is above the least; "
+            "VAF (%) is of left-out trials."
+        )
+        found.append(Finding("alternatives", table, caption))
+    if result.curves:
+        rows = [
+            {"input": curve.control, "limit": float(limit)}
+            | {f"unexplained_{name}_percent": float(value)
+               for name, value in zip(plant.outputs, values, strict=True)}
+            for curve in result.curves
+            for limit, values in zip(curve.limits, curve.unexplained, strict=True)
+        ]  # fmt: skip
+        found.append(Finding("limit_curve", pd.DataFrame(rows), folded="The curve in numbers"))
+    return found
+
+
+def number_name(plant: Plant, name: str) -> str:
+    """What a reader calls a number of a fit by its `name`, such as K.command.theta1."""
+    kind, _, rest = name.partition(".")
+    if name not in number_units(plant):
+        return name
+    if kind == "u_max":
+        return f"limit of {signal_name(plant, rest)}"
+    control = next(one for one in plant.controls if rest.startswith(f"{one}."))
+    state = signal_name(plant, rest.removeprefix(f"{control}."))
+    return state if plant.m == 1 else f"{state} to {signal_name(plant, control)}"
+
+
+def number_units(plant: Plant) -> dict[str, str]:
+    """Units of the numbers of a fit by their names: K.<control>.<state>, u_max.<control>."""
+    return {
+        f"K.{control}.{state}": gain_unit(plant, control, state)
+        for control in plant.controls
+        for state in plant.states
+    } | {f"u_max.{control}": plant.unit(control) for control in plant.controls}
+
+
+def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
+    """The gain of the truth.json that lies beside recordings. Returns (m, n)."""
+    folders = {path.absolute().parent for path in recordings}
+    said = truth_beside(folders.pop()) if len(folders) == 1 else {}
+    try:
+        states, gain = tuple(said["states"]), np.array(said["K"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError):  # none, or another program's file
+        return None
+    return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
+
+
+def truth_count(result: FitResult, truth: Array) -> tuple[int, int, float]:
+    """How many entries of the true gain (m, n) lie inside their intervals, of all; their level."""
+    pairs = _pairs(result, truth)
+    inside = sum(item.low <= value <= item.high for item, value in pairs)
+    return inside, len(pairs), 100 * pairs[0][0].level
+
+
+def truth_sentence(result: FitResult, truth: Array) -> str:
+    """The same in words, with the farthest off, and of the person who senses with noise."""
+    if not result.preferred:
+        return "The recordings are simulated: no gain was estimated to compare with the true one."
+    inside, count, level = truth_count(result, truth)
+    text = (
+        f"The recordings are simulated: {inside} of the {count} entries of their true gain lie "
+        f"inside their {level:.0f} % intervals"
+    )
+    person = _of_person(result, truth)
+    off = [pair for pair in _pairs(result, truth) if not pair[0].low <= pair[1] <= pair[0].high]
+    if not off:
+        return f"{text}.{person}"
+    item, value = max(off, key=lambda pair: _distance(*pair))
+    name = number_name(result.given.plant, item.name)
+    return (
+        f"{text}; farthest off is the gain on {name}, {number(item.low, 4)} to "
+        f"{number(item.high, 4)} where the truth is {number(value, 4)}.{person}"
+    )
+
+
+def _of_person(result: FitResult, truth: Array) -> str:
+    if result.person is None or result.person.fit is None:
+        return ""
+    ends = np.array(result.person.entries)  # NaN of what is not individually identified
+    identified = np.count_nonzero(~np.isnan(ends[:, 0]))
+    inside = np.count_nonzero((ends[:, 0] <= truth.ravel()) & (truth.ravel() <= ends[:, 1]))
+    return (
+        f" Of the gain of the person who senses with noise {inside} of {identified} lie inside "
+        "theirs."
+    )
+
+
+def _pairs(result: FitResult, truth: Array) -> list[tuple[Interval, float]]:
+    first = result.preferred
+    values = zip(entry_names(result.given.plant), truth.ravel(), strict=True)
+    return [(first[name], float(value)) for name, value in values if name in first]
+
+
+def _distance(item: Interval, value: float) -> float:
+    """From the middle of the interval, in its halves."""
+    half = (item.high - item.low) / 2
+    return abs(value - (item.low + item.high) / 2) / half if half else np.inf
+
+
+def agreement_finding(result: FitResult) -> Finding:
+    """Each trial: length, how much of each output is explained, time at the limit."""
+    plant, rows, labels = result.given.plant, [], {"length_s": "Length (s)"}
+    for index, trial in enumerate(result.trials):
+        row: dict[str, object] = {"trial": trial_name(result, index)}
+        row["length_s"] = result.given.recordings[index].samples * plant.dt
+        held = result.held_out[index].vaf if result.held_out else np.full(len(trial.vaf), np.nan)
+        for column, name in enumerate(plant.outputs):
+            words = signal_name(plant, name)
+            for key, label, value in (
+                (f"vaf_{name}_percent", f"VAF, {words} (%)", trial.vaf[column]),
+                (f"left_out_vaf_{name}_percent", f"Left-out VAF, {words} (%)", held[column]),
+                (f"p_{name}", f"p, uncorrelated residual, {words}", trial.whiteness[column]),
+            ):
+                row[key], labels[key] = float(value), label
+        rows.append(row | {"time_at_the_limit_percent": 100 * float(trial.saturated)})
+    table = pd.DataFrame(rows).dropna(axis="columns", how="all")
+    caption = "Variance accounted for (VAF). Left-out: predicted from the other trials."
+    return Finding("agreement", table, caption, labels=labels, digits=4)
+
+
+def offset_findings(result: FitResult) -> list[Finding]:
+    """What the outputs of each trial have too much, where that was asked for."""
+    plant, offsets = result.fitted.problem.plant, aim_data(result)["offsets"]
+    rows = [
+        (trial_name(result, index), signal_name(plant, name), shown_unit(plant, name)[1],
+         shown_unit(plant, name)[0] * value)
+        for name, values in offsets.items()
+        for index, value in enumerate(values)
+    ]  # fmt: skip
+    table = pd.DataFrame(rows, columns=["trial", "output", "unit", "offset"])
+    caption = "What the recorded outputs have too much, found with the gain."
+    return [Finding("offsets", table, caption, folded="Offsets of the outputs")] if rows else []
+
+
+def command_findings(result: FitResult) -> list[Finding]:
+    """The gain by regression on recorded commands beside that of the fit, where there are any."""
+    if result.commands is None:
+        return []
+    table = result.commands.reset_index(names="number")
+    table["number"] = [number_name(result.given.plant, name) for name in table["number"]]
+    inside = table["fitted"].between(table["low"], table["high"])
+    said = (
+        f"{inside.sum()} of the {len(table)} entries of the fitted gain lie inside the 95 % "
+        "intervals of a regression of the recorded commands on the states."
+    )
+    caption = (
+        "The regression takes samples inside the limit. Noise in recorded states biases it; a "
+        "wrong body model or limit biases the fit. Where the two differ by much, one of these is "
+        "present."
+    )
+    folded = "Regression of the commands"
+    return [Finding("command_regression", table, caption, [said], folded=folded)]
+
+
+def trajectory_finding(result: FitResult) -> Finding:
+    """A row a sample of the trials of the page, recorded and modelled, in shown units."""
+    names = {index: trial_name(result, index) for index in shown_trials(result)}
+    runs = {"simulated": result.inverse_mpc.runs}
+    table = trajectory_table(result.fitted.problem, names, runs)
+    return Finding("trajectories", table, "Recorded and modelled signals, a row a sample.")
+
+
+def response_findings(result: FitResult) -> list[Finding]:
+    """The frequency response in numbers."""
+    found, plant = result.response, result.given.plant
+    if found is None:
+        return []
+    drive, rows = shown_unit(plant, found.signal)[0], []
+    for column, name in enumerate(plant.outputs):
+        factor = shown_unit(plant, name)[0] / drive
+        for k, frequency in enumerate(found.frequencies):
+            rows.append(
+                (float(frequency), signal_name(plant, name),
+                 factor * float(found.recorded[k, column]),
+                 factor * float(found.modelled[k, column]),
+                 float(found.recorded_phase[k, column]), float(found.modelled_phase[k, column]),
+                 float(found.coherence[k, column]))
+            )  # fmt: skip
+    heads = ["frequency_hz", "output", "magnitude_recorded", "magnitude_model",
+             "phase_recorded_deg", "phase_model_deg", "coherence"]  # fmt: skip
+    table = pd.DataFrame(rows, columns=heads)
+    return [Finding("frequency_response", table, "From the perturbation to the movement.")]
+
+
+def weight_findings(result: FitResult) -> list[Finding]:
+    """Comparisons of cost, cost weights with ranges, and the reported weights."""
+    summary, plant = result.uncertainty.weights, result.given.plant
+    if summary is None:
+        return [weight_finding(result)]
+    table = table_of(
+        sorted(summary.statements, key=lambda item: (not item.made, item.holds is None)),
+        {
+            "comparison": lambda item: statement_text(plant, item),
+            "verdict": _verdict,
+            "other_gains_that_agree_percent": lambda item: (
+                np.nan if item.confidence is None else 100 * float(item.confidence)
+            ),
+            "low": lambda item: float(item.low),
+            "high": lambda item: float(item.high),
+        },
+    )
+    caption = (
+        "Low and high: the difference in cost, or the cross weight, over the cost of the state "
+        f"named first, at typical sizes, over all weights with the fitted gain. {summary.drawn} "
+        "other gains were tried; a comparison is decided if all of them but one at most agree."
+    )
+    found = [Finding("statements", table, caption)]
+    if summary.cost_weights:
+        table = table_of(
+            summary.cost_weights,
+            {
+                "state": lambda item: signal_name(plant, item.state),
+                "low_fitted_gain": lambda item: float(item.low),
+                "high_fitted_gain": lambda item: float(item.high),
+                "low": lambda item: float(item.low_drawn),
+                "high": lambda item: float(item.high_drawn),
+            },
+        )
+        caption = (
+            "What a typical excursion costs over all weights, at R = 1: with the fitted gain, and "
+            "(95 %) with it or any other that the recordings allow."
+        )
+        found.append(Finding("cost_weights", table, caption))
+    return [*found, weight_finding(result)]
+
+
+def _verdict(item: Statement) -> str:
+    if item.holds is None:
+        return "undecided: weights with the fitted gain differ"
+    return "decided" if item.made else "undecided: other gains differ"
+
+
+def weight_finding(result: FitResult) -> Finding:
+    """Entries of the reported weights, with their ranges where they were computed."""
+    plant, weights = result.given.plant, result.intent.reported.weights
+    summary = result.uncertainty.weights
+    # At trace R = m: with one command the scale of the entries.
+    ranged = summary.entries if summary is not None and plant.m == 1 else ()
+    ranges = {frozenset((item.first, item.second)): (item.low, item.high) for item in ranged}
+    none = (np.nan, np.nan)
+    rows = [
+        (*entry, *(ranges.get(frozenset(entry[1:3]), none) if entry[0] == "Q" else none))
+        for entry in weight_entries(plant, weights)
+    ]
+    heads = ["matrix", "first", "second", "unit", "value", "low", "high"]
+    caption = (
+        f"Cost weights at R = 1, set by convention ({result.intent.reported.rule}). Low and high: "
+        "over all weights with this gain."
+    )
+    return Finding("weights", pd.DataFrame(rows, columns=heads), caption)
+
+
+def reading_finding(result: FitResult) -> Finding:
+    """Weights with the fitted gain by several conventions."""
+    plant, found = result.fitted.problem.plant, result.intent
+    names = tuple(signal_name(plant, state) for state in plant.states)
+    table = table_of(
+        found.readings,
+        {
+            "convention": lambda item: item.rule,
+            "largest_eigenvalue": lambda item: float(item.eigenvalues[-1]),
+            "costliest_combination": lambda item: direction_name(item.dominant, names),
+            "turned_by_degrees": lambda item: float(item.angle),
+            "condition_number": lambda item: float(item.condition),
+        },
+    )
+    caption = (
+        "Weights with exactly the same gain, so with the same movement, by several conventions. "
+        f"The costliest combination depends on the convention: others turn it by up to "
+        f"{result.widest_angle:.0f} degrees."
+    )
+    said = [f"Not available: {line}" for line in found.missing]
+    return Finding("readings", table, caption, said, digits=3)

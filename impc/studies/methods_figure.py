@@ -1,0 +1,145 @@
+"""Methods beside each other: what they leave unexplained, and the largest command they need."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+
+from impc.assess.assessments import ASSESSMENTS
+from impc.reporting.shown_units import shown_unit, signal_name
+from impc.reporting.style import (
+    BLUE,
+    FORBIDDEN,
+    INK,
+    MUTED,
+    PAPER,
+    PHONE,
+    RULE,
+    VERMILLION,
+    WIDE,
+    new_figure,
+)
+from impc.studies.methods_table import method_label
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from impc.arrays import Array
+    from impc.assess.assessments import MethodFit
+
+# Percent that exact recordings leave, and less; the farthest command that is drawn, in limits.
+_ROUNDING, _FARTHEST = 1e-6, 5.0
+_MARKERS = ("o", "s", "^", "D", "v")
+
+
+def explained(fit: MethodFit) -> Array:
+    """VAF of each output on left-out trials, of all where none was (p,), %."""
+    return ASSESSMENTS["held_out_vaf"].find(fit) if len(fit.held_out) else fit.vaf
+
+
+def unexplained(fit: MethodFit) -> float:
+    """Variance that it leaves, mean over the outputs, %."""
+    return max(100.0 - float(np.mean(explained(fit))), 1e-9)
+
+
+def first_fall(fit: MethodFit) -> float | None:
+    """When the simulation of a method first leaves every reasonable range, s."""
+    return min((time for time in fit.fell if time is not None), default=None)
+
+
+def by_score(fits: Sequence[MethodFit]) -> list[MethodFit]:
+    """Methods with a gain, that which explains most first; those that fall are last."""
+
+    def rank(fit: MethodFit) -> tuple[bool, float, bool]:
+        left = float(np.mean(100 - explained(fit)))
+        return np.isnan(left), round(left, 2), fit.name != "inverse_mpc"
+
+    return sorted((fit for fit in fits if fit.estimate.K is not None), key=rank)
+
+
+def largest_commands(fit: MethodFit) -> tuple[float, float, str]:
+    """Largest command, its limit (infinite: none) and its label; of several, shares of limits."""
+    plant, bounds = fit.estimate.problem.plant, fit.bounds
+    limits = np.maximum(np.abs(bounds.u_min), np.abs(bounds.u_max))
+    limited = np.isfinite(limits)
+    if plant.m > 1 and np.any(limited):
+        share = float(np.max(100 * fit.largest_input[limited] / limits[limited]))
+        return share, 100.0, "Largest command (% of its limit)"
+    factor, unit = shown_unit(plant, plant.controls[0])
+    label = f"Largest command ({unit})"
+    return factor * float(fit.largest_input[0]), factor * float(limits[0]), label
+
+
+def methods_figure(fits: Sequence[MethodFit], narrow: bool, width: float = WIDE) -> Figure:
+    """A dot an output on a log axis, and bars whose area beyond the limit is shaded."""
+    shown = by_score(fits)
+    height = 0.9 + (0.55 if narrow else 0.42) * len(shown)
+    figure = new_figure(PHONE if narrow else width, 2 * height if narrow else height)
+    shape = (2, 1) if narrow else (1, 2)
+    left, right = figure.subplots(*shape, width_ratios=None if narrow else (1.5, 1))
+    labels = [method_label(fit.name) for fit in shown]
+    for ax in (left, right):
+        ax.set_ylim(len(shown) - 0.4, -0.6)
+        named = ax is left and not narrow
+        ax.set_yticks(range(len(shown)), labels if named else [""] * len(shown))
+        ax.tick_params(axis="y", length=0, labelcolor=INK)
+        for row, label in enumerate(labels if narrow else ()):
+            place = ax.get_yaxis_transform()
+            ax.text(0.01, row - 0.35, label, transform=place, va="center", fontsize=9.5)
+    _unexplained(left, shown)
+    _commands(right, shown, 0.3 if narrow else 0.42)
+    if len(shown[0].estimate.problem.plant.outputs) > 1:
+        figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4)
+    return figure
+
+
+def _colour(fit: MethodFit) -> str:
+    return BLUE if fit.keeps_bounds else MUTED
+
+
+def _unexplained(ax: Axes, fits: Sequence[MethodFit]) -> None:
+    plant = fits[0].estimate.problem.plant
+    left = np.array([np.maximum(100 - explained(fit), _ROUNDING) for fit in fits])
+    ax.set_xscale("log")
+    ax.hlines(range(len(fits)), left.min(axis=1), left.max(axis=1), color=RULE, zorder=0)
+    for place, (name, marker) in enumerate(zip(plant.outputs, itertools.cycle(_MARKERS))):
+        for row, fit in enumerate(fits):
+            ax.plot(left[row, place], row, marker, color=_colour(fit), markersize=7)
+        ax.plot([], [], marker, color=MUTED, label=signal_name(plant, name))
+    for row, fit in enumerate(fits):
+        fell = first_fall(fit)
+        missing = "no prediction" if np.any(np.isnan(left[row])) else ""
+        text = missing if fell is None else f"fell at {fell:.1f} s"
+        ax.text(0.02, row, text, transform=ax.get_yaxis_transform(), va="center", color=MUTED)
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.set_title("Variance not explained (%)", pad=18)
+
+
+def _commands(ax: Axes, fits: Sequence[MethodFit], thick: float) -> None:
+    rows = [largest_commands(fit) for fit in fits]
+    limit, label = rows[0][1:]
+    sizes = {k: row[0] for k, row in enumerate(rows) if first_fall(fits[k]) is None}
+    end = 1.2 * max([*sizes.values(), limit if np.isfinite(limit) else 0.0, 1e-12])
+    if np.isfinite(limit):
+        end = min(end, _FARTHEST * limit)
+        ax.axvspan(limit, end, color=FORBIDDEN, linewidth=0, zorder=0)
+        ax.axvline(limit, color=VERMILLION, linewidth=1, linestyle="--")
+        ax.text(limit, -0.55, " beyond the limit", color=VERMILLION, va="bottom", fontsize=10)
+    for row, size in sizes.items():
+        ax.barh(row, min(size, end), thick, color=_colour(fits[row]), linewidth=0)
+        inside = size > 0.85 * end
+        ax.annotate(
+            f"{size:.3g}", (min(size, end), row), (-5 if inside else 5, 0),
+            textcoords="offset points", va="center", ha="right" if inside else "left",
+            color=PAPER if inside else INK,
+        )  # fmt: skip
+    ax.set_xlim(0, end)
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.set_title(label, pad=18)

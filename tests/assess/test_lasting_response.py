@@ -1,0 +1,57 @@
+"""What a lasting tilt ends up with, against a simulation that waits."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+
+import impc
+from impc.assess.lasting_response import follows_command, lasting_responses
+from impc.assess.printed_gain import gain_estimate
+from impc.checking import replace
+from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import Problem
+from plants import seated_balance_for
+
+
+def test_states_of_nerves_and_muscles_are_found() -> None:
+    plant = impc.Plant(seated_balance_for(mass=70.0, height=1.7), ["command"])
+    inner = dict(zip(plant.states, follows_command(plant), strict=True))
+    assert [name for name, own in inner.items() if own] == [
+        *(f"delay_{k}" for k in range(1, 6)), "muscle_torque"
+    ]  # fmt: skip
+
+
+def test_the_command_settles_at_it() -> None:
+    """With the body held at a tilt of one, delay and muscle driven until nothing changes."""
+    A = [[1.0, 0.1, 0.0], [0.2, 0.9, 0.1], [0.0, 0.0, 0.7]]
+    system = control.ss(
+        A, [[0, 0], [0, 0.1], [0.4, 0]], [[1, 0, 0]], 0, 0.1,
+        states=["tilt", "rate", "muscle"], inputs=["u", "push"], outputs=["angle"],
+    )  # fmt: skip
+    plant = impc.Plant(system, ["u"])
+    bounds = impc.Bounds(plant, u_min=-9, u_max=9)
+    law = impc.Controller(plant, impc.Weights(np.diag([4.0, 1.0, 0.1]), 1), bounds, 8)
+    rng = np.random.default_rng(1)
+    push = 0.5 * np.repeat(rng.standard_normal(80), 5)
+    y = law.simulate([0, 0, 0], disturbance=push).outputs[:-1]
+    trial = impc.Recording(plant, y + 1e-3 * rng.standard_normal(y.shape), push)
+    problem = Problem(plant, bounds, 8, [trial], unknown_start=True)
+    estimate = gain_estimate(fit_controller(problem))
+    (found,) = lasting_responses(estimate)
+    K, muscle, u = np.array(estimate.K)[0], 0.0, 0.0
+    for _ in range(500):
+        u = -K[0] - K[2] * muscle
+        muscle = 0.7 * muscle + 0.4 * u
+    np.testing.assert_allclose(found.value, -u, rtol=1e-9)
+    # The interval is that of the linearised value.
+    slopes = []
+    for k in range(3):
+        ends = []
+        for sign in (-1, 1):
+            moved = K.copy()
+            moved[k] += sign * 1e-6
+            ends.append(lasting_responses(replace(estimate, K=moved[None]))[0].value)
+        slopes.append((ends[1] - ends[0]) / 2e-6)
+    (error,), _ = estimate.covariance.combinations(np.array([slopes]))
+    np.testing.assert_allclose((found.high - found.low) / 2, 1.96 * error, rtol=1e-3)
