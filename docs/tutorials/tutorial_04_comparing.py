@@ -18,7 +18,7 @@ terminal(
 # share of samples at which its explanation needs more than the person had. Only inverse MPC
 # explains the angle and keeps the limit; with the limit cut off afterwards, the gains of the
 # others let the stick fall (**falls**).
-show("compare/comparison.png")
+show("compare/figures/comparison.svg")
 
 # %%
 # :doc:`/comparing` says where each method breaks; :doc:`/what-may-be-concluded` what its weights

@@ -38,4 +38,4 @@ terminal("impc cohort cohort-data/study.toml --out cohort")
 # Differences between the groups are tested with the Holm correction over all measures; with two
 # subjects a group nothing can be significant, and the page says so.
 terminal("cat cohort/comparisons.csv")
-show("cohort/groups.png")
+show("cohort/figures/people.svg")

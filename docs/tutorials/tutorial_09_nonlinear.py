@@ -126,8 +126,7 @@ weight = { start = 15.0 }
 # **The fit.** The module that ``--plant`` names is imported and its function called, because it
 # is named here; nothing in the files can ask for that.
 terminal("impc fit swing.csv --plant swing:swing_up --config swing.toml --out swing-fit")
-show("swing-fit/trajectories-1.png")
-show("swing-fit/parameters.png")
+show("swing-fit/figures/movement.svg")
 
 # %%
 # The intervals, beside the parameters that made the recording:

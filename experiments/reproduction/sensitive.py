@@ -93,7 +93,7 @@ def _tables(
     first = ", ".join(
         model.names[index] for index in largest_subsets([information.F], 0.05).subsets[0]
     )
-    sizes = list(table(select, "sweep")["size_all_at_once"])
+    sizes = [len(item["subsets"][0]) if item["subsets"] else 0 for item in select["subsets"]]
     return [
         Entry(
             "Table 4.1",

@@ -119,7 +119,7 @@ def test_a_tracked_target_with_all_of_it(
     assert aim["observer_rate"]["wind"] == pytest.approx(RATE, rel=0.05)
     assert aim["offsets"]["x"] == pytest.approx([OFFSET], abs=0.002)
     table = found["findings"]["command_regression"]["table"]
-    assert table["number"] == ["gain of x", "gain of v"]
+    assert table["number"] == ["x", "v"]
     assert table["regression"] == pytest.approx(law.K[0], rel=0.02)
     assert found["findings"]["offsets"]["table"]["unit"] == ["m"]
     assert found["trials"][0]["missing"] == 17
