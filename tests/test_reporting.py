@@ -135,7 +135,7 @@ def every_block() -> Report:
             [EVIL],
             level=Level.RED,
         ),
-        Picture("one", EVIL, EVIL),
+        Picture(EVIL, EVIL, EVIL),
         Chart(EVIL, {EVIL: f"</script>{EVIL}"}),
         Quiet(EVIL),
         Checks([Check(Level.GREEN, EVIL, EVIL)]),
@@ -150,7 +150,7 @@ def every_block() -> Report:
         [Section(EVIL, blocks, contents="In short"), Section("2", ())],
         [EVIL],
         keys=[Key(EVIL, EVIL, EVIL, EVIL)],
-        figures={"one": hostile},
+        figures={EVIL: hostile},
         copy=Copy(EVIL, EVIL),
         data={"a": np.array([1.0, np.nan])},
     )
@@ -179,14 +179,14 @@ def test_a_drawing_follows_the_page_and_stands_alone() -> None:
     """Its colours are variables on the page, and colours in the file; the same bytes each time."""
     report = every_block()
     page, files = report.page(), report.files(pdf=True)
-    svg = files["figures/one.svg"].decode()
+    svg = files[f"figures/{EVIL}.svg"].decode()
     assert "var(--ink)" in page
     assert "#1b2229" not in page.partition("<main")[2]
     assert "#1b2229" in svg
     assert "$x^2$" in svg  # no mathematics
-    assert files["figures/one.pdf"].startswith(b"%PDF")
-    assert report.files()["figures/one.svg"] == files["figures/one.svg"]
-    assert "figures/one.pdf" not in report.files()
+    assert files[f"figures/{EVIL}.pdf"].startswith(b"%PDF")
+    assert report.files()[f"figures/{EVIL}.svg"] == files[f"figures/{EVIL}.svg"]
+    assert f"figures/{EVIL}.pdf" not in report.files()
 
 
 def test_terms_are_explained_once() -> None:
@@ -206,7 +206,7 @@ def test_terms_are_explained_once() -> None:
 def test_a_report_is_its_files() -> None:
     files = every_block().files()
     assert list(files) == ["report.html", "result.json", "numbers.csv", "tables.xlsx",
-                           "figures/one.svg"]  # fmt: skip
+                           f"figures/{EVIL}.svg"]  # fmt: skip
     found = json.loads(files["result.json"])
     own = every_block().provenance.data()
     assert list(found) == ["schema", *own, "verdict", "a", "findings"]

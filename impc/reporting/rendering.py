@@ -45,6 +45,7 @@ def render_page(report: Report, charts: bool) -> str:
     glossary = Glossary()
     environment.filters["prose"] = lambda text: _unbroken(glossary.marked(text))
     environment.filters["unbroken"] = _unbroken
+    environment.filters["name"] = _name
     environment.globals["icon"] = lambda level: Markup(
         '<svg viewBox="0 0 16 16" aria-hidden="true">{}</svg>'
     ).format(Markup(_ICONS[level.value]))
@@ -59,6 +60,12 @@ def _unbroken(text: str) -> Markup:
     parts = re.split(r"(<[^>]*>)", str(escape(text)))
     kept = [part if part.startswith("<") else _KEPT.sub(_joined, part) for part in parts]
     return Markup("".join(kept))  # of escaped text: nothing but spaces is another
+
+
+def _name(text: str) -> Markup:
+    """What a row of a table is called; names as programs write them stand as code."""
+    coded = re.fullmatch(r"[A-Za-z]\w*_[\w.]+", text)
+    return Markup("<code>{}</code>").format(text) if coded else _unbroken(text)
 
 
 def _joined(found: re.Match[str]) -> str:

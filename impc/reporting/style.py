@@ -125,6 +125,7 @@ def written(draw: Callable[[bool], Figure], kind: str) -> bytes:
 
 def inline(draw: Callable[[bool], Figure], name: str, title: str, *, phone: bool) -> Markup:
     """The drawing within a page; where a `phone` has one of its own, both, and the page chooses."""
+    name = re.sub(r"\W+", "-", name)  # in ids of the page
     with page_style():
         parts = [_svg(draw(False), f"{name}-w", title, "w" if phone else "")]
         if phone:

@@ -123,11 +123,11 @@ def test_a_tracked_target_with_all_of_it(
     assert table["regression"] == pytest.approx(law.K[0], rel=0.02)
     assert found["findings"]["offsets"]["table"]["unit"] == ["m"]
     assert found["trials"][0]["missing"] == 17
-    page = Path("out/report.html").read_text()
-    assert "It regulates to the target of x; it takes wind for lasting and learns it at 1." in page
+    page = Path("out/report.html").read_text().replace("\u00a0", " ")
+    assert "regulates to the target of x; it takes the wind for lasting and learns it at 1." in page
     assert "(fitted, 95 %: 1." in page
-    assert "x has an offset in each trial, 0.0" in page
-    assert "recorded commands (push) count beside the outputs." in page
+    assert "the x has an offset in each trial, 0.0" in page
+    assert "recorded commands (push) are fitted in addition to the outputs." in page
     assert "17 of 151 samples are missing or not finite" in page
     assert "11 % count as not measured" in page
 

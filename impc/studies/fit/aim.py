@@ -8,7 +8,7 @@ import numpy as np
 
 from impc.model.foresight import physical_disturbances
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit
+from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.asked import OBSERVER
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ def aim_sentences(result: FitResult) -> list[str]:
     said = []
     if aim["targets"]:
         ahead = f", known {plant.ahead * plant.dt:.3g} s ahead" if plant.ahead else ""
-        said.append(f"it regulates to the target of {' and '.join(aim['targets'])}{ahead}")
+        targets = " and ".join(signal_name(plant, name) for name in aim["targets"])
+        said.append(f"the controller regulates to the target of {targets}{ahead}")
     for name, rate in aim["observer_rate"].items():
         how = "knows it at once"
         if np.isfinite(rate):
@@ -53,14 +54,14 @@ def aim_sentences(result: FitResult) -> list[str]:
                 else ""
             )
             how = f"learns it at {number(rate, 3)} 1/s{between}"
-        said.append(f"it takes {name} for lasting and {how}")
+        said.append(f"it takes the {signal_name(plant, name)} for lasting and {how}")
     for name, values in aim["offsets"].items():
         factor, unit = shown_unit(plant, name)
         low, high = factor * min(values), factor * max(values)
-        said.append(
-            f"{name} has an offset in each trial, {number(low, 3)} to {number(high, 3)} {unit}"
-        )
+        words = f"{number(low, 3)} to {number(high, 3)} {unit}"
+        said.append(f"the {signal_name(plant, name)} has an offset in each trial, {words}")
     if aim["commands"]:
-        said.append(f"recorded commands ({', '.join(aim['commands'])}) count beside the outputs")
+        names = ", ".join(signal_name(plant, name) for name in aim["commands"])
+        said.append(f"recorded commands ({names}) are fitted in addition to the outputs")
     text = "; ".join(said)
     return [f"{text[0].upper()}{text[1:]}."] if said else []

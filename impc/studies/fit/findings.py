@@ -453,7 +453,13 @@ def weight_finding(result: FitResult) -> Finding:
         f"Cost weights at R = 1, set by convention ({result.intent.reported.rule}). Low and high: "
         "over all weights with this gain."
     )
-    return Finding("weights", pd.DataFrame(rows, columns=heads), caption)
+    table = pd.DataFrame(rows, columns=heads)
+    pairs = zip(table["first"], table["second"], strict=True)
+    words = [
+        " with ".join(dict.fromkeys(signal_name(plant, one) for one in pair)) for pair in pairs
+    ]
+    table.insert(1, "entry", words)
+    return Finding("weights", table, caption, hidden=("first", "second"))
 
 
 def reading_finding(result: FitResult) -> Finding:

@@ -180,8 +180,8 @@ def _draws(result: FitResult, window: int) -> dict[str, Draw]:
         "methods": functools.partial(methods_figure, result.methods[::-1]),
         "residuals": functools.partial(figures.residual_figure, result),
     }
-    for curve in result.curves:
-        found[f"limit-{curve.control}"] = functools.partial(figures.limit_figure, result, curve)
+    for place, curve in enumerate(result.curves):
+        found[f"limit-{place + 1}"] = functools.partial(figures.limit_figure, result, curve)
     if result.response is not None:
         response = functools.partial(figures.frequency_figure, result, result.response)
         found["frequency-response"] = response
@@ -219,6 +219,7 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
     ]
     if hidden:
         return [
+            *aim_sentences(result),
             Quiet(f"{_HIDDEN} Numbers are kept under details for troubleshooting."),
             Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
         ]
@@ -232,6 +233,7 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
     return [
         "Gain is the command against a deviation, as long as the limit is not reached."
         f"{lasting} {body_sentence_of(result)}",
+        *aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
         findings.per_unit_finding(result),
         Fold("All gains in SI units, combinations and parameters", tables),
@@ -285,11 +287,11 @@ def _limit(result: FitResult, doubtful: bool) -> list[Block]:
 def _limit_pictures(result: FitResult) -> list[Block]:
     return [
         Picture(
-            f"limit-{curve.control}",
-            f"Variance not explained against the limit of {curve.control} in the fit",
+            f"limit-{place + 1}",
+            "Variance not explained against the limit of the command in the fit",
             "Limit curve: each point is a fit of its own with that limit. The lowest fits best.",
         )
-        for curve in result.curves
+        for place in range(len(result.curves))
     ]
 
 

@@ -78,7 +78,7 @@ def structure_draw(result: FitResult) -> Draw:
     found = result.structures[0]
     ends = np.exp([[item.low, item.high] for item in found.intervals])
     values = np.exp([item.value for item in found.intervals])
-    axis = "Cost weight over that of the first input (SI)"
+    axis = "Cost weight, first input 1 (SI)"
     names = list(_names(result, found.structure.unknowns))
     return functools.partial(interval_figure, names, ends, values, axis)
 

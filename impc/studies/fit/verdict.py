@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Explained variance (%) below which much is left, and p of a residual that is no recorder's.
 _MUCH, _COLOURED = 90.0, 1e-3
+# Recorded numbers below which a left-out trial says little.
+_SHORT = 200
 #: What a kind may forbid.
 GAIN, WEIGHTS, SHARE = "gain", "weights", "share"
 
@@ -153,8 +155,9 @@ def _little(result: FitResult) -> Kind | None:
         return None
     if result.weights_test.rejected and result.gain_vaf > LITTLE:
         return None  # the gain explains it, and its nearest weights do not
-    if result.usable and _weak(result) is not None:
-        return None  # what is not known cannot predict
+    short = result.given.recorded_numbers < _SHORT
+    if result.usable and short and _weak(result) is not None:
+        return None  # what is hardly known predicts a few samples badly, whatever moved
     shares = shares if result.usable else result.inverse_mpc.vaf
     said = " and ".join(
         f"{value:.0f} % of the {signal_name(result.given.plant, name)}"
