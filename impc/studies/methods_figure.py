@@ -15,7 +15,6 @@ from impc.reporting.style import (
     FORBIDDEN,
     INK,
     MUTED,
-    PAPER,
     PHONE,
     RULE,
     VERMILLION,
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
 
-# Percent that exact recordings leave, and less; the farthest command that is drawn, in limits.
-_ROUNDING, _FARTHEST = 1e-6, 5.0
+# Percent that exact recordings leave, and less.
+_ROUNDING = 1e-6
 _MARKERS = ("o", "s", "^", "D", "v")
 
 
@@ -128,18 +127,12 @@ def _commands(ax: Axes, fits: Sequence[MethodFit], thick: float) -> None:
     sizes = {k: row[0] for k, row in enumerate(rows) if first_fall(fits[k]) is None}
     end = 1.2 * max([*sizes.values(), limit if np.isfinite(limit) else 0.0, 1e-12])
     if np.isfinite(limit):
-        end = min(end, _FARTHEST * limit)
         ax.axvspan(limit, end, color=FORBIDDEN, linewidth=0, zorder=0)
         ax.axvline(limit, color=VERMILLION, linewidth=1, linestyle="--")
         ax.text(limit, -0.55, " beyond the limit", color=VERMILLION, va="bottom", fontsize=10)
     for row, size in sizes.items():
-        ax.barh(row, min(size, end), thick, color=_colour(fits[row]), linewidth=0)
-        inside = size > 0.85 * end
-        ax.annotate(
-            f"{size:.3g}", (min(size, end), row), (-5 if inside else 5, 0),
-            textcoords="offset points", va="center", ha="right" if inside else "left",
-            color=PAPER if inside else INK,
-        )  # fmt: skip
+        ax.barh(row, size, thick, color=_colour(fits[row]), linewidth=0)
+        ax.annotate(f"{size:.3g}", (size, row), (5, 0), textcoords="offset points", va="center")
     ax.set_xlim(0, end)
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.set_title(label, pad=18)

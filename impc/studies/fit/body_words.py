@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
 from impc.assess.lack_of_fit import (
     DELAY,
@@ -56,18 +57,19 @@ def body_sentence_of(result: FitResult) -> str:
     )
 
 
-def parameter_words(result: FitResult) -> str:
+def parameter_words(result: FitResult) -> Markup:
     """Which parameters cause the uncertainty of the gain, and which only a measurement improves."""
     stated = _stated(result)
     parts = sorted(stated, key=lambda item: -item.share)
     named = [f"{item.name} {100 * item.share:.0f} %" for item in parts if item.share > _NAMED]
     as_before = [item.name for item in stated if item.learned > _AS_BEFORE]
-    said = ""
+    said, code = [], Markup("<code>{}</code>")
     if named:
-        said += f" Of the variance of the gain these cause: {', '.join(named)}."
+        said.append(f"Of the variance of the gain these cause: {code.format(', '.join(named))}.")
     if as_before:
-        said += f" The recordings add nothing on {', '.join(as_before)}: they can only be measured."
-    return said
+        names = code.format(", ".join(as_before))
+        said.append(f"The recordings add nothing on {names}: they can only be measured.")
+    return Markup(" ").join(map(Markup, said))
 
 
 def _stated(result: FitResult) -> list[FittedParameter]:

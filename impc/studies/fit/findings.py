@@ -16,7 +16,6 @@ from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.aim import aim_data
-from impc.studies.fit.body_words import parameter_words
 from impc.studies.fit.facts import gain_rows, named_gains, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.methods_table import trajectory_table, weight_entries
@@ -169,7 +168,6 @@ def parameter_findings(result: FitResult) -> list[Finding]:
         "Physical parameters fitted with the gain, in SI units. One with a stated deviation keeps "
         "to its nominal value as far as that says; its share is by how much the variance of the "
         "gain would fall if it were measured exactly. One without is free."
-        f"{parameter_words(result)}"
     )
     return [Finding("parameters", table, caption)]
 

@@ -32,7 +32,12 @@ from impc.reporting.verdict import Key, Verdict
 from impc.studies.charts import trajectories
 from impc.studies.fit import figures, findings
 from impc.studies.fit.aim import aim_sentences
-from impc.studies.fit.body_words import added_sentence, body_sentence_of, lack_finding
+from impc.studies.fit.body_words import (
+    added_sentence,
+    body_sentence_of,
+    lack_finding,
+    parameter_words,
+)
 from impc.studies.fit.data import fit_data
 from impc.studies.fit.facts import (
     amount,
@@ -123,8 +128,8 @@ def _hero(result: FitResult, index: int) -> Picture:
     return Picture(
         "movement",
         f"Recorded and modelled outputs, and the command within its limit, in {name}",
-        f"{name}, 10 s of it. Grey: recorded; blue: model{limit}. Recording and model differ by "
-        f"{said} (RMS, {signal_name(plant, plant.outputs[0])}).",
+        f"{name}, some seconds of it. Grey: recorded; blue: model{limit}. Over all of it they "
+        f"differ by {said} (RMS, {signal_name(plant, plant.outputs[0])}).",
     )
 
 
@@ -236,7 +241,10 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
         *aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
         findings.per_unit_finding(result),
-        Fold("All gains in SI units, combinations and parameters", tables),
+        Fold(
+            "All gains in SI units, combinations and parameters",
+            [*tables, *filter(None, [parameter_words(result)])],
+        ),
         *findings.command_findings(result),
         *findings.offset_findings(result),
     ]
@@ -472,7 +480,7 @@ def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy |
     methods = (
         f"{' and '.join(names).capitalize()} from {len(trials)} trials ({seconds:.3g} s in all) "
         f"were analysed by inverse model predictive control (impc {version}). The body model was "
-        f"{provenance.plant_name}{_arguments(provenance)}. The controller predicted "
+        f"{_model_name(provenance)}{_arguments(provenance)}. The controller predicted "
         f"{problem.horizon * dt:.3g} s ahead at {1 / dt:.3g} samples per second, {bounded}. "
         f"{' '.join(aim_sentences(result))}{' ' if aim_sentences(result) else ''}"
         "The feedback gain was estimated by minimising the difference between recorded and "
@@ -504,6 +512,12 @@ def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy |
         results.append(f"For all cost weights compatible with the recordings: {' '.join(made)}")
     results += structure_sentences(result)[:1]
     return Copy(methods, " ".join(results))
+
+
+def _model_name(provenance: Provenance) -> str:
+    """The function or file of the plant, in words."""
+    name = provenance.plant_name.rpartition(":")[2].removesuffix("_for").replace("_", " ")
+    return f"“{name}”" if name else "that of the program"
 
 
 def _arguments(provenance: Provenance) -> str:
