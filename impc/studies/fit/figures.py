@@ -261,7 +261,7 @@ def interval_figure(
     labels: list[str], ends: Array, values: Array, axis: str, narrow: bool
 ) -> Figure:
     """Rows with a value and an interval (rows, 2) each on a logarithmic axis; arrows go on."""
-    figure = new_figure(PHONE if narrow else HALF, 0.9 + 0.32 * len(labels))
+    figure = new_figure(PHONE if narrow else WIDE, 0.9 + 0.32 * len(labels))
     ax = figure.subplots()
     finite = np.append(ends[np.isfinite(ends) & (ends > 0)], values[np.isfinite(values)])
     left, right = float(np.min(finite)) / 3, float(np.max(finite)) * 3
