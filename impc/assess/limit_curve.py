@@ -33,6 +33,21 @@ class LimitCurve(Frozen):
     limits: Array  # In the unit of the control (t,), ascending
     unexplained: Array  # 100 - VAF, % (t, p); NaN where no gain was found
 
+    @property
+    def left(self) -> Array:
+        """Unexplained of all outputs (t,); infinite where no gain was found."""
+        return np.asarray(np.nan_to_num(self.unexplained, nan=np.inf).sum(axis=1))
+
+    @property
+    def best(self) -> int:
+        """Place of the limit that leaves least."""
+        return int(np.argmin(self.left))
+
+    @property
+    def own(self) -> int:
+        """Place of the limit of the fit."""
+        return int(np.argmin(np.abs(self.limits - self.given)))
+
 
 def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
     """Around the limit of a fit, where the command reaches it; None where it does not."""

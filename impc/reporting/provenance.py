@@ -59,10 +59,21 @@ class Provenance:
     @property
     def terms(self) -> list[tuple[str, str]]:
         """For the last section of a page; what is not known is left out."""
-        command = Markup("<code>{}</code>").format(self.command) if self.command else ""
-        found = [("Recordings", ", ".join(self.files)), ("Command", command)]
-        found += [("Created", self.made), ("Versions", self.all_versions)]
+        code = Markup("<code>{}</code>")
+        found = [("Recordings", ", ".join(self.files))]
+        found += [("Command", self.command and code.format(self.command))]
+        found += [("Plant", self.plant_name and code.format(self.plant_name + self.arguments))]
+        found += [("Created", self.made), ("Software", self.all_versions)]
+        if self.inputs is not None:
+            seal = f"{self.inputs.digest[:16]} (SHA-256 of all inputs; in full in result.json)"
+            found.append(("Fingerprint", seal))
         return [(name, text) for name, text in found if text]
+
+    @property
+    def arguments(self) -> str:
+        """What the plant was made with, in brackets."""
+        given = ", ".join(f"{name} {value}" for name, value in self.plant_arguments.items())
+        return f" ({given})" if given else ""
 
     @property
     def all_versions(self) -> str:

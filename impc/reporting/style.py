@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from contextlib import contextmanager
-from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -80,19 +79,6 @@ _RC: dict[Any, Any] = {
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
 }
-
-
-@dataclass(frozen=True)
-class Mark:
-    """How one signal is drawn, in the words of matplotlib."""
-
-    color: str  # Such as "#0a5ca8"
-    marker: str  # Empty for none
-    line: str  # Its style, such as "--"
-
-
-#: Of the first state and of the second.
-STATE_MARKS = (Mark(BLUE, "o", "-"), Mark(VERMILLION, "s", "--"))
 
 
 @contextmanager

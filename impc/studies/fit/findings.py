@@ -104,8 +104,8 @@ def gain_finding(result: FitResult, truth: Array | None = None) -> Finding:
         "gain",
         pd.DataFrame(rows),
         f"The gain K of u = -K x with {level:.0f} % intervals, which allow for autocorrelated "
-        "residuals. An entry that is not identified can only be told apart from others in "
-        f"combinations.{exact_words} The gain of the weights is that of the reported cost weights.",
+        "residuals. Of an entry that is not identified only combinations with others are "
+        f"determined.{exact_words} The gain of the weights is that of the reported cost weights.",
         hidden=("gain_of_the_weights",),
         labels={"number": "Gain on"},
     )

@@ -76,7 +76,6 @@ from impc.studies.methods_table import methods_finding
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.assess.limit_curve import LimitCurve
     from impc.studies.fit.result import FitResult
 
 _HIDDEN = "Not shown as a result, because of the warning above."
@@ -409,8 +408,7 @@ def _limit_check(result: FitResult) -> list[Check]:
     if not result.met:
         return [Check(Level.NOTE, "Limit", "Never reached: nothing can be said about it.")]
     if found is None:
-        best = [_best_limit(curve) for curve in result.curves]
-        if best and all(best):
+        if result.curves and all(curve.best == curve.own for curve in result.curves):
             return [Check(Level.GREEN, "Limit", f"Given as {limit}: of the limit curve the best.")]
         return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not estimated.")]
     said = (
@@ -418,12 +416,6 @@ def _limit_check(result: FitResult) -> list[Check]:
         f"({limit_ends(found)})."
     )
     return [Check(Level.AMBER if found.disagrees else Level.GREEN, "Limit", said)]
-
-
-def _best_limit(curve: LimitCurve) -> bool:
-    """Whether no other limit leaves less unexplained."""
-    left = np.nansum(np.where(np.isnan(curve.unexplained), np.inf, curve.unexplained), axis=1)
-    return bool(np.argmin(left) == np.argmin(np.abs(curve.limits - curve.given)))
 
 
 def _model(result: FitResult) -> Check:
@@ -480,7 +472,7 @@ def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy |
     methods = (
         f"{' and '.join(names).capitalize()} from {len(trials)} trials ({seconds:.3g} s in all) "
         f"were analysed by inverse model predictive control (impc {version}). The body model was "
-        f"{_model_name(provenance)}{_arguments(provenance)}. The controller predicted "
+        f"{_model_name(provenance)}{provenance.arguments}. The controller predicted "
         f"{problem.horizon * dt:.3g} s ahead at {1 / dt:.3g} samples per second, {bounded}. "
         f"{' '.join(aim_sentences(result))}{' ' if aim_sentences(result) else ''}"
         "The feedback gain was estimated by minimising the difference between recorded and "
@@ -520,27 +512,13 @@ def _model_name(provenance: Provenance) -> str:
     return f"“{name}”" if name else "that of the program"
 
 
-def _arguments(provenance: Provenance) -> str:
-    given = ", ".join(f"{name} {value}" for name, value in provenance.plant_arguments.items())
-    return f" ({given})" if given else ""
-
-
 def _made(provenance: Provenance, result: FitResult | None = None, missing: str = "") -> Section:
-    code = Markup("<code>{}</code>")
-    terms = [
-        ("Recordings", ", ".join(provenance.files)),
-        ("Command", code.format(provenance.command)),
-        ("Plant", code.format(f"{provenance.plant_name}{_arguments(provenance)}")),
-        ("Created", f"{provenance.made}" + (f", in {result.seconds:.1f} s" if result else "")),
-        ("Software", provenance.all_versions),
-    ]
-    if provenance.inputs is not None:
-        digest = provenance.inputs.digest[:16]
-        terms.append(("Fingerprint", f"{digest} (SHA-256 of all inputs; in full in result.json)"))
+    terms = list(provenance.terms)
     if missing:
         terms.insert(0, ("Not given", missing.removeprefix("Not given: ")))
     blocks: list[Block] = [Terms(terms)]
     if result is not None:
+        code = Markup("<code>{}</code>")
         settings = [
             (name, code.format(value)) for name, value in plain_settings(result.settings).items()
         ]
@@ -549,6 +527,7 @@ def _made(provenance: Provenance, result: FitResult | None = None, missing: str 
             ("Body", body_sentence(problem.plant)),
             ("Quadratic programs", f"Solved by {described(problem.solver)}."),
             ("Terminal set", _terminal_set(result)),
+            ("Time of the fit", f"{result.seconds:.1f} s"),
         ]
         blocks.append(Fold("All settings", [Terms([*how, *settings])]))
     return Section("Provenance", blocks)

@@ -148,10 +148,9 @@ class FitResult:
                 return self._limit(control, one.nominal, one.value, one.value - half,
                                    one.value + half)  # fmt: skip
         for curve in self.curves:
-            left = np.nan_to_num(curve.unexplained, nan=np.inf).sum(axis=1)
-            best, own = int(np.argmin(left)), int(np.argmin(np.abs(curve.limits - curve.given)))
-            if left[best] < _BETTER * left[own]:
-                around = curve.limits[[max(best - 1, 0), min(best + 1, len(left) - 1)]]
+            best = curve.best
+            if curve.left[best] < _BETTER * curve.left[curve.own]:
+                around = curve.limits[[max(best - 1, 0), min(best + 1, len(curve.limits) - 1)]]
                 found = self._limit(curve.control, curve.given, curve.limits[best], *around)
                 return found._replace(fitted=False)
         return None

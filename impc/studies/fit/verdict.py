@@ -22,6 +22,7 @@ from impc.studies.fit.facts import (
     amount,
     decided,
     given_limit,
+    held_out,
     lasting_or_first,
     left_out_text,
     limit_ends,
@@ -149,8 +150,8 @@ def _explained(result: FitResult) -> tuple[str, str, Alert | None]:
 
 
 def _little(result: FitResult) -> Kind | None:
-    outputs, held = result.given.plant.outputs, result.held_out
-    shares = np.mean([one.vaf for one in held], axis=0) if held else result.inverse_mpc.vaf
+    outputs, held = result.given.plant.outputs, held_out(result)
+    shares = held if held is not None and result.usable else result.inverse_mpc.vaf
     if result.usable and not np.any(shares < LITTLE):
         return None
     if result.weights_test.rejected and result.gain_vaf > LITTLE:
@@ -158,7 +159,6 @@ def _little(result: FitResult) -> Kind | None:
     short = result.given.recorded_numbers < _SHORT
     if result.usable and short and _weak(result) is not None:
         return None  # what is hardly known predicts a few samples badly, whatever moved
-    shares = shares if result.usable else result.inverse_mpc.vaf
     said = " and ".join(
         f"{value:.0f} % of the {signal_name(result.given.plant, name)}"
         if np.isfinite(value)
