@@ -1,1 +1,1 @@
-"""Short scripts, one for each result and each benchmark: they compose the package, no more."""
+"""Studies and benchmarks of the package; README.md lists questions, commands and answers."""

@@ -1,7 +1,4 @@
-"""What proves or restates results of the package, for experiments and tests.
-
-The entries of (3.6), and how far a terminal set is from invariant and from maximal.
-"""
+"""Checks for experiments and tests: Cholesky parameters of Eq. (3.6), terminal sets."""
 
 from __future__ import annotations
 
@@ -18,10 +15,9 @@ if TYPE_CHECKING:
 
 
 def cholesky_parameters(weights: Weights) -> Array:
-    """Lower-triangular entries (k,) of the Cholesky factors of Q and R, row by row: (3.6).
+    """Lower-triangular entries (k,) of the Cholesky factors of Q and R, row by row: Eq. (3.6).
 
-    R is scaled to R[0, 0] = 1 first and its first entry, then always 1, is left out, so that
-    k = n(n+1)/2 + m(m+1)/2 - 1: scale is not one of them.
+    R is scaled to R[0, 0] = 1 and its first entry is omitted: k = n(n+1)/2 + m(m+1)/2 - 1.
     """
     scaled = normalised(weights)
     q_factor, r_factor = np.linalg.cholesky(scaled.Q), np.linalg.cholesky(scaled.R)
@@ -40,23 +36,23 @@ def weights_from_parameters(parameters: Array, n: int, m: int) -> Weights:
 
 
 def invariance_violation(terminal: TerminalSet) -> float:
-    """By how much F leaves the set: the largest support of H F x over the set, less h, over h.
+    """Largest support of H F x over the set, minus h, over h.
 
-    At most about the tolerance when the set is invariant; capped at 1; 0 for a set without rows.
-    With `maximality_violation` it proves the set: invariant and inside the bounds, hence within
-    O; bounded by rows of O only, hence not smaller.
+    At most about the tolerance if the set is invariant; capped at 1; 0 for a set without rows.
+    Together with `maximality_violation` it certifies the set: it is invariant and inside the
+    bounds, hence within O, and bounded by rows of O only, hence not smaller.
     """
     normal = terminal.H / terminal.h[:, None]
     return _excess(terminal, normal @ terminal.F)
 
 
 def maximality_violation(terminal: TerminalSet) -> float:
-    """By how much the set differs from O_k*, relative to the bounds; capped at 1.
+    """Difference of the set from O_k*, relative to the bounds; capped at 1.
 
-    The larger of two numbers. First, the relative distance of the rows from rows (c, k) computed
-    afresh, by powers of F: every trajectory that keeps the bounds obeys those, so the set is not
-    too small. Second, the largest violation, over the set, of any removed row (c, k <= k*): the
-    set is not too large.
+    The larger of two numbers. First, the relative distance of the rows from rows (c, k) recomputed
+    by powers of F: every trajectory that keeps the bounds satisfies these, so the set is not too
+    small. Second, the largest violation over the set of any removed row (c, k <= k*): the set is
+    not too large.
     """
     rows, count = terminal.rows, terminal.determinedness + 1
     normal = (rows.E - rows.F @ terminal.gain) / rows.b[:, None]
@@ -73,7 +69,7 @@ def maximality_violation(terminal: TerminalSet) -> float:
 
 
 def _excess(terminal: TerminalSet, targets: Array) -> float:
-    """Largest support of the normalised target rows (t, n) over the set, less 1."""
+    """Largest support of the normalised target rows (t, n) over the set, minus 1."""
     if not np.any(targets):
         return 0.0
     normal = terminal.H / terminal.h[:, None]

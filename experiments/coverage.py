@@ -1,9 +1,9 @@
-"""What the colour of the residuals does to intervals: how many of 400 hold the true gain.
+"""Coverage of gain intervals with white and with autocorrelated residuals.
 
-A cart on a falling track, |force| <= 1 and at its limit 7 % of the time, pushed at random
-for 75 s; its position is recorded with noise of a fifth of its size, white or first-order (0.9).
-For each recording the gain is fitted and its intervals are taken twice: as if residuals were white
-(Cramér-Rao), and for the colour that they show (sandwich).
+A cart on a falling track, |force| <= 1 and at its limit in 7 % of the samples, is pushed at random
+for 75 s. Its position is recorded with noise of a fifth of its size, white or first-order (0.9).
+Each recording gives two intervals of the gain: for white residuals (Cramér-Rao), and for the
+estimated autocorrelation (sandwich). Results: experiments/coverage.md.
 
     python -m experiments.coverage --recordings 400
 """
@@ -42,14 +42,14 @@ _SETTINGS = FitSettings(horizon=_HORIZON, u_max=1.0)
 
 
 def cart(dt: float = 0.05) -> Plant:
-    """Position and speed on a falling track: a force commands, a push disturbs."""
+    """Cart on a falling track: states position and speed, command force, disturbance push."""
     A, B = [[0.0, 1.0], [0.5, -0.3]], [[0.0, 0.0], [1.0, 1.0]]
     system = control.ss(A, B, [[1.0, 0.0]], 0, inputs=["force", "push"], outputs=["position"])
     return Plant(control.c2d(system, dt), ["force"])
 
 
 def true_controller() -> Controller:
-    """Q = diag(4, 1), R = 1."""
+    """True controller, with Q = diag(4, 1) and R = 1."""
     plant = cart()
     bounds = Bounds(plant, u_min=-1, u_max=1)
     weights = Weights(np.diag([4.0, 1.0]), 1)
@@ -57,7 +57,7 @@ def true_controller() -> Controller:
 
 
 def noisy_trial(seed: int, root: float) -> Recording:
-    """One recording; the noise is first-order with that root and the same size for every root."""
+    """One recording with first-order noise of coefficient `root` and the same size for each."""
     rng, controller = np.random.default_rng(seed), true_controller()
     push = np.repeat(rng.choice([-0.85, 0.0, 0.85], _SAMPLES // 10), 10)
     drive = scenario(controller.plant, np.zeros(2), disturbance=push)
@@ -70,7 +70,7 @@ def noisy_trial(seed: int, root: float) -> Recording:
 
 
 def covered(seed: int, root: float) -> Array:
-    """Error over standard deviation, (2, n): Cramér-Rao, then sandwich."""
+    """Error over standard error, shape (2, n): Cramér-Rao, then sandwich."""
     problem = fit_problem(cart(), [noisy_trial(seed, root)], _SETTINGS)
     fit = fit_gain(problem)
     error = fit.K - true_controller().K
@@ -82,7 +82,7 @@ def covered(seed: int, root: float) -> Array:
 
 
 def main() -> None:
-    """Print the shares of recordings whose interval holds the true entry."""
+    """Print the share of recordings whose interval covers the true entry."""
     parser = argparse.ArgumentParser(description="Coverage of 95 % intervals of the gain.")
     parser.add_argument("--recordings", type=int, default=400)
     count = parser.parse_args().recordings

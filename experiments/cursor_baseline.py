@@ -1,9 +1,9 @@
-"""What inverse MPC has to reach on the cursor recordings: delayed feedback of error and velocity.
+"""Baseline of the cursor experiment: delayed feedback of error and velocity.
 
     c''(t) = -k_1 e(t - tau) - k_2 c'(t - tau),   tau a whole number of samples,
 
-simulated from the target alone, the two gains fitted by least squares for every delay and the delay
-chosen, all on the trials that are not predicted.
+simulated from the target alone. The two gains are fitted by least squares for every delay, and the
+delay is selected, on the trials that are not predicted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _START = np.log([15.0, 6.0])
 
 
 def delayed_feedback(target: Array, gains: Array, delay: int) -> Array:
-    """Cursor (trials, samples) from the target (trials, samples), both from where they start."""
+    """Cursor (trials, samples) from the target (trials, samples), both relative to their start."""
     k1, k2 = gains
     dt = 1 / RATE
     # (1 - z)^2 c + k2 dt z^(d+1) (1 - z) c + k1 dt^2 z^(d+1) c = k1 dt^2 z^(d+1) target
@@ -37,7 +37,7 @@ def delayed_feedback(target: Array, gains: Array, delay: int) -> Array:
 
 
 def fit_delayed_feedback(target: Array, response: Array) -> tuple[Array, int]:
-    """Gains and delay of least squares over all trials given."""
+    """Least-squares gains and delay over all given trials."""
     moved = response - response[:, :1]
     best: tuple[float, Array, int] | None = None
     start = _START

@@ -1,9 +1,9 @@
-"""How far any fixed linear response to the target could go: the ceiling of the cursor experiment.
+"""Upper bound of the cursor experiment: any fixed linear response to the target.
 
     c(t) - c(0) = sum_{j < J} s_j dr(t - j) + s_J (r(t - J) - r(0)),   dr(t) = r(t) - r(t - 1),
 
-a step response free at every sample for 2 s and constant after, by ridge least squares over trials.
-What it misses on a trial left out, no linear controller of the target alone can reach.
+a step response free at every sample for 2 s and constant after, by ridge regression over trials. It
+approximates the best held-out VAF of any linear controller that uses the target alone.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from impc.arrays import Array
 __all__ = ["fit_step_response", "follow"]
 
 _TAPS = 120
-# Share of the largest singular value squared: 120 neighbouring taps are all but alike.
+# Share of the largest squared singular value: neighbouring taps are almost collinear.
 _RIDGE = 1e-6
 
 
 def _regressors(target: Array) -> Array:
-    """(samples, taps + 1): increments at each lag, and all that lies further back."""
+    """Regressors (samples, taps + 1): increments at each lag, and the target before them."""
     moved = target - target[0]
     steps = np.diff(moved, prepend=0.0)
     lagged = np.zeros((target.size, _TAPS + 1))
@@ -31,7 +31,7 @@ def _regressors(target: Array) -> Array:
 
 
 def fit_step_response(target: Array, response: Array) -> Array:
-    """Step response (taps + 1) of trials (trials, samples) of target and cursor, both in px."""
+    """Fit a step response (taps + 1) to target and cursor (trials, samples), px."""
     rows = np.vstack([_regressors(trial) for trial in target])
     moved = np.ravel(response - response[:, :1])
     gram = rows.T @ rows
@@ -40,5 +40,5 @@ def fit_step_response(target: Array, response: Array) -> Array:
 
 
 def follow(target: Array, step_response: Array) -> Array:
-    """Cursor (samples,) from one target (samples,), px from where it starts."""
+    """Cursor (samples,) from one target (samples,), px relative to the start."""
     return np.asarray(_regressors(target) @ step_response)

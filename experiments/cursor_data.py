@@ -1,6 +1,6 @@
 """Recordings of human target tracking (Bonnen et al., Journal of Vision 15(3):14, 2015).
 
-They are not part of the project. The file is looked for beside it, or where IMPC_CURSOR_DATA says.
+The file is not part of the project; IMPC_CURSOR_DATA gives its path.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Condition:
     Attributes
     ----------
     blur : float
-        Width of the target, px.
+        Blur of the target, px.
     target, response : Array
         Positions of target and cursor, px, (trials, samples) at 60 Hz.
     """
@@ -39,7 +39,7 @@ class Condition:
 
 
 def data_file() -> Path:
-    """Where the recordings would be."""
+    """Path of the recordings, which may not exist."""
     beside = Path(__file__).resolve().parents[2] / "shared/data/cursor-tracking/bonnen2015.mat"
     return Path(os.environ.get("IMPC_CURSOR_DATA", beside))
 
@@ -50,7 +50,7 @@ def read_conditions(path: Path) -> list[Condition]:
     Raises
     ------
     DataError
-        When the file is absent or is not that of the recordings.
+        If the file is absent or does not contain the recordings.
     """
     if not path.is_file():
         raise DataError(f"recordings {path.name}", "is not there", "name it in IMPC_CURSOR_DATA")

@@ -1,4 +1,4 @@
-"""The figure of the cursor experiment: trials, VAF by blur, gain and cost weight by blur."""
+"""Figure of the cursor experiment: trials, and VAF, gain and cost weight by blur."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["cursor_figure"]
 
 
 def cursor_figure(results: Sequence[ConditionResult]) -> dict[str, bytes]:
-    """Draw it: ``cursor-tracking.png`` and ``.pdf``."""
+    """Draw ``cursor-tracking.png`` and ``.pdf``."""
     with page_style():
         figure = new_figure(HALF, 5.6)
         axes = figure.subplot_mosaic([["A", "A"], ["B", "B"], ["C", "D"]])
@@ -51,7 +51,7 @@ def _trial(axes: Axes, item: ConditionResult, letter: str) -> None:
         color=VERMILLION,
         linestyle="--",
         linewidth=1.2,
-        label="cursor, simulated from the target (trial left out)",
+        label="cursor, simulated from the target (held-out trial)",
     )
     blur = item.blur * ARCMIN_A_PIXEL
     axes.set_title(f"({letter}) blur {item.blur:.0f} px ({blur:.0f} arcmin)", loc="right")
@@ -69,7 +69,7 @@ def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
         [np.mean(item.vaf_out) for item in results],
         "o-",
         color=BLUE,
-        label="inverse MPC, trials left out",
+        label="inverse MPC, held-out trials",
     )
     axes.plot(
         blur,
@@ -77,7 +77,7 @@ def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
         "s--",
         color=INK,
         markerfacecolor="white",
-        label="delayed feedback, trials left out",
+        label="delayed feedback, held-out trials",
     )
     axes.set_ylim(0, 100)
     axes.set_xlabel("blur (px)")
@@ -87,7 +87,7 @@ def _vaf(axes: Axes, results: Sequence[ConditionResult]) -> None:
 
 
 def _cost_weights(axes: Axes, results: Sequence[ConditionResult]) -> None:
-    """Gain and weight; the weight is the same for all weights with that gain, so it has no band."""
+    """Gain and cost weight; all weights with the gain have the same one, so it has no band."""
     blur = [item.blur for item in results]
     axes.plot(
         blur,

@@ -1,13 +1,13 @@
-"""People following a blurred target by the package `lqg`, judged as `experiments.cursor_people`.
+"""Fit the package `lqg` to people who follow a blurred target, scored as in `cursor_people`.
 
 Straub and Rothkopf (eLife 11:e76635, 2022) infer costs and noise of linear-quadratic Gaussian
 regulators. Their two models of tracking are fitted here by their own `conditional_moments` and
-gains, to the log-likelihood of the cursor given target and past, for the same halves of the trials
-and the same samples. As there the target is shifted by 12 samples. Everything else is searched to
-the maximum, which their Adam steps do not reach, and an offset beside the target is searched too:
-`lqg` has none.
+gains. The objective is the log-likelihood of the cursor given target and past, for the same halves
+of the trials and the same samples. As in their work the target is shifted by 12 samples. All other
+parameters are optimised to convergence, which their Adam steps do not reach, and so is an offset
+from the target, which `lqg` does not have.
 
-It needs the extra `bench`, without which it says so:
+This needs the extra `bench`:
 
     python -m experiments.cursor_peer SubjectiveActor --out results/cursor-peer
 """
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PeerRow", "peer_half"]
 
-# Samples: the delay of their data. Then where their levels begin, in pixels and pixels a second.
+# Delay of their data, samples; then starting noise SDs, pixels and pixels a second.
 _DELAY = 12
 _STARTS = {
     "BoundedActor": {
@@ -55,13 +55,13 @@ _STARTS = {
         "action_cost": 1.0,
     },
 }
-# Logarithm of a number about its start; pixels for one unit of the search.
+# Bound on the change of a logarithm; pixels for one unit of the search.
 _FARTHEST, _PIXELS = 12.0, 3.0
 
 
 @dataclass(frozen=True)
 class PeerRow:
-    """One half of a blur, fitted to and judged on the other: see `experiments.cursor_people`."""
+    """One half of a blur, evaluated on the other half: see `experiments.cursor_people`."""
 
     model: str
     blur: float
@@ -74,7 +74,7 @@ class PeerRow:
 
 
 def peer_half(condition: Condition, half: int, model: str) -> PeerRow:
-    """A half of the trials of a condition by one of their models, judged on the other half."""
+    """Fit one of their models to half of the trials and evaluate it on the other half."""
     every = np.arange(len(condition.target))
     parts = every[half::2], every[1 - half :: 2]
     jax = importlib.import_module("jax")
@@ -111,7 +111,7 @@ def peer_half(condition: Condition, half: int, model: str) -> PeerRow:
 
 
 def _shifted(condition: Condition, which: IntArray) -> Array:
-    """Target and cursor (trials, samples, 2), the cursor's own delay taken off."""
+    """Target and cursor (trials, samples, 2), with the delay of the cursor removed."""
     target, response = condition.target[which], condition.response[which]
     return np.stack([target[:, :-_DELAY], response[:, _DELAY:]], axis=-1)
 
@@ -124,12 +124,12 @@ def _identified(jax: Any, model: str, steps: float) -> Callable[[Any, Array], An
 
     def likelihood(theta: Any, trials: Array) -> Any:
         x = jnp.asarray(trials).at[:, :, 1].add(-_PIXELS * theta[-1])
-        x = x - x[:, :1, :1]  # their estimate begins at zero
+        x = x - x[:, :1, :1]  # Their estimate starts at zero
         numbers = {name: jnp.exp(value) for name, value in zip(names, theta, strict=False)}
         person = make(process_noise=steps, T=x.shape[1] - 1, **numbers)
         mean, spread = jax.vmap(person.conditional_moments, in_axes=(0, None))(x, None)
         error = x[:, 1:] - mean[:, :, :2]
-        # Of the cursor, once the target of that sample is known.
+        # Distribution of the cursor given the target of that sample.
         slope = spread[:, :, 1, 0] / spread[:, :, 0, 0]
         left = error[:, :, 1] - slope * error[:, :, 0]
         variance = spread[:, :, 1, 1] - slope * spread[:, :, 1, 0]
@@ -140,17 +140,17 @@ def _identified(jax: Any, model: str, steps: float) -> Callable[[Any, Array], An
 
 
 def main() -> None:
-    """Fit every half; print the mean of each blur, write result.json."""
+    """Fit every half, print the mean of each blur, and write result.json."""
     parser = argparse.ArgumentParser(description="The package lqg on a blurred target.")
     parser.add_argument("model", choices=list(_STARTS))
     parser.add_argument("--out", type=Path, default=Path("results", "cursor-peer"))
     given = parser.parse_args()
     if not data_file().exists() or not importlib.util.find_spec("lqg"):
-        print("The recordings or the package lqg (extra `bench`) are not there: nothing to fit.")
+        print("The recordings or the package lqg (extra `bench`) are not there.")
         return
     jobs = [(one, half) for one in read_conditions(data_file()) for half in (0, 1)]
     rows = [peer_half(condition, half, given.model) for condition, half in tqdm(jobs)]
-    print("| blur, px | nats a sample, even, odd trials left out | mean |\n|---|---|---|")
+    print("| blur, px | nats a sample, even, odd trials held out | mean |\n|---|---|---|")
     for even, odd in zip(rows[::2], rows[1::2], strict=True):
         mean = (even.outside + odd.outside) / 2
         print(f"| {even.blur:.0f} | {odd.outside:.4f}, {even.outside:.4f} | {mean:.4f} |")

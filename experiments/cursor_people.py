@@ -1,19 +1,17 @@
-"""People following a blurred target as people who sense with noise, judged on trials left out.
+"""Fit the sensorimotor model to people who follow a blurred target, and evaluate it held out.
 
 The hand's velocity follows a command that arrives whole samples late (`plants.pursuit_plant`). The
-person sees the error with noise, feels the speed of the hand with noise, and knows how the target
-moves: by steps that no step before says, of the size that they have. Commands follow from the
-estimate, by the cost weight of the error beside that of the command. Motor noise enters with the
-command, and what moves the cursor beside is white from sample to sample. Everything but the delay
-is searched by maximum likelihood (docs/noisy-people.md), for each of some delays; people sit a few
-pixels beside the target, so the mean error is taken off, and then what the likelihood would rather
-have.
+person sees the error and feels the speed of the hand, both with noise, and knows that the target
+moves by independent steps of known size. Commands follow from the estimate; the cost contains the
+error and the command. Motor noise enters with the command, and process noise moves the cursor,
+white from sample to sample. Maximum likelihood estimates everything except the delay, for each of
+some delays (docs/why/output_feedback.md). People hold the cursor a few pixels off the target, so
+the mean error is subtracted, and then replaced by the offset that maximises the likelihood.
 
-A trial begins with the cursor on the target and ends with a person who has been at it for long: the
-first three seconds are given, and neither fitted nor judged. A person is judged by the mean
-log-likelihood, in nats a sample, of the next position of the cursor given all before and the
-target; beside stands what a linear prediction with every coefficient free says.
-`experiments.cursor_people_study` is the comparison.
+A trial begins with the cursor on the target, whereas the filter assumes a stationary subject. The
+first three seconds are therefore conditioned on. The score is the mean log-likelihood, in nats a
+sample, of the next position of the cursor given all earlier ones and the target. It is compared
+with a linear prediction with every coefficient free (`experiments.cursor_people_study`).
 """
 
 from __future__ import annotations
@@ -56,27 +54,27 @@ __all__ = [
     "regression_nats",
 ]
 
-#: Delays that are tried, samples of 1/60 s; and the first sample that is judged.
+#: Delays that are tried, samples of 1/60 s, and the first sample that is scored.
 DELAYS = (6, 8, 10, 12, 14)
 FIRST = 180
 _LAG = 0.03
-# Where levels begin: px, px/s. Under a blur of 17 px a search from others can end lower.
+# Starting noise SDs: px, px/s. At a blur of 17 px a search from others can end lower.
 _BESIDE, _MOTOR, _SEEN, _FELT, _RECORDER = 0.3, 60.0, 10.0, 20.0, 0.2
-# Logarithm of the cost weight about that where a search begins.
+# Prior SD of the logarithm of the cost weight about its start.
 _SPREAD = 5.0
 
 
 @dataclass(frozen=True)
 class Follower:
-    """The person behind some trials.
+    """Model fitted to some trials.
 
     Attributes
     ----------
     delay : int
-        Samples.
+        Delay, samples.
     offset : float
-        Where the cursor is held beside the target, px.
-    fit : PersonFit
+        Mean distance of the cursor from the target, px.
+    fit : OutputFeedbackFit
     """
 
     delay: int
@@ -85,7 +83,7 @@ class Follower:
 
 
 def follower_problem(condition: Condition, which: IntArray, delay: int, offset: float) -> Problem:
-    """The inverse problem of some trials (k,): the error starts as recorded, the hand at rest."""
+    """Inverse problem of some trials (k,): the error starts as recorded, the hand at rest."""
 
     def make(values: Array) -> Plant:
         return Plant(plants.pursuit_plant(delay, float(values[0])), ["command"])
@@ -105,9 +103,9 @@ def fit_follower(
     delays: tuple[int, ...] = DELAYS,
     counted: int = FIRST,
 ) -> Follower:
-    """The likeliest person behind some trials (k,), of those with one of some delays.
+    """Most likely model of some trials (k,) over some delays.
 
-    The first sample that is `counted` is identified given those before it.
+    Samples before `counted` are conditioned on.
     """
     error = (condition.response[which] - condition.target[which])[:, FIRST:]
     offset = float(np.mean(error))
@@ -147,7 +145,7 @@ def _fitted(
 
 
 def judged(follower: Follower, condition: Condition, which: IntArray) -> OutputFeedbackFit:
-    """The same person beside other trials (k,): what the fit would have said of them."""
+    """The fit applied to other trials (k,)."""
     fit = follower.fit
     other = follower_problem(condition, which, follower.delay, follower.offset)
     there = other.at(np.array(other.starts), np.array(fit.problem.logarithms))
@@ -163,12 +161,12 @@ def judged(follower: Follower, condition: Condition, which: IntArray) -> OutputF
 
 
 def nats(fit: OutputFeedbackFit) -> float:
-    """Mean log-likelihood of a sample, the first three seconds left out."""
+    """Mean log-likelihood of a sample, without the first three seconds."""
     return float(np.mean([trial.identified[FIRST:] for trial in fit.identified.trials]))
 
 
 def _beside(follower: Follower, condition: Condition, which: IntArray) -> float:
-    """By how much the offset is to be moved: innovations are linear in it."""
+    """Change of the offset that maximises the likelihood; innovations are linear in it."""
     step = 1.0
     moved = dataclasses.replace(follower, offset=follower.offset + step)
     here, there = (judged(one, condition, which).identified.trials for one in (follower, moved))
@@ -179,15 +177,15 @@ def _beside(follower: Follower, condition: Condition, which: IntArray) -> float:
     return -float(np.sum(slope * first / spread) / np.sum(slope**2 / spread))
 
 
-# Of a free regression on what was before.
+# Lags of the free regression.
 _POSITIONS, _TARGETS = 20, 60
 
 
 def regression_nats(condition: Condition, mine: IntArray, others: IntArray) -> float:
-    """What a free linear prediction says of trials left out, nats a sample.
+    """Held-out log-likelihood of a free linear prediction, nats a sample.
 
-    A regression on 20 positions before, 60 of the target and a constant, fitted to the trials
-    `mine` (k,) and judged on others (j,) as a person is.
+    A regression on 20 earlier positions, 60 samples of the target and a constant, fitted to the
+    trials `mine` (k,) and evaluated on `others` (j,).
     """
 
     def tables(which: IntArray) -> tuple[Array, Array]:

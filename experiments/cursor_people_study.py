@@ -1,8 +1,9 @@
-"""People following a blurred target: persons who sense with noise on trials left out.
+"""Compare models of people who follow a blurred target on held-out trials.
 
-Of each blur the even trials are fitted and the odd ones judged, and the other way round
-(`experiments.cursor_people`), with errors of predictions and what steps and rests are worth
-(`experiments.cursor_steps`); then all trials of a blur, with intervals of the levels of noise.
+For each blur the even trials are fitted and the odd ones predicted, and the other way round
+(`experiments.cursor_people`), with prediction errors and the gain of a model of steps and rests
+(`experiments.cursor_steps`). Then all trials of a blur are fitted, with intervals of the noise SDs.
+Results: experiments/cursor_tracking.md.
 
     python -m experiments.cursor_people_study --out results/cursor-people
 """
@@ -40,7 +41,7 @@ _IDENTIFIED = ("outside", "steps", "regression")
 
 @dataclass(frozen=True)
 class _Row:
-    """One half of a blur, fitted and judged on the other; or all trials of it, with intervals."""
+    """One half of a blur, evaluated on the other half; or all its trials, with intervals."""
 
     blur: float
     half: int
@@ -75,7 +76,7 @@ def _half(condition: Condition, half: int) -> _Row:
 
 
 def _expected(fit: OutputFeedbackFit, condition: Condition, which: IntArray) -> Expected:
-    """What the filter expects of the cursor, from the first sample that is judged."""
+    """Predictions of the filter from the first scored sample on."""
     position = condition.response[which]
     off = np.array([trial.innovations[:, 0] for trial in fit.identified.trials])
     spread = np.array([trial.spreads[:, 0, 0] for trial in fit.identified.trials])
@@ -121,9 +122,9 @@ def _row(
 
 
 def _table(rows: list[_Row]) -> str:
-    """Halves: how well the other half is identified."""
+    """Table of the held-out log-likelihoods of both halves."""
     lines = [
-        "| blur, px | nats a sample, even, odd trials left out | mean | with steps and rests "
+        "| blur, px | nats a sample, even, odd trials held out | mean | with steps and rests "
         "| free regression | errors 1, 6, 12, 30 samples ahead, px |",
         "|---|---|---|---|---|---|",
     ]
@@ -145,10 +146,10 @@ def _mean(rows: list[_Row], name: str) -> float:
 
 
 def _numbers(rows: list[_Row]) -> str:
-    """Whole blurs: every number of the model, with its interval where it has one."""
+    """Table of the parameters of each blur, with intervals of the noise SDs."""
     names = list(rows[0].levels)
     lines = [
-        "| blur, px | delay, ms | lag, ms | beside, px | cost weight of the error, 1/s^2 | "
+        "| blur, px | delay, ms | lag, ms | offset, px | cost weight of the error, 1/s^2 | "
         + " | ".join(names)
         + " |",
         "|" + "---|" * (5 + len(names)),
@@ -169,12 +170,12 @@ def _spanned(value: float, ends: list[float]) -> str:
 
 
 def main() -> None:
-    """Fit every half and every blur; print the tables, write result.json."""
-    parser = argparse.ArgumentParser(description="People who sense a blurred target with noise.")
+    """Fit every half and every blur, print the tables, and write result.json."""
+    parser = argparse.ArgumentParser(description="Sensory noise of a blurred target.")
     parser.add_argument("--out", type=Path, default=Path("results", "cursor-people"))
     given = parser.parse_args()
     if not data_file().exists():
-        print(f"{data_file().name} is not there: nothing to fit. IMPC_CURSOR_DATA may name it.")
+        print(f"{data_file().name} is not there; set IMPC_CURSOR_DATA to its path.")
         return
     conditions = read_conditions(data_file())
     jobs = [(condition, half) for condition in conditions for half in (0, 1)]

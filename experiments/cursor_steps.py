@@ -1,13 +1,13 @@
-"""How a cursor moves beside what a controller says: it stands still, or steps by whole pixels.
+"""Distribution of cursor positions that rest or move by whole pixels, given a prediction.
 
-A filter expects the next position with a mean m and a deviation s. A mouse reports whole pixels,
-and in most samples the cursor stands. So of the position k, with the last one k', one may say
+A filter predicts the next position with mean m and standard deviation s. A mouse reports whole
+pixels, and in most samples the cursor rests. With last position k', position k has probability
 
     p(k) = w [k = k'] + (1 - w) T((k - m) / (a s)),      w = 1 / (1 + exp(b + c |m - k'| / s)),
 
-T Student's distribution of n degrees of freedom over the pixel. Its four numbers a, b, c and n say
-nothing of control: what they are worth, in nats a sample, stands apart from what a model of the
-person is worth (docs/cursor-tracking.md).
+where T is Student's distribution with n degrees of freedom, integrated over the pixel. The four
+numbers a, b, c and n do not describe control, so their log-likelihood is reported separately
+(experiments/cursor_tracking.md).
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _LEAST = 1e-300
 
 @dataclass(frozen=True)
 class Expected:
-    """Positions, and what was expected of them; one number a sample (samples,).
+    """Recorded and predicted positions, one number a sample (samples,).
 
     Attributes
     ----------
     position, last : Array
-        Of the cursor now and a sample before, whole px.
+        Position now and one sample before, whole px.
     mean, deviation : Array
-        Expected, px.
+        Predicted mean and standard deviation, px.
     """
 
     position: Array
@@ -47,7 +47,7 @@ class Expected:
 
 
 def fit_steps(seen: Expected) -> Array:
-    """The likeliest numbers (4,) of the distribution of steps: log a, b, c, log n."""
+    """Maximum-likelihood numbers (4,) of the distribution: log a, b, c, log n."""
 
     def objective(theta: Array) -> float:
         return -step_nats(theta, seen)

@@ -1,9 +1,9 @@
-"""What people following a blurred target want: structures of their weights, blur by blur.
+"""Test three cost structures of people who follow a blurred target, blur by blur.
 
-Three statements on the cost, beside the command: the error alone; error and velocity of the cursor;
-error, velocity and effort, the acceleration of the hand. Each is fitted with delay and lag, tested,
-and judged on trials left out (docs/structures.md). The cost weight of velocity is identified over
-that of the error, in s^2, with its profile's interval.
+The cost contains the command and the error alone; error and velocity of the cursor; or error,
+velocity and effort (the acceleration of the hand). Each structure is fitted with delay and lag,
+tested, and evaluated on held-out trials. The cost weight of velocity is given relative to that of
+the error, in s^2, with its profile interval. Results: experiments/cursor_tracking.md.
 
     python -m experiments.cursor_structures --out results/cursor-structures
 """
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STRUCTURES", "StructureRow", "structure_rows"]
 
-#: Name -> features of the state that have a cost weight.
+#: Name -> penalised features of the state.
 STRUCTURES = {
     "error": ["error"],
     "error, velocity": ["error", "velocity"],
@@ -57,25 +57,25 @@ class StructureRow:
     Attributes
     ----------
     blur : float
-        px.
+        Blur of the target, px.
     structure : str
         A key of `STRUCTURES`.
     reason : str
-        Why there is no fit; empty otherwise.
+        Reason without a fit; empty otherwise.
     refused : bool
+        Whether the structure is rejected at 5 %.
     probability : float
-        Of residuals as far from the structure as these, if it holds.
+        p value of the test.
     freedom : int
-        Directions of the gain that the test looks at.
+        Directions of the gain that are tested.
     vaf, held_out : float
-        Of all trials, and mean over trials left out, %.
+        VAF of all trials, and mean over held-out trials, %.
     aic : float
-        Akaike's criterion; less is better.
-    cost weights : list of float
-        At R = 1.
+        Akaike's criterion; lower is better.
+    cost_weights : list of float
+        Cost weights at R = 1.
     velocity, low, high : float
-        Cost weight of velocity over that of the error and its interval of 95 %, s^2; NaN without
-        one.
+        Cost weight of velocity over that of the error, and its 95 % interval, s^2; or NaN.
     """
 
     blur: float
@@ -94,7 +94,7 @@ class StructureRow:
 
 
 def structure_rows(condition: Condition) -> list[StructureRow]:
-    """Every structure on the trials of a condition."""
+    """Fit every structure to the trials of a condition."""
     problem = condition_problem(condition)
     near = fit_controller(problem)
     rows = [_any_weights(condition.blur, problem, near)]
@@ -117,7 +117,7 @@ def structure_rows(condition: Condition) -> list[StructureRow]:
 
 
 def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
-    """The fit that no structure confines."""
+    """Row of the unrestricted fit."""
     runs = [simulate(near.controller(), drive) for drive in scenarios(near.problem)]
     simulated = np.concatenate([run.x @ near.problem.plant.C.T for run in runs])
     recorded = np.concatenate([trial.outputs for trial in problem.recordings])
@@ -154,7 +154,7 @@ def _row(blur: float, name: str, fit: StructureFit) -> StructureRow:
 
 
 def _velocity(fit: StructureFit) -> tuple[float, float, float]:
-    """Cost weight of velocity over that of the error, with the ends of its interval."""
+    """Cost weight of velocity over that of the error, with its interval."""
     estimate, covariance = fit.estimate, fit.covariance
     if estimate is None or covariance is None or "velocity" not in fit.structure.labels:
         return (float("nan"),) * 3
@@ -172,15 +172,15 @@ def _velocity(fit: StructureFit) -> tuple[float, float, float]:
 
 def _table(rows: list[StructureRow]) -> str:
     lines = [
-        "| blur, px | structure | refused at 5 % | p | VAF, % | left out, % | criterion | velocity "
-        "over error, s^2 (95 %) |",
+        "| blur, px | structure | rejected at 5 % | p | VAF, % | held out, % | criterion "
+        "| velocity over error, s^2 (95 %) |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         ratio = "-"
         if np.isfinite(row.velocity):
             ratio = f"{row.velocity:.2g} ({row.low:.2g} to {row.high:.2g})"
-        word = row.reason or ("refused" if row.refused else "no")
+        word = row.reason or ("rejected" if row.refused else "no")
         word = "-" if row.structure == "any weights" else word
         lines.append(
             f"| {row.blur:g} | {row.structure} | {word} | {row.probability:.2g} | {row.vaf:.1f} | "
@@ -190,8 +190,8 @@ def _table(rows: list[StructureRow]) -> str:
 
 
 def main() -> None:
-    """Write the table and its numbers."""
-    parser = argparse.ArgumentParser(description="Structures of the weights of target tracking.")
+    """Write the table and result.json."""
+    parser = argparse.ArgumentParser(description="Cost structures of target tracking.")
     parser.add_argument("--out", type=Path, default=Path("results/cursor-structures"))
     out: Path = parser.parse_args().out
     rows = list[StructureRow]()

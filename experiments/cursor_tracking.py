@@ -1,12 +1,13 @@
-"""People following a blurred target: inverse MPC of each condition, from the target alone.
+"""Inverse MPC of people who follow a blurred target, simulated from the target alone.
 
 For every blur the controller, the delay and the lag of the hand are fitted to all trials at once
-(section 3.5 of the dissertation on other data), and again without each trial, which is then
-predicted. VAF is of the cursor's position, mean removed, without the first second. Beside it stands
-delayed feedback of error and velocity, fitted in the same way (`experiments.cursor_baseline`).
+(section 3.5 of the dissertation, other data), and again without each trial, which is then
+predicted. VAF is of the cursor's position, mean removed, without the first second. It is compared
+with delayed feedback of error and velocity, fitted in the same way (`experiments.cursor_baseline`).
 
-Intervals are ranges over fits to trials drawn again with replacement: 39 of them for 95 %. A delay
-or lag whose logarithm has a deviation of 0.5 or more is not determined: it stays where it began.
+Intervals are ranges over fits to trials drawn with replacement: 39 of them for 95 %. A delay or lag
+whose logarithm has a standard error of 0.5 or more is not determined: it stays at its start.
+Results: experiments/cursor_tracking.md.
 
     python -m experiments.cursor_tracking --out results/cursor-tracking
 """
@@ -60,44 +61,44 @@ __all__ = [
 
 _SECOND = round(RATE)
 _NOMINAL = (0.15, 0.08)
-# Weights count as alike up to this multiple of the least condition number.
+# Largest condition number of equivalent weights, over the minimum one.
 _RATIO = 10.0
-# The range of 39 holds the next one in 95 of 100 cases.
+# The range of 39 draws contains the next draw with a probability of 95 %.
 _RESAMPLES = 39
-# Standard deviation of the logarithm of a delay or lag that the recordings identify.
+# Largest standard error of the logarithm of an identified delay or lag.
 _IDENTIFIED = 0.5
 
 
 @dataclass(frozen=True)
 class ConditionResult:
-    """One blur.
+    """Results of one blur.
 
     Attributes
     ----------
     blur : float
-        px.
+        Blur of the target, px.
     trials : int
     delay, lag : float
-        s.
+        Fitted values, s.
     delay_determined, lag_determined : bool
         Whether the recordings identify them.
     vaf_in, vaf_out : list of float
-        Of each trial, from all and from the others, %.
+        VAF of each trial, fitted to all trials and to the others, %.
     baseline_out, ceiling_out : list of float
-        The same of delayed feedback, and of a free linear response (`cursor_ceiling`), %.
+        Held-out VAF of delayed feedback, and of a free linear response (`cursor_ceiling`), %.
     gain : list of float
-        Of error (1/s^2) and velocity (1/s).
+        Gains of error (1/s^2) and velocity (1/s).
     gain_determined : int
-        Directions of the gain, of 7, that are known to better than their natural size.
+        Directions of the gain, of 7, with a standard error below one whitened unit.
     weight_of_error, cost_weight_low, cost_weight_high : float
-        Q_ee at R = 1 in the least conditioned weights, and its range over all weights with the same
-        gain and a condition number up to ten times the least.
+        Q_ee at R = 1 in the weights of minimum condition number, and its range over all weights
+        with the same gain and a condition number up to ten times the minimum.
     resampled_weight, resampled_gain : list of float
-        Cost weight and gain of the error of every fit to trials drawn again.
+        Cost weight and gain of the error in every fit to resampled trials.
     limit : str
-        What the recordings say of an acceleration limit.
+        Finding on an acceleration limit.
     recorded, simulated, target : list of float
-        One trial, left out of the fit that predicts it, px.
+        One held-out trial, px.
     """
 
     blur: float
@@ -124,7 +125,7 @@ class ConditionResult:
 
 
 def condition_problem(condition: Condition) -> Problem:
-    """The inverse problem of a condition: the error starts as recorded, the hand at rest."""
+    """Inverse problem of a condition: the error starts as recorded, the hand at rest."""
 
     def make(values: Array) -> Plant:
         return Plant(cursor_plant(float(values[0]), float(values[1])), ["command"])
@@ -141,7 +142,7 @@ def condition_problem(condition: Condition) -> Problem:
 
 
 def left_out_vaf(condition: Condition, index: int) -> tuple[float, float, Array]:
-    """VAF of one trial predicted from the others: ours, delayed feedback's, and our cursor."""
+    """Held-out VAF of a trial by inverse MPC and by delayed feedback, and the predicted cursor."""
     others = np.arange(len(condition.target)) != index
     problem = condition_problem(condition)
     kept = tuple(trial for trial, keep in zip(problem.recordings, others, strict=True) if keep)
@@ -154,10 +155,9 @@ def left_out_vaf(condition: Condition, index: int) -> tuple[float, float, Array]
 
 
 def resampled(condition: Condition, count: int, seed: int = 0) -> tuple[list[float], list[float]]:
-    """Cost weight (R = 1) and gain of the error, of `count` fits to trials drawn with replacement.
+    """Cost weight (R = 1) and gain of the error in `count` fits to resampled trials.
 
-    Every pair of weights with one gain has the same cost weight of the error on this plant, so that
-    of the weights at hand will do.
+    On this plant all weights with one gain have the same cost weight of the error.
     """
     problem = condition_problem(condition)
     cost_weights, gains = [], []
@@ -175,7 +175,7 @@ def resampled(condition: Condition, count: int, seed: int = 0) -> tuple[list[flo
 def fit_condition(
     condition: Condition, seed: int = 0, resamples: int = _RESAMPLES
 ) -> ConditionResult:
-    """Fit a condition, predict each of its trials, and say what the weights say."""
+    """Fit a condition, predict each of its trials, and evaluate its cost weights."""
     problem = condition_problem(condition)
     fitted = fit_controller(problem)
     count = len(condition.target)
@@ -219,17 +219,17 @@ def fit_condition(
 
 
 def _ceiling(condition: Condition, index: int) -> float:
-    """VAF of one trial from the free linear response of the others, %."""
+    """VAF of one trial by the free linear response of the others, %."""
     others = np.arange(len(condition.target)) != index
     response = fit_step_response(condition.target[others], condition.response[others])
     return _vaf(condition.response[index], follow(condition.target[index], response))
 
 
 def _limit(fitted: Estimate) -> str:
-    """What a bound on the command would change, everything else held.
+    """Effect of a command bound with everything else fixed.
 
-    From the largest command of the fit downwards: the least bound that costs less than 1 % of the
-    misfit, and whether any bound lowers it by as much.
+    Finds the smallest bound that raises the misfit by less than 1 %, and whether any bound lowers
+    it by as much.
     """
     known = replace(fitted.problem, family=None, logarithms=frozen([]))
     K, S = np.array(fitted.gain), np.array(fitted.metric)
@@ -255,7 +255,7 @@ def _parameters(fitted: Estimate) -> tuple[float, float]:
 
 
 def _cursor(fitted: Estimate, problem: Problem, condition: Condition, index: int) -> Array:
-    """Cursor of one trial, simulated from its target."""
+    """Simulate the cursor of one trial from its target."""
     one = replace(fitted.problem, recordings=(problem.recordings[index],))
     known = replace(one, family=None, logarithms=frozen([]))
     controller = controller_for(known, np.array(fitted.gain), np.array(fitted.metric))
@@ -298,16 +298,14 @@ def _span(values: list[float]) -> str:
 
 
 def weight_ratio(results: list[ConditionResult]) -> str:
-    """How much less the error costs under the widest blur than under the least, in words."""
+    """Sentence on the ratio of the cost weights at the smallest and the largest blur."""
     first, last = results[0], results[-1]
     ratios = [
         one / other
         for one, other in zip(first.resampled_weight, last.resampled_weight, strict=False)
     ]
     if not ratios:
-        return (
-            "Without resampled trials nothing is said of how the cost weight of the error changes."
-        )
+        return "Without resampled trials the change of the cost weight of the error is unknown."
     count, least, most = len(first.resampled_weight), np.min(ratios), np.max(ratios)
     level = 100 * (count - 1) / (count + 1)
     identified = "falls" if least > 1 else "is not distinguished from constant: it changes"
@@ -320,18 +318,18 @@ def weight_ratio(results: list[ConditionResult]) -> str:
 
 
 def main() -> None:
-    """Fit every condition; print the table, write figure and result.json."""
+    """Fit every condition, print the table, and write figure and result.json."""
     parser = argparse.ArgumentParser(description="Inverse MPC of human target tracking.")
     parser.add_argument("--out", type=Path, default=Path("results", "cursor-tracking"))
     parser.add_argument("--resamples", type=int, default=_RESAMPLES)
     given = parser.parse_args()
     if not data_file().exists():
-        print(f"{data_file().name} is not there: nothing to fit. IMPC_CURSOR_DATA may name it.")
+        print(f"{data_file().name} is not there; set IMPC_CURSOR_DATA to its path.")
         return
     conditions = read_conditions(data_file())
     with ProcessPoolExecutor(2) as pool:
         fit = functools.partial(fit_condition, resamples=given.resamples)
-        # Seeds of their own: draws of one condition say nothing of another's.
+        # Different seeds, so that the draws of conditions are independent.
         found = pool.map(fit, conditions, range(0, 1000 * len(conditions), 1000))
         results = list(tqdm(found, total=len(conditions), unit="condition", disable=None))
     print(_table(results))

@@ -1,8 +1,8 @@
-"""Does a fit find the truth of the subjects that `impc simulate seated-balance` makes?.
+"""Coverage of the gain intervals of subjects made by `impc simulate seated-balance`.
 
-Each is simulated, written, read and fitted as the commands do it; counted are the entries of the
-true gain inside the 95 % intervals that the page prints. Beside it the same recordings with
-`body = "linear"`: how many are inside then, and the CPU time of either fit.
+Each subject is simulated, written, read and fitted as the commands do it. The script counts the
+entries of the true gain inside the printed 95 % intervals, for the nonlinear body and for
+`body = "linear"`, and the CPU time of both fits. Results: experiments/nonlinear.md.
 
     python -m experiments.default_subjects --seeds 20
     python -m experiments.default_subjects --seeds 20 --motor-noise 0.3
@@ -35,7 +35,7 @@ class Found:
     Attributes
     ----------
     inside : int
-        Entries of the true gain inside their intervals, of `entries`.
+        Number of entries of the true gain inside their intervals, of `entries`.
     entries : int
     misfit : float
         2-norm of the residual.
@@ -50,14 +50,14 @@ class Found:
 
 
 def simulated_files(folder: Path, seed: int, *more: str) -> tuple[Path, ...]:
-    """Trials of the default subject of a seed in a folder, with subject.toml and truth.json."""
+    """Simulate the default subject of a seed into a folder; return the trial files."""
     given = ["--formats", "csv", "--seed", str(seed), "--out", str(folder), *more]
     command.main(["seated-balance", *given], standalone_mode=False)
     return tuple(sorted(folder.glob("trial_*.csv")))
 
 
 def fitted_subject(files: tuple[Path, ...], body: str) -> Found:
-    """Fit the trials with the body that is asked for, and compare with their truth."""
+    """Fit the trials with the given body, and compare with the truth."""
     folder = files[0].parent
     config = folder / f"{body}.toml"
     config.write_text(
@@ -76,12 +76,12 @@ def fitted_subject(files: tuple[Path, ...], body: str) -> Found:
 
 
 def main() -> None:
-    """Print a line a subject, and the shares over all of them."""
-    parser = argparse.ArgumentParser(description="Fits of the default subject beside its truth.")
+    """Print a line for each subject, and the shares over all."""
+    parser = argparse.ArgumentParser(description="Coverage of the default subject.")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--motor-noise", default="0", help="Nm")
-    parser.add_argument("--beside", type=int, default=20, help="of them with the linear body too")
+    parser.add_argument("--beside", type=int, default=20, help="how many with the linear body too")
     given = parser.parse_args()
     found: dict[str, list[Found]] = {"nonlinear": [], "linear": []}
     for seed in tqdm(range(given.first, given.first + given.seeds), unit="subject", disable=None):

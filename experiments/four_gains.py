@@ -1,7 +1,7 @@
-"""Four gains on angles and rates, K = [K_4, 0] of (3.20): do they hold the delayed seat upright.
+"""Stabilise the delayed seat by feedback of angles and rates only, K = [K_4, 0] of Eq. (3.20).
 
-Searches all of the four-dimensional space of gains for the least spectral radius of A - BK, by
-differential evolution from several seeds, with gains of either sign up to ten times the true ones.
+Differential evolution from several seeds minimises the spectral radius of A - BK over four gains of
+either sign, up to ten times the true ones. Results: experiments/coverage.md.
 
     python -m experiments.four_gains
 """
@@ -19,7 +19,7 @@ __all__ = ["least_radius"]
 
 
 def least_radius(seed: int, reach: float = 10.0) -> tuple[float, list[float]]:
-    """Least spectral radius found, and the four gains that have it."""
+    """Smallest spectral radius found, and its four gains."""
     plant = Plant(plants.seated_balance_plant(), ["command"])
     truth = np.abs(np.array(seat(1, 1.0).controller.K)[0, :4])
 
@@ -40,11 +40,11 @@ def least_radius(seed: int, reach: float = 10.0) -> tuple[float, list[float]]:
 
 
 def main() -> None:
-    """Print what every seed finds."""
+    """Print the result of each seed."""
     for seed in range(4):
         radius, gains = least_radius(seed)
         shown = ", ".join(f"{value:.0f}" for value in gains)
-        print(f"seed {seed}: least spectral radius {radius:.4f} at K_4 = [{shown}]")
+        print(f"seed {seed}: smallest spectral radius {radius:.4f} at K_4 = [{shown}]")
 
 
 if __name__ == "__main__":

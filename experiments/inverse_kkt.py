@@ -1,28 +1,27 @@
-"""Weights from the stationarity of recorded trajectories: inverse KKT, a peer of the noise study.
+"""Weights from the stationarity of recorded trajectories: inverse KKT.
 
-Each stretch of N samples of a trajectory (x_j, u_j) is taken for a plan that was optimal. With the
-adjoint lambda_j of the dynamics it satisfies
+The method treats each segment of N samples of a trajectory (x_j, u_j) as an optimal plan. With the
+adjoint lambda_j of the dynamics, an optimal plan satisfies
 
     lambda_j = Q x_j + A' lambda_{j+1},        R u_j + B' lambda_{j+1} = 0
 
-wherever no input is at its bound (there a multiplier takes what is missing, and the row is left
-out). lambda_N, what comes after the stretch, is free. The rows are linear in (Q, R, lambda_N): the
-weights that leave the least sum of squares, Q >= 0, R > 0, trace R = m, are one convex program.
+for each input that is not at its bound; rows of inputs at a bound are left out. lambda_N, which
+depends on what follows the segment, is free. The rows are linear in (Q, R, lambda_N), so the
+weights with the least sum of squares, Q >= 0, R > 0, trace R = m, follow from one convex program.
 Keshavarz, Wang, Boyd 2011 (imputing a convex objective); Englert, Vien, Toussaint 2017 (inverse
 KKT).
 
-The method needs no simulation. It takes recorded motion for planned motion, though: a disturbance
-that nobody foresaw is in the first and not in the second, and states and commands have to be
-estimated first (`smoothing`).
+The method needs no simulation, but it treats recorded motion as planned motion: a disturbance that
+was not anticipated is only in the recorded one.
 
-States and commands behind recorded outputs, when nothing is known of the controller.
+It needs states and commands. They are estimated from the recorded outputs, without a controller, by
 
     x+ = A x + B u + E d,    u+ = u + w,    y = C x + e,    w ~ N(0, q r W), e ~ N(0, r V)
 
-The disturbance d is known, the command is a random walk. V is the squared size of the outputs, and
-W such that a step of each input moves the outputs by their size within the first n samples. The
-ratio q is that of greatest likelihood, r follows from it; then fixed-interval smoothing
-(statsmodels; Durbin and Koopman 2012, chapter 4). A laboratory calls it inverse dynamics.
+with a known disturbance d and a random-walk command. V is the squared size of the outputs. W is
+such that a step of each input moves the outputs by their size within the first n samples. Ratio q
+maximises the likelihood, and r follows from it. Then fixed-interval smoothing gives states and
+commands (statsmodels; Durbin and Koopman 2012, chapter 4). This is a form of inverse dynamics.
 """
 
 from __future__ import annotations
@@ -54,18 +53,15 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
-# An input this near to its bound, of the bound, counts as at it.
+# An input within this share of its bound counts as at the bound.
 _AT_BOUND = 1e-2
-# Least eigenvalue in natural coordinates, where R is about one, and a ridge that decides among
-# weights that leave the same residual.
+# Least eigenvalue in whitened coordinates, where R is about one, and a ridge that chooses among
+# weights with the same residual.
 _FLOOR, _RIDGE = 1e-6, 1e-6
 
 
 def inverse_kkt(problem: Problem, gain: Array) -> Weights:
-    """Weights of least stationarity residual on smoothed trajectories.
-
-    `gain` (m, n).
-    """
+    """Weights of least stationarity residual on smoothed trajectories; `gain` (m, n)."""
     return stationarity_weights(
         problem.plant,
         smoothed_trials(problem),
@@ -78,10 +74,7 @@ def inverse_kkt(problem: Problem, gain: Array) -> Weights:
 def stationarity_weights(
     plant: Plant, trials: Sequence[Smoothed], length: int, u_max: Array, gain: Array
 ) -> Weights:
-    """The same for given states and commands.
-
-    `u_max` (m,); `gain` (m, n).
-    """
+    """Weights for given states and commands; `u_max` (m,), `gain` (m, n)."""
     n, m = plant.n, plant.m
     T, G = natural_coordinates(plant, gain)
     back, forth = np.linalg.inv(T), np.linalg.inv(G)
@@ -110,7 +103,7 @@ def stationarity_weights(
 
 
 def _stretch(A: Array, B: Array, units: Array, x: Array, u: Array, free: BoolArray) -> Array:
-    """Rows of one stretch (r, k) in the entries of (Q, R), what lambda_N explains taken out."""
+    """Rows of one segment (r, k) in the entries of (Q, R), lambda_N projected out."""
     n = len(B)
     length = len(x)
     # Backwards: lambda = (basis of Q) x + power lambda_N.
@@ -155,7 +148,7 @@ def _least_squares(triangle: Array, units: Array, n: int, G: Array) -> Array:
     return np.asarray(start + null @ solved.y[:-1])
 
 
-# Logarithms (base 10) of q between which it is looked for.
+# Range of log10(q) in the search.
 _RATIOS = (-8.0, 8.0)
 # Variance of states and commands at the first sample, over that of the outputs.
 _DIFFUSE = 1e6
@@ -170,7 +163,7 @@ def _estimate(problem: Problem, start: Estimate) -> Estimate:
     )
 
 
-#: The method for `Method.estimate`, as the noise study compares it with those of the registry.
+#: The method as an entry for the noise study.
 INVERSE_KKT = Method(
     "inverse_kkt",
     "inverse KKT",
@@ -189,10 +182,10 @@ class Smoothed(Frozen):
 
 
 def smoothed_trials(problem: Problem) -> tuple[Smoothed, ...]:
-    """Estimate states and commands of every trial; bounds and controller play no part."""
+    """Estimate states and commands of every trial, without bounds or controller."""
 
     def cost(logarithm: float) -> float:
-        """-2 log-likelihood with r at its best, up to a constant."""
+        """-2 log-likelihood maximised over r, up to a constant."""
         logdet, squares, count = 0.0, 0.0, 0
         for trial in problem.recordings:
             found = _model(problem, trial, 10.0**logarithm).filter()
@@ -214,8 +207,8 @@ def smoothed_trials(problem: Problem) -> tuple[Smoothed, ...]:
 
 
 def _model(problem: Problem, trial: Recording, ratio: float) -> KalmanSmoother:
-    """The state-space model of the module's text with states (x, u), at r = 1."""
-    # Imported here: it takes half a second, and few recordings need it.
+    """State-space model of the module docstring with states (x, u), at r = 1."""
+    # Imported here because it takes half a second.
     from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother  # noqa: PLC0415
 
     plant, scale = problem.plant, np.asarray(problem.output_scale)
@@ -236,7 +229,7 @@ def _model(problem: Problem, trial: Recording, ratio: float) -> KalmanSmoother:
 
 
 def _step(plant: Plant, scale: Array) -> Array:
-    """Size of a step of each input (m,) that moves the outputs by their size in n samples."""
+    """Step of each input (m,) that moves the outputs by their size in n samples."""
     x, total = np.zeros((plant.n, plant.m)), np.zeros(plant.m)
     for _ in range(plant.n + 1):
         x = plant.A @ x + plant.B

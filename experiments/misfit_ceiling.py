@@ -1,8 +1,8 @@
-"""Does a fit reach what the truth reaches? Random plants with several inputs, VAF of 90 %.
+"""Compare the misfit of fits with that of the true controller, random plants, VAF of 90 %.
 
 Each recording of `random_recording` is fitted from the default start, and the misfit of its weights
-is compared with that of the controller that made it, at its own initial state. A fit that ends in
-another basin leaves more. One hundredth of the noise's power is a tenth of a point of VAF.
+is compared with that of the true controller at its own initial state. A fit in another local
+minimum has a larger misfit. One hundredth of the power of the noise is a tenth of a point of VAF.
 
     python -m experiments.misfit_ceiling --inputs 3 --first 0 --count 100
 """
@@ -26,7 +26,7 @@ __all__ = ["short_of_truth"]
 
 
 def short_of_truth(truth: Controller, trial: Recording) -> float:
-    """What a fit leaves beyond the truth, % of the power that the truth leaves."""
+    """Residual power of the fit above that of the truth, %."""
     settings = FitSettings(horizon=truth.horizon, u_max=list(truth.bounds.u_max))
     problem = fit_problem(truth.plant, [trial], settings)
     ours = fit(truth, trial).misfit
@@ -35,7 +35,7 @@ def short_of_truth(truth: Controller, trial: Recording) -> float:
 
 
 def main() -> None:
-    """Read the options, fit, and print what falls short."""
+    """Fit the plants and print those with a larger misfit than the truth."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--inputs", type=int, default=3)
     parser.add_argument("--first", type=int, default=0)

@@ -1,10 +1,10 @@
-"""Where each method breaks: nine methods over noise levels and saturation shares.
+"""Compare nine methods over noise levels and torque limits.
 
 The linear seat under a torque limit, one trial of 30 s with white noise on the angles. For each
-limit (70, 6 and 4.5 Nm: the subject saturates never, for an eighth and for a third of the time),
-noise level and seed every method of `impc compare`, and inverse KKT, is fitted; then its controller
-simulates another trial, and is compared with the truth without noise. A cell that is done is kept
-in the folder: the same command, after an interruption, goes on from there.
+limit (70, 6 and 4.5 Nm: the subject is at it never, in an eighth and in a third of the samples),
+noise level and seed, every method of `impc compare` and inverse KKT is fitted. Its controller then
+simulates another trial and is compared with the noise-free truth. Finished cells are kept in the
+folder, so the same command continues an interrupted run. Results: experiments/noise_study.md.
 
     python -m experiments.noise_study --out results/noise-study
 """
@@ -57,12 +57,12 @@ if TYPE_CHECKING:
 
 __all__ = ["COMPARED", "Cell", "Outcome", "study_cell"]
 
-#: The methods by name: those of `impc compare`, and a peer.
+#: The methods by name: those of `impc compare`, and inverse KKT.
 COMPARED = {name: METHODS[name] for name in compared_methods()} | {"inverse_kkt": INVERSE_KKT}
 
 _LIMITS = (70.0, 6.0, 4.5)
 _CEILINGS = (99.99, 99.0, 90.0, 70.0, 50.0)
-# Colour, marker and line of each method: three families, inside each distinguished by the marker.
+# Colour, marker and line style of each method: colours for families, markers within a family.
 _MARKS = {
     "feedback_gain": (INK, "o", ":"),
     "inverse_lqr_gradient": (BLUE, "s", "--"),
@@ -78,7 +78,7 @@ _MARKS = {
 
 @dataclass(frozen=True)
 class Cell:
-    """One simulated subject: torque limit (Nm), VAF that the noise leaves (%), seed."""
+    """One simulated subject: torque limit (Nm), VAF of the true controller (%), seed."""
 
     limit: float
     ceiling: float
@@ -86,7 +86,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of its file."""
+        """Name of the result file."""
         return f"{self.limit:g}Nm-{self.ceiling:g}-{self.seed}"
 
 
@@ -97,10 +97,10 @@ class Outcome:
     Attributes
     ----------
     vaf : float or None
-        Of a trial that it has not seen, without noise, mean over outputs, %; None when there is no
-        gain or the simulation does not reach the end.
+        VAF of another trial without noise, mean over outputs, %; None without a gain, or if the
+        simulation diverges.
     gain_error : float or None
-        ||(K - K_true) T|| / ||K_true T||, natural coordinates of the truth.
+        ||(K - K_true) T|| / ||K_true T||, in whitened coordinates of the truth.
     has_weights : bool
     seconds : float
     reason : str
@@ -114,7 +114,7 @@ class Outcome:
 
 
 def study_cell(cell: Cell) -> dict[str, Outcome]:
-    """Fit every method to one noisy trial, and judge it on another one without noise."""
+    """Fit every method to a noisy trial, and evaluate it on another trial without noise."""
     work = seat(2, 30.0, cell.limit)
     plant, (clean, unseen) = work.problem.plant, work.problem.recordings
     rng = np.random.default_rng([cell.seed, round(100 * cell.ceiling), round(10 * cell.limit)])
@@ -148,7 +148,7 @@ def _judge(estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array) -
 
 
 def _run(cells: list[Cell], out: Path) -> dict[str, dict[str, Outcome]]:
-    """All cells: those kept in the folder are read, the others computed and kept."""
+    """Read finished cells from the folder; compute and keep the others."""
     kept = out / "cells"
     found: dict[str, dict[str, Outcome]] = {}
     for cell in cells:
@@ -178,7 +178,7 @@ def _run(cells: list[Cell], out: Path) -> dict[str, dict[str, Outcome]]:
 def _median(
     found: dict[str, dict[str, Outcome]], limit: float, ceiling: float, seeds: int, name: str
 ) -> tuple[float, float, int]:
-    """Median VAF of the seeds (a fall counts as 0) and gain error, and how many had a gain."""
+    """Median VAF (a fall counts as 0) and gain error over seeds, and the number with a gain."""
     cells = [Cell(limit, ceiling, seed).name for seed in range(seeds)]
     items = [found[cell][name] for cell in cells if name in found[cell]]
     usable = [item for item in items if item.gain_error is not None]
@@ -194,7 +194,7 @@ def _table(found: dict[str, dict[str, Outcome]], seeds: int) -> str:
     for limit in _LIMITS:
         lines += [
             f"\nlimit {limit:g} Nm: VAF % of an unseen trial without noise (error of the gain)",
-            f"{'noise leaves':<38}" + "".join(f"{ceiling:>15.2f} %" for ceiling in _CEILINGS),
+            f"{'VAF of the truth':<38}" + "".join(f"{ceiling:>15.2f} %" for ceiling in _CEILINGS),
         ]
         for name, method in COMPARED.items():
             cells = []
@@ -232,7 +232,7 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
 
 
 def main() -> None:
-    """Run the study; print the table, write figure and result.json."""
+    """Run the study, print the table, and write figure and result.json."""
     parser = argparse.ArgumentParser(description="Methods over noise and saturation.")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("results", "noise-study"))
@@ -241,7 +241,7 @@ def main() -> None:
     try:
         found = _run(cells, given.out)
     except KeyboardInterrupt:
-        print(f"interrupted; what is done is kept in {given.out / 'cells'}")
+        print(f"interrupted; finished cells are kept in {given.out / 'cells'}")
         return
     print(_table(found, given.seeds))
     content: Any = plain(

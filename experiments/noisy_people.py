@@ -1,10 +1,11 @@
-"""People of the study of noise, who sense positions and velocities: carts, and the seat.
+"""Simulate subjects with motor and sensory noise: carts, and the seat.
 
-A cart of two states under a push of three levels, two such carts with a spring between them and an
-input each, or the linear seated subject under the ternary torque. Noise is in the motor, in the
-senses, or in both, of a size that leaves the motion without noise a VAF of 90 or 70 %; the limit of
-the command is far away, or met at a tenth of the samples and more (by two carts, less often).
-Cost weights are log-uniform within a factor of two. At the limit some on the seat fall.
+The body is a cart of two states pushed at three levels, two such carts coupled by a spring with one
+input each, or the linear seated subject under the ternary torque. Noise is in the motor command, in
+the senses, or in both. Its size is chosen so that the motion without noise has a VAF of 90 or 70 %
+in the motion with noise. The limit of the command is far away, or reached in a tenth of the samples
+and more (less often by two carts). Cost weights are log-uniform within a factor of two. At the
+limit some subjects on the seat fall.
 """
 
 from __future__ import annotations
@@ -37,29 +38,29 @@ if TYPE_CHECKING:
 
 __all__ = ["BODIES", "NOISES", "Recorded", "Subject", "recorded", "subject"]
 
-#: Noise of each kind before it is scaled, as shares of the sizes that a body has: motor, senses.
+#: Motor and sensory noise of each kind before scaling, as shares of the typical sizes of a body.
 NOISES = {"motor": (1.0, 0.1), "sensory": (0.05, 1.0), "both": (1.0, 1.0)}
-#: Who moves what.
+#: Simulated bodies.
 BODIES = ("cart", "seat", "pair")
 _TRIALS, _FACTOR = 3, 2.0
-# Of the standard deviation of the recorded motion.
+# Recording noise as a share of the standard deviation of the motion.
 _RECORDER = 0.02
-# Bisections of the logarithm of the noise's size, and where it lies.
+# Bisections of the logarithm of the noise size, and its range.
 _HALVINGS, _SIZES = 14, (-4.0, 1.5)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A person, as simulated.
+    """A simulated subject.
 
     Attributes
     ----------
     controller : Controller
     person : Observer
     recorder : Array
-        Standard deviations of the recorder's noise (p,).
+        Standard deviations of the recording noise, shape (p,).
     pushes : sequence of Array
-        Of each trial (samples,), of two carts (samples, 2).
+        Disturbance of each trial, shape (samples,); (samples, 2) for two carts.
     """
 
     controller: Controller
@@ -70,18 +71,18 @@ class Subject:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What is recorded of a subject.
+    """Recordings of a subject.
 
     Attributes
     ----------
     problem : Problem
-        Initial states are not known.
+        Inverse problem with unknown initial states.
     saturated : float
         Share of the samples at the limit.
     vaf : float
-        Of the motion without noise, %, the mean of the outputs.
+        VAF of the motion without noise, mean over outputs, %.
     largest : float
-        Of the recorded outputs, in rad or m.
+        Largest magnitude of the recorded outputs, rad or m.
     """
 
     problem: Problem
@@ -91,7 +92,7 @@ class Recorded:
 
 
 def subject(body: str, seed: int, noise: str, share: float, limit: float) -> Subject:
-    """A subject whose motion without noise has a VAF of about `share` %."""
+    """Draw a subject whose motion without noise has a VAF of about `share` %."""
     kind = [BODIES.index(body), list(NOISES).index(noise)]
     rng = np.random.default_rng([seed, round(share), *kind, round(100 * limit)])
     law, pushes = {"cart": _on_cart, "seat": _on_seat, "pair": _on_pair}[body](rng, limit)
@@ -109,7 +110,7 @@ def subject(body: str, seed: int, noise: str, share: float, limit: float) -> Sub
 
 
 def recorded(who: Subject, seed: int) -> Recorded:
-    """The trials of a subject."""
+    """Simulate and record the trials of a subject."""
     law, plant, trials, met, shares = who.controller, who.controller.plant, [], [], []
     for number, push in enumerate(who.pushes):
         found = simulate_person(law, who.person, push, recorder=who.recorder, seed=[seed, number])
@@ -130,7 +131,7 @@ def recorded(who: Subject, seed: int) -> Recorded:
 
 
 def _on_cart(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
-    """Mass on wheels, 20 samples a second, 30 s a trial."""
+    """One cart: 20 samples a second, 30 s a trial."""
     system = control.ss(
         [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
         states=["x", "v"], inputs=["u", "push"], outputs=["x"],
@@ -144,7 +145,7 @@ def _on_cart(rng: np.random.Generator, limit: float) -> tuple[Controller, list[A
 
 
 def _on_pair(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
-    """Two such masses with a spring of 2 N/m between them, each pushed and each with an input."""
+    """Two carts coupled by a spring of 2 N/m, each with a disturbance and an input."""
     A = np.array(np.kron(np.eye(2), [[1, 0.05], [0, 0.98]]), dtype=np.float64)
     A[1::2, ::2] += 0.05 * 2.0 * np.array([[-1, 1], [1, -1]])
     B = np.zeros((4, 4))
@@ -164,7 +165,7 @@ def _on_pair(rng: np.random.Generator, limit: float) -> tuple[Controller, list[A
 
 
 def _on_seat(rng: np.random.Generator, limit: float) -> tuple[Controller, list[Array]]:
-    """The seated subject of the benchmarks, 100 samples a second, 30 s a trial."""
+    """The seated subject of the benchmarks: 100 samples a second, 30 s a trial."""
     work = seat(1, 2.0)
     plant, factor = work.controller.plant, np.ones(work.controller.plant.n)
     factor[:4] = np.sqrt(_factors(rng, 4))
@@ -202,7 +203,7 @@ def _agreement(
 
 
 def _moved(law: Controller, states: Array, push: Array) -> float:
-    """VAF of the motion without noise in the motion with it, the mean of the outputs, %."""
+    """VAF of the noise-free motion in the noisy motion, mean over outputs, %."""
     plant = law.plant
     clean = simulate(law, scenario(plant, np.zeros(plant.n), disturbance=push)).x[:-1]
     return float(np.mean(vaf(states @ plant.C.T, clean @ plant.C.T)))

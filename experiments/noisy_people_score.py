@@ -1,4 +1,4 @@
-"""A simulated subject of `noisy_people` scored: least squares beside maximum likelihood."""
+"""Score the fits of a simulated subject: least squares and maximum likelihood."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ __all__ = [
     "true_unknowns",
 ]
 
-#: A limit that is not met, and one that is, of each body at each VAF.
+#: A limit that is not reached, and one that is, for each body and VAF.
 LIMITS = {
     ("cart", 90.0): (5.0, 0.7),
     ("cart", 70.0): (5.0, 0.7),
@@ -44,17 +44,16 @@ LIMITS = {
     ("seat", 90.0): (70.0, 6.0),
     ("seat", 70.0): (70.0, 9.0),
 }
-# Who on the seat is at a limit that is met in fewer samples, or more, is no subject, nor who falls
-# in any trial that is not recorded, from this number on: of people who fall now and then, those who
-# did not have had other noise than the model says.
+# Subjects on the seat are left out if they saturate outside this range, or if they fall in any of
+# `_SIMULATED` further trials: the noise of trials without a fall differs from that of the model.
 _SHARES, _UNSEEN, _SIMULATED = (0.12, 0.40), 1000, 60
-#: An angle that is a fall, rad.
+#: Angle that counts as a fall, rad.
 FALLEN = 1.0
 
 
 @dataclass(frozen=True)
 class Score:
-    """A subject.
+    """Scores of both fits of a subject.
 
     Attributes
     ----------
@@ -64,28 +63,26 @@ class Score:
     saturated : float
         Share of the samples at the limit.
     vaf : float
-        Of the motion without noise, %.
+        VAF of the motion without noise, %.
     above : float
-        What the search makes largest, at its end minus at the truth, nats.
+        Objective of the search at its end minus that at the truth, nats.
     converged : bool
     evaluations : int
     least_error, likely_error : float
-        Of the gain, as a share of it, in natural coordinates.
+        Relative error of the gain, in whitened coordinates.
     least, likely, expected : list of pairs
-        Error and deviation along each direction that the method says, the best first: of least
-        squares, and of maximum likelihood by the sandwich and as expected.
+        Error and standard error along each determined direction, best first: of least squares,
+        and of maximum likelihood with sandwich and with expected covariance.
     entries : list of pairs
-        Intervals of the entries of the gain by the sandwich, less the truth, as shares of the
-        entry: as printed.
+        Printed sandwich intervals of the gain entries minus the truth, relative to the entry.
     fell : list of float
-        Where asked for, by how many nats the likelihood falls with each of the directions of
-        `likely` held at the truth.
+        Optional: fall of the likelihood with each direction of `likely` fixed at the truth, nats.
     levels, found : list of float
-        Motor, senses, recorder: true, and found.
+        True and fitted noise SDs: motor, senses, recording.
     level_intervals : list of pairs
-        By the sandwich, as printed.
+        Printed sandwich intervals of the noise SDs.
     seconds : list of float
-        Of processor time: least squares, likelihood, what falls.
+        Processor time of least squares, likelihood, and profiles.
     """
 
     study: str
@@ -116,7 +113,7 @@ def score(
     *,
     profiled: bool = False,
 ) -> Score:
-    """Both fits of a subject and, asked for, what falls."""
+    """Fit a subject by both methods, with profiles on request."""
     truth = np.array(who.controller.K)
     clock = [time.process_time()]
     first = fit(trials.problem)
@@ -159,17 +156,17 @@ def score(
 
 
 def blind(who: Subject) -> Observer:
-    """Levels to start from that know nothing of the subject but which there are."""
+    """Starting noise SDs that use only which of them are zero."""
     return who.person.with_levels(np.where(who.person.levels > 0, 0.1, 0.0))
 
 
 def above_truth(likely: OutputFeedbackFit, who: Subject) -> float:
-    """What the search makes largest, at the fit minus at the subject as simulated, nats."""
+    """Objective of the search at the fit minus that at the true subject, nats."""
     return likely.value - likely.prior.at(true_unknowns(likely, who)).value
 
 
 def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
-    """The subject as simulated, in the coordinates of the fit (q,)."""
+    """The true subject in the coordinates of the fit, shape (q,)."""
     space = likely.space
     own, theta = space.space, np.array(space.start)
     truth = own.natural(np.array(who.controller.K))
@@ -191,7 +188,7 @@ def _steps(
 
 
 def _identified(directions: Array, deviations: Array) -> tuple[Array, Array]:
-    """Determined directions and their deviations, the best identified first."""
+    """Determined directions and their standard errors, best first."""
     order = np.argsort(deviations, kind="stable")
     order = order[deviations[order] < IDENTIFIED]
     return directions[order], deviations[order]
@@ -200,13 +197,13 @@ def _identified(directions: Array, deviations: Array) -> tuple[Array, Array]:
 def _aims(
     fit: OutputFeedbackFit, covariance: PersonCovariance, who: Subject
 ) -> tuple[Array, Array, Array]:
-    """Determined directions, their deviations, and where the truth is along them."""
+    """Determined directions, their standard errors, and the truth along them."""
     directions, deviations = _identified(covariance.directions, covariance.deviations)
     return directions, deviations, directions @ true_unknowns(fit, who)[: fit.space.gain]
 
 
 def _fell(likely: OutputFeedbackFit, covariance: PersonCovariance, who: Subject) -> list[float]:
-    """What the likelihood falls by along each direction held at the truth, nats."""
+    """Fall of the likelihood with each direction fixed at the truth, nats."""
     found, along = [], np.zeros(len(likely.theta))
     directions, _, aims = _aims(likely, covariance, who)
     for direction, aim in zip(directions, aims, strict=True):
@@ -216,7 +213,7 @@ def _fell(likely: OutputFeedbackFit, covariance: PersonCovariance, who: Subject)
 
 
 def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
-    """Errors and deviations along determined directions, each turned to where it is largest."""
+    """Errors and standard errors along determined directions, with a fixed sign convention."""
     found = []
     for direction, deviation in zip(*_identified(directions, deviations), strict=True):
         sign = np.sign(direction[np.argmax(np.abs(direction))])
@@ -225,7 +222,7 @@ def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[flo
 
 
 def passed_over(who: Subject, trials: Recorded, seed: int, *, met: bool) -> str:
-    """Why somebody on the seat is no subject; empty for a subject."""
+    """Why a subject on the seat is left out; empty if kept."""
     low, high = _SHARES
     if trials.largest > FALLEN or (met and falls(who, seed)):
         return "falls"
@@ -233,7 +230,7 @@ def passed_over(who: Subject, trials: Recorded, seed: int, *, met: bool) -> str:
 
 
 def falls(who: Subject, seed: int) -> int:
-    """In how many of sixty trials that nobody records a subject falls."""
+    """Number of sixty further simulated trials that end in a fall."""
     found = 0
     for number in range(_SIMULATED):
         push = who.pushes[number % len(who.pushes)]

@@ -1,7 +1,8 @@
-"""People who sense with noise: the fit of least squares beside maximum likelihood, with coverage.
+"""Coverage of least squares and maximum likelihood on subjects with sensory noise.
 
-The people are those of `noisy_people`. Each line that is written is a subject, of each kind in
-turn, so that a run can be ended at any time, be gone on with, and be summed up:
+The subjects are those of `noisy_people`. Each line that is written is one subject, of each kind in
+turn, so a run can be interrupted, continued and summarised.
+Results: experiments/output_feedback.md.
 
     python -m experiments.noisy_people_study run --subjects 200 --out a.jsonl
     python -m experiments.noisy_people_study run --body seat --vaf 90 --subjects 20 --out b.jsonl
@@ -21,7 +22,7 @@ from experiments.noisy_people_score import LIMITS, Score, passed_over, score
 from experiments.noisy_people_table import pooled, table
 from impc.errors import ImpcError
 
-# Digits of a number that is kept.
+# Digits kept of each number.
 _DIGITS = 4
 
 
@@ -47,14 +48,14 @@ def _run(given: argparse.Namespace) -> None:
                 line = {"study": study, "seed": seed, "passed": reason}
                 if not reason:
                     line = asdict(score(who, trials, study, seed, profiled=given.profiles))
-            except ImpcError as error:  # counted: most are of the first fit, of a cart that ran off
+            except ImpcError as error:  # Most are first fits of a diverged cart
                 line = {"study": study, "seed": seed, "reason": str(error)}
             file.write(json.dumps(_short(line)) + "\n")
             file.flush()
 
 
 def _short(value: object) -> object:
-    """The same with fewer digits."""
+    """Round all numbers."""
     if isinstance(value, float):
         return float(f"{value:.{_DIGITS}g}")
     if isinstance(value, dict):
@@ -90,8 +91,8 @@ def _sum(given: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Run a study, or sum up what runs have written."""
-    parser = argparse.ArgumentParser(description="People who sense with noise.")
+    """Run a study, or summarise result files."""
+    parser = argparse.ArgumentParser(description="Coverage on subjects with sensory noise.")
     which = parser.add_subparsers(required=True)
     run = which.add_parser("run")
     run.add_argument("--body", choices=BODIES, default="cart")

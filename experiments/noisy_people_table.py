@@ -1,4 +1,4 @@
-"""Rows of the table of people who sense with noise, and all rows of a kind in one line."""
+"""Tables of the study of subjects with sensory noise, and summaries of each kind."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ if TYPE_CHECKING:
 
 __all__ = ["HEADS", "means", "pooled", "row", "table"]
 
-#: Of the columns.
+#: Headings of the columns.
 HEADS = (
-    "people", "count", "at the limit %", "ended at the truth or above", "settled",
+    "subjects", "count", "at the limit %", "ended at the truth or above", "converged",
     "least squares: error %", "bias / deviation", "95 % holds %",
     "likelihood: error %", "bias / deviation", "95 % holds % (sandwich)", "(expected)",
-    "(profile)", "entries identified, all", "levels hold %", "seconds: least squares, likelihood",
+    "(profile)", "entries identified, all", "SDs hold %", "seconds: least squares, likelihood",
 )  # fmt: skip
-# Nats by which a likelihood falls at either end of an interval of 95 %.
+# Fall of the likelihood at either end of a 95 % interval, nats.
 _LOWER = TWO_SIDED**2 / 2
-# An entry is identified when half of its interval is below this share of it.
+# An entry is identified if half of its interval is below this share of it.
 _IDENTIFIED = 1.0
-# As far below the truth a search may end, nats.
+# A search ended at the truth if it is at most so far below it, nats.
 _ENDED = 0.5
-# Of a deviation: what a bias is to be below.
+# Small bias, in standard errors.
 _BIAS = 0.25
 
 Pairs = list[tuple[float, float]]
 
 
 def table(studies: Sequence[list[Score]]) -> list[str]:
-    """Lines in Markdown, without columns in which no study has anything.
+    """Markdown table without columns that are empty in all studies.
 
     Parameters
     ----------
     studies : sequence of list of Score
-        Those of one kind each.
+        Scores of one kind each.
     """
     rows = [row(each) for each in studies]
     filled = [k for k in range(len(HEADS)) if any(cells[k] != "-" for cells in rows)]
@@ -56,7 +56,7 @@ def row(scores: list[Score]) -> list[str]:
     Parameters
     ----------
     scores : list of Score
-        Of the same kind of people.
+        Scores of the same kind of subjects.
     """
     cells = [
         scores[0].study,
@@ -82,13 +82,12 @@ def row(scores: list[Score]) -> list[str]:
 
 
 def means(pairs: Sequence[Pairs]) -> list[tuple[float, float]]:
-    """Mean error in deviations and its standard error, of each direction that most identify.
+    """Mean error over SE, with its standard error, of each direction that most subjects identify.
 
     Parameters
     ----------
     pairs : sequence of list of pairs
-        Error and deviation along the directions that each subject is identified along, the best
-        first.
+        Error and standard error along the identified directions of each subject, best first.
     """
     found = []
     for each in itertools.zip_longest(*pairs):
@@ -100,12 +99,12 @@ def means(pairs: Sequence[Pairs]) -> list[tuple[float, float]]:
 
 
 def pooled(studies: Sequence[list[Score]]) -> str:
-    """What holds of all people of several kinds, in one line.
+    """Summarise all subjects of several kinds in one line.
 
     Parameters
     ----------
     studies : sequence of list of Score
-        Those of one kind each.
+        Scores of one kind each.
     """
     scores = list(itertools.chain(*studies))
     biases = [each for one in studies for each in means([score.likely for score in one])]
@@ -116,14 +115,14 @@ def pooled(studies: Sequence[list[Score]]) -> str:
     counts = (
         f"directions {_count([_inside(one.likely) for one in scores])}",
         f"entries {_count([_around(one.entries) for one in scores])}",
-        f"levels {_count([_levels(one) for one in scores])}",
-        f"settled {sum(one.converged for one in scores)}",
-        f"gains off by more than themselves {len(far)}, of which {len(settled)} settled",
+        f"noise SDs {_count([_levels(one) for one in scores])}",
+        f"converged {sum(one.converged for one in scores)}",
+        f"gains off by more than themselves {len(far)}, of which {len(settled)} converged",
         f"mean errors below {_BIAS} {small} of {len(biases)}",
         f"the farthest {farthest:.1f} of its standard errors from none",
         f"mean errors of all {_bias([one.likely for one in scores])}",
     )
-    return f"{len(scores)} people: " + ", ".join(counts)
+    return f"{len(scores)} subjects: " + ", ".join(counts)
 
 
 def _bias(pairs: Sequence[Pairs]) -> str:
@@ -131,7 +130,7 @@ def _bias(pairs: Sequence[Pairs]) -> str:
 
 
 def _levels(score: Score) -> list[bool]:
-    """Which levels are inside their intervals."""
+    """Whether each noise SD is inside its interval."""
     both = zip(score.levels, score.level_intervals, strict=True)
     return [low <= level <= high for level, (low, high) in both]
 
@@ -150,7 +149,7 @@ def _count(holds: list[list[bool]]) -> str:
 
 
 def _share(holds: list[list[bool]]) -> str:
-    """Share of all, %, with its standard error, subjects being independent; - of none."""
+    """Share in % with its standard error for independent subjects; "-" without data."""
     if not holds:
         return "-"
     counts = np.array([[sum(each), len(each)] for each in holds], dtype=np.float64)

@@ -1,9 +1,9 @@
-"""When is the linear controller adequate: it against a nonlinear one, both on the full equations.
+"""Compare the linear with a nonlinear controller on the full equations of the seat.
 
-The seated subject under the ternary torque at rising amplitudes, the torque limit rising with it so
-that the share of saturated samples stays. Three loops: the linear controller on the linear plant,
-the linear controller on the nonlinear plant, and the nonlinear controller (IPOPT) on the nonlinear
-plant, all with the true weights.
+The amplitude of the ternary torque and the torque limit increase together, so the share of
+saturated samples stays. Three loops: the linear controller on the linear plant, the linear
+controller on the nonlinear plant, and the nonlinear controller (IPOPT) on the nonlinear plant, all
+with the true weights.
 
     python -m experiments.nonlinear_check
 """
@@ -41,7 +41,7 @@ class Comparison:
     Attributes
     ----------
     amplitude : float
-        Of the torque, Nm.
+        Amplitude of the torque, Nm.
     angle : float
         Largest angle under the nonlinear controller.
     controllers : float

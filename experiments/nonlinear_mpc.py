@@ -1,11 +1,11 @@
-"""The controller with the plant's full equations inside, to show when the linear one is adequate.
+"""MPC with the full equations of the plant, to test when the linear controller is adequate.
 
     minimise    x_N' P x_N + sum_{k<N} (x_k' Q x_k + u_k' R u_k)              (3.1), with f
     subject to  x_{k+1} = f(x_k, u_k),   u_min <= u_k <= u_max
 
-by single shooting in CasADi, solved by IPOPT at every sample, each from the last answer moved on by
-one sample. P is the Riccati solution of the linearised plant, so that for small states the law is
-that of the linear controller.
+by single shooting in CasADi. IPOPT solves every sample, starting from the last solution shifted by
+one sample. P is the Riccati solution of the linearised plant, so for small states the controller is
+the linear one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.model.weights import Weights
 
 _OPTIONS: dict[str, Any] = {
-    "expand": True,  # the functions of all samples in one list: half the time
+    "expand": True,  # All functions in one list: half the time
     "print_time": False,
     "error_on_fail": False,
     "ipopt": {
@@ -39,15 +39,15 @@ _OPTIONS: dict[str, Any] = {
         "mu_init": 1e-4,
     },
 }
-# A state this many times the driving size is no state of a plant that still stands.
+# States above this multiple of the disturbance count as diverged.
 _FALLEN = 1e6
 
 
 @dataclass(frozen=True)
 class NonlinearMpc:
-    """A nonlinear controller, built."""
+    """A nonlinear controller with its solver."""
 
-    plant: Plant  # Its linearisation
+    plant: Plant  # Linearised plant
     step: Any  # (state (n), all inputs (m + d)) -> next state: the plant, with its disturbances
     solver: Any  # CasADi's nlpsol: start x and parameters -> sequence
     horizon: int  # N in samples, number of states, number of inputs
@@ -61,7 +61,7 @@ class NonlinearMpc:
 def build_nonlinear_mpc(
     step: Any, plant: Plant, weights: Weights, bounds: Bounds, horizon: int
 ) -> NonlinearMpc:
-    """Build the program."""
+    """Build the nonlinear program and its solver."""
     n, m, d = plant.n, plant.m, plant.E.shape[1]
     P = solve_lqr(plant, weights).P
     finite = np.where(np.isfinite(bounds.u_max), np.abs(bounds.u_max), 1.0)
@@ -74,7 +74,7 @@ def build_nonlinear_mpc(
         cost += x.T @ Q @ x + command.T @ R @ command
         x = step(x, ca.vertcat(command, ca.DM.zeros(d)))
     cost += x.T @ ca.DM(np.array(P)) @ x
-    # The scale of the cost follows the state, so that the tolerance means the same at every one.
+    # The cost is scaled by the state, so that the tolerance means the same at every state.
     size = 1e-9 + x0.T @ ca.DM(np.array(P)) @ x0
     program = {"x": ca.vec(u), "p": x0, "f": cost / size}
     solver = ca.nlpsol("nonlinear_mpc", "ipopt", program, _OPTIONS)
@@ -84,7 +84,7 @@ def build_nonlinear_mpc(
 
 
 def simulate_nonlinear(mpc: NonlinearMpc, given: Scenario) -> Simulation:
-    """Simulate the nonlinear plant under the nonlinear controller; never raises on the way."""
+    """Simulate the nonlinear plant and controller; a failed sample ends it without an error."""
     steps = given.steps
     x, u = np.zeros((steps + 1, mpc.n)), np.zeros((steps, mpc.m))
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)

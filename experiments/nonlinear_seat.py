@@ -1,12 +1,11 @@
-"""Does it matter whether a person predicts with the full equations? The seat, by simulation.
+"""Simulate and fit seated subjects whose controller predicts with the full equations.
 
-    python -m experiments.nonlinear_seat people    torques and recordings of such people, and fits
-    python -m experiments.nonlinear_seat prices    prices, by the full equations and without
+    python -m experiments.nonlinear_seat people    torques, recordings, fits, and the figure
+    python -m experiments.nonlinear_seat prices    cost weights, with full equations and without
 
-The body that moves has its full equations throughout. A *full* person predicts with them too
-(`experiments.nonlinear_mpc`), a *linear* one with their slopes at rest. The torque limit
-is 1.2 times the amplitude of the torque on the seat. docs/nonlinear-seat.md has the answers;
-`people` draws its figure.
+The simulated body has its full equations throughout. A *full* subject predicts with them too
+(`experiments.nonlinear_mpc`), a *linear* one with their linearisation at rest. The torque limit is
+1.2 times the amplitude of the torque on the seat. Results: experiments/nonlinear_seat.md.
 """
 
 from __future__ import annotations
@@ -48,13 +47,13 @@ if TYPE_CHECKING:
 __all__ = ["Amplitude", "Fitted", "compare_at", "first_torques", "fitted_person", "fitted_prices"]
 
 _RATE, _SHARE = 100.0, 1.2
-_NOISE = np.radians(0.03)  # of the recorder, at 100 samples a second
-FIGURE = Path(__file__).parent.parent / "docs" / "images" / "nonlinear-seat.png"
+_NOISE = np.radians(0.03)  # Recording noise at 100 samples a second
+FIGURE = Path(__file__).parent / "images" / "nonlinear-seat.png"
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """The usual fit of a person's recordings: nonlinear body, linear prediction.
+    """Fit with nonlinear body and linear prediction, compared with the truth.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class Fitted:
     vaf : float
         %, without noise.
     deviations : float
-        Largest error of an entry of the gain over its standard deviation (`deviations_at`).
+        Largest error of an entry of the gain over its standard error (`deviations_at`).
     """
 
     error: float
@@ -77,18 +76,18 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Amplitude:
-    """A full person under a torque on the seat.
+    """A full subject under a torque on the seat.
 
     Attributes
     ----------
     amplitude, angle : float
-        Of that torque, N m; largest angle, rad.
+        Amplitude of the torque, N m, and largest angle, rad.
     seat : Array
-        Angle of the seat at each sample (samples,), rad.
+        Angle of the seat at each sample, shape (samples,), rad.
     torques : Array
-        From each of these states, of this person and of a linear one (samples, 2), N m.
+        First torques from each state, of this subject and of a linear one (samples, 2), N m.
     where : Array
-        0: nowhere in the linear plan at the limit; 1: later in it; 2: at once (samples,).
+        Limit in the linear plan: 0 never active, 1 later, 2 at the first sample (samples,).
     fitted : Fitted
     """
 
@@ -115,7 +114,7 @@ def first_torques(tilts: Sequence[float], together: bool) -> Array:
 
 
 def compare_at(amplitude: float, seconds: float) -> Amplitude:
-    """Simulate a full person at one amplitude of the torque on the seat, and fit the recording."""
+    """Simulate a full subject at one amplitude of the torque on the seat, and fit the recording."""
     limit = _SHARE * amplitude
     controller = _person(limit)
     plant = controller.plant
@@ -139,7 +138,7 @@ def compare_at(amplitude: float, seconds: float) -> Amplitude:
 def fitted_person(
     controller: Controller, drive: Scenario, run: Simulation, deviations: Array
 ) -> Fitted:
-    """Fit a trial without noise from the person's weights, and compare with the gain at rest."""
+    """Fit a noise-free trial from the true weights, and compare with the gain at rest."""
     truth, plant = np.ravel(controller.K), controller.plant
     problem = _problem(controller, [drive], [run.x @ plant.C.T])
     found = free_gain(problem, seat_weights(plant))
@@ -154,10 +153,7 @@ def fitted_person(
 
 
 def deviations_at(amplitude: float, trials: int = 3, seconds: float = 30.0) -> Array:
-    """Standard deviations of the gain (1, n) that noise alone makes in trials of a linear person.
-
-    White noise of 0.03 degrees at 100 samples a second, as the default subject's recorder leaves.
-    """
+    """Standard errors of the gain (1, n) of a linear subject with the default recording noise."""
     controller = _person(_SHARE * amplitude)
     plant, rng = controller.plant, np.random.default_rng(0)
     drives = [
@@ -177,9 +173,9 @@ def deviations_at(amplitude: float, trials: int = 3, seconds: float = 30.0) -> A
 
 
 def fitted_prices(amplitude: float, steps: int) -> dict[str, Array]:
-    """Prices of a full person over the truth, by the full equations and by linear prediction.
+    """Fitted cost weights over true ones, with the full equations and with linear prediction.
 
-    The states are recorded without noise and the limit is known; the search begins 30 % off.
+    The states are recorded without noise and the limit is known; the search starts 25 to 30 % off.
     """
     truth = {**TRUTH, "limit": _SHARE * amplitude}
     problem = seat_problem().with_known({"limit": truth.pop("limit")})
@@ -228,7 +224,7 @@ def _problem(
 
 
 def _linear_plans(controller: Controller, x: Array) -> Array:
-    """Torques (samples, N) that the linear person plans from each state (samples, n)."""
+    """Torques (samples, N) that the linear subject plans from each state (samples, n)."""
     mpc = build_mpc(controller, "daqp")
     return np.array([np.ravel(solve_mpc(mpc, one).plan) for one in x])
 
@@ -256,18 +252,18 @@ def _print_amplitude(found: Amplitude) -> None:
     one = found.fitted
     print(
         f"  gain off by {100 * one.error:.2f} %, its torque by {100 * one.torque:.3f} %, VAF "
-        f"{one.vaf:.5f} %, {one.deviations:.1f} deviations",
+        f"{one.vaf:.5f} %, {one.deviations:.1f} standard errors",
         flush=True,
     )
 
 
 def main() -> None:
     """Print the tables of a study."""
-    parser = argparse.ArgumentParser(description="People who predict with the full equations.")
+    parser = argparse.ArgumentParser(description="Subjects who predict with the full equations.")
     parser.add_argument("study", choices=("people", "prices"))
     parser.add_argument("--amplitudes", type=float, nargs="+", default=[1.0, 2.5, 5.0, 7.5, 10.0])
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--steps", type=int, default=60, help="of the recording of prices")
+    parser.add_argument("--steps", type=int, default=60, help="samples of `prices`")
     given = parser.parse_args()
     if given.study == "prices":
         for amplitude in given.amplitudes:

@@ -1,4 +1,4 @@
-"""The figure of docs/nonlinear-seat.md: torques by tilt, errors of the fitted gain by angle."""
+"""Figure of experiments/nonlinear_seat.md: torque by tilt, error of the fitted gain by angle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["seat_figure"]
 
 
 def seat_figure(tilts: Array, from_rest: Mapping[str, Array], people: Sequence[Amplitude]) -> bytes:
-    """Draw it as PNG; `tilts` in degrees, `from_rest` as `first_torques` by the posture."""
+    """Draw the PNG; `tilts` in degrees, `from_rest` maps posture to `first_torques`."""
     with page_style():
         figure = new_figure(3.5, 4.6)
         above, below = figure.subplots(2, 1)

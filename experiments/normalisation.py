@@ -1,8 +1,8 @@
-"""Both normalisation protocols of chapter 2, run on the simulated seated subject.
+"""Run both normalisation protocols of chapter 2 on the simulated seated subject.
 
-The subject holds the seat by one controller, learnt at 120 Nm/rad, with a torque limit of 6 Nm and
-motor noise of 1 Nm; balance is lost beyond 12 degrees. A subject who adapts fully to every seat
-loses balance only near 0 Nm/rad.
+The subject uses one controller, learnt at 120 Nm/rad, with a torque limit of 6 Nm and motor noise
+of 1 Nm; balance is lost beyond 12 degrees. A subject who adapts fully to every stiffness would
+lose balance only near 0 Nm/rad.
 
     python -m experiments.normalisation
 """
@@ -29,12 +29,12 @@ _LEARNT = 120.0  # Nm/rad
 
 
 def subject_balances(stiffness: float, torque: Array, seed: int) -> bool:
-    """Whether the seat stays inside its stops for the length of a torque."""
+    """Whether the seat stays inside its stops during a trial."""
     return subject_peak(stiffness, torque, seed) < _STOP
 
 
 def subject_peak(stiffness: float, torque: Array, seed: int) -> float:
-    """Largest angle of the seat in degrees; infinite when the subject falls."""
+    """Largest angle of the seat, degrees; infinite after a fall."""
     step = plants.seated_balance_step_for(k_r=stiffness)
     trial = simulate_subject(
         _controller(), step, torque, rate=_RATE, motor=_MOTOR, largest=np.pi, seed=seed
@@ -55,7 +55,7 @@ def _controller() -> Controller:
 
 
 def main() -> None:
-    """Run both protocols and print what they find."""
+    """Run both protocols and print their results."""
     seeds = iter(range(10_000))
     still = np.zeros(round(10 * _RATE))
     stiffness = critical_stiffness(lambda k: subject_balances(k, still, next(seeds)))

@@ -1,11 +1,10 @@
-"""Nonlinear inverse MPC on the four systems of Safe-PDP: the tables of docs/nonlinear.md.
+"""Nonlinear inverse MPC on the four systems of Safe-PDP: tables of experiments/nonlinear.md.
 
     python -m experiments.peer_benchmark starts     ten starts 10 % and ten 30 % off, one plan each
     python -m experiments.peer_benchmark loops      receding horizon: 60 samples, horizon 20
     python -m experiments.peer_benchmark noise      coverage of intervals at 20 dB on the robot arm
 
-A start is truth * exp(S normal), seeds 0 to 9. Safe-PDP's figures are those that its repository
-records (Jin, Mou and Pappas, NeurIPS 2021).
+A start is truth * exp(S normal), seeds 0 to 9 (Jin, Mou and Pappas, NeurIPS 2021).
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "identified_error"]
 
-#: Of the closed loops: initial state, and what differs from the truth of the one plan, so that
-#: limits of states and of inputs are both met.
+#: Closed loops: initial state, and changes of the true parameters so that limits of states and of
+#: inputs are both reached.
 LOOPS: dict[str, tuple[list[float], dict[str, float]]] = {
     "cart-pole": ([0.0, 0.0, 0.0, 0.0], {}),
     "robot arm": ([-1.5, 1.5, 0.0, 0.0], {"max_q": 1.6, "wdq1": 0.02, "wdq2": 0.02}),
@@ -44,19 +43,19 @@ LOOPS: dict[str, tuple[list[float], dict[str, float]]] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """A search from a start.
+    """Result of one search.
 
     Attributes
     ----------
     loss : float
-        Sum of squares over states and inputs; NaN where there is no plan at the start.
+        Sum of squares over states and inputs; NaN without a plan at the start.
     error : float
-        Largest relative error of a identified product of parameters.
+        Largest relative error of an identified product of parameters.
     evaluations : int
     seconds : float
         CPU time, s.
     unidentified : str
-        What is not identified.
+        Unidentified combinations.
     """
 
     loss: float
@@ -67,7 +66,7 @@ class Outcome:
 
 
 def demonstration(system: PeerSystem) -> OptimalRecording:
-    """The plan at the truth, to the last digit."""
+    """Recording of the plan at the true parameters, without noise."""
     plan = system.problem.plan(system.truth, system.x0, mu=1e-12)
     return system.problem.recorded_plan(plan.x, plan.u)
 
@@ -107,10 +106,11 @@ def _product(truth: dict[str, float], one: Combination) -> float:
 
 
 def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bool]], list[str]]:
-    """Whether 95 % intervals hold the truth, by identified product, on the noisy robot arm.
+    """Whether 95 % intervals cover, by identified product, on the noisy robot arm.
 
-    Noise on states and inputs, each of its signal's root mean square less `decibel`; the initial
-    state is known, and the start is the truth. What else was unidentified by the noise is listed.
+    The noise on states and inputs is `decibel` below the root mean square of each signal. The
+    initial state is known, and the search starts at the truth. The second result lists repetitions
+    with other unidentified directions.
     """
     system = SYSTEMS["robot arm"]()
     clean = demonstration(system)
@@ -185,7 +185,7 @@ def main() -> None:
     parser.add_argument("study", choices=["starts", "loops", "noise"])
     parser.add_argument("--systems", nargs="+", default=list(SYSTEMS), choices=list(SYSTEMS))
     parser.add_argument("--count", type=int, default=10, help="starts, or tens of repetitions")
-    parser.add_argument("--solver", default="ipopt", choices=SOLVERS, help="of the closed loops")
+    parser.add_argument("--solver", default="ipopt", choices=SOLVERS, help="for `loops`")
     given = parser.parse_args()
     if given.study == "starts":
         _starts(given.systems, given.count)

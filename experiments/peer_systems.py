@@ -1,8 +1,8 @@
 """The four systems of Safe-PDP (Jin, Mou and Pappas, NeurIPS 2021) as optimal control problems.
 
-Equations, prices, limits, sample times, horizons and initial states are those by which its
-demonstrations of *learning MPC from demonstrations* are made; dynamics, constraints and prices are
-unknown together, and one price is known for the scale.
+Equations, cost weights, limits, sample times, horizons and initial states are those of its
+demonstrations (*learning MPC from demonstrations*). Dynamics, constraints and cost weights are
+unknown together; one cost weight is known and fixes the scale.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class PeerSystem:
     name : str
     problem : OptimalControlProblem
     truth : dict
-        Parameters that made the demonstration, in SI units.
+        Parameters of the demonstration, in SI units.
     x0 : Array
         Initial state of the demonstration (n,).
     """
@@ -165,7 +165,7 @@ def _rocket(horizon: int = 40) -> PeerSystem:
     return PeerSystem("rocket", problem, truth, x0)
 
 
-#: By its name, how a system is made; a horizon in samples may be given.
+#: Name -> function that builds the system, optionally with another horizon in samples.
 SYSTEMS = {
     "cart-pole": _cart_pole,
     "robot arm": _robot_arm,

@@ -1,11 +1,12 @@
-"""Does a plan come true? Fits of simulated recordings beside the deviations that were foreseen.
+"""Compare the standard errors that a plan predicts with the scatter of simulated fits.
 
     python -m experiments.plan_study cart --fits 100
     python -m experiments.plan_study seat --fits 100
 
-Every experiment of a small grid is planned and fitted with fresh noise, so that the best amplitude
-of the plan can be compared with the best one of the fits (docs/planning.md). The cart is at its
-limit for up to a fifth of the time; the seat has three trials of 30 s, coloured noise and no limit.
+Every experiment of a small grid is planned and fitted with new noise, so the best amplitude of the
+plan can be compared with the best one of the fits. The cart is at its limit in up to a fifth of the
+samples. The seat has three trials of 30 s, coloured noise and no limit. Results:
+experiments/planning.md.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def cart() -> tuple[Person, Perturbation, tuple[Design, ...], int]:
 
 
 def seat() -> tuple[Person, Perturbation, tuple[Design, ...], int]:
-    """The seated person of docs/structures.md, with noise correlated over 50 ms."""
+    """The seated subject of experiments/structures.md, noise with a correlation time of 50 ms."""
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, "diagonal", over=_BODY)
     cost_weights = np.log([6e3, 9e3, 6e2, 4e2])
@@ -79,10 +80,7 @@ _PEOPLE: dict[str, Callable[[], tuple[Person, Perturbation, tuple[Design, ...], 
 
 
 def compare(name: str, fits: int) -> list[tuple[Design, Array, Array, Array, Array]]:
-    """Experiment, then deviations of weights, foreseen and seen, and of identified gains, both.
-
-    Gains are along the directions that the plan calls identified.
-    """
+    """Experiment, then predicted and observed SEs of cost weights and of identified directions."""
     person, perturbation, grid, trials = _PEOPLE[name]()
     found = []
     for design in tqdm(grid, disable=None):
@@ -107,15 +105,15 @@ def compare(name: str, fits: int) -> list[tuple[Design, Array, Array, Array, Arr
 
 
 def main() -> None:
-    """Print a row an experiment."""
-    parser = argparse.ArgumentParser(description="Plans beside fits of simulated recordings.")
+    """Print a row for each experiment."""
+    parser = argparse.ArgumentParser(description="Plans compared with simulated fits.")
     parser.add_argument("person", choices=tuple(_PEOPLE))
     parser.add_argument("--fits", type=int, default=100)
     given = parser.parse_args()
     found = compare(given.person, given.fits)
     print(
-        "| amplitude | dwell (s) | cost weights, foreseen | seen / foreseen | gains, seen / "
-        "foreseen |"
+        "| amplitude | hold time (s) | cost weights, predicted | observed / predicted | gains, "
+        "observed / predicted |"
     )
     print("|---|---|---|---|---|")
     for design, foreseen, seen, gains, gains_seen in found:

@@ -1,10 +1,10 @@
-"""Coverage of the 95 % intervals that a fit prints: how often they hold the true gain.
+"""Coverage of the 95 % gain intervals that a fit prints.
 
-One, two or three carts on a falling track, each with a force of its own and coupled by springs,
-pushed at random for 80 s; every force is at its limit for some percent of the time. The positions
-are recorded with noise, white or first-order, that leaves a VAF of 90 or 70 % to reach. Each
-recording is fitted as `impc fit` does, and the intervals of the entries of K that the recordings
-say, and of its identified directions, are compared with the truth.
+One, two or three carts on a falling track, each with its own force and coupled by springs, are
+pushed at random for 80 s. Every force is at its limit in some percent of the samples. The positions
+are recorded with noise, white or first-order, with which the truth has a VAF of 90 or 70 %. Each
+recording is fitted as `impc fit` does. The intervals of the individually identified entries of K
+and of the identified directions are compared with the truth. Results: experiments/coverage.md.
 
     python -m experiments.printed_intervals --recordings 200
     python -m experiments.printed_intervals --recordings 200 --random
@@ -60,16 +60,16 @@ _HORIZON, _SAMPLES, _HOLD, _BEFORE = 8, 800, 10, 500
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of one recording's fit over the standard deviations that are printed with it.
+    """Errors of one fit over the printed standard errors.
 
     Attributes
     ----------
     entries : Array
-        Of K (m * n,); NaN where the recording does not identify the entry by itself.
+        Errors of the entries of K (m * n,); NaN if not individually identified.
     directions : Array
-        Along the directions of the gain (m * n,), best determined first; NaN where not identified.
+        Errors along the directions of the gain (m * n,), best first; NaN if not identified.
     bias : Array
-        Error of each entry of K over its true value (m * n,).
+        Relative error of each entry of K (m * n,).
     """
 
     entries: Array
@@ -102,7 +102,7 @@ def carts(count: int, dt: float = 0.1) -> Plant:
 
 
 def regulator(plant: Plant) -> Controller:
-    """Cost weights of 4, 5, ... on positions and 1 on speeds; R is 1 on, .3 beside the diagonal."""
+    """Q: 4, 5, ... on positions and 1 on speeds; R: 1 on the diagonal, 0.3 elsewhere."""
     m = plant.m
     Q = np.diag(np.concatenate([4.0 + np.arange(m), np.ones(plant.n - m)]))
     weights = Weights(Q, 0.7 * np.eye(m) + 0.3)
@@ -111,7 +111,7 @@ def regulator(plant: Plant) -> Controller:
 
 
 def noisy_recording(controller: Controller, seed: int, vaf: float, root: float) -> Recording:
-    """One recording of 80 s with noise of that root that leaves a VAF of `vaf` %."""
+    """One recording of 80 s; with noise of coefficient `root` the truth has a VAF of `vaf` %."""
     rng = np.random.default_rng(seed)
     count = controller.plant.E.shape[1]
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (_SAMPLES // _HOLD, count)), _HOLD, axis=0)
@@ -121,7 +121,7 @@ def noisy_recording(controller: Controller, seed: int, vaf: float, root: float) 
 def with_noise(
     controller: Controller, push: Array, rng: np.random.Generator, vaf: float, root: float
 ) -> Recording:
-    """The controller's outputs under a disturbance, with noise."""
+    """Simulate the controller under a disturbance and add noise to its outputs."""
     plant, samples = controller.plant, len(push)
     run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=push))
     clean = (require_complete(controller, run).x @ plant.C.T)[:samples]
@@ -134,7 +134,7 @@ def with_noise(
 def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Recording]:
     """A random plant of up to five states and random weights; 400 samples, white noise.
 
-    Each limit is what the command without one exceeds for a twentieth of the time.
+    The unbounded command exceeds each limit in a twentieth of the samples.
     """
     rng = np.random.default_rng([seed, inputs])
     n = int(rng.integers(max(2, inputs), 6))
@@ -169,7 +169,7 @@ def fit(controller: Controller, trial: Recording) -> Estimate:
 
 
 def score(controller: Controller, trial: Recording) -> Scores:
-    """Fit a recording and compare what is printed with the truth."""
+    """Fit a recording and compare the printed gain with the truth."""
     estimate = gain_estimate(fit(controller, trial))
     found, error = estimate.covariance, estimate.K - controller.K
     return Scores(
@@ -191,7 +191,7 @@ def score_random(seed: int, inputs: int, vaf: float) -> Scores:
 
 
 def shares(scores: Array) -> Array:
-    """Share of the intervals of 95 % that hold the truth, for each column; NaN is left out."""
+    """Coverage of the 95 % intervals of each column; NaN is left out."""
     inside = np.where(np.isnan(scores), np.nan, np.abs(scores) <= TWO_SIDED)
     return np.asarray(np.nanmean(inside, axis=0))
 
@@ -223,7 +223,7 @@ def _random(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float) -> N
 
 
 def _range(scores: Array) -> str:
-    """Least, most and mean share of the columns identified in a quarter of the recordings."""
+    """Smallest, largest and mean share of columns identified in a quarter of the recordings."""
     often = np.mean(np.isfinite(scores), axis=0) >= 0.25
     if not np.any(often):
         return "none identified"
@@ -232,12 +232,12 @@ def _range(scores: Array) -> str:
 
 
 def main() -> None:
-    """Print a row for each number of inputs, VAF and colour of the noise."""
+    """Print a row for each number of inputs, VAF and noise coefficient."""
     parser = argparse.ArgumentParser(description="Coverage of the intervals that a fit prints.")
     parser.add_argument("--recordings", type=int, default=200)
     parser.add_argument("--inputs", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
-    parser.add_argument("--random", action="store_true", help="a random plant each, white noise")
+    parser.add_argument("--random", action="store_true", help="random plants, white noise")
     parser.add_argument("--roots", type=float, nargs="+", default=[0.0, 0.8])
     given = parser.parse_args()
     print(

@@ -1,13 +1,13 @@
-"""How a laboratory normalises the seat to a subject: the two protocols of chapter 2.
+"""Normalise the seat to a subject: the two protocols of chapter 2.
 
-A protocol asks for trials and decides by their outcome, so each takes the subject as a function.
+A protocol requests trials and depends on their outcome, so the subject is a function.
 
-Stiffness: from a stiff seat downwards without perturbation, coarse steps until balance is lost,
-twice, the lower kept; fine steps from a little above, three times, their mean. The seat is then
-used at twice that critical stiffness. The level that counts is the first at which balance is lost.
+Stiffness: without perturbation, from a stiff seat downwards in coarse steps until balance is lost,
+twice, the lower level kept; then in fine steps from above it, three times, averaged. The level is
+the first at which balance is lost. The experiment uses twice this critical stiffness.
 
-Torque: one-second pulses of rising size until the seat reaches a given angle; then trials like the
-real ones at that amplitude, smaller by a step after each loss, until two in a row are passed.
+Torque: one-second pulses of increasing size until the seat reaches a given angle; then trials of
+the experiment at that amplitude, reduced by a step after each loss, until two in a row succeed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class CriticalStiffness:
     coarse: float  # Lower of the two coarse searches
     fine: float  # Mean of the fine searches: the critical stiffness
     levels: tuple[float, ...]  # First failing level of every search, coarse ones first
-    trials: int  # Trials that the subject did
+    trials: int  # Number of trials
 
     @property
     def experimental(self) -> float:
@@ -40,9 +40,9 @@ class CriticalStiffness:
 class TorqueAmplitude:
     """Result of the torque protocol, in Nm."""
 
-    coarse: float  # Least pulse at which the seat reached the angle
-    amplitude: float  # Largest amplitude of the trials that were passed
-    trials: int  # Trials that the subject did, pulses included
+    coarse: float  # Smallest pulse at which the seat reached the angle
+    amplitude: float  # Largest amplitude without a loss of balance
+    trials: int  # Number of trials, including pulses
 
 
 def critical_stiffness(
@@ -80,10 +80,7 @@ def torque_amplitude(
     step: float = 1.0,
     largest: float = 100.0,
 ) -> TorqueAmplitude:
-    """Run the torque protocol.
-
-    `angle` in degrees.
-    """
+    """Run the torque protocol; `angle` in degrees."""
     coarse, trials = step, 1
     while pulse_angle(coarse) < angle:
         coarse += step

@@ -1,13 +1,15 @@
-"""How often the test of the model speaks, on simulated subjects whose noise is known.
+"""Alarm rates of the residual test on simulated subjects with known noise.
 
-The seat, three trials of 30 s at 100 Hz, |u| <= 6 Nm, fitted from the true weights
-and with the linear plant, whichever body moved. The subjects:
+The seat, three trials of 30 s at 100 Hz, |u| <= 6 Nm. The fit starts from the true weights and uses
+the linear plant, also if the simulated body is nonlinear. The subjects:
 
-    recorder     the linear plant, white noise on the angles
-    coloured     the same of first order, root 0.9
-    linear       that of `impc simulate seated-balance --motor-noise 0.3` on the linear plant
-    default      the same on its own, nonlinear body
-    motor        the linear plant, motor noise of 1 Nm, which the loop answers
+    recorder     linear plant, white noise on the angles
+    coloured     linear plant, first-order noise with coefficient 0.9 on the angles
+    linear       subject of `impc simulate seated-balance --motor-noise 0.3`, linear plant
+    default      the same subject with its nonlinear body
+    motor        linear plant, motor noise of 1 Nm inside the loop
+
+Results: experiments/coverage.md.
 
     python -m experiments.residual_study --seeds 20
 """
@@ -48,7 +50,7 @@ _LIMIT = 6.0
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of subject: motor noise (Nm), noise on the angles (degrees) of a root, the plant."""
+    """A kind of subject: motor noise (Nm), noise on the angles (degrees), its root, the plant."""
 
     motor: float
     sensor: float
@@ -56,7 +58,7 @@ class Kind:
     linear: bool
 
 
-#: By name. White noise of 0.1 degrees at 1000 samples a second is 0.032 at 100.
+#: Kinds by name. White noise of 0.1 degrees at 1000 samples a second is 0.032 at 100.
 SUBJECTS = {
     "recorder": Kind(0.0, 0.9, 0.0, linear=True),
     "coloured": Kind(0.0, 0.9, 0.9, linear=True),
@@ -69,7 +71,7 @@ SUBJECTS = {
 def fitted_subject(
     kind: Kind, seed: int, order: int, horizon: int, duration: float = 30.0
 ) -> Estimate:
-    """Simulate and fit a subject; `order` is that of the delay's approximant, trials in s."""
+    """Simulate and fit a subject; `order` of the Padé delay, `duration` of a trial in s."""
     system = plants.seated_balance_for(sample_time=0.01, delay_order=order)
     plant = Plant(system, ["command"]).linear()
     weights = _weights(plant)
@@ -92,7 +94,7 @@ def fitted_subject(
 def diagnosed(
     seed: int, name: str, order: int = 5, horizon: int = 20, duration: float = 30.0
 ) -> LackOfFit | None:
-    """The test of the model on one subject, whose three trials last `duration` seconds each."""
+    """Residual test of one subject with three trials of `duration` s."""
     fitted = fitted_subject(SUBJECTS[name], seed, order, horizon, duration)
     K, S = np.array(fitted.gain), np.array(fitted.metric)
     return lack_of_fit(identified_gain(fitted.problem, K, S))
@@ -123,8 +125,8 @@ def _noise(root: float, shape: tuple[int, ...], rng: np.random.Generator) -> Arr
 
 
 def main() -> None:
-    """Print, for each kind, how often the test of the model speaks, and what it names."""
-    parser = argparse.ArgumentParser(description="The test of the model on known subjects.")
+    """Print the alarms of the residual test for each kind, and the errors that it names."""
+    parser = argparse.ArgumentParser(description="Alarm rates of the residual test.")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--order", type=int, default=5)
     parser.add_argument("--horizon", type=int, default=20)

@@ -1,4 +1,4 @@
-"""Inverse problems with known answers on which searches are tried: sticks, and random plants."""
+"""Inverse problems with known gains for search tests: sticks and random plants."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SAMPLE, _PUSHED, _NOISE, _FALLEN = 0.02, 10, np.radians(0.02), 0.6
 
 @dataclass(frozen=True)
 class Known:
-    """A problem and the gain behind it.
+    """An inverse problem with its true gain.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Known:
 
 
 def stick(length: float = 1.0) -> control.StateSpace:
-    """A stick (m) on a fingertip, 50 samples a second; its angle is recorded."""
+    """A stick of `length` m on a fingertip, 50 samples a second; its angle is the output."""
     turn = 1.5 / length
     continuous = control.ss(
         [[0, 1], [9.81 * turn, 0]],
@@ -57,7 +57,7 @@ def stick(length: float = 1.0) -> control.StateSpace:
 
 
 def stick_problem(seed: int, samples: int = 600) -> Known | None:
-    """A subject who balances a stick with a clipped gain; None if it falls or the loop is slow."""
+    """A stick balanced by a clipped gain; None if it falls or the loop is slow."""
     rng = np.random.default_rng([77, seed])
     length = float(rng.uniform(0.7, 1.6))
     plant = Plant(stick(length), ["finger"])
@@ -84,9 +84,10 @@ def stick_problem(seed: int, samples: int = 600) -> Known | None:
 def random_problem(
     seed: int, inputs: int = 1, *, half: bool = False, samples: int = 40
 ) -> Known | None:
-    """An exact recording of a random MPC from a random initial state; None where it diverges.
+    """An exact recording of a random MPC from a random initial state; None if it diverges.
 
-    Of all states, or with `half` of half as many mixed outputs, the initial state unknown.
+    All states are recorded; with `half`, half as many mixed outputs, and the initial state is
+    unknown.
     """
     rng = np.random.default_rng([900, inputs, seed])
     n = int(rng.integers(max(2, inputs), 7))

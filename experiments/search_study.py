@@ -1,7 +1,7 @@
-"""How often the default search finds the right answer: the table of docs/fitting.md.
+"""Share of default searches that find the right gain: a table of experiments/coverage.md.
 
 python -m experiments.search_study                 # all rows: a quarter of an hour on one core
-python -m experiments.search_study --rows sticks   # some
+python -m experiments.search_study --rows sticks   # one row
 """
 
 from __future__ import annotations
@@ -26,16 +26,13 @@ if TYPE_CHECKING:
 
 __all__ = ["is_right", "warned"]
 
-# A noisy answer is right within this share of the misfit of a search from the truth; an exact one
-# below this share of the recorded outputs.
+# Right: a misfit of at most this multiple of that of a search from the truth, or for exact
+# recordings of at most this share of the recorded outputs.
 _NOISY, _EXACT = 1.01, 1e-6
 
 
 def is_right(known: Known, found: Estimate) -> bool:
-    """Whether an estimate explains the recordings as well as the truth does.
-
-    By its weights, if the recordings are exact; by its gain, which need not have any, if not.
-    """
+    """Whether an estimate fits as well as the truth: its weights if exact, its gain if noisy."""
     truth = refine_gain(known.problem, known.K, known.S)
     exact = _EXACT * recorded_size(known.problem)
     if truth.misfit <= exact:
@@ -44,7 +41,7 @@ def is_right(known: Known, found: Estimate) -> bool:
 
 
 def warned(found: Estimate) -> bool:
-    """Whether an estimate says why it may be wrong."""
+    """Whether an estimate carries a warning."""
     return bool(found.doubts) or not found.converged
 
 
@@ -69,10 +66,10 @@ _ROWS: dict[str, tuple[str, Callable[[], Iterator[Known]], int]] = {
 
 
 def main() -> None:
-    """Print for each row how many are right, with its interval, and how many wrong ones warn."""
+    """Print the right answers of each row with their interval, and the warnings of wrong ones."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rows", nargs="+", choices=list(_ROWS), default=list(_ROWS))
-    parser.add_argument("--count", type=int, help="problems of each row, in place of its own")
+    parser.add_argument("--count", type=int, help="number of problems in each row")
     chosen = parser.parse_args()
     for row in chosen.rows:
         name, make, usual = _ROWS[row]

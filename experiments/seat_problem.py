@@ -1,10 +1,10 @@
-"""A seated person who predicts with the full equations, as an optimal control problem with prices.
+"""Optimal control problem of a seated subject who predicts with the full equations.
 
     stage cost    line (v'z)^2 + angle1 theta1^2 + angle2 theta2^2 + command^2,      z the body
 
-with v the direction of `impc.cli.seat.seat_weights`, and a limit of the command. What comes after
-the horizon costs x'P x, P the Riccati solution of the linearised plant as a function of the prices:
-the person with small angles is the linear controller.
+with v the direction of `impc.cli.seat.seat_weights`, and a limit of the command. The terminal cost
+is x'P x, with P the Riccati solution of the linearised plant as a function of the cost weights. For
+small angles the controller is therefore the linear one.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from plants import seated_balance_for
 
 __all__ = ["DIRECTION", "TRUTH", "seat_problem"]
 
-#: Of angles and rates of the two bodies, rad and rad/s.
+#: Direction in angles and rates of the two bodies, rad and rad/s.
 DIRECTION = (0.70, 0.65, 0.22, 0.20)
-#: Prices over that of the command, and the limit, N m.
+#: Cost weights relative to that of the command, and the limit, N m.
 TRUTH = {"line": 6e5, "angle1": 2e4, "angle2": 2e4, "limit": 12.0}
-# Samples covered are two to this power; the slowest mode of the loop has then fallen to 1e-9.
+# Doublings of the Riccati horizon: after 2^9 samples the slowest mode has decayed to 1e-9.
 _DOUBLINGS = 9
 
 
 def seat_problem(terminal: Array | None = None) -> OptimalControlProblem:
-    """The problem at 100 samples a second; its disturbance is the torque on the seat.
+    """Build the problem at 100 samples a second; its disturbance is the torque on the seat.
 
     Parameters
     ----------
     terminal : Array, optional
-        P (n, n) that does not depend on the prices; by default it does.
+        Constant P, shape (n, n); by default P depends on the cost weights.
     """
     system = seated_balance_for()
     plant = Plant(system, ["command"])
@@ -62,7 +62,7 @@ def seat_problem(terminal: Array | None = None) -> OptimalControlProblem:
 
 
 def _riccati(plant: Plant, Q: ca.SX) -> ca.SX:
-    """P by the doubling algorithm (Chu, Fan and Lin 2005), R = 1."""
+    """Riccati solution P for R = 1 by the doubling algorithm (Chu, Fan and Lin 2005)."""
     A, B = ca.DM(np.array(plant.A)), ca.DM(np.array(plant.B))
     one = ca.SX.eye(plant.n)
     step, G, P = ca.SX(A), ca.SX(B @ B.T), Q

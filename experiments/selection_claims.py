@@ -1,9 +1,9 @@
-"""The surviving claims of chapters 4 and 5 beside what this package finds on simulated cohorts.
+"""Compare the surviving claims of chapters 4 and 5 with simulated cohorts.
 
     python -m experiments.selection_claims --replicates 200 --nelder-mead
 
-Ten subjects as `impc simulate head-tracking` makes them (chapter 4), and ten about the FIM column
-of table 4.3 for the widths of its intervals. The dissertation's numbers are of its own subjects.
+Ten subjects of `impc simulate head-tracking` (chapter 4), and ten about the FIM column of table 4.3
+for the widths of its intervals. Results: experiments/reliability_selection.md.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _VAF = (0.8265, 0.0757)
 
 @dataclass(frozen=True)
 class Width:
-    """Width of an interval: ours over ten subjects, and the dissertation's mean and SD."""
+    """Interval width over ten simulated subjects, and mean and SD in the dissertation."""
 
     name: str
     mean: float
@@ -67,7 +67,7 @@ class Width:
 
 
 def bootstrap_widths(shortest: float, longest: float, replicates: int) -> tuple[Width, ...]:
-    """Mean widths over ten subjects about the FIM column; steps of a duration in s."""
+    """Mean widths over ten subjects about the FIM column; durations of the steps in s."""
     model = model_source("plants:head_neck_model", {}).model
     nominal, centre = np.array(model.typical), plants.table_4_3_column("fim")
     free = list(free_indices(model, FIM_SUBSET))
@@ -98,7 +98,7 @@ def bootstrap_widths(shortest: float, longest: float, replicates: int) -> tuple[
 
 
 def mean_subject() -> tuple[ParametricModel, Array, list[Trial]]:
-    """The FIM column of table 4.3, three trials, noise that leaves a VAF of 82.65 %."""
+    """Subject of the FIM column of table 4.3: three trials, noise for a VAF of 82.65 %."""
     model = model_source("plants:head_neck_model", {}).model
     theta = plants.table_4_3_column("fim")
     rng, trials = np.random.default_rng(0), []
@@ -111,7 +111,7 @@ def mean_subject() -> tuple[ParametricModel, Array, list[Trial]]:
 
 
 def nominal_information() -> tuple[ParametricModel, Information]:
-    """Information at the nominal column of table 4.3, for the noise of its VAF, 82.26 %."""
+    """Information at the nominal column of table 4.3, with noise for its VAF of 82.26 %."""
     model = model_source("plants:head_neck_model", {}).model
     theta = np.array(model.typical)
     trials = []
@@ -125,7 +125,7 @@ def nominal_information() -> tuple[ParametricModel, Information]:
 def reduced_widths(replicates: int) -> dict[str, Array]:
     """Widths of the intervals of Kvis, Kccr and tau when 12, FIM-5 and LASSO-5 are free.
 
-    Others stay at the subject's own values, so that all three fits could find the truth.
+    The other parameters keep their true values, so all three fits can reach the truth.
     """
     model, theta, trials = mean_subject()
     shown = free_indices(model, _COMMON)
@@ -139,7 +139,7 @@ def reduced_widths(replicates: int) -> dict[str, Array]:
 
 
 def exhaustive(F: Array, bound: float, least: int = 2) -> Selection:
-    """`largest_subsets` of one information (k, k), by trying every subset."""
+    """`largest_subsets` of one information matrix (k, k) by exhaustive search."""
     for size in range(len(F), least - 1, -1):
         subsets = list(itertools.combinations(range(len(F)), size))
         tried = zip(subsets, subset_variances([F], subsets).tolist(), strict=True)
@@ -174,7 +174,7 @@ def _print_times(nelder_mead: bool) -> None:
 
 
 def main() -> None:
-    """Print widths for several step durations, their reduction, times, and the subsets."""
+    """Print widths for several step durations, their reduction, run times and subsets."""
     parser = argparse.ArgumentParser(description="Claims of chapters 4 and 5.")
     parser.add_argument("--replicates", type=int, default=60)
     parser.add_argument("--nelder-mead", action="store_true", help="Table C.1 too: minutes")

@@ -1,10 +1,11 @@
-"""Share of true values inside the intervals of a selection, on simulated people.
+"""Coverage of the intervals of selected parameters, on simulated subjects.
 
     python -m experiments.selection_coverage --people 10 --seeds 0 1
 
-People of `impc simulate head-tracking`, who differ in all twelve parameters by a factor of e^0.25.
-Some parameters are fitted; the others are taken as exactly typical, or as typical give or take the
-deviation between people that the model states, or a quarter of their range.
+The subjects of `impc simulate head-tracking` vary in all twelve parameters (log-SD 0.25). The
+parameters that are not selected are fixed at their typical values, or have a prior with the stated
+standard deviation between subjects, or one with a quarter of their range. Results:
+experiments/reliability_selection.md.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from impc.studies.selection.report import read_truths
 
 __all__ = ["coverage"]
 
-#: What `impc select` chooses of the people of seed 0, and the five of the dissertation.
+#: The subset that `impc select` finds in the subjects of seed 0, and that of the dissertation.
 _SUBSETS = (("Kccr", "tau", "tauMS1"), ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1"))
 _STATED = ("exactly typical", "stated deviations", "a quarter of the range")
 
 
 def coverage(people: int, seed: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """For each of `_STATED`: inside, and width in ranges, (people, parameters, 2)."""
+    """For each of `_STATED`: covered, and width over range, shape (subjects, parameters, 2)."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "data"
         given = ["--subjects", str(people), "--seed", str(seed), "--out", str(folder)]
@@ -56,13 +57,13 @@ def coverage(people: int, seed: int, names: tuple[str, ...]) -> dict[str, np.nda
 
 
 def main() -> None:
-    """Print the share inside, and the median width of each parameter."""
+    """Print the share covered, and the median width of each parameter."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--people", type=int, default=10)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     given = parser.parse_args()
     for names in _SUBSETS:
-        print(f"\n{', '.join(names)}: {given.people} people of each of seeds {given.seeds}")
+        print(f"\n{', '.join(names)}: {given.people} subjects of each of seeds {given.seeds}")
         found = [coverage(given.people, seed, names) for seed in given.seeds]
         for stated in _STATED:
             both = np.concatenate([item[stated] for item in found])

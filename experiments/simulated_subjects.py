@@ -1,8 +1,9 @@
-"""Many simulated subjects with noise: is the ceiling reached, and are the deviations right?.
+"""Fit many noisy simulated subjects: VAF below that of the truth, and standard errors.
 
-The seat of W2, linear, three trials of 30 s, white noise on the angles that leaves a VAF of 90 % to
-reach. For each torque limit it prints how far the fit stays below the VAF of the true controller,
-and how often each entry of the true gain lies within three of its estimated standard deviations.
+The linear seat of W2, three trials of 30 s, white noise on the angles with which the true
+controller has a VAF of 90 %. For each torque limit the script prints how far the fit is below the
+VAF of the true controller, and how often each entry of the true gain lies within three estimated
+standard errors. Results: experiments/coverage.md.
 
     python -m experiments.simulated_subjects --subjects 100 --limits 70 6 4.5
 """
@@ -33,16 +34,16 @@ __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
 
 @dataclass(frozen=True)
 class Subject:
-    """One fit against its truth.
+    """One fit compared with the truth.
 
     Attributes
     ----------
     below_ceiling : float
-        VAF of the true controller minus that of the fit, in points of the scaled outputs together.
+        VAF of the true controller minus that of the fit, percentage points, scaled outputs.
     entries : Array
-        Error of each entry of K over its estimated standard deviation (n,).
+        Error of each entry of K over its estimated standard error, shape (n,).
     directions : Array
-        The same along the directions of `GainCovariance` (n,).
+        The same along the directions of `GainCovariance`, shape (n,).
     """
 
     below_ceiling: float
@@ -51,7 +52,7 @@ class Subject:
 
 
 def noisy_recordings(limit: float, seed: int, ceiling: float) -> tuple[Recording, ...]:
-    """Three trials of the seat whose true controller has a VAF of `ceiling`, a share."""
+    """Three noisy trials of the seat whose true controller has a VAF of `ceiling` (0 to 1)."""
     rng = np.random.default_rng(seed)
     trials = []
     work = seat(3, 30.0, limit)
@@ -63,7 +64,7 @@ def noisy_recordings(limit: float, seed: int, ceiling: float) -> tuple[Recording
 
 
 def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
-    """Fit one subject and compare."""
+    """Simulate and fit one subject, and compare with the truth."""
     work = seat(3, 30.0, limit)
     plant, truth = work.problem.plant, np.array(work.controller.K)
     trials = noisy_recordings(limit, seed, ceiling)
@@ -97,7 +98,7 @@ def _print(limit: float, found: list[Subject], names: tuple[str, ...]) -> None:
     directions = np.array([item.directions for item in found])
     print(f"\ntorque limit {limit:g} Nm, {len(found)} subjects (seeds 0 to {len(found) - 1})")
     print(f"points below the ceiling: median {np.median(below):.3f}, most {np.max(below):.3f}")
-    print("entry of K           within 3 deviations   spread of error/deviation")
+    print("entry of K           within 3 SE           SD of error/SE")
     for index, name in enumerate(names):
         share = np.mean(np.abs(entries[:, index]) <= 3)
         print(f"  {name:<18} {100 * share:12.0f} % {np.std(entries[:, index]):22.2f}")

@@ -1,13 +1,13 @@
-"""People who steer a cursor against a known push: offset-free inverse MPC and delayed PI feedback.
+"""Compare offset-free inverse MPC with delayed PI feedback on people who steer a cursor.
 
     python -m experiments.steering folder [trials]
 
-The folder has prepared trials of Yamagami, Howell, Roth and Burden (CPHS 2018), <person>_<plant>_
-<trial>.csv with columns time (s), y, slider, push at 60 Hz; the recordings are public and not part
-of the project. The plant y' = u + d (fo) or y'' = u + d - y' (so) is exact, and so is the record
-of the slider. The hand answers its command after a delay and a lag, which are fitted together with
-the rate at which the person learns the push. Fitted to the trials with phases `p`, each is
-simulated on those with phases `m`, from its first second on.
+`folder` contains trials of Yamagami, Howell, Roth and Burden (CPHS 2018) as <person>_<plant>_
+<trial>.csv, with columns time (s), y, slider, push at 60 Hz. The recordings are public and not part
+of the project. The plant is y' = u + d (fo) or y'' = u + d - y' (so), without model error, and the
+slider is recorded exactly. The hand follows its command after a delay and a lag. Both are fitted,
+together with the rate at which the person learns the push. Both methods are fitted to the trials
+with phases `p` and simulated on those with phases `m`, without the first second.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RATE, SETTLE, HORIZON, FAR = 60.0, 1.0, 20, 1e3
 
 
 def hand_and_cursor(values: Array, order: int) -> impc.Plant:
-    """Cursor, hand and delay (Pade, order 2), for delay (s), lag (s) and rate of learning (1/s)."""
+    """Plant of cursor, hand and Padé delay, from delay (s), lag (s) and learning rate (1/s)."""
     delay, lag, learning = values
     late = pade_delay(delay, 2)
     a, b, c, d = (np.asarray(late.A), np.asarray(late.B), np.asarray(late.C), np.asarray(late.D))
@@ -55,7 +55,7 @@ def hand_and_cursor(values: Array, order: int) -> impc.Plant:
 
 
 def trials_of(folder: Path, person: str, kind: str, phase: str, most: int) -> Array:
-    """Columns time, y, slider, push of every trial (samples, trials, 4)."""
+    """Read time, y, slider, and push of every trial, shape (samples, trials, 4)."""
     files = sorted(folder.glob(f"{person}_{kind}_*{phase}.csv"))[:most]
     read = [np.loadtxt(file, delimiter=",", skiprows=1) for file in files]
     return np.stack([one[: min(map(len, read))] for one in read], axis=1)
@@ -68,10 +68,7 @@ def vaf(recorded: Array, simulated: Array) -> float:
 
 
 def delayed_feedback(gains: Array, delay: int, trials: Array, order: int) -> Array:
-    """Cursors (samples, k) of k trials under u = -kp y - ki (integral of y), `delay` samples late.
-
-    `trials` (samples, k, 4).
-    """
+    """Simulate u = -kp y - ki (integral of y), `delay` samples late: cursors (samples, k)."""
     e, h = np.exp(-1 / RATE), 1 / RATE
     y = np.zeros(trials.shape[:2])
     v, total = np.zeros(y.shape[1]), np.zeros(y.shape[1])
@@ -85,12 +82,12 @@ def delayed_feedback(gains: Array, delay: int, trials: Array, order: int) -> Arr
         else:
             y[t + 1] = y[t] + (1 - e) * v + (h - (1 - e)) * push
             v = e * v + (1 - e) * push
-        y[t + 1] = np.clip(y[t + 1], -FAR, FAR)  # it runs away: no number grows without end
+        y[t + 1] = np.clip(y[t + 1], -FAR, FAR)  # Diverging simulations stay finite
     return y
 
 
 def fit_delayed(train: Array, order: int) -> tuple[Array, int]:
-    """The two gains and the delay of least squares."""
+    """Least-squares gains and delay of the delayed PI feedback."""
     best: tuple[float, Array, int] = (np.inf, np.zeros(2), 0)
     for delay in range(2, 31, 2):
 
@@ -110,7 +107,7 @@ def fit_delayed(train: Array, order: int) -> tuple[Array, int]:
 def compare(
     folder: Path, person: str, kind: str, most: int, report: Callable[[str], None] = print
 ) -> None:
-    """Print both VAF on the trials that were left out, and what was fitted."""
+    """Print the held-out VAF of both methods and the fitted parameters."""
     order = 1 if kind == "fo" else 2
     train, test = (trials_of(folder, person, kind, phase, most) for phase in "pm")
     gains, delay = fit_delayed(train, order)
@@ -155,7 +152,7 @@ def compare(
 
 
 def main(folder: Path, most: int) -> None:
-    """Both people, both plants."""
+    """Compare the methods for every person and both plants."""
     for person in sorted({file.name.split("_")[0] for file in folder.glob("*_fo_*.csv")}):
         for kind in ("fo", "so"):
             compare(folder, person, kind, most)

@@ -1,10 +1,10 @@
-"""Structured weights on simulated subjects: coverage, level and power of the test, global misfit.
+"""Cost structures on simulated subjects: coverage, level and power of the test, global search.
 
-The seat: cost weights of the four body states, log-uniform within a factor of four of (6e3, 9e3,
-6e2, 4e2), three trials of 30 s under the ternary torque, no limit, noise on the angles. Carts: two
-of `experiments.printed_intervals` with cost weights of four states and two inputs, at their limits
-for some percent of the time; there a cross term shows in the gain. Each line that is written is one
-subject, so that a run can be ended at any time and be summed up:
+Seat: cost weights of the four body states, log-uniform within a factor of four of (6e3, 9e3, 6e2,
+4e2), three trials of 30 s under the ternary torque, no limit, noise on the angles. Carts: two of
+`experiments.printed_intervals` with cost weights of four states and two inputs, at their limits in
+some percent of the samples; their gain depends on a cross term. Each line that is written is one
+subject, so a run can be interrupted and summarised at any time. Results: experiments/structures.md.
 
     python -m experiments.structure_study run seat --vaf 90 --subjects 200 --out seat.jsonl
     python -m experiments.structure_study run carts --cross 0.5 --subjects 400 --out carts.jsonl
@@ -45,7 +45,7 @@ __all__ = ["Person", "Score", "cart_person", "score", "seat_person"]
 
 _BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _TYPICAL = np.log([6e3, 9e3, 6e2, 4e2])
-# Misfits that differ by less are those of one end: half a unit of chi-squared's distance.
+# Two searches ended at the same minimum if their misfits differ by less, units of chi-squared.
 _GLOBAL = 0.5
 
 
@@ -56,9 +56,9 @@ class Person:
     Attributes
     ----------
     structure : Structure
-        That is fitted.
-    cost weights : Array
-        Its true unknowns (count,).
+        Fitted structure.
+    cost_weights : Array
+        True logarithms of the cost weights, shape (count,).
     problem : Problem
     """
 
@@ -69,25 +69,25 @@ class Person:
 
 @dataclass(frozen=True)
 class Score:
-    """A fit against its truth.
+    """A fit compared with its truth.
 
     Attributes
     ----------
     study : str
-        Plant, VAF, colour of the noise, cross term.
+        Plant, VAF, noise coefficient, cross term.
     seed : int
     holds, normal : list of bool
-        Whether the profile and the normal interval of each cost weight hold the truth.
+        Whether the profile and the normal interval of each cost weight cover the true value.
     one_sided : list of bool
         Whether the profile has no lower end.
     errors : list of float or None
-        Of the logarithms, over their deviations; None for a cost weight of zero.
+        Errors of the logarithms over their SEs; None for a cost weight of zero.
     excess : float
-        How far the misfit is above that of a search from the truth, in units of chi-squared.
+        Misfit above that of a search from the truth, in units of chi-squared.
     probability, freedom : float and int
-        Of the test of the structure.
+        p value and degrees of freedom of the test of the structure.
     power : float
-        That the test foresees for the worst seen cross term.
+        Predicted power, the largest over cross terms.
     """
 
     study: str
@@ -103,7 +103,7 @@ class Score:
 
 
 def seat_person(seed: int, vaf: float, root: float) -> Person:
-    """A seated subject whose true controller has a VAF of `vaf` %, noise of that root."""
+    """A seated subject whose true controller has a VAF of `vaf` % with noise of that root."""
     rng = np.random.default_rng([seed, round(vaf), round(100 * root)])
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, "diagonal", over=_BODY)
@@ -119,7 +119,7 @@ def seat_person(seed: int, vaf: float, root: float) -> Person:
 
 
 def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
-    """Two carts; the weights of the positions have `cross` of their geometric mean together."""
+    """Two carts; the cross term of the positions is `cross` times their geometric mean."""
     rng = np.random.default_rng([seed, round(vaf), round(100 * root), round(100 * cross)])
     plant = carts(2)
     structure = Structure(plant, "diagonal")
@@ -139,16 +139,16 @@ def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
 
 
 def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> Score:
-    """Fit a person from the default start, and compare.
+    """Fit a subject from the default start, and compare with the truth.
 
     Parameters
     ----------
     person : Person
     study : str
-        Its name in what is written.
+        Name of the study in the output.
     seed : int
     intervals : bool
-        Whether the intervals are made too; the test alone takes a third of the time.
+        Whether to compute intervals; the test alone takes a third of the time.
     """
     problem, structure = person.problem, person.structure
     near = fit_controller(problem)
@@ -189,7 +189,7 @@ def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> S
 
 
 def _misfit(at: Tangent) -> float:
-    """Square of the misfit, with initial states as free as the intervals take them to be."""
+    """Squared misfit with initial states projected out, as in the intervals."""
     return float(np.sum(at.without_nuisance(np.array(at.residual)[:, None]) ** 2))
 
 
@@ -239,8 +239,8 @@ def _run(given: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Run a study, or sum up what runs have written."""
-    parser = argparse.ArgumentParser(description="Structured weights on simulated subjects.")
+    """Run a study, or summarise result files."""
+    parser = argparse.ArgumentParser(description="Cost structures on simulated subjects.")
     which = parser.add_subparsers(required=True)
     run = which.add_parser("run")
     run.add_argument("plant", choices=("seat", "carts"))
@@ -260,9 +260,9 @@ def main() -> None:
 
 
 def _sum(given: argparse.Namespace) -> None:
-    print("| study | subjects | profile intervals hold % (each) | where a cost weight is zero % "
-          "| one-sided % | normal ones hold % "
-          "| refused at 5 % | global misfit % | power foreseen % |")  # fmt: skip
+    print("| study | subjects | profiles cover % (each) | if a cost weight is zero % "
+          "| one-sided % | normal intervals cover % "
+          "| rejected at 5 % | global minimum % | predicted power % |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|")
     by_study: dict[str, list[Score]] = {}
     for name in given.files:

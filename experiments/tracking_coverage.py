@@ -1,10 +1,10 @@
-"""How often 95 % intervals hold the gain where there are targets, pushes, commands and gaps.
+"""Coverage of 95 % gain intervals with targets, lasting pushes, recorded commands and gaps.
 
     python -m experiments.tracking_coverage [recordings]
 
-A cart on a weak spring (mass 1 kg, .1 s) whose position follows a target that drifts, 30 s, with
-recorder noise of 5 % of the positions' size; half of the carts are at their limit. Every
-recording has weights, targets and noise of its own.
+A cart on a weak spring (mass 1 kg, 0.1 s) follows a drifting target for 30 s, with recording noise
+of 5 % of the positions' size. Half of the carts reach their limit. Every recording has its own
+weights, target and noise. Results: experiments/coverage.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ KINDS = (
 
 
 def cart() -> impc.Plant:
-    """Position and velocity, pushed by a command and by the wind; the position is recorded."""
+    """Cart with states position and velocity, command push, and disturbance wind."""
     system = control.ss(
         [[1, 0.1], [-0.02, 0.97]], [[0, 0], [0.1, 0.1]], [[1, 0]], 0, 0.1,
         states=["x", "v"], inputs=["push", "wind"], outputs=["x"],
@@ -43,7 +43,7 @@ def cart() -> impc.Plant:
 
 
 def covered(task: tuple[str, int]) -> tuple[int, int, int]:
-    """Of one recording: intervals of identified entries, how many hold them, samples at a limit."""
+    """Identified entries of one recording, covered ones, and samples at a limit."""
     kind, seed = task
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     limit = 0.25 if seed % 2 else 9.0
@@ -89,7 +89,7 @@ def covered(task: tuple[str, int]) -> tuple[int, int, int]:
 
 
 def rate(inside: int, count: int) -> str:
-    """A share with its 95 % interval of Clopper and Pearson."""
+    """A share with its Clopper-Pearson 95 % interval."""
     low = beta.ppf(0.025, inside, count - inside + 1) if inside else 0.0
     high = beta.ppf(0.975, inside + 1, count - inside) if inside < count else 1.0
     return (
@@ -98,7 +98,7 @@ def rate(inside: int, count: int) -> str:
 
 
 def main(recordings: int, report: Callable[[str], None] = print) -> None:
-    """Print the rates of all kinds."""
+    """Print the coverage of all kinds."""
     with ProcessPoolExecutor(2) as pool:
         for kind in KINDS:
             found = np.array(list(pool.map(covered, [(kind, seed) for seed in range(recordings)])))

@@ -1,9 +1,10 @@
-"""A person who stands on a moving platform: two links, as Park, Horak and Kuo (2004) recorded them.
+"""Simulate and fit a two-link body on a moving platform (Park, Horak and Kuo 2004).
 
-The parameters, gain and platform are those of the example of Moore and van den Bogert's direct
-collocation. The body is not linear and its feedback is continuous; the plant is neither.
+Parameters, gain and platform are those of the example of Moore and van den Bogert's direct
+collocation. The simulated body is nonlinear with continuous feedback; the fitted plant is linear
+and sampled.
 
-python -m experiments.two_link_standing            # what each method finds, with its misfit
+    python -m experiments.two_link_standing
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _AMPLITUDE = 0.02
 
 
 def _accelerations(x: Array, torques: Array, platform: float) -> Array:
-    """Of both joints (2,), rad/s^2, from angles and rates (4,)."""
+    """Accelerations of both joints (2,), rad/s^2, from angles and rates (4,)."""
     ankle, hip, ankle_rate, hip_rate = x
     coupled = _TRUNK_MASS * _LEG * _TRUNK_CENTRE
     own = _TRUNK_INERTIA + _TRUNK_MASS * _TRUNK_CENTRE**2
@@ -57,7 +58,7 @@ def _accelerations(x: Array, torques: Array, platform: float) -> Array:
 
 
 def standing(sample_time: float) -> control.StateSpace:
-    """The body about upright, held over a sample: all states recorded."""
+    """Body linearised about upright and sampled with held inputs; all states are outputs."""
     rest, step = np.zeros(4), 1e-6
     A, B = np.zeros((4, 4)), np.zeros((4, 3))
     A[:2, 2:] = np.eye(2)
@@ -82,10 +83,10 @@ def standing(sample_time: float) -> control.StateSpace:
 def standing_recording(
     seed: int, *, noisy: bool, samples: int = 4000
 ) -> tuple[float, Array, Array]:
-    """Sample time (s), states (samples, 4) and accelerations of the platform (samples,), m/s^2.
+    """Sample time (s), states (samples, 4) and platform accelerations (samples,), m/s^2.
 
-    All are measured with noise of 0.25 degrees (m/s^2). With `noisy` the person also takes the
-    states for others, off by 1 degree (degree/s).
+    All are measured with noise of 0.25 degrees (m/s^2). With `noisy`, the feedback also senses the
+    states with noise of 1 degree (degree/s).
     """
     rng = np.random.default_rng([2004, seed])
     times, step = np.linspace(0, _DURATION, samples, retstep=True)
@@ -116,7 +117,7 @@ def standing_recording(
 
 
 def standing_problem(seed: int, *, noisy: bool, samples: int = 4000) -> impc.Problem:
-    """The recording as `impc fit` poses it, with the mean acceleration of each sample."""
+    """Inverse problem as `impc fit` poses it, with the mean acceleration of each sample."""
     step, states, platform = standing_recording(seed, noisy=noisy, samples=samples)
     plant = impc.Plant(standing(step), ["ankle_torque", "hip_torque"])
     held = np.append((platform[:-1] + platform[1:]) / 2, platform[-1])
@@ -125,7 +126,7 @@ def standing_problem(seed: int, *, noisy: bool, samples: int = 4000) -> impc.Pro
 
 
 def main() -> None:
-    """Print gain and misfit of inverse MPC, of the printed gain and of `feedback_gain`."""
+    """Print the fits of `inverse_mpc` and `feedback_gain`, without and with sensory noise."""
     for noisy in (False, True):
         problem = standing_problem(1, noisy=noisy)
         print("noisy" if noisy else "clean")

@@ -1,14 +1,15 @@
-"""Carts and seats whose body is not the nominal one: coverage of intervals, and lack of fit.
+"""Coverage of intervals and residual tests when the body differs from the nominal one.
 
-    python -m experiments.uncertain_body coverage cart 60 99 0.0    persons, VAF, correlation
+    python -m experiments.uncertain_body coverage cart 60 99 0.0   subjects, VAF, correlation
     python -m experiments.uncertain_body coverage seat 20 99 0.0
-    python -m experiments.uncertain_body test none 100 99 0.9       error, persons, VAF, correlation
-    python -m experiments.uncertain_body summary FILE...            of the lines of these
+    python -m experiments.uncertain_body test none 100 99 0.9      error, subjects, VAF, correlation
+    python -m experiments.uncertain_body summary FILE...           summarise the lines of files
 
-Every person has a body drawn from the stated uncertainty and weights drawn about typical ones, and
-is fitted as a user would: from nothing, with the nominal body. One line of JSON a person. Errors of
-`test` are none, plant (3 % of both coefficients), delay (one sample), limit (5 %) and lean (a
-constant push of .04 of the limit, what 1 degree is to a cart that falls as a seated person does).
+Every subject has a body drawn from the stated uncertainty and weights drawn about typical ones. The
+fit starts without prior knowledge of the weights and uses the nominal body. Each output line is the
+JSON of one subject. Errors of `test` are none, plant (3 % of both coefficients), delay (one
+sample), limit (5 %) and lean (a constant push of 0.04 of the limit, the effect of 1 degree on a
+cart that falls as a seated subject does). Results: experiments/coverage.md.
 """
 
 from __future__ import annotations
@@ -35,22 +36,22 @@ from impc.assess.printed_gain import gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
 from impc.inverse.problem import Problem
 
-# Seconds for one person: the searches of one who nearly falls go on for minutes.
+# Time limit of one subject, s: searches for subjects who nearly fall take minutes.
 _LONGEST = 300
 DT, HORIZON, SAMPLES, LIMIT, KNOWN = 0.05, 10, 400, 0.55, 0.03
 Rng = np.random.Generator
 
 
 class Person(NamedTuple):
-    """The problem that the recordings of a person pose, and the truth."""
+    """Inverse problem of a simulated subject, with the true gain and body."""
 
     problem: Problem
     gain: Array
-    truth: Array  # Factors of the parameters of the body (k,)
+    truth: Array  # True parameters of the body over nominal ones (k,)
 
 
 def cart(factors: Sequence[float] = (1.0, 1.0), outputs: int = 1) -> impc.Plant:
-    """A cart that falls: its two coefficients are uncertain."""
+    """An unstable cart with two uncertain coefficients."""
     A = np.array([[0.0, 1.0], [1.2 * factors[0], -0.3 * factors[1]]])
     B = np.array([[0.0, 0.0], [1.0, 1.0]])
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, 4))]]) * DT)
@@ -62,14 +63,14 @@ def cart(factors: Sequence[float] = (1.0, 1.0), outputs: int = 1) -> impc.Plant:
 
 
 def noise(rng: Rng, samples: int, p: int, root: float) -> Array:
-    """Stationary first-order noise of variance one (samples, p)."""
+    """Stationary first-order noise of variance one, shape (samples, p)."""
     white = rng.standard_normal((samples + 200, p))
     found = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
     return np.asarray(found[200:])
 
 
 def moved(law: impc.Controller, push: Array, late: int) -> Array:
-    """Outputs of a law that answers the state of `late` samples ago; NaN where it falls."""
+    """Outputs of a controller that acts on the state `late` samples ago; NaN after a fall."""
     plant = law.plant
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -88,7 +89,7 @@ def recorded(
     rng: Rng, nominal: impc.Plant, law: impc.Controller, pushes: Sequence[Array], vaf: float,
     root: float, late: int = 0, lean: float = 0.0,
 ) -> list[impc.Recording] | None:  # fmt: skip
-    """Recordings of a law; None of one that falls."""
+    """Recordings of a controller; None if a trial ends in a fall."""
     trials, share = [], np.sqrt((100 - vaf) / vaf)
     for push in pushes:
         outputs = moved(law, push + lean, late)
@@ -107,7 +108,7 @@ def _law(plant: impc.Plant, weights: impc.Weights, limit: float, N: int) -> impc
 def cart_person(
     seed: int, vaf: float, root: float, error: str = "none", *, stated: bool = True
 ) -> Person | None:
-    """One cart and its recordings."""
+    """Draw a cart and its recordings; None after a fall."""
     rng = np.random.default_rng([seed, int(vaf), int(10 * root)])
     outputs = 1 + seed % 2
     factors = np.exp(KNOWN * rng.standard_normal(2)) if stated else np.ones(2)
@@ -131,7 +132,7 @@ def cart_person(
 
 
 def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Person | None:
-    """One person on the linear seat, at the limit of 6 Nm for part of the time; never an error."""
+    """Draw a subject on the linear seat, limit 6 Nm; `error` must be "none"."""
     rng = np.random.default_rng([seed, int(vaf), int(10 * root), 1])
     found = plant_family_of(plant_source("plants:seated_balance_for", {}), ["perturbation"], [])
     assert found is not None
@@ -157,10 +158,7 @@ def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Pers
 
 
 def covered(person: Person) -> dict[str, Any]:
-    """Errors of identified entries and directions in deviations, with and without the uncertainty.
-
-    Of the seat hardly any entry is identified by itself; directions are.
-    """
+    """Errors of identified entries and directions in standard errors, body uncertain and exact."""
     problem, truth, _ = person
     both = {}
     for name, posed in (("stated", problem), ("exact", problem.with_body_fixed())):
@@ -179,7 +177,7 @@ def covered(person: Person) -> dict[str, Any]:
 
 
 def tested(person: Person) -> dict[str, Any]:
-    """The test of lack of fit: alarm, errors with probability and size."""
+    """Run the residual test: alarm, and each error with probability and size."""
     found = lack_of_fit(gain_estimate(impc.fit(person.problem)))
     assert found is not None
     errors = [[one.name, one.probability, one.size, one.deviation] for one in found.errors]
@@ -187,7 +185,7 @@ def tested(person: Person) -> dict[str, Any]:
 
 
 def summary(path: str) -> str:
-    """The rates of a file of lines, with intervals of 95 %; coverage is clustered by person."""
+    """Rates of a result file with 95 % intervals; coverage is clustered by subject."""
     with open(path, encoding="utf-8") as file:
         rows = [row for row in map(json.loads, file) if "failed" not in row]
     if "alarm" in rows[0]:
@@ -195,7 +193,7 @@ def summary(path: str) -> str:
         low, high = _interval(len(alarms), len(rows))
         named = dict(collections.Counter(alarms))
         return f"{len(alarms)} of {len(rows)} ({low:.0f} to {high:.0f} %): {named}"
-    said = [f"{len(rows)} persons"]
+    said = [f"{len(rows)} subjects"]
     for kind in ("stated", "exact"):
         for what, key in (("entries", "z"), ("directions", "directions")):
             said.append(f"{kind} {_coverage([row[kind][key] for row in rows])} {what}")
@@ -203,12 +201,12 @@ def summary(path: str) -> str:
             np.median(np.concatenate([row[kind][name] for row in rows] or [np.nan]))
             for name in ("width", "error")
         )
-        said.append(f"deviation {100 * width:.2g} %, error {100 * error:.2g} %")
+        said.append(f"standard error {100 * width:.2g} %, error {100 * error:.2g} %")
     return "; ".join(said)
 
 
 def _coverage(z: list[list[float]]) -> str:
-    """Share of errors inside 95 %, with its interval, clustered by person."""
+    """Coverage of 95 % intervals with its own interval, clustered by subject."""
     counts = np.array([len(one) for one in z])
     if not counts.sum():
         return "none of 0"
@@ -219,7 +217,7 @@ def _coverage(z: list[list[float]]) -> str:
 
 
 def _interval(k: int, n: int) -> tuple[float, float]:
-    """Clopper's and Pearson's interval of a rate, %."""
+    """Clopper-Pearson interval of a rate, %."""
     low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
     high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
     return 100 * float(low), 100 * float(high)
@@ -230,7 +228,7 @@ def _too_long(*_: object) -> None:
 
 
 def main(kind: str, *given: str) -> None:
-    """Print one line a person, or a summary."""
+    """Print one line a subject, or a summary."""
     if kind == "summary":
         for path in given:
             print(path, summary(path))

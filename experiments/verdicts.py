@@ -1,10 +1,11 @@
-"""Are verdicts right? Simulated subjects of nine kinds, and what their pages would say.
+"""Test the verdicts of `impc fit` on simulated subjects of nine kinds.
 
     python -m experiments.verdicts --seeds 10
 
-Each kind is a cart (`experiments.coverage`) whose recordings are made so that one verdict is right.
-A line a kind: how many verdicts were right, and which others came out. Below them: how many of the
-gains that may be reported, and of the comparisons of cost, are true.
+Each kind is a cart (`experiments.coverage`) whose recordings make one verdict right. The script
+prints, for each kind, the number of right verdicts and the other ones. It then prints how many
+intervals of reportable gains cover, and how many reportable comparisons of cost are true. Results:
+experiments/coverage.md.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _NOISE, _FAR = 0.003, 3.0
 
 @dataclass(frozen=True)
 class Made:
-    """A fit of a simulated subject, and its true gain where it has one."""
+    """Fit of a simulated subject, with its true gain if known."""
 
     result: FitResult
     gain: Array | None
@@ -61,7 +62,7 @@ def subject(
     samples: int = _SAMPLES,
     settle: float = 1.0,
 ) -> Made:
-    """A cart with such a perturbation and limit; `unknown` pushes that are not recorded."""
+    """Simulate and fit a cart; `unknown` scales pushes that are not recorded."""
     rng, known = np.random.default_rng(seed), cart()
     body = plant or known
     weights = impc.Weights(_WEIGHTS, 1)
@@ -73,7 +74,7 @@ def subject(
         push = _pushes(rng, size, samples)
         pushed = push + unknown * rng.standard_normal(samples)
         y = _linear(body, gain, pushed) if gain is not None else _moved(law, pushed)
-        if not np.all(np.abs(y) < _FAR):  # it fell: once more
+        if not np.all(np.abs(y) < _FAR):  # A fall: draw again
             continue
         own = wander * np.cumsum(rng.standard_normal((samples, 1)), axis=0)
         y = y + noise * rng.standard_normal(y.shape) + own - own.mean()
@@ -91,7 +92,7 @@ def _moved(law: impc.Controller, push: Array) -> Array:
 
 
 def _linear(plant: impc.Plant, gain: Array, push: Array) -> Array:
-    """Outputs of u = -Kx without a limit."""
+    """Outputs under u = -Kx without a limit."""
     x = np.zeros((len(push), plant.n))
     for k in range(len(push) - 1):
         x[k + 1] = plant.A @ x[k] - plant.B @ (gain @ x[k]) + plant.E[:, 0] * push[k]
@@ -108,7 +109,7 @@ def _fell(seed: int) -> Made:
     return replace(made, result=replace(made.result, falls=("trial 3: fell at 5.1 s",)))
 
 
-#: Kind -> how its subject is made, its level, and words that its headline has.
+#: Kind -> function that makes a subject, right level, and words of the right headline.
 KINDS: dict[str, tuple[Callable[[int], Made], Level, str]] = {
     "explained": (subject, Level.GREEN, "explains this movement"),
     "limit": (lambda seed: subject(seed, limit=0.7), Level.AMBER, "probably wrong"),
@@ -131,7 +132,7 @@ KINDS: dict[str, tuple[Callable[[int], Made], Level, str]] = {
 
 
 def _true_statements(result: FitResult) -> tuple[int, int]:
-    """True and all of the decided comparisons."""
+    """Number of true comparisons, and of all decided ones."""
     states, sizes = result.given.plant.states, np.array(result.intent.sizes)
     true = made = 0
     for item in decided(result):
@@ -144,7 +145,7 @@ def _true_statements(result: FitResult) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the rates of right verdicts, intervals and comparisons."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
@@ -174,7 +175,7 @@ def main() -> None:
         print(f"{name:<20}{right} of {given.seeds}  {others}", flush=True)
     fallen = fallen_verdict(("trial 1: fell at 3.2 s",))
     print(f"{'fell in all':<20}{fallen.level.value}: {fallen.headline}")
-    print(f"gains that may be reported: {inside} of {gains} intervals hold the truth")
+    print(f"gains that may be reported: {inside} of {gains} intervals cover the true value")
     print(f"comparisons of cost that may be reported: {true} of {made} are true")
 
 

@@ -1,4 +1,4 @@
-"""Benchmarks: ratios of medians measured side by side in one run.
+"""Benchmarks: ratios of median times measured in turn in one run.
 
 Run them with `python -m experiments.benchmarks`.
 """

@@ -1,8 +1,8 @@
-"""Run every benchmark and write docs/benchmarks: results.md, results.json and growth.{png,pdf}.
+"""Run all benchmarks; write results.md, results.json and growth.{png,pdf} into this folder.
 
     python -m experiments.benchmarks [--runs 7]
 
-Every figure is a ratio of medians measured side by side in this run. About eight minutes.
+Every number is a ratio of medians measured in turn in this run. About eight minutes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=7, help="runs of each case (default 7)")
-    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
+    parser.add_argument("--out", type=Path, default=Path("experiments/benchmarks"))
     chosen = parser.parse_args()
     rows = []
     with tqdm(_PARTS.items()) as parts:

@@ -1,4 +1,4 @@
-"""Whole fits: one and three trials of W2, a ten times longer one, W1 against a plain script."""
+"""Whole fits: one and three trials of W2, a ten times longer one, W1 and a plain script."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 __all__ = ["fit_rows"]
 
-# What a careful script with a continuation in the weights used on this example (580).
+# Simulations that a script with continuation in the weights used on this example.
 _NELDER_MEAD_BUDGET = 580
 
 
 def fit_rows(runs: int, _: Path) -> list[Row]:
-    """Time the fits; each must reach the true gain, or the true weights in W1."""
+    """Time the fits; each must reach the true gain, or for W1 the true weights."""
     return [*_seat(runs), *_memory(), *_example(runs)]
 
 

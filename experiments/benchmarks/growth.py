@@ -1,4 +1,4 @@
-"""How the time of simulation + Jacobian grows with the horizon and with the number of states."""
+"""Growth of the time of simulation + Jacobian with the horizon and the number of states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STATES = (10, 20, 30, 40)
 
 
 def growth_rows(runs: int, folder: Path) -> list[Row]:
-    """Measure both, fit an exponent by least squares in the logarithms, and plot."""
+    """Measure both, fit exponents by least squares in the logarithms, and plot."""
     work = seat()
     horizons = _measure({h: with_horizon(work, h) for h in _HORIZONS}, runs)
     states = _measure({n: chain_of_masses(n) for n in _STATES}, runs)

@@ -1,4 +1,4 @@
-"""One closed loop of W1 with its gradient through a general differentiable layer, if installed."""
+"""Closed loop of W1 with gradient, compared with cvxpylayers if installed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["layer_rows"]
 
 
 def layer_rows(runs: int, _: Path) -> list[Row]:
-    """Compare with cvxpylayers; a row without a figure says that it is not installed."""
+    """Row of the comparison with cvxpylayers; without a value if not installed."""
     what, against = "W1 simulation + gradient", "cvxpylayers, forward and backward"
     if not all(importlib.util.find_spec(name) for name in ("cvxpylayers", "torch")):
         note = "not installed: pip install '.[bench]'"
@@ -41,7 +41,7 @@ def layer_rows(runs: int, _: Path) -> list[Row]:
 
 
 def _layer(work: Workload) -> Callable[[], Any]:
-    # By name, because the pair is heavy and optional: `layer_rows` has looked for it.
+    # Imported by name because both are heavy and optional; `layer_rows` checks for them.
     torch = importlib.import_module("torch")
     CvxpyLayer = importlib.import_module("cvxpylayers.torch").CvxpyLayer
 

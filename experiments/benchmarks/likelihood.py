@@ -1,6 +1,6 @@
-"""The likelihood of a person on the seat who senses with noise, against simulations with Jacobian.
+"""Likelihood of a seated subject with sensory noise, compared with simulations with Jacobian.
 
-These rows alone, in a minute: python -m experiments.benchmarks.likelihood
+These rows only, in a minute: python -m experiments.benchmarks.likelihood
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = ["likelihood_rows"]
 
 
 def likelihood_rows(runs: int, _: Path) -> list[Row]:
-    """Three trials of 30 s, at the limit; gain and initial states are searched in all cases."""
+    """Rows for three trials of 30 s at the limit, with derivatives by gain and initial states."""
     who, work = subject("seat", 0, "both", 90.0, 6.0), seat(3)
     law, problem = who.controller, recorded(who, 0).problem
     given = problem, np.array(law.K), np.array(law.S)
@@ -53,23 +53,23 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     }
     timings = side_by_side(cases, 4 * runs, time.process_time)
     wall = side_by_side({name: cases[name] for name in ("kept", "W2")}, 4 * runs)
-    what = "likelihood of a person on the seat, gradient and information"
+    what = "likelihood of a subject on the seat, gradient and information"
     met = "W2 simulation + exact Jacobian (gain, initial states), three trials"
     return [
         compare(f"{what}, processor time", met, timings["kept"], timings["W2"], 10.0),
         compare("the same by the clock, trials side by side", met, wall["kept"], wall["W2"], None),
-        compare(what, "the person's own, who meets no limit without noise",
+        compare(what, "the same subject's simulation, at no limit without noise",
                 timings["kept"], timings["person"], None),
-        compare("the same with any gain, ten numbers in the place of five", met,
+        compare("the same with any gain, ten numbers instead of five", met,
                 timings["free"], timings["W2"], None),
-        compare("three trials of a person without a limit", met,
+        compare("three trials of a subject without a limit", met,
                 timings["no limit"], timings["W2"], None),
         compare("the likelihood alone", met, timings["value"], timings["W2"], None),
     ]  # fmt: skip
 
 
 def _at_the_truth(who: Subject, problem: Problem) -> PersonCoordinates:
-    """Gains that cost weights can have, from the person's own."""
+    """Coordinates at the truth, restricted to gains that cost weights can have."""
     point = Point(np.array(who.controller.K), np.array(who.controller.S), problem)
     return PersonCoordinates(gain_space(point, None), who.person, who.recorder)
 

@@ -1,8 +1,9 @@
-"""Memory, page and time of `impc fit` with many trials of ten seconds.
+"""Memory, time and report size of `impc fit` with many trials of ten seconds.
 
     python -m experiments.benchmarks.many_trials 500
 
-A simulated seated subject; no trial is left out, as that would be a fit for each. Half an hour.
+The subject is the simulated seated one. No trial is held out, because each would need a fit of its
+own. Half an hour.
 """
 
 from __future__ import annotations
@@ -15,18 +16,12 @@ from pathlib import Path
 
 __all__ = ["measure"]
 
-_AT_ONCE = 84  # `impc simulate` makes 99 at the most
+_AT_ONCE = 84  # `impc simulate` makes at most 99
 _IMPC = (sys.executable, "-m", "impc")
 
 
 def measure(trials: int, folder: Path) -> dict[str, float]:
-    """Simulate so many `trials` in a `folder` and fit them as one subject.
-
-    Returns
-    -------
-    dict of str to float
-        What was measured, MB and s.
-    """
+    """Simulate `trials` in a `folder`, fit them as one subject; measured values in MB and s."""
     files: list[str] = []
     for seed in range(-(-trials // _AT_ONCE)):
         out = folder / f"{seed}"

@@ -13,7 +13,7 @@ __all__ = ["peak_megabytes"]
 
 
 def peak_megabytes(seconds: float) -> float:
-    """Largest resident memory of a process that fits a recording of that many seconds."""
+    """Peak resident memory of a process that fits a recording of `seconds`, MB."""
     call = [sys.executable, "-m", "experiments.benchmarks.memory", str(seconds)]
     answer = subprocess.run(call, capture_output=True, text=True, check=True)
     return float(answer.stdout)
@@ -23,6 +23,6 @@ if __name__ == "__main__":
     duration = float(sys.argv[1])
     if duration > 0:
         inverse_mpc_reduced(seat(seconds=duration).problem)
-    # The high-water mark of this program alone: ru_maxrss would count what started it. Linux only.
+    # Peak of this program alone (Linux only); ru_maxrss would include its parent.
     status = Path("/proc/self/status").read_text(encoding="ascii")
     print(float(status.split("VmHWM:")[1].split()[0]) / 1024)

@@ -1,4 +1,4 @@
-"""What a user would otherwise pick: the same closed loop in CasADi's own graph, and in cvxpy."""
+"""Alternatives to the package: the closed loop as a CasADi graph, and in cvxpy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def casadi_loop(work: Workload, solver: str) -> Any:
     """The closed loop K -> states as one CasADi Function, a quadratic program at every sample.
 
     The rows T(K), M(K) of the input bounds are computed once in the graph and given to every step
-    of a `mapaccum`; the program is in v = u + Kx, as in `impc`, so that only the machinery differs.
+    of a `mapaccum`. The program is in v = u + Kx as in `impc`, so only the implementation differs.
     """
     plant, controller = work.controller.plant, work.controller
     n, horizon = plant.n, controller.horizon
@@ -80,11 +80,11 @@ def casadi_loop(work: Workload, solver: str) -> Any:
 def cvxpy_nelder_mead(
     work: Workload, start: Weights, condition_weight: float, budget: int
 ) -> tuple[Weights, int]:
-    """Inverse MPC as a script would do it: Nelder-Mead over Cholesky entries, cvxpy inside.
+    """Inverse MPC as a plain script: Nelder-Mead over Cholesky entries, cvxpy inside.
 
-    Without a terminal set, whose computation at every iterate would cost more than all else. The
-    simplex collapses on the kinks of the objective; it is started anew from there, as such scripts
-    do, until the budget of simulations is spent.
+    There is no terminal set, because computing one at every iterate would dominate the time. The
+    simplex collapses on the kinks of the objective and is restarted from there until the budget of
+    simulations is spent.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Two routes of the upper level on the same problems: objective reached, simulations, seconds."""
+"""Compare two solvers of the upper level: objective reached, simulations, seconds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["route_rows"]
 
 
 def route_rows(_: int, __: Path) -> list[Row]:
-    """One run of each: what is compared is the objective, which does not vary."""
+    """Run each case once; the compared objective does not vary."""
     short, person = example(), seat()
     cases = {
         "W1 from the Table 3.1 start": (short, starting_weights(short.problem)),

@@ -1,4 +1,4 @@
-"""What the runner takes of a client's processor for each task, where tasks themselves take none."""
+"""Processor time that the runner takes of the client for each empty task."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ _LIMIT = 0.5  # ms
 
 
 def empty(index: int) -> int:
-    """A task that takes no time."""
+    """A task without work."""
     return index
 
 
 class _Ready:
-    """A pool whose answers are there at once: what is left is the client's."""
+    """A pool that answers at once, so that only the time of the client remains."""
 
     threads = 32
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
         numbers = {"seconds": 1e-4, "memory_mb": 400.0, "K": rng.standard_normal((1, 10)).tolist()}
-        # A fit of 70 kB, as one of three trials of the seat has.
+        # A fit of 70 kB, the size for three trials of the seat.
         fit = dict.fromkeys(("starts", "logarithms", "S", "Q", "R"), numbers["K"])
         self._fit = numbers | fit | {"trajectory": rng.standard_normal((600, 6)).tolist()}
         self._replicate = numbers | {"parameters": [1.0]}
@@ -79,7 +79,7 @@ def _through(pool: Pool, folder: str) -> None:
 
 
 def runner_rows(runs: int, _: Path) -> list[Row]:
-    """The client of a cohort by itself, workers on this machine, and Dask's beside Dask's own."""
+    """Rows of the cohort client, local workers, and Dask workers relative to Dask alone."""
     runs = max(3, runs // 2)
     with tempfile.TemporaryDirectory() as folder, processes(2) as pool:
         cases: dict[str, Callable[[], object]] = {
@@ -95,7 +95,7 @@ def runner_rows(runs: int, _: Path) -> list[Row]:
 
 
 def _dask_rows(runs: int, folder: str) -> list[Row]:
-    beside = "a task, two workers of Dask, beside Dask's own time"
+    beside = "a task, two workers of Dask, in addition to Dask's own time"
     if importlib.util.find_spec("distributed") is None:
         return [Row(beside, "", None, _LIMIT, "ms", "not installed: pip install 'impc[cohort]'")]
     import distributed  # noqa: PLC0415
@@ -125,7 +125,7 @@ def _dask_rows(runs: int, folder: str) -> list[Row]:
 
 
 def _each(timing: Timing) -> float:
-    """Milliseconds a task."""
+    """Milliseconds for each task."""
     return 1e3 * timing.median / _TASKS
 
 

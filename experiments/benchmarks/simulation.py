@@ -1,4 +1,4 @@
-"""W2: simulation with exact Jacobian, against CasADi's own graph; its nonlinear body."""
+"""W2: simulation with exact Jacobian compared with a CasADi graph; its nonlinear body."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def simulation_rows(runs: int, _: Path) -> list[Row]:
 
 
 def _body_row(work: Workload, runs: int) -> Row:
-    """The same weights and torque, a person of the default size: equations beside matrices."""
+    """Row of the nonlinear body against the linear plant, same weights and torque."""
     system = seated_balance_for()
     plant = Plant(system, ["command"], body=system.body)
     laws = [

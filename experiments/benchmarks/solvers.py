@@ -1,4 +1,4 @@
-"""The controller's programs by other solvers than the compiled one, and the loop as a function."""
+"""Quadratic programs by other solvers than the compiled one, and the loop as a function."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _simulations(runs: int) -> list[Row]:
     steps = iter(np.arange(1, 10**6))
 
     def by_function() -> object:
-        # Another gain at each call: the function remembers the last one.
+        # A new gain at each call, because CasADi caches the last one.
         return slope(np.array(controller.K) * (1 + 1e-12 * next(steps)))
 
     timings = side_by_side({**cases, "function": by_function}, runs)
@@ -122,6 +122,6 @@ def _seat_fits(runs: int) -> list[Row]:
 
 
 def _require_close(found: Array, expected: Array, tolerance: float) -> None:
-    """Largest difference, relative to the largest entry."""
+    """Raise if the largest difference, relative to the largest entry, is above `tolerance`."""
     if np.max(np.abs(found - expected)) > tolerance * np.max(np.abs(expected)):
         raise AssertionError(f"differs by {np.max(np.abs(found - expected)):.3g}")

@@ -1,4 +1,4 @@
-"""The rows of the benchmark table, and the files that they are written to."""
+"""Rows of the benchmark table, and the files with them."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _PACKAGES = ("casadi", "numpy", "scipy", "numba", "clarabel", "cvxpy")
 
 @dataclass(frozen=True)
 class Row:
-    """One claim: a ratio (or a plain number) beside what it must not exceed.
+    """One result: a ratio (or a number) with its upper limit.
 
     Attributes
     ----------
     what, compared : str
-        What was measured, and against what.
+        The measured case, and the reference.
     value : float or None
-        None when the peer is not installed.
+        None if the reference is not installed.
     limit : float or None
-        None where the figure is for information.
+        Largest accepted value; None if for information.
     unit : str
-        Empty for a ratio.
+        Unit of the value; empty for a ratio.
     note : str
-        Medians and quartiles, or why there is no figure.
+        Medians and quartiles, or why there is no value.
     """
 
     what: str
@@ -46,19 +46,20 @@ class Row:
 
 
 def compare(what: str, compared: str, own: Timing, other: Timing, limit: float | None) -> Row:
-    """A ratio of medians, with both medians and quartiles in the note."""
+    """Row with a ratio of medians; the note has both medians and quartiles."""
     return Row(what, compared, own.median / other.median, limit, "", f"{_say(own)} / {_say(other)}")
 
 
 def write_tables(rows: list[Row], folder: Path, runs: int) -> str:
-    """Write results.md and results.json, whole or not at all; return the former."""
+    """Write results.md and results.json, each complete or not at all; return results.md."""
     lines = [
         "# Benchmarks",
         "",
-        "Written by `make bench`. Ratios of medians measured side by side in one run; in brackets "
-        "the quartiles. Times are of the machine named below; only the ratios travel. `make bench` "
-        "gives every method one BLAS thread: the matrices are small, and with two threads on a "
-        "busy machine one fit took six times as long (`OPENBLAS_NUM_THREADS=1`).",
+        "Written by `make bench`. Ratios of median times measured in turn in one run, quartiles in "
+        "brackets. W1 is the example with two states, W2 the simulated seat. Times are of the "
+        "machine named below; only ratios can be compared. Every method has one BLAS thread "
+        "(`OPENBLAS_NUM_THREADS=1`): the matrices are small, and with two threads on a busy "
+        "machine one fit took six times as long.",
         "",
         "| what | against | measured | at most | median [quartiles], ms |",
         "|---|---|---|---|---|",

@@ -1,4 +1,4 @@
-"""Timing side by side: every repeat runs all cases in turn, so a busy machine slows them all."""
+"""Time cases in turn within every repeat, so that a busy machine slows all of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Timing", "ratio", "side_by_side"]
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of one case over its runs."""
+    """Run times of one case, s."""
 
     seconds: tuple[float, ...]
 
@@ -38,9 +38,9 @@ def side_by_side(
     repeats: int,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, Timing]:
-    """Run all cases `repeats` times in turn, after one run of each that is not counted.
+    """Run all cases `repeats` times in turn, after one warm-up run of each.
 
-    `clock` says the seconds: those on the wall, or `time.process_time` those of all processors.
+    `clock` measures wall time, or with `time.process_time` the time of all processors.
     """
     seconds: dict[str, list[float]] = {name: [] for name in cases}
     for repeat in range(repeats + 1):

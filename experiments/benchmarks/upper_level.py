@@ -1,8 +1,8 @@
-"""The upper level by two routes: prox-linear with a semidefinite step, and a smooth surrogate.
+"""Solve the upper level by prox-linear semidefinite steps and by a smooth surrogate.
 
-The surrogate is what a general optimiser would be given: L-BFGS on the Cholesky entries, the
-condition number replaced by a ratio of p-norms of the eigenvalues (p = 8, 32, 128 in turn), and the
-2-norm by sqrt(||r||^2 + e^2) with e = 1e-2, 1e-4, 1e-6.
+The surrogate suits a general optimiser: L-BFGS on the Cholesky entries, the condition number
+replaced by a ratio of p-norms of the eigenvalues (p = 8, 32, 128 in turn), and the 2-norm by
+sqrt(||r||^2 + e^2) with e = 1e-2, 1e-4, 1e-6.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["Route", "prox_linear", "smooth_surrogate"]
 
 @dataclass(frozen=True)
 class Route:
-    """Where a route ended: the true objective there, simulations, seconds."""
+    """End of a search: weights, true objective, number of simulations, seconds."""
 
     weights: Weights
     objective: float
@@ -40,7 +40,7 @@ class Route:
 
 
 def prox_linear(problem: Problem, start: Weights) -> Route:
-    """The package's own route, with the condition weight of the other."""
+    """Prox-linear steps of the package, with the condition weight of the surrogate."""
     begin = time.perf_counter()
     fit = inverse_mpc(problem, start, condition_weight=CONDITION_WEIGHT)
     weights = fit.stage_weights
@@ -49,7 +49,7 @@ def prox_linear(problem: Problem, start: Weights) -> Route:
 
 
 def smooth_surrogate(problem: Problem, start: Weights) -> Route:
-    """L-BFGS with continuation on the surrogate of the module's text."""
+    """L-BFGS with continuation on the surrogate of the module docstring."""
     begin = time.perf_counter()
     plant = problem.plant
     parameters, simulations = cholesky_parameters(start), 0

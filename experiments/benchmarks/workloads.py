@@ -1,4 +1,4 @@
-"""The problems that are timed: W1 is the simulation example, W2 the seated subject."""
+"""Timed problems: W1 is the simulation example, W2 the seated subject."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DIRECTION = np.array([0.70, 0.65, 0.22, 0.20])
 
 @dataclass(frozen=True)
 class Workload:
-    """A true controller, what drives it, and the inverse problem of its recordings."""
+    """A true controller, its scenarios, and the inverse problem of its recordings."""
 
     weights: Weights
     controller: Controller
@@ -50,8 +50,8 @@ def example() -> Workload:
 def seat(trials: int = 1, seconds: float = 30.0, limit: float = 6.0) -> Workload:
     """W2: the seated subject at 100 Hz under the 5 Nm ternary torque, |u| <= 6 Nm, N = 20.
 
-    The weights are the "true" intent of the reference, without weight on delay and muscle states
-    but 1e-2. Trials differ in the phase of the torque.
+    The weights are the "true" intent of the reference, with 1e-2 on delay and muscle states.
+    Trials differ in the phase of the torque.
     """
     plant = Plant(plants.seated_balance_plant(), ["command"])
     v = _DIRECTION / np.linalg.norm(_DIRECTION)
@@ -69,13 +69,13 @@ def seat(trials: int = 1, seconds: float = 30.0, limit: float = 6.0) -> Workload
 
 
 def with_horizon(work: Workload, horizon: int) -> Workload:
-    """The same workload with another horizon, recorded anew."""
+    """The same workload recorded with another horizon."""
     controller = replace(work.controller, horizon=horizon)
     return _record(work.weights, controller, work.drives, controller.plant, terminal_set=False)
 
 
 def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
-    """A chain of masses, springs and dampers whose first mass stands on an inverted spring.
+    """A chain of masses, springs and dampers whose first mass has a negative spring.
 
     `states` / 2 masses of 1 kg, springs of 40 N/m, dampers of 1 Ns/m between neighbours; the last
     mass is tied to a wall, the first is pushed away from the origin by 5 N/m: one unstable mode. A
@@ -85,7 +85,7 @@ def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
     laplacian = 2 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
     laplacian[0, 0] = 1.0
     stiffness = 40.0 * laplacian
-    stiffness[0, 0] -= 40.0 / masses + 5.0  # overcomes the chain behind it: unstable
+    stiffness[0, 0] -= 40.0 / masses + 5.0  # Overcomes the stiffness of the chain: unstable
     eye, zero = np.eye(masses), np.zeros((masses, masses))
     A = np.block([[zero, eye], [-stiffness, -laplacian]])
     B = np.zeros((states, 2))
@@ -96,7 +96,7 @@ def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
     push = np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], size=steps // 25 + 1)
     controller = Controller(plant, weights, Bounds(plant), 20, terminal_set=False)
     drive = scenario(plant, np.zeros(states), disturbance=np.repeat(push, 25)[:steps])
-    # A limit that about one sample in ten reaches.
+    # About one sample in ten reaches this limit.
     free = require_complete(controller, simulate(controller, drive))
     limit = float(np.quantile(np.abs(free.u), 0.9))
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
@@ -122,6 +122,6 @@ def _record(
         controller.horizon,
         tuple(recordings),
         terminal_set=terminal_set,
-        output_scale=np.ones(len(plant.outputs)),  # the objective that peers are given too
+        output_scale=np.ones(len(plant.outputs)),  # The same objective as for the alternatives
     )
     return Workload(weights, controller, tuple(drives), problem)

@@ -1,1 +1,1 @@
-"""The likelihood of a person at a limit by particles, and a fit that they correct."""
+"""Particle likelihood of the sensorimotor model at a limit, compared with the filter."""

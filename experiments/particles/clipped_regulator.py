@@ -1,12 +1,12 @@
-"""A person whose command is a gain times the estimate, clipped: what particles can be exact about.
+"""Sensorimotor model whose command is a clipped gain times the estimate.
 
-With z of `joint_loop` and g the command that is wanted, before the bounds at the present sample,
+With z of `joint_loop` and g the command before it is clipped to its bounds,
 
     z+ = F z + B clip(g) + E d + noise of covariance Q,    g = h'z,    y = C z + noise of R
 
-which is the person of `joint_likelihood` where no later sample of a plan meets a bound. Once y and
-g are given up to a sample, z is normal, with a covariance that depends on neither: particles need
-to draw g alone (docs/noisy-people.md, section "Particles").
+This is the model of `joint_likelihood` if no later sample of a plan reaches a bound. Given y and g
+up to a sample, z is normal with a covariance that depends on neither, so particles sample g only
+(experiments/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ if TYPE_CHECKING:
 
 __all__ = ["ClippedRegulator", "clipped_regulator", "first_state"]
 
-# Eigenvalues of the noise below that, of the largest, are rounding.
+# Eigenvalues of the noise below this share of the largest are rounding.
 _ROUNDING = 1e-14
-# A wanted command whose deviation is below 1e-7 of the nearer bound is known.
+# An unclipped command with a standard deviation below 1e-7 of the nearer bound is taken as exact.
 _KNOWN = 1e-14
 
 
 class ClippedRegulator(NamedTuple):
-    """The system; a named tuple because compiled code takes it as it is.
+    """Matrices of the system, as a named tuple for compiled code.
 
     Attributes
     ----------
     F, B, E, C : Buffer
         (z, z), (z,), (z, d) and (p, z): transition, command, perturbations, outputs.
     Q, root, R, P0 : Buffer
-        Covariance of the noise (z, z) and A with A A' = Q (z, r); that of the recorder (p, p) and
-        of the first state (z, z).
+        Covariance of the noise (z, z), its square root (z, r), covariance of the recording noise
+        (p, p) and of the first state (z, z).
     h : Buffer
-        The wanted command of z (z,).
+        Row that gives the unclipped command g = h'z, shape (z,).
     low, high : float
         Bounds of the command, in its unit.
     unit : float
-        The nearer of them.
+        The bound nearer to zero, as a magnitude.
     known : float
-        A wanted command of a smaller variance is known: 1e-14 of the square of that.
+        Variance below which g is taken as exact: 1e-14 of the square of `unit`.
     """
 
     F: Buffer
@@ -69,7 +69,7 @@ class ClippedRegulator(NamedTuple):
 def clipped_regulator(
     plant: Plant, gain: Array, bounds: Bounds, person: Observer, recorder: Array
 ) -> ClippedRegulator:
-    """The system of a `person` at a `plant` of one input, with noise that is no share of commands.
+    """Build the system of a `person` and a `plant` with one input, without signal-dependent noise.
 
     Parameters
     ----------
@@ -77,15 +77,15 @@ def clipped_regulator(
     gain : Array
         K (1, n), u = -K x.
     bounds : Bounds
-        Those of the input are met.
+        Only the input bounds are used.
     person : Observer
     recorder : Array
-        Standard deviations of the noise in the recorded outputs (p,).
+        Standard deviations of the recording noise, shape (p,).
 
     Raises
     ------
     SolverError
-        When the person's filter has no stationary gain.
+        If the filter of the person has no stationary gain.
     """
     joint = joint_loop(plant, person, recorder)
     at = plant.n if person.estimates else 0
@@ -101,13 +101,13 @@ def clipped_regulator(
 
 
 def first_state(plant: Plant, regulator: ClippedRegulator, x0: Array) -> Array:
-    """What is expected of z at the first sample (z,), the estimate being x0 (n,).
+    """Expected z at the first sample, shape (z,), for the estimate x0, shape (n,).
 
     Parameters
     ----------
     plant : Plant
     regulator : ClippedRegulator
-        Of the plant.
+        System of the plant.
     x0 : Array
         (n,).
     """

@@ -1,15 +1,14 @@
-"""Compiled code: the likelihood of a clipped regulator by particles that know what is to come.
+"""Compiled code: likelihood of a clipped regulator by look-ahead particles.
 
-Each particle is a path of wanted commands g; given that and the outputs the state is normal, with a
-covariance that is the same for all (`gains`). With psi of `lookahead` and
+Each particle is a path of unclipped commands g. Given the path and the outputs, the state is normal
+with a covariance common to all particles (`gains`). With psi of `lookahead` and
 Psi_t(m) = E psi_t(z), z normal about m, a particle that expects the state m before output t
 
-    is weighed by   p(y_t | m) E_g Psi_t+1(m+(g)) / Psi_t(m),
-    and draws g of density in proportion to   N(g; h'm_y, v) Psi_t+1(m+(g)),
+    is weighted by   p(y_t | m) E_g Psi_t+1(m+(g)) / Psi_t(m),
+    and draws g with a density proportional to   N(g; h'm_y, v) Psi_t+1(m+(g)),
 
-m_y what it expects once y_t is known and m+(g) of the next state once g is. As m+ is a line in g
-below the lower bound, another between the bounds and a third above, both are exact: three pieces of
-normal densities.
+where m_y is the expected state given y_t and m+(g) the expected next state given g. m+ is affine in
+g below, between and above the bounds, so both are exact sums over three pieces of normal densities.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from impc.jit import njit
 
 __all__ = ["particles"]
 
-# Particles are drawn anew when their effective share is below this.
+# Particles are resampled when their effective share is below this.
 _SHARE = 0.5
 
 
@@ -41,17 +40,17 @@ def particles(
     seed: int,
     count: int,
 ) -> float:
-    """Log-likelihood, nats.
+    """Log-likelihood of a recording, nats.
 
     Parameters
     ----------
     regulator, known, ahead : ClippedRegulator, Gains, Twist
     outputs, disturbance, start : Buffer
-        (samples, p), (samples, d), and what is expected of the first state (z,).
+        (samples, p), (samples, d), and the expected first state (z,).
     seed : int
-        Of all numbers drawn.
+        Seed of the random numbers.
     count : int
-        How many particles.
+        Number of particles.
     """
     F, B, E, C, _, _, _, _, h, low, high, _, least_spread = regulator
     last = len(outputs) - 1
@@ -106,7 +105,7 @@ def _average(P: Buffer, ahead: Twist, t: int) -> tuple[Buffer, Buffer, float]:
 
 @njit(cache=True)
 def _psi(bend: Buffer, pulled: Buffer, level: float, z: Buffer) -> Buffer:
-    """What all particles (z, count) expect of psi, its logarithm (count,)."""
+    """Logarithm (count,) of the expected psi of all particles (z, count)."""
     found: Buffer = level + pulled @ z - np.sum(z * (bend @ z), axis=0) / 2
     return found
 
@@ -123,10 +122,10 @@ def _weigh_piece(
     mass: Buffer,
     top: Buffer,
 ) -> None:
-    """Write the logarithm of N(g) times Psi(base + line g), summed over a piece, and its top.
+    """Write log of N(g) Psi(base + line g) integrated over a piece, and its mode `top`.
 
-    Along g that is a parabola of curvature `steep`. (Where a bound is infinite the piece beyond it
-    is empty.)
+    Along g the logarithm is a parabola of curvature `steep`. Beyond an infinite bound the piece is
+    empty.
     """
     if ends[0] == ends[1]:
         mass[:] = -np.inf
@@ -143,7 +142,7 @@ def _weigh_piece(
 
 @njit(cache=True)
 def _log_normal(low: float, high: float) -> float:
-    """Logarithm of the probability of a normal number between two ends."""
+    """Log-probability that a standard normal variable lies between two ends."""
     if low > 0:
         low, high = -high, -low
     share = math.erfc(-high / math.sqrt(2.0)) - math.erfc(-low / math.sqrt(2.0))
@@ -152,7 +151,7 @@ def _log_normal(low: float, high: float) -> float:
 
 @njit(cache=True)
 def _logarithm_of_sum(values: Buffer) -> Buffer:
-    """Of e to the power of three rows of values (3, count)."""
+    """Log of the sum of the exponentials of three rows (3, count)."""
     top = np.maximum(np.maximum(values[0], values[1]), values[2])
     found: Buffer = top + np.log(
         np.exp(values[0] - top) + np.exp(values[1] - top) + np.exp(values[2] - top)
@@ -168,14 +167,14 @@ def _logarithm_of_mean(weight: Buffer) -> float:
 
 @njit(cache=True)
 def _effective(weight: Buffer) -> float:
-    """Effective share of particles: one where all weigh the same."""
+    """Effective share of the particles: 1 if all weights are equal."""
     share = np.exp(weight - np.max(weight))
     return float(np.sum(share) ** 2 / np.sum(share**2) / len(share))
 
 
 @njit(cache=True)
 def _systematic(weight: Buffer) -> Buffer:
-    """Which particle each of the new ones is: systematic resampling."""
+    """Indices of the particles kept by systematic resampling."""
     share = np.exp(weight - np.max(weight))
     step, at = np.sum(share) / len(share), np.random.random()
     found, j, reached = np.zeros(len(share), np.int64), 0, share[0]
@@ -195,7 +194,7 @@ def _drawn(
     steep: Buffer,
     pieces: tuple[float, float, float, float],
 ) -> Buffer:
-    """A wanted command for each particle: a piece by its mass, then a normal number inside it."""
+    """Draw g for each particle: a piece by its mass, then a truncated normal variable."""
     g = np.zeros(len(both))
     for j in range(len(g)):
         left, k = np.random.random(), 0
@@ -210,7 +209,7 @@ def _drawn(
 
 @njit(cache=True)
 def _normal_between(low: float, high: float) -> float:
-    """A normal number between two ends, by rejection (Robert 1995)."""
+    """Truncated standard normal variable, by rejection (Robert 1995)."""
     sign = 1.0
     if low + high < 0:
         low, high, sign = -high, -low, -1.0

@@ -1,11 +1,10 @@
-"""Compiled code: paths of wanted commands, given which a clipped regulator is linear and normal.
+"""Compiled code: Kalman gains of a clipped regulator whose unclipped commands g are given.
 
-With the wanted commands g given, recordings and g have a density in closed form,
+Given g the system is linear and normal, and recordings and g have the density
 
     log p(y, g) = sum_t  log N(y_t; C z_t, S_t) + log N(g_t; h'z_t|y, v_t)
 
-of a Kalman filter that is identified y_t and then g_t itself. Here are the gains of that filter,
-which depend on neither.
+of a Kalman filter that observes y_t and then g_t. Its gains depend on neither.
 """
 
 from __future__ import annotations
@@ -21,23 +20,22 @@ from impc.jit import njit
 
 __all__ = ["Gains", "gains"]
 
-# The gains are taken for stationary when no variance of a state changes by more, of itself.
+# Gains are stationary if no variance of a state changes by more than this relative amount.
 _STILL = 1e-12
 
 
 class Gains(NamedTuple):
-    """The filter that is identified outputs and wanted commands, sample by sample.
+    """Gains of the filter that observes outputs and unclipped commands, sample by sample.
 
     Attributes
     ----------
     P : Buffer
-        Covariance of z before the output (samples, z, z).
+        Covariance of z before the output, shape (samples, z, z).
     K, weight, volume : Buffer
         Gain of the outputs (samples, z, p), the inverse of the innovation's covariance
         (samples, p, p), and the logarithm of the determinant of 2 pi times that (samples,).
     L, spread : Buffer
-        Gain of the wanted command (samples, z), and its variance (samples,): zero where it is
-        known.
+        Gain of the unclipped command (samples, z), and its variance (samples,): zero if exact.
     """
 
     P: Buffer
@@ -50,13 +48,13 @@ class Gains(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def gains(regulator: ClippedRegulator, samples: int) -> Gains:
-    """The gains of each sample.
+    """Compute the gains of each sample.
 
     Parameters
     ----------
     regulator : ClippedRegulator
     samples : int
-        How many there are.
+        Number of samples.
     """
     F, _, _, C, Q, _, R, P0, h, _, _, _, known = regulator
     size, p = len(F), len(C)

@@ -1,8 +1,8 @@
-"""The likelihood of a clipped regulator, with no approximation but that of particles.
+"""Likelihood of a clipped regulator, approximated by particles only.
 
-The filter of `joint_likelihood` takes what it knows of a command that is clipped for a normal
-number. Along the size of a whole gain its score is then off by half a deviation for each trial of
-the seat at its limit; that of particles is not (docs/noisy-people.md, section "Particles").
+The filter of `joint_likelihood` treats a clipped command as a normal variable, which biases its
+score along the size of the gain at a limit. The particle score is unbiased
+(experiments/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["particle_likelihood"]
 
-# How often the commands are replaced by lines before particles look ahead; with one their weights
-# differ more, with six no less.
+# Linearisations of the commands: with one the weights vary more, with six no less.
 _ROUNDS = 2
 
 
@@ -32,7 +31,7 @@ def particle_likelihood(
     count: int,
     seed: int,
 ) -> float:
-    """Log-likelihood of a recording, nats; its exponential has no bias.
+    """Log-likelihood of a recording, nats; its exponential is unbiased.
 
     Parameters
     ----------
@@ -40,11 +39,11 @@ def particle_likelihood(
     outputs, disturbance : Array
         (samples, p) and (samples, d).
     start : Array
-        What is expected of the first state (z,).
+        Expected first state, shape (z,).
     count : int
-        How many particles.
+        Number of particles.
     seed : int
-        Of all numbers drawn.
+        Seed of the random numbers.
     """
     known = gains(regulator, len(outputs))
     ahead = twist(regulator, outputs, disturbance, start, _ROUNDS)

@@ -1,14 +1,14 @@
-"""Compiled code: what later outputs say of a state, for particles that are to know it.
+"""Compiled code: approximate likelihood of later outputs given a state, for look-ahead particles.
 
-Particles of the past alone die of what comes: a command shows in the outputs only samples later.
-Those of `drawn_particles` are drawn and weighed with
+Particles that use past outputs only degenerate, because a command appears in the outputs only
+samples later. Those of `drawn_particles` are drawn and weighted with
 
-    psi_t(z) = exp(-z' L_t z / 2 + a_t' z),    about p(y_t, ..., y_T | z_t = z)
+    psi_t(z) = exp(-z' L_t z / 2 + a_t' z),    approximately p(y_t, ..., y_T | z_t = z)
 
-which is that density where each command is replaced by a line, c + rho g and a variance beside, the
-best for what all outputs say of g (`compiled_clip`; posterior linearisation, García-Fernández et
-al. 2017; twisted particles, Guarniero, Johansen and Lee 2017). Whatever psi is the likelihood of
-the particles has no bias; it has the less noise the better psi is.
+which is this density if each command is replaced by c + rho g plus noise, fitted to the
+distribution of g given all outputs (`compiled_clip`; posterior linearisation, García-Fernández et
+al. 2017; twisted particles, Guarniero, Johansen and Lee 2017). The particle likelihood is unbiased
+for any psi; a better psi gives less variance.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ __all__ = ["Twist", "twist"]
 
 
 class Twist(NamedTuple):
-    """What the outputs from a sample on say of its state.
+    """Coefficients of psi: information of the outputs from a sample on about its state.
 
     Attributes
     ----------
     L, a : Buffer
-        (samples, z, z) and (samples, z).
+        Shapes (samples, z, z) and (samples, z).
     """
 
     L: Buffer
@@ -43,7 +43,7 @@ class Twist(NamedTuple):
 def twist(
     regulator: ClippedRegulator, outputs: Buffer, disturbance: Buffer, start: Buffer, rounds: int
 ) -> Twist:
-    """What the outputs from each sample on say of its state.
+    """Compute psi for every sample.
 
     Parameters
     ----------
@@ -51,10 +51,10 @@ def twist(
     outputs, disturbance : Buffer
         (samples, p) and (samples, d).
     start : Buffer
-        What is expected of the first state (z,).
+        Expected first state, shape (z,).
     rounds : int
-        How often each command is replaced by the line that is best for what all outputs say; the
-        first line is that for what earlier ones say.
+        Number of linearisations of the commands; the first uses earlier outputs only, the others
+        all outputs.
     """
     samples, size = len(outputs), len(regulator.F)
     lines = np.zeros((samples, 3))
@@ -72,7 +72,7 @@ def twist(
 
 @njit(cache=True)
 def _line(regulator: ClippedRegulator, g: float, variance: float, line: Buffer) -> None:
-    """Write offset, slope and variance beside of a command of which g is wanted, about."""
+    """Write offset, slope and residual variance of the linearised clipped command."""
     clip = Clip(True, regulator.low, regulator.high, regulator.unit)
     found = clipped(clip, g, math.sqrt(max(variance, 0.0)))
     line[0], line[1], line[2] = found.value - found.inside * g, found.inside, found.variance
@@ -89,7 +89,7 @@ def _expect(
     means: Buffer,
     spreads: Buffer,
 ) -> None:
-    """Write mean and covariance of each state before its output; `own` lines are written too."""
+    """Write mean and covariance of each state before its output; with `own`, its line too."""
     F, B, E, C, Q, _, R, P0, h, _, _, _, _ = regulator
     z, P = start.copy(), P0.copy()
     for t in range(len(outputs)):
@@ -136,7 +136,7 @@ def _look_back(
 def _smooth(
     regulator: ClippedRegulator, means: Buffer, spreads: Buffer, found: Twist, lines: Buffer
 ) -> None:
-    """Write the line of each command for what all outputs say of it."""
+    """Write the linearisation of each command given all outputs."""
     h, size = regulator.h, len(regulator.h)
     both = np.zeros((size, 2))
     for t in range(len(means)):

@@ -1,8 +1,9 @@
-"""Is the score at the truth without bias at a limit? By the filter, and by particles.
+"""Bias of the score at the true gain at a limit, by the filter and by particles.
 
-People of the seat of `noisy_people` plan one sample ahead here, so that the command is a gain times
-the estimate, clipped, and particles have the likelihood with no approximation. Of fresh trials of
-each, falls left out, the difference of log-likelihoods at a gain a twentieth larger and smaller:
+Subjects on the seat of `noisy_people` plan one sample ahead here, so the command is a clipped gain
+times the estimate, and the particle likelihood has no model error. The script prints the mean
+difference of the log-likelihoods at a gain 5 % above and 5 % below the true one, over new trials
+without a fall. It should be zero. Results: experiments/output_feedback.md.
 
     python -m experiments.particles.scores --noise sensory --vaf 70 --seeds 3 6 --trials 30
 """
@@ -36,12 +37,12 @@ _APART, _PARTICLES = 0.05, 300
 
 
 def differences(who: Subject, trials: int) -> tuple[Array, int]:
-    """Of each trial that is no fall, by filter and by particles (kept, 2), nats; and falls.
+    """Differences of trials without a fall (kept, 2), filter and particles, nats; and falls.
 
     Parameters
     ----------
     who : Subject
-        Of whom gain, levels and limit are taken.
+        Source of gain, noise SDs and limit.
     trials : int
     """
     plant, K = who.controller.plant, np.array(who.controller.K)
@@ -83,8 +84,8 @@ def _filter(law: Controller, who: Subject) -> PreparedFilter:
 
 
 def main() -> None:
-    """Print a line for each person."""
-    parser = argparse.ArgumentParser(description="Scores at the truth, at a limit.")
+    """Print a line for each subject."""
+    parser = argparse.ArgumentParser(description="Bias of the score at the true gain, at a limit.")
     parser.add_argument("--noise", choices=tuple(NOISES), default="sensory")
     parser.add_argument("--vaf", type=float, default=70.0)
     parser.add_argument("--seeds", type=int, nargs="+", default=[3, 6])
@@ -95,7 +96,7 @@ def main() -> None:
         found, falls = differences(who, given.trials)
         mean, error = found.mean(axis=0), found.std(axis=0, ddof=1) / np.sqrt(len(found))
         print(
-            f"{seed}: {falls} of {given.trials} trials are falls; of the others the filter says "
+            f"{seed}: {falls} of {given.trials} trials end in a fall; the others: filter "
             f"{mean[0]:.2f} ± {error[0]:.2f} nats, particles {mean[1]:.2f} ± {error[1]:.2f}"
         )
 

@@ -141,7 +141,7 @@ def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]
             " typical value; bounded Nelder and Mead.",
             ("impc.studies.selection.lasso:table_c1",),
             "Run by `nelder_mead = true` and by `python -m experiments.selection_claims"
-            " --nelder-mead`: docs/selection.md.",
+            " --nelder-mead`: experiments/reliability_selection.md.",
             Verdict.IN_KIND,
             "The rule by which lambda changes is lost.",
         ),

@@ -180,9 +180,8 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
         ("experiments.protocols", "experiments.normalisation"),
         "`python -m experiments.normalisation` runs both on the simulated subject.",
         Verdict.IN_KIND,
-        "Whether the last success or the first failure is the critical stiffness is not "
-        "identified; here"
-        " the first failure.",
+        "The text does not say whether the last success or the first failure is the critical"
+        " stiffness; here the first failure.",
     )
     encoder = Entry(
         "Claim, 2.2.2",
@@ -196,7 +195,7 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
 
 
 def _looked_for(result: dict[str, Any]) -> list[tuple[str, bool, str]]:
-    """Statements of chapter 2, whether each holds here, and the numbers that say so."""
+    """Statements of chapter 2, whether each holds here, and the numbers."""
     iccs = pd.concat([table(result, f"icc-{name}") for name in ("rms", "energy")])
     least, means = float(iccs["icc"].min()), iccs.groupby("output", sort=False)["icc"].mean()
     lower, upper = (float(means[name]) for name in ("theta1", "theta2"))

@@ -1,4 +1,4 @@
-"""One line of the reproduction table: what the dissertation says, and what is found here."""
+"""Lines of the reproduction table: claim of the dissertation, result here, verdict."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Chapter", "Entry", "Verdict", "agrees", "drawing", "kind"]
 
 
 class Verdict(Enum):
-    """How the dissertation's statement stands."""
+    """Verdict on a statement of the dissertation."""
 
     REPRODUCED = "reproduced"
     IN_KIND = "reproduced in kind"
@@ -19,23 +19,23 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Entry:
-    """A line.
+    """A line of the table.
 
     Attributes
     ----------
     item : str
         "(3.4)", "Table 4.3", "Figure 3.2", or "Claim, 3.4" for a statement of that section.
     says : str
-        What the dissertation says; where its text has lost it, what can be inferred.
+        Statement of the dissertation; if its text is lost, what can be inferred.
     where : tuple of str
         Names in this repository, "module:name" or "module".
     found : str
-        Computed when the table is made.
+        Result, computed when the table is made.
     verdict : Verdict
     why : str
-        Needed where the verdict is not `REPRODUCED`.
+        Reason; required if the verdict is not `REPRODUCED`.
     figure : str
-        Path of the PNG that this package draws for it, inside the folder of results; or empty.
+        Path of the figure drawn here, inside the folder of results; or empty.
     """
 
     item: str
@@ -49,7 +49,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Chapter:
-    """Lines under one heading; `stand_in` says what takes the place of data that are lost."""
+    """Lines under one heading; `stand_in` describes the data used instead of lost ones."""
 
     title: str
     stand_in: str
@@ -57,17 +57,17 @@ class Chapter:
 
 
 def agrees(holds: bool) -> Verdict:
-    """Of a statement that is found exactly as it was made, or is not."""
+    """Verdict on a statement that can be reproduced exactly."""
     return Verdict.REPRODUCED if holds else Verdict.NOT
 
 
 def kind(holds: bool) -> Verdict:
-    """Of a statement about the dissertation's own data, looked for in data of ours."""
+    """Verdict on a statement about lost data, tested on simulated data."""
     return Verdict.IN_KIND if holds else Verdict.NOT
 
 
 def drawing(item: str, says: str) -> Entry:
-    """A figure of the seat or of its model: there is nothing in it to reproduce."""
+    """Entry of a drawing of the seat or its model, which has no result to reproduce."""
     return Entry(
         item,
         says,

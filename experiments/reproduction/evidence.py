@@ -1,9 +1,8 @@
-"""What the entries look at: the package's own commands, run once, and their `result.json`.
+"""Run the commands of the package once and read their `result.json`.
 
-A command whose result is there is not run again, so `make reproduce` may be interrupted; delete
-the folder to begin anew. The studies that feed `impc select`, `impc key-parameters` and
-`impc reliability` are simulated by the package (seed 0), because the dissertation's recordings are
-not public.
+A command with a result is not run again, so `make reproduce` can be interrupted; delete the folder
+to start again. The studies for `impc select`, `impc key-parameters` and `impc reliability` are
+simulated (seed 0), because the dissertation's recordings are not public.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ TRIALS = ("trial_1.csv", "trial_2.csv", "trial_3.csv")
 
 @dataclass(frozen=True)
 class Evidence:
-    """`result.json` of each command, as read; `claims` are of `experiments.selection_claims`."""
+    """`result.json` of each command; `claims` come from `experiments.selection_claims`."""
 
     example: dict[str, Any]
     fit: dict[str, Any]
@@ -40,7 +39,7 @@ class Evidence:
 
 
 def gather(folder: Path) -> Evidence:
-    """Run what has no result yet in `folder`; about half an hour on two cores."""
+    """Run the commands without a result in `folder`; about half an hour on two cores."""
     subject = folder / "subject"
     _once(subject / "truth.json", ["simulate", "seated-balance", "--formats", "csv"])
     balance = folder / "balance"
@@ -69,12 +68,12 @@ def gather(folder: Path) -> Evidence:
 
 
 def table(result: dict[str, Any], name: str) -> pd.DataFrame:
-    """The table of a finding of a `result`."""
+    """Table of one finding of a `result`."""
     return pd.DataFrame(result["findings"][name]["table"])
 
 
 def _claims(path: Path) -> dict[str, Any]:
-    """Widths of bootstrap intervals, with 60 replicates; kept like the results of commands."""
+    """Widths of bootstrap intervals with 60 replicates, kept in a file."""
     if not path.exists():
         print("bootstrap intervals of chapter 4: ten minutes", flush=True)
         content = {
@@ -86,7 +85,7 @@ def _claims(path: Path) -> dict[str, Any]:
 
 
 def _once(result: Path, line: list[str]) -> Path:
-    """Run `impc <line> --out <folder of the result>` unless the result is there."""
+    """Run `impc <line> --out <folder of the result>` unless the result exists."""
     if not result.exists():
         given = [*line, "--out", str(result.parent)]
         print("impc", *given, flush=True)

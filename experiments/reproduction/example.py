@@ -130,7 +130,7 @@ def controller_entries() -> list[Entry]:
                 "impc.inverse.table31:inverse_mpc",
             ),
             f"Inputs with (7Q, 7R) differ by {ray:.0e}. The manifold is larger than multiples: with"
-            " one input the law depends on the weights through K alone (docs/theory.md).",
+            " one input the law depends on the weights through K alone (docs/why/theory.md).",
             agrees(ray < 1e-12),
         ),
         Entry(
@@ -170,7 +170,7 @@ def controller_entries() -> list[Entry]:
             "Figure 3.1",
             "Block diagram of the loop with MPC, and of the two levels.",
             ("impc.inverse.table31",),
-            "docs/architecture.md has the drawing of this package.",
+            "docs/dev/architecture.md has the drawing of this package.",
             Verdict.IN_KIND,
             "A drawing of structure, not a result.",
         ),
@@ -304,7 +304,7 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             ),
             f"{case['identifiability']['rank']} of {case['identifiability']['free']} directions"
             " are determined; the condition number chooses the rest, and its choice depends on the"
-            " units of the states (docs/equivalent-weights.md).",
+            " units of the states (docs/why/equivalent_weights.md).",
             Verdict.IN_KIND,
             "A unique answer, but the convention's, not the recording's.",
         ),

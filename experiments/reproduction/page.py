@@ -1,4 +1,4 @@
-"""The entries as a page in Markdown, with the figures beside what they are counterparts of."""
+"""Markdown page of the entries, with figures next to their counterparts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HEAD = """\
 
 Every equation, table, figure and numerical claim of the dissertation (A. Ramadan, Michigan State
 University, 2018): what it says, what is found here and where, and how it stands. Most of its
-equations and numbers are lost from the text that we have; its recordings were never public.
+equations and numbers are lost from the available text; its recordings were never public.
 Written by `make reproduce`, which runs the commands of the package and computes every number in
 the third column.
 
@@ -32,7 +32,7 @@ the third column.
 
 
 def page(chapters: Sequence[Chapter]) -> str:
-    """Write the page: counts, a table a chapter, the figures."""
+    """Page with counts, one table for each chapter, and the figures."""
     everything = [entry for chapter in chapters for entry in chapter.entries]
     counts = Counter(entry.verdict for entry in everything)
     counted = ", ".join(f"{counts[verdict]} {verdict.value}" for verdict in Verdict)
@@ -48,7 +48,7 @@ def page(chapters: Sequence[Chapter]) -> str:
 
 
 def figure_name(entry: Entry) -> str:
-    """File of the figure beside the page."""
+    """File name of the figure next to the page."""
     return entry.figure.replace("/", "-")
 
 

@@ -100,7 +100,7 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             "[fit] feedback_states does it. It stabilises the seat; with a delay of 80 ms the"
             " gains of the other six states are not zero for any weights we know of.",
             Verdict.IN_KIND,
-            "An assumption of the dissertation; docs/fitting.md says what it costs.",
+            "An assumption of the dissertation; experiments/coverage.md has its cost in VAF.",
         ),
         Entry(
             "(3.21)",
@@ -196,7 +196,8 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             f" ({len(readings)} rules).",
             agrees(same),
             "The direction is a property of the rule that chooses Q and of the units of the states"
-            " as much as of the subject: no recording determines it (docs/equivalent-weights.md)."
+            " as much as of the subject: no recording determines it"
+            " (docs/why/equivalent_weights.md)."
             " What the recording says is K.",
             "fit/figures/statements.svg",
         ),

@@ -224,7 +224,8 @@ def _claims(
             ("impc.studies.selection.analysis:select_study", "experiments.selection_claims"),
             f"{ratio:.0f} times, against the proximal LASSO.",
             kind(ratio > 10),
-            "Another solver on another machine; Table C.1 itself: docs/selection.md.",
+            "Another solver on another machine; Table C.1 itself:"
+            " experiments/reliability_selection.md.",
         ),
         Entry(
             "Claim, 4.1",

@@ -1,4 +1,4 @@
-"""Tests that need the recordings of cursors, which are not in the repository."""
+"""Mark tests that need the cursor recordings, which are not in the repository."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Test = TypeVar("Test", bound=Callable[..., object])
 
 
 def recorded(test: Test) -> Test:
-    """A test, or a class of them, that is left out where the recordings are not there."""
+    """Skip a test, or a class of tests, if the recordings are absent."""
     name = data_file().name
     absent = pytest.mark.skipif(
         not data_file().exists(), reason=f"{name} is not there (IMPC_CURSOR_DATA)"

@@ -1,4 +1,4 @@
-"""Followers of a target who sense with noise: simulated ones, whose numbers are known."""
+"""The sensorimotor model of followers, on simulated subjects with known parameters."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from tests.support import nelder_mead
 pytestmark = pytest.mark.full
 
 DELAY, LAG, OFFSET, COST_WEIGHT = 8, 0.03, 3.0, 20.0
-#: And how near logarithms are found, some four of their deviations, whatever noise is drawn: that
-#: depends on the processor's eigenvectors.
+#: True noise SDs and tolerances of their logarithms, about four standard errors: the noise that is
+#: drawn depends on the eigenvectors of the processor.
 LEVELS = {"motor command": (50.0, 0.4), "sensory error": (10.0, 1.0)}
-#: The first second of a trial is given.
+#: The first second of a trial is conditioned on.
 COUNTED = 60
 
 
 @functools.cache
 def simulated() -> Condition:
-    """Four trials of 15 s; the target walks at random, by one pixel a sample."""
+    """Four trials of 15 s; the target moves by random steps of one pixel (SD) a sample."""
     plant = Plant(plants.pursuit_plant(DELAY, LAG), ["command"])
     law = Controller(
         plant,
@@ -73,10 +73,10 @@ def test_what_a_follower_senses_is_found() -> None:
     assert follower.fit.converged
 
 
-def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
-    """By another search: the ridge of the recorder's noise moves that beside by many powers of e.
+def test_the_interval_of_an_sd_near_zero_ends_at_the_profile_fall() -> None:
+    """Compared with another search; along the ridge the process noise moves by powers of e.
 
-    Searches that began there and nowhere else ended a thousand nats low, and the interval at once.
+    A search from the ridge alone can end a thousand nats too low, and the interval too early.
     """
     fit = fitted().fit
     index = fit.space.own + fit.space.names.index("recorder error")
@@ -89,12 +89,12 @@ def test_an_interval_ends_where_a_level_that_is_all_but_none_lets_it() -> None:
 
     fit_value = prior.placed(np.array(fit.theta), fit.identified).value
     rest = np.delete(np.array(fit.theta), index)
-    # Half of 1.96^2; the root of what has fallen is found to .04 of 1.39.
+    # Half of 1.96^2; the root of the fall is found to 0.04 of 1.39.
     assert nelder_mead(lower, rest, 400) == pytest.approx(1.92, abs=0.15)
 
 
 def test_a_free_regression_is_that_of_its_normal_equations() -> None:
-    """Against rows written out one by one; and no better than the truth can be."""
+    """Compared with rows written out one by one; and no better than the truth."""
     condition, mine, others = simulated(), np.array([0, 1]), np.array([2, 3])
 
     def row(trial: int, t: int) -> list[float]:

@@ -1,4 +1,4 @@
-"""Human target tracking: on recordings where they are, and what is compared with it."""
+"""Human target tracking, on the recordings if present, and its baselines."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from tests.experiments.recordings import recorded
 pytestmark = pytest.mark.full
 
 
-#: Leave-one-trial-out VAF of a delayed second-order feedback, from the sharpest target on.
+#: Leave-one-trial-out VAF of a delayed second-order feedback, sharpest target first.
 REFERENCE = (86.7, 82.7, 84.3, 80.1, 57.8, 48.4)
 
 
 def test_delayed_feedback_is_its_difference_equation() -> None:
-    """Step by step, against the filter; seed 0."""
+    """Compared with a simulation step by step; seed 0."""
     target = np.cumsum(np.random.default_rng(0).standard_normal((2, 200)), axis=1)
     k1, k2, delay, dt = 20.0, 6.0, 5, 1 / RATE
     moved = target - target[:, :1]
@@ -37,7 +37,7 @@ def test_delayed_feedback_is_its_difference_equation() -> None:
         before = cursor[:, k - 1] if k >= 1 else 0.0
         cursor[:, k + 1] = 2 * cursor[:, k] - before - dt**2 * (k1 * error + k2 * speed)
     found = delayed_feedback(target, np.array([k1, k2]), delay)
-    # The filter takes the speed between the samples `delay` and `delay + 1` ago.
+    # The filter uses the speed between the samples `delay` and `delay + 1` ago.
     np.testing.assert_allclose(found, cursor, atol=1e-9 * np.max(np.abs(cursor)))
 
 
@@ -50,7 +50,7 @@ def test_delayed_feedback_is_found_again() -> None:
 
 
 def test_the_free_response_finds_that_of_delayed_feedback() -> None:
-    """By superposition, against the recursion, which settles within the two seconds; seed 2."""
+    """Superposition against the recursion, whose response settles within 2 s; seed 2."""
     target = np.cumsum(np.random.default_rng(2).standard_normal((8, 1200)), axis=1)
     response = delayed_feedback(target, np.array([20.0, 8.0]), 3)
     found = fit_step_response(target[1:], response[1:])
@@ -83,7 +83,7 @@ def one(position: float, last: float = 2.0, mean: float = 2.7, deviation: float 
 
 
 def test_probabilities_of_all_pixels_sum_to_one() -> None:
-    # Beyond them are 5e-11.
+    # Pixels beyond have 5e-11.
     total = sum(np.exp(step_nats(NUMBERS, one(float(k)))) for k in range(-500, 500))
     assert total == pytest.approx(1.0, abs=1e-9)
 
@@ -109,7 +109,7 @@ def test_numbers_of_drawn_steps_are_found() -> None:
     steps = np.round(mean + np.exp(NUMBERS[0]) * deviation * rng.standard_t(4, count))
     position = np.where(rng.random(count) < still, last, steps)
     found = fit_steps(Expected(position, last, mean, deviation))
-    # Deviations of 20 000 steps are .01 to .07.
+    # Standard errors for 20 000 steps are 0.01 to 0.07.
     np.testing.assert_allclose(found, NUMBERS, atol=0.2)
 
 
@@ -124,7 +124,7 @@ def mean_left_out(condition: Condition) -> tuple[float, float]:
     "index", [5, *(pytest.param(index, marks=pytest.mark.slow) for index in range(5))]
 )
 def test_left_out_trials_are_predicted(index: int) -> None:
-    """At least the reference less a point, and as well as our own delayed feedback."""
+    """At least the reference minus a point, and as good as the delayed feedback here."""
     ours, baseline = mean_left_out(read_conditions(data_file())[index])
     assert ours >= REFERENCE[index] - 1.0
     assert ours >= baseline - 1.0

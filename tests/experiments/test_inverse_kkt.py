@@ -1,4 +1,4 @@
-"""Inverse KKT: exact where its assumption holds, and smoothing against simulated states."""
+"""Inverse KKT: exact if its assumption holds; smoothing compared with simulated states."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEED = 6
 
 
 def optimal_runs(seed: int, n: int, m: int) -> tuple[object, Array, list[Smoothed]]:
-    """Undisturbed regulators from random starts: every stretch is an optimal plan."""
+    """Undisturbed regulators from random starts: every segment is an optimal plan."""
     rng = np.random.default_rng(seed)
     plant = random_plant(rng, n, m, 1.1)
     weights = Weights(random_weights(rng, n), random_weights(rng, m))
@@ -44,7 +44,7 @@ def test_optimal_plans_give_back_their_gain(size: tuple[int, int]) -> None:
 
 
 def test_the_residual_is_that_of_the_stationarity_conditions() -> None:
-    """The same least-squares problem by cvxpy, every lambda a variable of its own."""
+    """The same least-squares problem by cvxpy, with every lambda as a variable."""
     plant, K, runs = optimal_runs(SEED + 1, 2, 1)
     rng = np.random.default_rng(SEED)
     noisy = [Smoothed(run.x, run.u + 0.05 * rng.standard_normal(run.u.shape)) for run in runs]
@@ -64,7 +64,7 @@ def test_the_residual_is_that_of_the_stationarity_conditions() -> None:
 
 
 def test_saturated_rows_are_left_out() -> None:
-    """All commands at the bound: nothing is left, and that is said."""
+    """All commands at the bound: no row is left, which raises an error."""
     plant, K, runs = optimal_runs(SEED, 2, 1)
     with pytest.raises(DataError, match="no stretch"):
         stationarity_weights(plant, runs, 12, np.array([1e-300]), K)  # type: ignore[arg-type]

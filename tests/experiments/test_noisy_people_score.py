@@ -1,4 +1,4 @@
-"""The study of people who sense with noise, small: one subject scored; more in the slow one."""
+"""A small study with sensory noise: one subject scored; more in the slow test."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_subject_is_scored_against_its_truth() -> None:
     assert found.converged
     assert found.above > 0
     assert len(found.expected) == len(found.entries) == len(found.fell) == 2
-    # At a parabola's end of 95 % the likelihood has fallen by 1.92.
+    # The fall of a quadratic log-likelihood is half the squared ratio of error and SE.
     for (error, deviation), nats in zip(found.expected, found.fell, strict=True):
         assert nats == pytest.approx((error / deviation) ** 2 / 2, abs=0.3)
     for error, deviation in found.expected:
@@ -35,8 +35,8 @@ def test_a_subject_is_scored_against_its_truth() -> None:
 
 
 @pytest.mark.full
-def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
-    """Noise in the senses: least squares has five times the gain, in coordinates of its own."""
+def test_on_the_seat_the_gain_is_found_if_least_squares_is_far_off() -> None:
+    """Sensory noise: the least-squares gain is five times as large."""
     who = subject("seat", 2, "sensory", 90.0, 70.0)
     trials, truth = recorded(who, 2), np.array(who.controller.K)
     first = fit(trials.problem)
@@ -45,7 +45,7 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
     assert found.converged
     assert found.space.gain == 5
     np.testing.assert_allclose(found.K[0, :4], truth[0, :4], rtol=0.2)
-    # The prior is that about a gain close by, in whose coordinates there are less than half units.
+    # The final prior is centred at a gain less than half a whitened unit away.
     assert np.linalg.norm((np.array(found.theta) - found.prior.center)[:5]) < 0.5
     covariance = person_covariance(found)
     z = (np.array(found.K) - truth)[0] / np.array(covariance.entries)[0]
@@ -53,8 +53,8 @@ def test_on_the_seat_a_person_is_told_where_least_squares_is_far_off() -> None:
 
 
 @pytest.mark.full
-def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
-    """The likeliest start leads there, 80 nats below the truth, and settles."""
+def test_a_search_leaves_a_model_with_exact_rates() -> None:
+    """The most likely start leads to that model, 80 nats below the truth, and converges."""
     who = subject("seat", 16, "motor", 70.0, 70.0)
     found = fit_output_feedback(fit(recorded(who, 16).problem), blind(who))
     truth = np.array(who.controller.K)
@@ -65,7 +65,7 @@ def test_a_search_leaves_somebody_who_knows_the_rates_exactly() -> None:
 
 @pytest.mark.slow
 def test_intervals_of_the_likelihood_hold() -> None:
-    """Of 40 at 95 % two miss: 8 or more have a probability of 0.1 %."""
+    """Of 40 at 95 % two misses are expected: 8 or more have a probability of 0.1 %."""
     people = [scored(seed, 5.0) for seed in range(40)]
     pairs = np.array([one.expected for one in people])
     assert np.all(np.sum(np.abs(pairs[..., 0]) > 1.96 * pairs[..., 1], axis=0) < 8)

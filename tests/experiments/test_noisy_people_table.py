@@ -1,4 +1,4 @@
-"""The table of people who sense with noise, of scores that are counted by hand."""
+"""Table of the study with sensory noise, from scores that are counted by hand."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_row_counts_what_is_inside() -> None:
     assert cells["ended at the truth or above"] == "1"
     everything = row([ONE])
     assert len(everything) == len(HEADS)
-    assert everything[7] == "0 ± 0"  # least squares, three deviations off
+    assert everything[7] == "0 ± 0"  # Least squares, three standard errors off
     assert everything[10:12] == ["50 ± 0", "100 ± 0"]
     assert everything[13] == "50 ± 0 (2), 67 ± 0"
     assert everything[14] == "50 ± 0"
@@ -51,5 +51,5 @@ def test_means_have_the_standard_errors_of_draws() -> None:
     assert mean == pytest.approx(np.mean(drawn[:, 0]))
     assert error == pytest.approx(0.05, rel=0.1)
     assert other == pytest.approx(0.05, rel=0.1)
-    # A direction that few are identified along has no mean.
+    # A direction that few subjects identify has no mean.
     assert len(means([[(1.0, 1.0)], [(1.0, 1.0)], [(1.0, 1.0), (2.0, 1.0)]])) == 1

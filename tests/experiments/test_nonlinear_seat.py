@@ -1,4 +1,4 @@
-"""The study of people who predict with the full equations, small."""
+"""A small study of subjects who predict with the full equations."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ pytestmark = pytest.mark.full
 
 
 def test_the_first_torque_from_a_tilt_is_that_of_the_optimality_conditions() -> None:
-    """IPOPT, shooting over the torques, beside Newton's method on all states at once.
+    """IPOPT with single shooting, compared with Newton's method on all states at once.
 
-    They agree to 8e-9 N m; the numbers are those of docs/nonlinear-seat.md.
+    They agree to 8e-9 N m; the numbers are those of experiments/nonlinear_seat.md.
     """
     plant = seat_controller({}, np.inf).plant
     weights = seat_weights(plant)

@@ -1,4 +1,4 @@
-"""Particles that know what is to come, beside dense densities, other particles and other draws."""
+"""Look-ahead particles against a Kalman filter, a bootstrap filter and repeated draws."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def given(who: Someone, samples: int, seed: int = 1) -> tuple[Array, Array, Arra
 
 @pytest.mark.parametrize("who", [one._replace(limit=1e3) for one in PEOPLE])
 def test_where_no_bound_is_met_it_is_that_of_a_kalman_filter(who: Someone) -> None:
-    """Whatever is drawn: psi is exact, and so each particle has the same weight."""
+    """For any seed: psi is exact, so all particles have the same weight."""
     outputs, disturbance, start = given(who, 120)
     exact = likelihood(who._replace(limit=np.inf), outputs).value
     for seed in (0, 1):
@@ -43,7 +43,7 @@ def test_where_no_bound_is_met_it_is_that_of_a_kalman_filter(who: Someone) -> No
 
 
 def test_it_is_that_of_particles_that_know_the_past_only() -> None:
-    """A bootstrap filter needs thousands for what forty do here."""
+    """A bootstrap filter needs thousands of particles where forty suffice here."""
     who = PEOPLE[0]
     trial = given(who, 60)
     draws = [particles(who, trial[0], 20_000, seed) for seed in range(4)]
@@ -65,7 +65,7 @@ def test_numbers_between_two_ends_are_drawn_as_they_should(ends: tuple[float, fl
 
 
 def test_the_score_has_no_mean_over_recordings() -> None:
-    """Along the size of the gain of somebody at a limit, and with the variance that is expected."""
+    """Score along the size of the gain at a limit: zero mean, and the expected variance."""
     who = Someone(limit=0.5, horizon=1, sensory=(0.2, 0.4), motor=0.1, start=(0.0, 0.0))
     slopes, bends = [], []
     for seed in range(60):
@@ -77,5 +77,5 @@ def test_the_score_has_no_mean_over_recordings() -> None:
         slopes.append((high - low) / 0.3)
         bends.append(-(high - 2 * middle + low) / 0.15**2)
     assert abs(np.mean(slopes)) < 3 * np.std(slopes) / np.sqrt(60)
-    # The second Bartlett identity: of 60 draws a variance is known to a fifth, the bend to less.
+    # Second Bartlett identity; with 60 draws the variance is uncertain by a fifth.
     assert 0.4 < np.var(slopes) / np.mean(bends) < 2.5

@@ -1,4 +1,4 @@
-"""The study of the four systems, small; in full: python -m experiments.peer_benchmark."""
+"""A small study of the four systems; in full: python -m experiments.peer_benchmark."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from experiments.peer_systems import SYSTEMS
 pytestmark = pytest.mark.full
 
 
-def test_a_start_a_third_off_ends_at_what_is_told() -> None:
+def test_a_start_a_third_off_recovers_the_identified_products() -> None:
     system = SYSTEMS["rocket"]()
     found = fit_from(system, demonstration(system), system.truth, 0.3, 3)
     assert found.loss < 1e-10
@@ -23,7 +23,7 @@ def test_a_start_without_a_plan_is_a_line_and_not_a_loss() -> None:
     system = SYSTEMS["robot arm"]()
     found = fit_from(system, demonstration(system), system.truth, 0.3, 7)
     assert np.isnan(found.loss)
-    assert found.unidentified.startswith("constraint angle[1]: no plan was found that keeps it")
+    assert found.unidentified.startswith("constraint angle[1]: no plan was found that satisfies it")
 
 
 def test_intervals_of_noisy_recordings_hold_the_truth() -> None:
@@ -46,8 +46,8 @@ def test_nine_of_ten_starts_a_tenth_off_end_at_the_truth(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
-def test_a_closed_loop_gives_back_what_it_tells(name: str) -> None:
-    """Sixty samples, a horizon of twenty; limits of inputs and of states are met."""
+def test_a_closed_loop_recovers_the_identified_products(name: str) -> None:
+    """60 samples, horizon 20; limits of inputs and of states are reached."""
     system = SYSTEMS[name](20)
     x0, changes = LOOPS[name]
     truth = system.truth | changes

@@ -1,4 +1,4 @@
-"""The protocols find planted thresholds to their steps, and say when they cannot."""
+"""The protocols find given thresholds to within a step, and raise errors if they cannot."""
 
 from __future__ import annotations
 

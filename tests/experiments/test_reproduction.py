@@ -1,4 +1,4 @@
-"""The reproduction page is complete, its names exist, and quick entries still come out so."""
+"""The reproduction page is complete, its names exist, and quick entries have its verdicts."""
 
 from __future__ import annotations
 

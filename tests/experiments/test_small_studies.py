@@ -1,4 +1,4 @@
-"""The studies of the pages, small: one subject or recording each; more in the slow ones."""
+"""Small versions of the studies: one subject or recording each; more in the slow tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.full
 
 
 def shares(count: int, root: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Share of recordings (seeds 0 to count - 1) whose 95 % interval holds each entry of K."""
+    """Share of recordings (seeds 0 to count - 1) whose 95 % interval covers each entry of K."""
     scores = np.array([covered(seed, root) for seed in range(count)])
     return np.asarray(np.mean(np.abs(scores) <= 1.96, axis=0))
 
@@ -43,10 +43,7 @@ def test_four_hundred_recordings() -> None:
 
 
 def test_the_truth_of_a_short_default_subject_is_found(tmp_path: Path) -> None:
-    """Seed 0, a trial of 10 s: the nonlinear body explains what the linear plant cannot.
-
-    So short a trial says little, and the intervals of either are wide.
-    """
+    """Seed 0, a trial of 10 s: the nonlinear body has the smaller misfit; intervals are wide."""
     files = simulated_files(tmp_path / "one", 0, "--trials", "1", "--duration", "10")
     own, linear = (fitted_subject(files, body) for body in ("nonlinear", "linear"))
     assert own.inside == own.entries == 10
@@ -55,7 +52,7 @@ def test_the_truth_of_a_short_default_subject_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_twenty_default_subjects(tmp_path: Path) -> None:
-    """As `python -m experiments.default_subjects` has it, without the CPU times."""
+    """The coverage of `python -m experiments.default_subjects`."""
     found = []
     for seed in range(20):
         files = simulated_files(tmp_path / str(seed), seed)
@@ -64,9 +61,9 @@ def test_twenty_default_subjects(tmp_path: Path) -> None:
 
 
 def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 4.5 Nm and 1 % noise inverse MPC wins by more than a point over all without bounds.
+    """At 4.5 Nm and 1 % noise inverse MPC has a point more VAF than methods without bounds.
 
-    Trials of 10 s, for the 30 s of the study.
+    Trials of 10 s instead of the 30 s of the study.
     """
     monkeypatch.setattr(
         noise_study, "seat", lambda trials, seconds, limit: seat(trials, seconds / 3, limit)
@@ -86,7 +83,7 @@ def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_cells_that_are_done_are_not_done_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All cells kept: nothing is computed, and the table is made of what was kept."""
+    """With all cells kept nothing is computed, and the table uses the kept results."""
     outcome = {"vaf": 50.0, "gain_error": 0.5, "has_weights": True, "seconds": 1.0, "reason": ""}
     cells = [Cell(6.0, 90.0, seed) for seed in range(2)]
     (tmp_path / "cells").mkdir()
@@ -122,14 +119,14 @@ def test_a_subject_is_scored_against_its_truth() -> None:
     found = score(cart_person(0, 90.0, 0.0, 0.0), "carts", 0)
     assert found.holds == [True] * 5  # seed 0
     assert found.one_sided == [False] * 5
-    assert found.excess < 0.5  # the default start ends where a search from the truth does
+    assert found.excess < 0.5  # The default start ends where a search from the truth ends
     assert found.freedom >= 3
     assert 0.05 < found.probability <= 1  # seed 0
 
 
 @pytest.mark.slow
 def test_the_level_of_the_test_and_its_power() -> None:
-    """Of 40 at 5 % two are refused: 7 or more have a probability of 0.5 %."""
+    """Of 40 at 5 % two rejections are expected: 7 or more have a probability of 0.5 %."""
     people = [score(cart_person(k, 90.0, 0.8, 0.0), "", k, intervals=False) for k in range(40)]
     assert sum(item.probability < 0.05 for item in people) <= 6
     crossed = [score(cart_person(k, 90.0, 0.0, 0.5), "", k, intervals=False) for k in range(5)]

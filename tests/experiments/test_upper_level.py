@@ -1,4 +1,4 @@
-"""The two routes of the upper level make the same objective small."""
+"""Both solvers of the upper level minimise the same objective."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from impc.model.weights import Weights, condition_number
 def test_a_route_says_misfit_and_condition_number_with_one_weight(
     route: Callable[[Problem, Weights], Route],
 ) -> None:
-    """The package's own had another weight, of the outputs' size, so that 105 stood beside 1.9."""
+    """Prox-linear steps and the surrogate use the same condition weight."""
     problem = example().problem
     found = route(problem, Weights(np.diag([2.0, 0.2]), 1))
     solution = solve_lqr(problem.plant, found.weights)
