@@ -1,7 +1,7 @@
-"""Inverse model predictive control: the weights behind a recorded closed loop.
+"""Inverse model predictive control: the feedback gain and cost weights behind recorded movements.
 
-What most users import is here, and docs/api.md lists it by subject. A name is loaded from its
-module when it is first used: `import impc` itself loads no other library.
+The public names are listed by subject in docs/ref/api.md. A name is loaded from its module when it
+is first used: `import impc` itself loads no other library.
 """
 
 from __future__ import annotations
@@ -120,10 +120,8 @@ _NAMES = {
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-__all__ = sorted(_MODULES)  # noqa: PLE0605 - a list of the names of the table above
-
-
-if not TYPE_CHECKING:  # a type checker that sees it takes any name for one of ours
+__all__ = sorted(_MODULES)  # noqa: PLE0605 - names of the table above
+if not TYPE_CHECKING:  # a type checker would accept any attribute
 
     def __getattr__(name: str) -> object:
         """Load a public name from its module, once (PEP 562)."""
@@ -138,8 +136,8 @@ if not TYPE_CHECKING:  # a type checker that sees it takes any name for one of o
                 error = import_module("impc.errors").ImpcError  # an optional subpackage
                 raise error(
                     f"impc.{name}",
-                    f"needs {missing.name}, which is not there",
-                    "install all of impc",
+                    f"needs {missing.name}, which is not installed",
+                    "install the complete package",
                 ) from None
         else:
             raise AttributeError(f"module 'impc' has no attribute {name!r}")

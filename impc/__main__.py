@@ -1,12 +1,12 @@
-"""`python -m impc`: the same as the command `impc`."""
+"""`python -m impc`: equivalent to the command `impc`."""
 
 from __future__ import annotations
 
 import os
 import sys
 
-# `python -m` puts the working folder first: a numpy.py among recordings is not numpy. The folder
-# of a checkout is left, for the plants in it.
+# `python -m` puts the working folder first on the path, where a numpy.py among recordings would
+# replace numpy. The folder of a checkout stays, for its plants.
 if __name__ == "__main__" and not (
     sys.flags.safe_path or os.path.exists(os.path.join(sys.path[0], "impc", "__main__.py"))
 ):

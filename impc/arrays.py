@@ -1,4 +1,4 @@
-"""Arrays at the door: generous with what comes in, strict with what is kept."""
+"""Array types, conversion of numeric input, and read-only copies."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-#: An array of float64, of the shape that each docstring gives.
+#: Array of float64; docstrings give its shape.
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
-#: An array of int64.
+#: Array of int64.
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-#: An array of truth values.
+#: Array of booleans.
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-#: A control.StateSpace, or what has its attributes.
+#: control.StateSpace, or an object with its attributes.
 System = Any
-#: An array as compiled code takes it, of any element type.
+#: Array of any element type, as compiled code takes it.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 
 
 class Frozen:
-    """Base of frozen dataclasses: their arrays stay read-only when copied and out of a pickle.
+    """Base of frozen dataclasses: arrays stay read-only in copies and pickles; short repr.
 
-    numpy makes arrays that can be written of those that it copies or finds in a pickle. In an
-    interpreter they are one line: small arrays in full, others by their shapes.
+    numpy makes the arrays of copies and pickles writable. The repr is one line, with small arrays
+    in full and others by shape.
     """
 
     def __init_subclass__(cls) -> None:
-        if "__repr__" not in vars(cls):  # else the dataclass would write every sample
+        if "__repr__" not in vars(cls):  # that of a dataclass would print every sample
             cls.__repr__ = Frozen.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
@@ -42,7 +42,7 @@ class Frozen:
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def __getstate__(self) -> dict[str, Any]:
-        """Its fields: what was computed from them once is computed again where it is wanted."""
+        """State without cached values, which are recomputed on demand."""
         named = {item.name for item in fields(self)}  # type: ignore[arg-type]  # a dataclass
         return {name: value for name, value in vars(self).items() if name in named}
 
@@ -68,32 +68,24 @@ def _brief(value: Any) -> str:
 
 
 def frozen(values: ArrayLike) -> Array:
-    """Return a read-only float64 copy, so that a frozen dataclass is frozen to the last entry.
-
-    `values` any shape; returns same shape.
-    """
+    """Return a read-only float64 copy; `values` any shape; returns same shape."""
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
 
 
 def percentiles(drawn: ArrayLike, level: float) -> tuple[Array, Array]:
-    """Ends of the interval that holds the share `level` of draws.
-
-    `drawn` any shape; returns same shape.
-    """
+    """Ends of the central interval with the share `level` of draws; `drawn` any shape."""
     values = np.asarray(drawn, dtype=np.float64)
     low, high = np.quantile(values, [0.5 - level / 2, 0.5 + level / 2], axis=0)
     return np.asarray(low), np.asarray(high)
 
 
 def as_numbers(name: str, values: ArrayLike) -> Array:
-    """Convert numbers of any kind to float64; what a masked array masks is missing: NaN.
+    """Convert real numbers of any kind to float64; masked entries become NaN.
 
-    Lists, tuples, arrays of whole or real numbers, pandas' series and frames. Text, complex
-    numbers and dates are not numbers, although numpy converts some of them.
-
-    `values` any shape; returns same shape.
+    Accepts lists, tuples, arrays, and series and frames of pandas; rejects text, complex numbers
+    and dates, some of which numpy would convert. `values` any shape; returns same shape.
     """
     if isinstance(values, np.ma.MaskedArray):
         if values.dtype.kind not in "biuf":
@@ -103,14 +95,14 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
     try:
         raw = np.asarray(values)
         if raw.dtype.kind == "O" and all(_is_real(entry) for entry in raw.flat):
-            # Whole numbers beyond int64, fractions, pandas' NA; None would become NaN.
+            # Integers beyond int64, fractions, NA of pandas; None would become NaN.
             real = [np.nan if repr(entry) == "<NA>" else float(entry) for entry in raw.flat]
             raw = np.array(real, dtype=np.float64).reshape(raw.shape)
     except (TypeError, ValueError, OverflowError, AttributeError):
         raise _not_numbers(name, type(values).__name__) from None
     if raw.dtype.kind not in "biuf":
         raise _not_numbers(name, f"an array of {raw.dtype}" if raw.shape else str(raw.dtype))
-    with np.errstate(over="ignore"):  # longdouble: infinite, which `finite_array` refuses
+    with np.errstate(over="ignore"):  # longdouble overflows to inf, which `finite_array` rejects
         return np.asarray(raw, dtype=np.float64)
 
 
@@ -125,20 +117,14 @@ def _not_numbers(name: str, got: str) -> DataError:
 
 
 def finite_array(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """Convert to float64 and check the shape and that every entry is finite.
-
-    `values` any shape; returns that shape.
-    """
+    """Convert to float64; require the shape and finite entries. `values` any shape."""
     array = with_shape(name, as_numbers(name, values), shape)
     require_finite(name, array)
     return array
 
 
 def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
-    """Return the array when it has the shape.
-
-    `array` any shape; returns that shape.
-    """
+    """Return the array if it has the shape; `array` any shape; returns that shape."""
     wanted = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
 
     def fits(given: tuple[int, ...]) -> bool:
@@ -153,10 +139,7 @@ def with_shape(name: str, array: Array, shape: tuple[int | None, ...]) -> Array:
 
 
 def require_finite(name: str, array: Array) -> None:
-    """Require that every entry is finite.
-
-    `array` any shape.
-    """
+    """Require finite entries; `array` any shape."""
     if np.all(np.isfinite(array)):
         return
     bad = np.argwhere(~np.isfinite(array))
@@ -169,10 +152,7 @@ def require_finite(name: str, array: Array) -> None:
 
 
 def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> Array:
-    """Convert to a square symmetric float64 matrix; asymmetry above 1e-9 relative is an error.
-
-    Returns (size, size).
-    """
+    """Convert to a symmetric float64 matrix (size, size); relative asymmetry must be <= 1e-9."""
     given = as_numbers(name, values)
     if given.ndim != 0 and (given.ndim != 2 or given.size == 0):
         diagonal = f"np.diag({given.tolist()})" if given.size < 6 else "np.diag(...)"
@@ -181,8 +161,8 @@ def symmetric_matrix(name: str, values: ArrayLike, size: int | None = None) -> A
     # R of a single input is usually written as a number.
     matrix = finite_array(name, given.reshape(1, 1) if given.ndim == 0 else given, (size, size))
     if matrix.shape[0] != matrix.shape[1]:
-        raise DataError(name, f"expected a square matrix, got {matrix.shape}", "give it square")
+        raise DataError(name, f"expected a square matrix, got {matrix.shape}", "make it square")
     scale = float(np.max(np.abs(matrix), initial=0.0))
     if float(np.max(np.abs(matrix - matrix.T), initial=0.0)) > 1e-9 * scale:
         raise InputError(name, "is not symmetric", "give (M + M')/2")
-    return np.asarray(matrix / 2 + matrix.T / 2)  # no sum beyond the largest number
+    return np.asarray(matrix / 2 + matrix.T / 2)  # the sum could overflow

@@ -1,18 +1,17 @@
-"""The door: what comes in from outside is checked here, once, by one table.
+"""Validation and conversion of arguments by their annotations.
 
-`checked` reads the annotations of a public function, and `Value` those of a dataclass: each stands
-for a kind in `_KINDS`, a function that returns the value as the inside takes it or raises in one
-line that names the argument. What means the same is let in: lists, tuples, arrays of any number
-type, pandas' series and frames, numpy's scalars. The samples that a masked array masks are missing:
-NaN, whatever stands below the mask.
+`checked` reads the annotations of a function, `Value` those of a dataclass. Each annotation stands
+for a kind in `_KINDS`, a function that returns the converted value or raises an error that names
+the argument. Equivalent inputs are accepted: lists, tuples, arrays of any number type, series and
+frames of pandas, scalars of numpy. Masked entries become NaN.
 
     @checked(gain="m n", horizon=1)
     def Controller.from_gain(plant: Plant, gain: ArrayLike, ..., horizon: int) -> Controller: ...
 
 A rule is a shape in the sizes of the plant (n states, m inputs, d disturbances, p outputs; ``*``
-any; ``~`` before it lets infinite and missing entries in), or the least value of a number, or
-least and largest. The values of one call must have the same sizes. Definiteness and signs are for
-the function.
+any; a leading ``~`` allows infinite and missing entries), or the smallest value of a number, or
+(smallest, largest). All values of a call must have the same sizes. Definiteness and signs are
+checked by the functions themselves.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ R = TypeVar("R")
 _V = TypeVar("_V")
 
 _SIZES = {"n": "states", "m": "inputs", "d": "disturbances", "p": "outputs"}
-# No array of the package can have more entries, and no count (samples, evaluations) means more.
+# Limit for counts (samples, evaluations): no array of the package has more entries.
 _LARGEST_COUNT = 2**31 - 1
 
 
@@ -52,7 +51,7 @@ def checked(function: Callable[P, R], /) -> Callable[P, R]: ...
 @overload
 def checked(**rules: Rule) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
 def checked(function: Any = None, /, **rules: Rule) -> Any:
-    """Check and convert every argument by its annotation and its rule, before the function runs."""
+    """Check and convert every argument by annotation and rule before the function runs."""
     if function is None:
         return functools.partial(_checked, rules=rules)
     return _checked(function, {})
@@ -86,7 +85,7 @@ def _checked(function: Callable[P, R], rules: dict[str, Rule]) -> Callable[P, R]
 
 
 def _of_all(kind: Kind, place: Any) -> Kind:
-    """Of each of *args or **kwargs, where the parameter is one of these."""
+    """Apply `kind` to each item if the parameter is *args or **kwargs."""
     if place is inspect.Parameter.VAR_POSITIONAL:
         return lambda name, given: tuple(kind(f"{name}[{k}]", one) for k, one in enumerate(given))
     if place is inspect.Parameter.VAR_KEYWORD:
@@ -95,17 +94,16 @@ def _of_all(kind: Kind, place: Any) -> Kind:
 
 
 class Value(Frozen):
-    """Base of frozen dataclasses: fields are checked by the same table, arrays made read-only.
+    """Base of frozen dataclasses with checked fields and read-only arrays.
 
-    So whenever one is made, by its constructor or by `replace`; copies and what comes out of a
-    pickle were checked, and stay read-only too. `_rules` are the rules of the fields. A class whose
-    constructor takes other things than its fields ends it with `_fill`.
+    Fields are checked by the constructor and by `replace`, according to `_rules`. A class whose
+    constructor takes other arguments than its fields calls `_fill` at its end.
     """
 
     _rules: ClassVar[Mapping[str, Rule]] = {}
 
     def _fill(self, **fields: Any) -> None:
-        """Take the fields, all of them, and check them."""
+        """Set and check all fields."""
         for name, value in fields.items():
             object.__setattr__(self, name, value)
         self.__post_init__()
@@ -119,25 +117,30 @@ class Value(Frozen):
             if found is not None and name in self._rules:
                 found = _ruled(name, found, self._rules[name], sizes)
             if isinstance(found, np.ndarray) and found.flags.writeable:
-                found = found.copy()  # it may be the caller's
+                found = found.copy()  # the array may belong to the caller
                 found.flags.writeable = False
             if found is not value:
                 object.__setattr__(self, name, found)
 
 
 def replace(value: _V, **changes: Any) -> _V:
-    """Return a copy of a value of this package with other fields, checked as when it was made.
+    """Return a copy of a value of this package with changed fields, checked like a new one.
 
     Parameters
     ----------
     value : Problem, Plant, Controller, ...
+        Value to copy.
     **changes
-        Fields by name, with what they become.
+        New values of fields, by name.
+
+    Returns
+    -------
+    same type as `value`
 
     Raises
     ------
     InputError
-        When there is no such field, or it cannot have that value.
+        If a field does not exist or cannot have that value.
 
     Examples
     --------
@@ -162,13 +165,13 @@ def replace(value: _V, **changes: Any) -> _V:
 
 
 def _require_sizes(name: str, value: Any, sizes: dict[str, int]) -> None:
-    """Numbers of states, inputs and so on: the same in all values of a call."""
+    """Require equal numbers of states, inputs and so on in all values of a call."""
     for symbol, size in _sizes_of(value).items():
         if sizes.setdefault(symbol, size) != size:
             raise InputError(
                 name,
-                f"has {size} {_SIZES[symbol]}, what stands before it {sizes[symbol]}",
-                "give values of one plant",
+                f"has {size} {_SIZES[symbol]}, but an earlier argument has {sizes[symbol]}",
+                "use the same plant for all",
             )
 
 
@@ -208,7 +211,7 @@ def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
 
 
 def _size(symbol: str, sizes: dict[str, int]) -> int | None:
-    """A size if it is known: of "n", or of "n+m"."""
+    """Size of a symbol such as "n" or "n+m", if known."""
     parts = [sizes.get(part) for part in symbol.split("+")]
     return None if None in parts else sum(part for part in parts if part is not None)
 
@@ -290,19 +293,19 @@ def _column(name: str, value: Any) -> Any:
 
 
 def _columns(name: str, value: Any) -> Any:
-    """A dictionary of columns, each of numbers along one axis; of a frame its columns."""
+    """A dictionary of columns (samples,); for a frame its columns."""
     given = dict(value.items()) if hasattr(value, "dtypes") else value
     return _mapping_of(_column)(name, given)
 
 
 def _numbers_or_names(name: str, value: Any) -> Any:
-    """Numbers, or a dictionary of them by the names of signals."""
+    """Numbers, or a dictionary of numbers by signal name."""
     of = _mapping_of(_number) if isinstance(value, Mapping) else as_numbers
     return of(name, value)
 
 
 def _instance(kind: str, remedy: str) -> Kind:
-    """A value of the package, by the name of its class: its module need not be loaded."""
+    """A class of the package, by name, so that its module need not be loaded."""
 
     def check(name: str, value: Any) -> Any:
         ours = (one.__name__ for one in type(value).__mro__ if one.__module__.startswith("impc."))
@@ -314,7 +317,7 @@ def _instance(kind: str, remedy: str) -> Kind:
 
 
 def _estimate(name: str, value: Any) -> Any:
-    """An estimate, also one of an optional subpackage, which makes its page itself."""
+    """An estimate, also one of an optional subpackage that makes its own report."""
     return value if hasattr(value, "page") else _KINDS["Estimate"](name, value)
 
 
@@ -324,7 +327,7 @@ def _start(name: str, value: Any) -> Any:
 
 
 def _path(name: str, value: Any) -> Any:
-    """What may be the name of a file; whether there is one is for who opens it."""
+    """A possible file name; whether the file exists is checked where it is opened."""
     if not isinstance(value, (str, os.PathLike)):
         raise _refused(name, value, "give a path, as text or a Path")
     try:
@@ -332,7 +335,7 @@ def _path(name: str, value: Any) -> Any:
     except UnicodeEncodeError:
         raise InputError(name, f"got {brief(ascii(value))}", "give a name that is text") from None
     if b"\0" in text:
-        raise InputError(name, f"has a zero byte: {brief(ascii(value))}", "give a path without")
+        raise InputError(name, f"has a zero byte: {brief(ascii(value))}", "remove it")
     return value
 
 
@@ -350,14 +353,14 @@ def _pair(name: str, value: Any) -> Any:
 
 
 def _choice_of_set(name: str, value: Any) -> Any:
-    """Whether there is a terminal set, or the set: a value, or its pair (H, h)."""
+    """True, False, a terminal set, or its pair (H, h)."""
     if type(value).__name__ == "TerminalSet":
         return value
     return _pair(name, value) if isinstance(value, (tuple, list)) else _truth(name, value)
 
 
 def _several(kind: Kind) -> Kind:
-    """A tuple of the items of any sequence but a text, an array or a frame of several columns."""
+    """Tuple of the items of a sequence, except text, matrices and frames."""
 
     def check(name: str, values: Any) -> tuple[Any, ...]:
         single = isinstance(values, (str, bytes, set, frozenset, Mapping))
@@ -369,7 +372,7 @@ def _several(kind: Kind) -> Kind:
 
 
 def _described(value: object) -> str:
-    """A wrong value in a few words: of an array its shape."""
+    """A wrong value in a few words; an array by its shape."""
     kind, shape = type(value).__name__, getattr(value, "shape", ())
     if isinstance(shape, tuple) and shape:
         return f"{kind} of shape {shape}"
@@ -380,7 +383,7 @@ def _described(value: object) -> str:
     return brief(value) if isinstance(value, int) else kind
 
 
-# What makes a value, for the remedy, where it is not its class.
+# Functions that make a value, for the remedy, if not its class.
 _MAKERS = {
     "Body": "Plant(system, body=function)",
     "BoundRows": "bound_rows",
@@ -435,7 +438,7 @@ _KINDS: dict[str, Kind] = {
 
 
 def add_value(kind: str, maker: str) -> None:
-    """Have values of a class of this package checked too, such as of an optional subpackage."""
+    """Register a further class, for example of an optional subpackage."""
     _KINDS[kind] = _instance(kind, f"make it with {maker}")
 
 

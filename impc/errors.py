@@ -1,29 +1,29 @@
-"""What can go wrong, as one tree of exceptions that say what to do.
+"""Exception classes; each message names the cause and the remedy.
 
-Every message is one line: the subject (an argument, a file, a sample), what was found there,
-and the remedy; signs that would break the line are escaped. The three parts are kept apart so that
-the command line, a report and a worker process can show them without parsing text.
+A message is one line: subject (an argument, file or sample), problem, and remedy, with control
+characters escaped. The three parts are separate attributes, so that the command line, reports and
+worker processes can show them without parsing.
 """
 
 from __future__ import annotations
 
-# A line that is longer than this hides its remedy; names and values are cut in the middle.
+# Longest message; longer names and values are shortened in the middle.
 _LONGEST = 600
 _MANY_BITS = 128  # 39 digits
 _ESCAPED_BYTE = range(0xDC80, 0xDD00)
 
 
 class ImpcError(Exception):
-    """Root of all errors raised on purpose.
+    """Base class of all errors that impc raises on purpose.
 
     Parameters
     ----------
     subject : str
-        The argument, file or sample at fault.
+        Argument, file or sample at fault.
     problem : str
-        What was expected and what was given instead.
+        What was expected and what was given.
     remedy : str
-        What to do about it.
+        What to do.
 
     Examples
     --------
@@ -32,11 +32,11 @@ class ImpcError(Exception):
     ...     impc.Weights([[1, 0], [0, 1]], -1)
     ... except impc.ImpcError as error:
     ...     print(error.subject, "|", error.remedy)
-    R | every input needs a positive cost
+    R | give every input a positive cost weight
     """
 
     def __init__(self, subject: str, problem: str, remedy: str) -> None:
-        # All three go to Exception.__init__ so that the error survives pickling by workers.
+        # All three go to Exception.__init__ so that the error can be pickled by workers.
         super().__init__(subject, problem, remedy)
         self.subject = subject
         self.problem = problem
@@ -47,7 +47,7 @@ class ImpcError(Exception):
 
 
 class InputError(ImpcError, ValueError):
-    """An argument that cannot be used as it is.
+    """An argument that cannot be used.
 
     Examples
     --------
@@ -82,7 +82,7 @@ class WeightsError(InputError):
     >>> impc.Weights([[1, 0], [0, 1]], -1)
     Traceback (most recent call last):
         ...
-    impc.errors.WeightsError: R: is not positive definite: its least eigenvalue is -1; ...
+    impc.errors.WeightsError: R: is not positive definite: its smallest eigenvalue is -1; ...
     """
 
 
@@ -115,11 +115,11 @@ class DataError(InputError):
 
 
 class FallError(DataError):
-    """A recording in which the subject fell: other recordings of the subject may be used."""
+    """A recording in which the subject fell; their other recordings may be usable."""
 
 
 class InfeasibleError(ImpcError):
-    """A state from which no input sequence keeps the bounds.
+    """A state from which no input sequence satisfies the bounds.
 
     Examples
     --------
@@ -139,7 +139,7 @@ class InfeasibleError(ImpcError):
 
 
 class SolverError(ImpcError):
-    """A numerical method that ended without an answer.
+    """A numerical method that failed.
 
     Examples
     --------
@@ -153,7 +153,7 @@ class SolverError(ImpcError):
     >>> impc.require_complete(law, run)
     Traceback (most recent call last):
         ...
-    impc.errors.SolverError: sample ...: the state left every reasonable range; ...
+    impc.errors.SolverError: sample ...: the state diverged; ...
     """
 
 
@@ -166,16 +166,15 @@ class OutputError(ImpcError):
     >>> impc.write_table("trial.docx", impc.make_table("simulated", {"angle": [0.1, 0.2]}))
     Traceback (most recent call last):
         ...
-    impc.errors.OutputError: trial.docx: has the ending '.docx', and not .csv, ...
+    impc.errors.OutputError: trial.docx: has the ending '.docx', not one of .csv, ...
     """
 
 
 def one_line(text: object, longest: int = _LONGEST) -> str:
-    r"""A `text` as one line that any terminal, page and file can take.
+    r"""Return `text` as one printable line of at most `longest` characters.
 
-    Line breaks, control characters, marks that turn the direction of writing and bytes of a name
-    that are not UTF-8 become what Python writes for them, such as ``\n`` and ``\xff``; of a text of
-    more than `longest` characters the middle is left out.
+    Line breaks, control and bidirectional characters, and bytes that are not UTF-8 are escaped as
+    in Python (``\n``, ``\xff``); of a longer text the middle is left out.
     """
     line = "".join(part if part.isprintable() else _escaped(part) for part in _text(text))
     if len(line) <= longest:
@@ -185,22 +184,22 @@ def one_line(text: object, longest: int = _LONGEST) -> str:
 
 
 def brief(value: object, longest: int = 60) -> str:
-    """A `value` that somebody gave, for a message: at most `longest` characters of it."""
+    """Shorten a `value` for a message to at most `longest` characters."""
     if isinstance(value, int) and value.bit_length() > _MANY_BITS:
         return f"an integer of about {value.bit_length() * 0.30103:.0f} digits"
     return one_line(value, longest)
 
 
 def _text(value: object) -> str:
-    """str(value), also of what has none: an integer of 5000 digits, a class that fails at it."""
+    """str(value), also if that fails (an integer of 5000 digits, a faulty class)."""
     try:
         return str(value)
-    except Exception:  # whatever a value of somebody else's does
+    except Exception:  # a faulty class may raise anything
         return f"a {type(value).__name__}"
 
 
 def _escaped(character: str) -> str:
     code = ord(character)
-    if code in _ESCAPED_BYTE:  # how Python keeps a byte of a file's name that is not UTF-8
+    if code in _ESCAPED_BYTE:  # Python's representation of a file-name byte that is not UTF-8
         return f"\\x{code - 0xDC00:02x}"
     return character.encode("unicode_escape").decode("ascii")

@@ -1,7 +1,7 @@
-"""Optional libraries: each is imported here, or one line says how to get it.
+"""Optional libraries: import them, or say how to install them.
 
-A plain installation has what `impc example`, and `impc fit` and `impc compare` of CSV and MATLAB
-files need. The rest are extras of pyproject.toml, listed in docs/release.md.
+A plain installation supports `impc example`, and `impc fit` and `impc compare` with CSV and MATLAB
+files. The other libraries are extras of pyproject.toml (docs/install.md).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 from impc.errors import ImpcError
 
-#: Optional library, as it is imported -> the extra of pyproject.toml that brings it.
+#: Import name of each optional library -> extra of pyproject.toml that installs it.
 EXTRAS = {
     "c3d": "c3d",
     "distributed": "cohort",
@@ -23,7 +23,7 @@ EXTRAS = {
 
 
 def optional(library: str, subject: str) -> Any:
-    """The module of an optional library."""
+    """Import an optional library."""
     try:
         return importlib.import_module(library)
     except ImportError:
@@ -32,5 +32,5 @@ def optional(library: str, subject: str) -> Any:
 
 
 def installed(library: str) -> bool:
-    """Whether an optional `library` is there; it is not imported."""
+    """Whether an optional `library` is installed, without importing it."""
     return importlib.util.find_spec(library) is not None

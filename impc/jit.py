@@ -1,11 +1,11 @@
-"""numba's `njit`, with compiled code kept where it stays true and safe.
+"""numba's `njit` with a safe cache.
 
-numba looks only into the file of a function for changes, not into those of the functions that it
-calls. Compiled code is therefore kept in a folder named by the digest of all compiled sources, in
-the folder of NUMBA_CACHE_DIR, else beside the package or in the user's cache folder; where none can
-be written, in a folder of the user's own among the temporary files, or nowhere. It is run as it is
-read: a folder that another user could have made or may write to is never used, nor one that a file
-of the working folder names (docs/speed.md).
+numba detects changes in the file of a function, but not in those of functions that it calls.
+Compiled code is therefore kept in a folder named by the digest of all compiled sources: in
+NUMBA_CACHE_DIR, else next to the package, or in the user's cache folder; if neither is writable, in
+a private temporary folder, or nowhere. Cached code is executed as it is read: a folder that another
+user could have made or can write to is never used, nor one named by a file of the working folder
+(docs/howto/speed.md).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ F = TypeVar("F", bound="Callable[..., Any]")
 
 
 def njit(**options: Any) -> Callable[[F], F]:
-    """numba's decorator of the same name and `options`; without a cache where none can be kept."""
+    """`numba.njit` with `options`; without a cache if there is no folder for it."""
     ignore_settings_files("numba")
-    import numba  # noqa: PLC0415  # a quarter of a second, and `keep_caches` needs none
+    import numba  # noqa: PLC0415  # takes 0.25 s; `keep_caches` does not need it
 
     if _waiting:
         _listen()
@@ -48,7 +48,7 @@ def njit(**options: Any) -> Callable[[F], F]:
 
 
 def say_when_compiling(say: Callable[[str], None]) -> None:
-    """Have `say` called with a line, once, when something is compiled that is not in the cache."""
+    """Call `say` with a line, once, when code is compiled that is not in the cache."""
     _waiting[:] = [say]
 
 
@@ -56,16 +56,16 @@ _waiting: list[Callable[[str], None]] = []
 
 
 def _listen() -> None:
-    """Say on the screen, once, that numba compiles."""
+    """Report once when numba compiles."""
     from numba.core import event  # noqa: PLC0415  # with numba, not before
 
     class Once(event.Listener):
         def on_start(self, _event: Any) -> None:
             while _waiting:
-                _waiting.pop()("compiling, once: a minute or two (`impc warm` does it beforehand)")
+                _waiting.pop()("compiling once, a minute or two (`impc warm` does it in advance)")
 
         def on_end(self, _event: Any) -> None:
-            """Nothing is said."""
+            """No output."""
 
     register: Any = event.register
     register("numba:compile", Once())
@@ -73,7 +73,7 @@ def _listen() -> None:
 
 @functools.cache
 def _compiled() -> str:
-    """The folder of what is compiled from the sources as they are; empty where there is none."""
+    """Cache folder for the current sources; empty if there is none."""
     base, package = _base(), Path(__file__).parent
     if base is None:
         return ""
@@ -84,7 +84,7 @@ def _compiled() -> str:
 
 
 def _base() -> Path | None:
-    """Where that folder is made: as the environment says, beside the package, or at home."""
+    """Parent of the cache folder: from the environment, next to the package, or at home."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named:
         return Path(named)
@@ -93,9 +93,9 @@ def _base() -> Path | None:
 
 
 def keep_caches() -> str:
-    """Give numba and matplotlib a folder where they have none; what to tell the user, or nothing.
+    """Give numba and matplotlib a cache folder if they have none; return a note or "".
 
-    To be called before either is imported; processes that are begun later inherit it.
+    Call it before either is imported; child processes inherit the folder.
     """
     stated = []
     if _base() is None:
@@ -108,11 +108,11 @@ def keep_caches() -> str:
         return ""
     folder = _private_folder()
     if folder is None:
-        return "caches are not kept, no folder for them can be written: TMPDIR may name one"
+        return "caches are disabled: no folder for them can be written; set TMPDIR to one"
     for name in stated:
         os.environ[name] = str(folder / name.lower())
         (folder / name.lower()).mkdir(exist_ok=True)
-    return f"caches are kept in {folder}, for home or installation cannot be written"
+    return f"caches are kept in {folder}: home or installation folder cannot be written"
 
 
 def _cache_home() -> Path:
@@ -124,7 +124,7 @@ def _config_home() -> Path:
 
 
 def _writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, or it can be made; nothing is."""
+    """Whether files can be made in a folder, or the folder can; creates nothing."""
     for place in (folder, *folder.parents):
         if place.is_dir():
             return os.access(place, os.W_OK | os.X_OK)
@@ -134,10 +134,10 @@ def _writable(folder: Path) -> bool:
 
 
 def _private_folder() -> Path | None:
-    """A folder of this user's alone among the temporary files; None where there is none."""
+    """Temporary folder that only this user can access; None if there is none."""
     import tempfile  # noqa: PLC0415  # seldom needed
 
-    user = os.getuid() if hasattr(os, "getuid") else 0  # Windows: temporary files are the user's
+    user = os.getuid() if hasattr(os, "getuid") else 0  # Windows: temporary files are private
     try:
         folder = Path(tempfile.gettempdir(), f"impc-{user}")
         with contextlib.suppress(FileExistsError):

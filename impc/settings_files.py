@@ -1,7 +1,7 @@
-"""Keep libraries from obeying settings files of the working folder.
+"""Keep libraries from reading settings files of the working folder.
 
-matplotlib reads `matplotlibrc`, numba `.numba_config.yaml` and IPOPT `ipopt.opt` of the folder in
-which a command is typed. Recordings of other people may lie there (docs/security.md).
+matplotlib reads `matplotlibrc`, numba `.numba_config.yaml` and IPOPT `ipopt.opt` in the folder in
+which a command is run, which may hold other people's files (docs/ref/security.md).
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
-#: Options with which IPOPT prints nothing and reads no file. ipopt.opt may have it write over any
-#: file, and load a library as its linear solver.
+#: Options with which IPOPT prints nothing and reads no file. With ipopt.opt it could overwrite any
+#: file, or load a library as its linear solver.
 IPOPT_ALONE: dict[str, Any] = {"print_level": 0, "sb": "yes", "option_file_name": ""}
 
 
 def ignore_settings_files(*libraries: str) -> None:
-    """Import these `libraries` as if their settings files were absent."""
+    """Import these `libraries` without their settings files."""
     for library in libraries:
         if not any(isinstance(item, _Finder) and item.name == library for item in sys.meta_path):
             sys.meta_path.insert(0, _Finder(library))
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Find one library as the other finders do, and run its `__init__` away from the folder."""
+    """Find one library like the other finders, and run its `__init__` in another folder."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -39,7 +39,7 @@ class _Finder(importlib.abc.MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """The specification of the library; None for other modules."""
+        """Specification of the library; None for other modules."""
         if fullname != self.name:
             return None
         others = (finder for finder in sys.meta_path if finder is not self)
@@ -53,7 +53,7 @@ class _Finder(importlib.abc.MetaPathFinder):
                 with _away():
                     execute(module)
                 if fullname == "numba":
-                    # numba looks again before each compilation: by no name it finds nothing.
+                    # numba reads it again before each compilation: an empty name matches nothing.
                     sys.modules["numba.core.config"].__dict__["_config_fname"] = ""
 
             loader.exec_module = away
@@ -62,10 +62,10 @@ class _Finder(importlib.abc.MetaPathFinder):
 
 @contextmanager
 def _away() -> Iterator[None]:
-    """In this package's folder, and without yaml, by which numba would read its file later."""
+    """Work in this package's folder, and hide yaml, with which numba would read its file."""
     try:
         os.getcwd()
-    except OSError:  # the folder is gone, and its files with it
+    except OSError:  # the folder no longer exists
         elsewhere: Any = nullcontext()
     else:
         elsewhere = chdir(Path(__file__).parent)

@@ -1,7 +1,4 @@
-"""Plants: physics as `control.StateSpace`, with named signals, units and sources.
-
-This package knows nothing of `impc`; either can be used without the other.
-"""
+"""Plants as `control.StateSpace` with named signals and units; independent of impc."""
 
 from plants.actuation import LinearSystem, delayed_muscle, pade_delay
 from plants.anthropometry import SeatLayout, from_anthropometry

@@ -1,4 +1,4 @@
-"""Checks shared by the plants: one-line errors that say what was given and what to do."""
+"""Argument checks with one-line messages."""
 
 from __future__ import annotations
 
@@ -22,23 +22,9 @@ def finite_number(
     above: float = -math.inf,
     most: float = math.inf,
 ) -> float:
-    """Return the value as a float when it is a finite number, ``above < value``, in [least, most].
+    """Return `value` as a float if it is finite, above `above`, and in [least, most].
 
-    Parameters
-    ----------
-    name : str
-        Name of the argument, for the message.
-    value : object
-        What the caller gave. Truth values are refused: they are a slip, not a quantity.
-    remedy : str
-        What to do, the end of the message.
-    least, above, most : float
-        Lower bound, strict lower bound and upper bound.
-
-    Raises
-    ------
-    ValueError
-        When the value is not such a number.
+    Booleans are rejected. The ValueError begins with `name` and ends with `remedy`.
     """
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if math.isfinite(number) and least <= number <= most and number > above:
@@ -53,15 +39,7 @@ def finite_number(
 
 
 def whole_number(name: str, value: object, remedy: str, *, least: int, most: int) -> int:
-    """Return the value as an int when it is a whole number in [least, most].
-
-    The message of the error begins with `name` and ends with `remedy`.
-
-    Raises
-    ------
-    ValueError
-        When it is not.
-    """
+    """Return `value` as an int if it is a whole number in [least, most]; else ValueError."""
     if isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most:
         return int(value)
     raise ValueError(

@@ -1,4 +1,4 @@
-"""Units of signals and what they are, beside a `control.StateSpace` that has no place for them."""
+"""Attach units, names and uncertainties to a `control.StateSpace`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["with_uncertainty", "with_units"]
 
 
 def with_units(system: Any, units: dict[str, str], words: dict[str, str] | None = None) -> Any:
-    """Return the `system` with `units` and `words` by the names of signals (docs/units.md)."""
+    """Attach `units` and `words` by signal name (docs/howto/recordings.md)."""
     system.units = units
     system.words = words or {}
     return system
@@ -17,10 +17,7 @@ def with_units(system: Any, units: dict[str, str], words: dict[str, str] | None 
 def with_uncertainty(
     system: Any, parameters: dict[str, float], uncertainty: dict[str, float | str]
 ) -> Any:
-    """Return the `system` with its parameters and how well they are known, by name.
-
-    A standard deviation is in the unit of its parameter, or a share of it as "5 %".
-    """
+    """Attach parameters and their standard deviations (in the unit, or relative as "5 %")."""
     system.parameters = parameters
     system.uncertainty = uncertainty
     return system

@@ -1,11 +1,10 @@
-"""The way from a command to a torque: a delay and a first-order muscle, as linear systems.
+"""Actuation from command to torque: a delay and a first-order muscle as linear systems.
 
     command u -> Padé approximation of exp(-tau_d s) -> 1 / (tau_m s + 1) -> torque
 
-The Padé approximant is realised as the lossless ladder that the continued fraction of the
-hyperbolic tangent gives, not by its polynomials: for order 5 and a delay of 80 ms their
-coefficients span ten decades, and the companion form inherits that. Delay and muscle are those of
-the seat's model, Table 3.2.
+The Padé approximant is realised as a lossless ladder from the continued fraction of the hyperbolic
+tangent. The companion form would be ill-conditioned: for order 5 and a delay of 80 ms the
+coefficients of the polynomials span ten decades. Delay and muscle: Table 3.2.
 """
 
 from __future__ import annotations
@@ -18,9 +17,7 @@ from plants._checks import Array, finite_number, whole_number
 
 __all__ = ["MAX_DELAY_ORDER", "LinearSystem", "delayed_muscle", "pade_delay"]
 
-# At order 10 the approximation is exact to 1e-15 where delay times frequency is 1.6; beyond 20,
-# states would only cost time.
-#: Largest order of a Padé approximant.
+#: Largest order of a Padé approximant; order 10 is exact to 1e-15 if delay times frequency is 1.6.
 MAX_DELAY_ORDER = 20
 
 
@@ -55,37 +52,37 @@ def pade_delay(delay: float, order: int) -> LinearSystem:
 
         t = 1 / (2/z + 1 / (6/z + 1 / (10/z + ...))),    z = delay s,
 
-    a ladder of ``order`` lossless elements a_k^2 = 4k - 2, ended by a resistance. With m_k = 1
-    where order - k is even and 0 elsewhere, and J_kj = (1 - m_k) m_j for j > k, its realisation is
+    a ladder of ``order`` lossless elements a_k^2 = 4k - 2, terminated by a resistance. With m_k = 1
+    if order - k is even and 0 otherwise, and J_kj = (1 - m_k) m_j for j > k, its realisation is
 
         A = diag(a) (J - J' - m m') diag(a) / delay,   B = a m / delay,
         D = (-1)^order,                                C = -2 D (a m)'.
 
     It satisfies A + A' = -2 delay B B' and C' = -2 delay D B: both Gramians are multiples of the
-    identity, the best conditioned form an all-pass system has. The condition number of A is 24 at
-    order 5. Its states are in the unit of the input.
+    identity, the best conditioned form of an all-pass system. The states have the unit of the
+    input.
 
     Parameters
     ----------
     delay : float
         Delay in s, positive.
     order : int
-        From 0, which is no delay at all, to ``MAX_DELAY_ORDER``. Any positive order has direct
-        feedthrough: the approximant is all-pass.
+        From 0 (no delay) to ``MAX_DELAY_ORDER``. Positive orders have direct feedthrough, because
+        the approximant is all-pass.
 
     Returns
     -------
     LinearSystem
-        With ``order`` states.
+        System with ``order`` states.
 
     Raises
     ------
     ValueError
-        When the delay or the order is out of range.
+        If the delay or the order is out of range.
 
     Notes
     -----
-    The continued fraction is Lambert's (1761); its even and odd convergents are the diagonal Padé
+    The continued fraction is by Lambert (1761); its even and odd convergents are the diagonal Padé
     approximants of the exponential.
     """
     delay = finite_number("delay", delay, "give it in seconds; order 0 is no delay", above=0.0)
@@ -106,7 +103,7 @@ def pade_delay(delay: float, order: int) -> LinearSystem:
 
 
 def delayed_muscle(delay: float, time_constant: float, order: int) -> LinearSystem:
-    """Join the Padé delay and the muscle 1 / (time_constant s + 1).
+    """Connect the Padé delay and the muscle 1 / (time_constant s + 1) in series.
 
     Parameters
     ----------
@@ -118,13 +115,13 @@ def delayed_muscle(delay: float, time_constant: float, order: int) -> LinearSyst
     Returns
     -------
     LinearSystem
-        Input command and output torque, both in Nm. The states are those of the delay, then the
-        muscle torque, all in Nm; ``D`` is 0.
+        Input command and output torque in N m. The states are those of the delay, then the muscle
+        torque, all in N m; ``D`` is 0.
 
     Raises
     ------
     ValueError
-        When an argument is out of range.
+        If an argument is out of range.
     """
     time_constant = finite_number("time_constant", time_constant, "give it in seconds", above=0.0)
     chain = pade_delay(delay, order)

@@ -1,19 +1,19 @@
 """Parameters of the seated-balance plant from body mass, height and sex.
 
-The segments are those of de Leva, J Biomech 29(9), 1996, Table 4: mass as a fraction of the body,
-length at the mean height of the sample, centre of mass and radii of gyration as fractions of the
-length. Trunk and head follow the chain vertex, cervicale, xiphoid, navel, mid-hip. The fractions
-were compared in two public transcriptions that agree; the lengths were found in one.
+Segments: de Leva, J Biomech 29(9), 1996, Table 4: mass as a fraction of body mass, length at the
+mean height of the sample, centre of mass and radii of gyration as fractions of the length. Trunk
+and head follow the chain vertex, cervicale, xiphoid, navel, mid-hip. The fractions are from two
+public transcriptions that agree, the lengths from one.
 
 Assumptions
 -----------
 - Lengths of the segments scale with height; the layout of the seat does not, except heights and
   breadth of the arms.
-- The lumbar joint is at the height of the navel: pelvis and legs move with the seat, the rest is
-  the upper body. The feet rest on a support that is fixed to the seat.
+- The lumbar joint is at the height of the navel: pelvis and legs move with the seat, the other
+  segments are the upper body. The feet rest on a support that is fixed to the seat.
 - Trunk, head and upper arms are upright, the forearms lie across the trunk in the frontal plane,
-  the thighs and feet point forwards, the shanks hang. Each is a rod along its own axis.
-- Left and right are symmetric, all centres of mass lie above or below the pivot at upright.
+  the thighs and feet point forwards, the shanks hang. Each segment is a rod along its own axis.
+- Left and right are symmetric; all centres of mass are above or below the pivot when upright.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ class Segment(NamedTuple):
     Attributes
     ----------
     mass : float
-        Fraction of the body mass (in kg for kg), of one side.
+        Mass of one side as a fraction of body mass.
     length : float
-        m, at the mean height of the sample.
+        Length in m at the mean height of the sample.
     centre : float
-        Centre of mass from the upper end, or the end nearer the trunk, as a fraction of length.
+        Distance of the centre of mass from the upper (or proximal) end as a fraction of length.
     across : float
-        Sagittal radius of gyration as a fraction of length: about the axis from back to front,
-        for a segment that stands or lies in the frontal plane.
+        Sagittal radius of gyration as a fraction of length: about the anteroposterior axis for a
+        segment in the frontal plane.
     along : float
-        Longitudinal radius of gyration as a fraction of length: about that axis for a segment
-        that points forwards.
+        Longitudinal radius of gyration as a fraction of length: about the anteroposterior axis for
+        a segment that points forwards.
     """
 
     mass: float
@@ -55,7 +55,7 @@ class Segment(NamedTuple):
     along: float
 
 
-#: By sex: mean height of the sample in m, and its segments by name.
+#: Sex -> mean height of the sample in m, and segments by name.
 DE_LEVA: dict[str, tuple[float, dict[str, Segment]]] = {
     "male": (
         1.741,
@@ -92,17 +92,17 @@ DE_LEVA: dict[str, tuple[float, dict[str, Segment]]] = {
 
 @dataclass(frozen=True)
 class SeatLayout(Quantities):
-    """How a person sits; every value is chosen, not measured.
+    """Geometry of seat and posture; all values are assumed, not measured.
 
-    The last three and the seat's centre were chosen, within what is plausible, so that a man of
-    79.7 kg and 1.66 m has the default `SeatedBalanceParameters` to the digits given there.
+    The last three values and the seat's centre are chosen within a plausible range such that a man
+    of 79.7 kg and 1.66 m has the default `SeatedBalanceParameters`.
 
     Attributes
     ----------
     seat_mass : float
-        kg.
+        Mass of the seat, kg.
     seat_radius : float
-        Radius of gyration of the seat, frontal plane, m.
+        Radius of gyration of the seat in the frontal plane, m.
     seat_centre : float
         Height of the centre of mass of the seat above the pivot, m.
     pivot_depth : float
@@ -122,7 +122,8 @@ class SeatLayout(Quantities):
     Raises
     ------
     ValueError
-        When a value is not a finite number, or one that is no height is negative.
+        If a value is not finite, or one other than seat_centre, pivot_depth, upper_arm_height and
+        forearm_height is negative.
     """
 
     seat_mass: float = quantity(20.0, "kg", "chosen", least=0.0)
@@ -138,7 +139,7 @@ class SeatLayout(Quantities):
 
 
 class _Part(NamedTuple):
-    """A rigid part: mass (kg), height and distance from the midline (m), radius of gyration (m)."""
+    """Rigid part: mass (kg), height and distance from the midline (m), radius of gyration (m)."""
 
     mass: float
     height: float
@@ -156,26 +157,26 @@ def from_anthropometry(
     mass : float
         Body mass in kg, from 20 to 300.
     height : float
-        Standing height in m, from 1 to 2.5: the fractions are those of adults.
+        Standing height in m, from 1 to 2.5; the fractions are for adults.
     sex : {"male", "female"}
-        Which of the two samples of de Leva.
+        Sample of de Leva.
     layout : SeatLayout, optional
-        How the person sits.
+        Geometry of seat and posture.
 
     Returns
     -------
     SeatedBalanceParameters
-        To change the others: ``dataclasses.replace(result, k_r=...)``.
+        Change other parameters by ``dataclasses.replace(result, k_r=...)``.
 
     Raises
     ------
     ValueError
-        When an argument is out of range, or the layout puts the lumbar joint below the pivot or
-        the upper body below the joint.
+        If an argument is out of range, or the layout puts the lumbar joint below the pivot or the
+        upper body below the joint.
 
     Notes
     -----
-    The assumptions are in the text of this module.
+    The module's docstring lists the assumptions.
     """
     mass = finite_number("mass", mass, "give it in kg", least=20.0, most=300.0)
     height = finite_number("height", height, "give it in m", least=1.0, most=2.5)
@@ -196,7 +197,7 @@ def from_anthropometry(
 
 
 def _lower_body(segments: dict[str, Segment], layout: SeatLayout, hip: float) -> list[_Part]:
-    """Pelvis, legs and seat; heights from the pivot."""
+    """Pelvis, legs and seat; heights relative to the pivot."""
     pelvis, thigh, shank, foot = (segments[s] for s in ("lower trunk", "thigh", "shank", "foot"))
     ankle = hip - shank.length
     knee_to_centre = shank.centre * shank.length
@@ -210,7 +211,7 @@ def _lower_body(segments: dict[str, Segment], layout: SeatLayout, hip: float) ->
 
 
 def _upper_body(segments: dict[str, Segment], layout: SeatLayout, scale: float) -> list[_Part]:
-    """Trunk above the navel, head and arms; heights from the lumbar joint."""
+    """Trunk above the navel, head and arms; heights relative to the lumbar joint."""
     parts = []
     end = 0.0
     for name in ("middle trunk", "upper trunk", "head"):
@@ -227,17 +228,17 @@ def _upper_body(segments: dict[str, Segment], layout: SeatLayout, scale: float) 
 
 
 def _standing(segment: Segment, height: float, lateral: float = 0.0, sides: int = 1) -> _Part:
-    """A segment that stands, or lies across, in the frontal plane."""
+    """Segment in the frontal plane, upright or across."""
     return _Part(sides * segment.mass, height, lateral, segment.across * segment.length)
 
 
 def _pointing_forwards(segment: Segment, height: float, lateral: float) -> _Part:
-    """A pair of segments that point forwards."""
+    """Pair of segments that point forwards."""
     return _Part(2 * segment.mass, height, lateral, segment.along * segment.length)
 
 
 def _combine(parts: list[_Part]) -> tuple[float, float, float]:
-    """Total mass, height of the centre of mass, moment of inertia about it."""
+    """Total mass, height of the centre of mass, and moment of inertia about it."""
     mass = sum(part.mass for part in parts)
     centre = sum(part.mass * part.height for part in parts) / mass
     inertia = sum(

@@ -1,28 +1,24 @@
-"""Following a target with a cursor: the tracking error as a plant, in two ways.
+"""Two plants for the error of tracking with a cursor (docs/howto/tracking.md).
 
-In `cursor_plant` the hand moves the cursor with an acceleration that answers the command after a
-delay and a lag,
+`cursor_plant`: the command sets the acceleration of the cursor after a delay and a lag,
 
-    c'' = a,    tau_m a' + a = u(t - tau_d),    e = c - target,    e' = c' - target',
+    c'' = a,    tau_m a' + a = u(t - tau_d),    e = c - target,    e' = c' - target'.
 
-so that the target's velocity disturbs the error as the torque on a seat disturbs the angles.
-States: error (px), velocity of the cursor (px/s), the states of the delay
-(`plants.actuation.pade_delay`), acceleration (px/s^2). Inputs: command (px/s^2) and target_rate
-(px/s), which is held between samples: give it the increments of the target over the sample time.
-Output: error (px). Any unit of length may stand for the pixel.
+The target's velocity is a disturbance of the error. States: error (px), velocity of the cursor
+(px/s), states of the delay (`plants.actuation.pade_delay`), acceleration (px/s^2). Inputs: command
+(px/s^2) and target_rate (px/s), held between samples: the increments of the target over the sample
+time. Output: error (px). Any unit of length may replace the pixel.
 
-In `pursuit_plant` the hand's velocity answers, and the delay is one of whole samples, exactly:
+`pursuit_plant`: the command sets the velocity, after an exact delay of N samples,
 
     c' = v,    tau v' + v = u(t - N T).
 
-States: error (px), velocity of the cursor (px/s), the commands that are on their way, the next one
-first (px/s). Input: command (px/s). There noise in the command is drift of the hand, which fades as
-a movement does.
+States: error (px), velocity of the cursor (px/s), delayed commands, the next one first (px/s).
+Inputs: command (px/s) and target_rate (px/s). Noise in the command is drift of the hand.
 
-Their parameters were not measured by anybody: delay and lag are fitted, the defaults are where a
-fit starts. They are known to 30 ms (visual delays of tracking hands are .1 to .2 s) and 40 %
-(judgement). A bound on the command is one before delay and lag. The recordings that they were made
-for are described in docs/cursor-tracking.md.
+The default parameters are starting values for a fit, not measurements. Their standard deviations
+are 30 ms for the delay (visual delays of tracking hands are 0.1 to 0.2 s) and 40 % for the lag (an
+assumption). A bound on the command acts before delay and lag.
 """
 
 from __future__ import annotations
@@ -52,25 +48,25 @@ def cursor_plant(
     Parameters
     ----------
     delay : float
-        tau_d in s: from what is seen to what the hand does. Chosen; to be fitted.
+        Visuomotor delay tau_d in s. Assumed; to be fitted.
     lag : float
-        tau_m in s: first-order lag of the hand's acceleration. Chosen; to be fitted.
+        First-order lag tau_m of the hand's acceleration in s. Assumed; to be fitted.
     sample_time : float
-        s; a screen of 60 Hz by default.
+        Sample time in s; the default is that of a 60-Hz screen.
     delay_order : int
         Order of the Padé approximant of the delay.
     length : str
-        The unit in which the recordings have the error.
+        Unit of the recorded error.
 
     Returns
     -------
     control.StateSpace
-        Discrete, ``3 + delay_order`` states; order and units in the module's text.
+        Discrete, ``3 + delay_order`` states; order and units as in the module's docstring.
 
     Raises
     ------
     ValueError
-        When an argument is out of range.
+        If an argument is out of range.
     """
     sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
     lag = finite_number("lag", lag, "give it in seconds", above=0.0)
@@ -81,7 +77,7 @@ def cursor_plant(
     A[2:, 2:] = chain.A
     B[2:, 0] = chain.B
     B[0, 1] = -1.0
-    # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also where A is singular, as here.
+    # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also for singular A.
     held = scipy.linalg.expm(np.block([[A, B], [np.zeros((2, n + 2))]]) * sample_time)
     delays = [f"delay_{k}" for k in range(1, delay_order + 1)]
     stages = {name: f"stage {k} of the delay of the nerves" for k, name in enumerate(delays, 1)}
@@ -100,30 +96,30 @@ def pursuit_plant(
     Parameters
     ----------
     delay : int
-        N: whole samples from a command to what the hand does, at least 1. Chosen; to be fitted.
+        Delay N from command to velocity, in whole samples, at least 1. Assumed; to be fitted.
     lag : float
-        tau in s: first-order lag of the hand's velocity. Chosen; to be fitted.
+        First-order lag tau of the hand's velocity in s. Assumed; to be fitted.
     sample_time : float
-        T in s; a screen of 60 Hz by default.
+        Sample time T in s; the default is that of a 60-Hz screen.
     length : str
-        The unit in which the recordings have the error.
+        Unit of the recorded error.
 
     Returns
     -------
     control.StateSpace
-        Discrete, ``2 + delay`` states; order and units in the module's text.
+        Discrete, ``2 + delay`` states; order and units as in the module's docstring.
 
     Raises
     ------
     ValueError
-        When an argument is out of range.
+        If an argument is out of range.
     """
     sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
     lag = finite_number("lag", lag, "give it in seconds", above=0.0)
     if isinstance(delay, bool) or not isinstance(delay, int) or delay < 1:
         raise ValueError(f"delay: got {delay!r}; give whole samples, at least 1")
     kept = np.exp(-sample_time / lag)
-    # The integral of an answer exp(-t/lag) over a sample: from a velocity to a distance.
+    # Integral of exp(-t/lag) over a sample: distance per unit of velocity.
     moved = lag * (1 - kept)
     n = 2 + delay
     A, B = np.zeros((n, n)), np.zeros((n, 2))
@@ -147,9 +143,9 @@ def _tracking(
     stages: dict[str, str],
     command: tuple[str, str],
 ) -> Any:
-    """The system of A and B whose states are error, velocity and stages, with their words.
+    """System of A and B with the states error, velocity and `stages` (name -> words).
 
-    The stages are in the unit of the command, which comes with its words.
+    `command` has the unit of the command and of the stages, and its words.
     """
     A, B = matrices
     unit, asked = command

@@ -1,6 +1,6 @@
 """Head tracking in yaw and pitch: visual, vestibular, proprioceptive and intrinsic pathways.
 
-r is the angle to follow, y that of the head; e = r - y. With the trunk at rest
+r is the target angle, y the head angle, e = r - y. With the trunk at rest
 
     visual           T_vis = Kvis exp(-tau s) e
     vestibular       T_vcr = Kvcr s^2 (tau1A s + 1)(tauCNS1 s + 1) / ((tauC s + 1)(tauCNS2 s + 1)) y
@@ -9,15 +9,15 @@ r is the angle to follow, y that of the head; e = r - y. With the trunk at rest
     head             (J s^2 + B s + K - m g l) y = T        m g l in pitch only
 
 (Peng, Hain, Peterson 1996; Chen et al. 2002; the dissertation's chapters 4 and 5.) The vestibular
-and proprioceptive blocks are improper one by one, so the loop is built as one fraction:
+and proprioceptive blocks alone are improper, so the loop is one fraction:
 
     y = N / D u,   u = Kvis exp(-tau s) (r - y),   N = (tauC s + 1)(tauCNS2 s + 1)
     D = (tau_c s + 1)(J s^2 + B s + K - m g l) N + Kvcr s^2 (tau1A s + 1)(tauCNS1 s + 1)
         + Kccr (tauMS1 s + 1)(tauMS2 s + 1) N
 
-of degree 5, with a Padé approximant of the delay. Time is measured in units of 1/3 s inside, so
-that the coefficients of the companion form differ by 1e4 and not by 1e9; its fast pole (about
-16 000 1/s) is left to an exact discretisation.
+of degree 5, with a Padé approximant of the delay. Internally time is in units of 1/3 s, which
+reduces the range of the companion form's coefficients from 1e9 to 1e4. The fast pole (about
+16 000 1/s) requires exact discretisation.
 """
 
 from __future__ import annotations
@@ -54,20 +54,20 @@ _SCALE = 3.0  # rad/s
 
 @dataclass(frozen=True)
 class HeadNeckParameter:
-    """A candidate parameter: its unit, bounds, pathway and where they come from.
+    """A candidate parameter: unit, bounds, pathway and source.
 
     Attributes
     ----------
     name, meaning : str
-        As in table 4.2, and in words.
+        Name in table 4.2, and description.
     unit : str
-        Of its values.
+        Unit of its values.
     low, high : float
         Bounds, in that unit.
     pathway : str
-        The pathway of the loop that it belongs to.
+        Pathway of the loop to which it belongs.
     source : str
-        Of name and bounds.
+        Source of name and bounds.
     """
 
     name: str
@@ -80,7 +80,7 @@ class HeadNeckParameter:
 
 
 _BOUNDS = "names: dissertation, table 4.2; bounds: likely, consistent with its interval widths"
-#: The twelve candidates of chapters 4 and 5, in their order.
+#: The twelve candidate parameters of chapters 4 and 5, in their order.
 HEAD_NECK_PARAMETERS = tuple(
     HeadNeckParameter(*row, _BOUNDS)
     for row in (
@@ -102,43 +102,40 @@ HEAD_NECK_PARAMETERS = tuple(
 HEAD_NECK_FIXED = {
     "J": (0.0148, "kg m^2", "Peng et al. 1996"),
     "tau_c": (0.1, "s", "Peng et al. 1996"),
-    "m": (4.5, "kg", "chosen: lost"),
-    "l": (0.15, "m", "chosen: lost"),
+    "m": (4.5, "kg", "chosen: not in the dissertation"),
+    "l": (0.15, "m", "chosen: not in the dissertation"),
 }
-#: Table 4.3 of the dissertation, means over ten subjects; None is fixed at the nominal mean.
+#: Table 4.3 of the dissertation, means over ten subjects; None: fixed at the nominal mean.
 TABLE_4_3: dict[str, tuple[float | None, ...]] = {
     "nominal": (428, 4860, 87.9, 0.263, 0.099, 0.675, 1.733, 27.2, 0.433, 0.439, 1.690, 2.170),
     "fim": (279, None, 16.2, 0.242, 0.069, 0.918, None, None, None, None, None, None),
     "lasso": (401, 8055, 36.4, 0.226, None, None, 2.200, None, None, None, None, None),
 }
-# SD of the nominal column over its ten subjects: it holds the errors of their estimates too, most
-# for the last five parameters, so that it rather overstates how much people differ.
+# SD of the nominal column over its ten subjects. It includes estimation errors, mostly in the last
+# five parameters, so it overstates the differences between people.
 _BETWEEN_PEOPLE = (125, 2205, 55.3, 0.027, 0.063, 0.280, 1.118, 16.2, 0.381, 0.325, 1.213, 1.736)
 
 
 def table_4_3_column(name: str) -> NDArray[np.float64]:
-    """All twelve parameters (12,) of the column `name` of table 4.3, in their units.
-
-    Where the column is empty the parameter was fixed at the nominal mean.
-    """
+    """All twelve parameters of the column `name` of table 4.3; empty cells: nominal mean."""
     filled = zip(TABLE_4_3[name], TABLE_4_3["nominal"], strict=True)
     return np.array([base if value is None else value for value, base in filled], dtype=float)
 
 
 def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
-    """Return theta (12) -> A (5 + order, same), B (same, 1), C (1, same) of the closed loop.
+    """Return the function theta (12) -> A (n, n), B (n, 1), C (1, n), n = 5 + order.
 
     Parameters
     ----------
     axis : {"yaw", "pitch"}
-        Gravity acts in pitch.
+        Axis of rotation; gravity acts in pitch only.
     delay_order : int
-        Of the Padé approximant.
+        Order of the Padé approximant.
 
     Raises
     ------
     ValueError
-        When the axis is unknown or the order out of range.
+        If the axis is unknown or the order is out of range.
     """
     if axis not in ("yaw", "pitch"):
         raise ValueError(f"axis: expected yaw or pitch, got {axis!r:.60}")
@@ -159,7 +156,7 @@ def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
         seen[0, column] = coefficient / lead
     enters = ca.SX.zeros(n, 1)
     enters[n - 1] = 1
-    delay = pade_delay(1.0, order)  # of one second; its states run 1 / (tau scale) times as fast
+    delay = pade_delay(1.0, order)  # for one second; rescaled in time by `rate`
     rate = 1 / (tau * _SCALE)
     D = np.asarray(delay.A)
     E, F = np.reshape(delay.B, (order, 1)), np.reshape(delay.C, (1, order))
@@ -182,14 +179,14 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order
     Parameters
     ----------
     values : array_like
-        The parameters (12,), in the order and units of `HEAD_NECK_PARAMETERS`.
+        Parameters (12,), in the order and units of `HEAD_NECK_PARAMETERS`.
     axis, delay_order
-        As in `head_neck_matrices`.
+        See `head_neck_matrices`.
 
     Raises
     ------
     ValueError
-        When there are not twelve finite values, or as `head_neck_matrices`.
+        If there are not twelve finite values, or see `head_neck_matrices`.
     """
     given = np.asarray(values, dtype=np.float64)
     if given.shape != (len(HEAD_NECK_PARAMETERS),):
@@ -211,25 +208,25 @@ def step_reference(
     longest: float = 0.9,
     seed: int = 0,
 ) -> NDArray[np.float64]:
-    """Pseudorandom steps of random duration and size: the reference of chapters 4 and 5.
+    """Steps of random duration and size: the reference signal of chapters 4 and 5.
 
     Parameters
     ----------
     duration : float
-        s.
+        Duration in s.
     rate : float
         Samples per s.
     amplitude : float
-        Largest magnitude, in the unit wanted. The dissertation's is lost.
+        Largest magnitude, in any unit. The dissertation does not give it.
     shortest, longest : float
-        Of a step, s: 0.3 and 0.9 in chapter 5.
+        Durations of a step in s: 0.3 and 0.9 in chapter 5.
     seed : int
-        Another one gives other steps.
+        Seed of the random numbers.
 
     Returns
     -------
-    ndarray
-        (samples,) with samples = round(duration * rate).
+    ndarray of shape (samples,)
+        samples = round(duration * rate).
     """
     rng = np.random.default_rng(seed)
     samples = round(duration * rate)
@@ -243,7 +240,7 @@ def step_reference(
 
 
 def _inner(theta: Any, axis: Axis) -> tuple[list[Any], list[Any]]:
-    """Coefficients of N and D, lowest first, of p = s / scale."""
+    """Coefficients of N and D in p = s / scale, lowest power first."""
     kvcr, kccr, t1a, tcns1, tc, tcns2, tms1, tms2, damping, stiffness = (
         theta[index] for index in (1, 2, 4, 5, 6, 7, 8, 9, 10, 11)
     )
@@ -278,15 +275,10 @@ def _sum(*polynomials: list[Any]) -> list[Any]:
 
 
 def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
-    """Describe the model for a selection of parameters: names, bounds, pathways, matrices.
+    """Return the model for `impc select`: names, bounds, pathways, matrices.
 
-    Typical values are the nominal column of table 4.3, deviations between people its SD; `axis`
-    and `delay_order` are those of `head_neck_matrices`.
-
-    Raises
-    ------
-    ValueError
-        As `head_neck_matrices`.
+    Typical values are the nominal column of table 4.3, deviations between people its SDs. For
+    `axis`, `delay_order` and errors see `head_neck_matrices`.
     """
     return {
         "names": [item.name for item in HEAD_NECK_PARAMETERS],

@@ -1,4 +1,4 @@
-"""Fixed-step integration of a plant, as a CasADi function that can be mapped and differentiated.
+"""Fixed-step integration of a plant as a CasADi function.
 
 Source: Hairer, Nørsett and Wanner 1993, section II.1.
 """
@@ -13,16 +13,16 @@ __all__ = ["runge_kutta_step", "with_linear_part"]
 
 
 def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> ca.Function:
-    """Make one sample of the classical fourth-order Runge-Kutta method.
+    """Return the function of one sample by the classical fourth-order Runge-Kutta method.
 
     Parameters
     ----------
     dynamics : casadi.Function
         (state (n), input (m)) -> state rate (n), in units per s.
     step : float
-        Length of the sample in s, over which the input is held.
+        Sample time in s, over which the input is held.
     substeps : int
-        Runge-Kutta steps in the sample.
+        Number of Runge-Kutta steps per sample.
 
     Returns
     -------
@@ -32,7 +32,7 @@ def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> c
     Raises
     ------
     ValueError
-        When the step is not positive or the substeps are not a whole number from 1 to 10000.
+        If the step is not positive or the substeps are not a whole number from 1 to 10000.
     """
     step = finite_number("step", step, "give it in seconds", above=0.0)
     substeps = whole_number("substeps", substeps, "1 is usual", least=1, most=10_000)
@@ -50,17 +50,16 @@ def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> c
 
 
 def with_linear_part(step: ca.Function, A: Array, B: Array) -> ca.Function:
-    """Make a sample whose linearisation at rest is x+ = A x + B u exactly.
+    """Correct a sample so that its linearisation at rest is exactly x+ = A x + B u.
 
-    An integrator's error is that of its linear part nearly all of it, and that part is known: the
-    slopes of the step at rest are replaced.
+    This removes most of the integration error, which is in the linear part.
 
     Parameters
     ----------
     step : casadi.Function
-        (state (n), input (m)) -> next state (n), near enough to A and B.
+        (state (n), input (m)) -> next state (n), with a linearisation close to A and B.
     A, B : Array
-        Of the sampled linear plant, (n, n) and (n, m).
+        Matrices of the sampled linear plant, (n, n) and (n, m).
     """
     state, inputs = ca.SX.sym("state", *step.size_in(0)), ca.SX.sym("input", *step.size_in(1))
     ahead = step(state, inputs)

@@ -1,9 +1,8 @@
-"""Small unstable systems of the literature on which inverse MPC is shown.
+"""Small unstable systems from the literature as examples for inverse MPC.
 
-The dissertation takes its example (3.8) from its reference [80]; the matrices, the bound and the
-initial state are lost. These systems stand in for it; `yalmip_example` reproduces every
-statement that the dissertation makes about its own. All are discrete with a sample time of 1 s,
-two states, one input and no direct feedthrough.
+The dissertation takes its example (3.8) from its reference [80]; matrices, bound and initial state
+are not available. `yalmip_example` has all properties that the dissertation states of its example.
+All systems are discrete with a sample time of 1 s, two states, one input and no direct feedthrough.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ def yalmip_example() -> Any:
     """Return A = [2 -1; 1 0.2], B = [1; 0], the primary example. Used with abs(u) <= 1.
 
     Source: the "standard MPC" model of the YALMIP wiki, where Q = I, R = 2, N = 7 and
-    x0 = [3; 1]; the dissertation used YALMIP. Confidence in the matrices: certain; that they are
-    those of the dissertation's (3.8), which are lost: a guess.
+    x0 = [3; 1]; the dissertation used YALMIP. Confidence in the matrices: certain. That they equal
+    those of the dissertation's (3.8), which are not available, is a guess.
 
     Returns
     -------
@@ -64,10 +63,10 @@ def yalmip_example() -> Any:
 def bbm_example() -> Any:
     """Return A = [2 1; 0 0.5], B = [1; 0]. Used with abs(u) <= 1, abs(x) <= 10.
 
-    Its second state cannot be controlled: the weight Q22 has no effect on the gain, whatever the
-    data. Source: the textbook of Borrelli, Bemporad and Morari on predictive control,
-    "unstable second order system". Confidence: from memory, not read again. The matrices of the
-    dissertation's (3.8) are lost.
+    Its second state is not controllable: the weight Q22 has no effect on the gain. Source: the
+    textbook of Borrelli, Bemporad and Morari on predictive control, "unstable second order system".
+    Confidence: from memory, not verified. The matrices of the dissertation's (3.8) are not
+    available.
 
     Returns
     -------
@@ -81,8 +80,8 @@ def cannon_example() -> Any:
     """Return A = [1.1 2; 0 0.95], B = [0; 0.0787], C = [-1 1]. Used with abs(u) <= 1.
 
     Source: the Oxford lecture notes and the textbook of Kouvaritakis and Cannon on predictive
-    control. Confidence: from memory, not read again. The matrices of the dissertation's (3.8)
-    are lost.
+    control. Confidence: from memory, not verified. The matrices of the dissertation's (3.8) are
+    not available.
 
     Returns
     -------
@@ -95,8 +94,8 @@ def cannon_example() -> Any:
 def unstable_integrator_example() -> Any:
     """Return A = [1.2 1; 0 1], B = [0; 1]. Used with abs(u) <= 1.
 
-    Source: chosen here, a generic unstable mode driven through an integrator. Confidence: it is
-    what it is. The matrices of the dissertation's (3.8) are lost.
+    Source: chosen here, a generic unstable mode driven through an integrator. Confidence: certain.
+    The matrices of the dissertation's (3.8) are not available.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Nonlinear equations of motion in CasADi: cart-pole, robot arm, quadrotor, rocket.
 
 The four systems of the benchmark of Jin, Mou and Pappas 2021 (Safe Pontryagin Differentiable
-Programming), written from their mechanics: each function gives the rate of the state, for symbols
+Programming), derived from their mechanics. Each function returns the rate of the state for symbols
 or numbers. Attitudes are unit quaternions q = (q0, q1, q2, q3) of the body in the inertial frame.
 """
 
@@ -24,11 +24,11 @@ def cart_pole(state: Any, force: Any, cart: Any, pole: Any, length: Any) -> Any:
     state : casadi expression
         m, rad, m/s, rad/s; the angle is 0 when the pole hangs and pi when it stands.
     force : casadi expression
-        On the cart, N.
+        Force on the cart, N.
     cart, pole : casadi expression or float
-        Mass of the cart and of the point at the end of the pole, kg.
+        Mass of the cart and point mass at the end of the pole, kg.
     length : casadi expression or float
-        Of the pole, m.
+        Length of the pole, m.
     """
     _, angle, velocity, rate = ca.vertsplit(state)
     sine, cosine = ca.sin(angle), ca.cos(angle)
@@ -49,9 +49,9 @@ def robot_arm(state: Any, torque: Any, lengths: tuple[Any, Any], masses: tuple[A
     state : casadi expression
         rad, rad/s; the second angle is relative to the first rod.
     torque : casadi expression
-        At both joints, Nm.
+        Torques at both joints, N m.
     lengths, masses : pair
-        Of the rods, m and kg.
+        Lengths and masses of the rods, m and kg.
     """
     rate = state[2:]
     (l1, _), (m1, m2) = lengths, masses
@@ -74,15 +74,15 @@ def quadrotor(state: Any, thrusts: Any, inertia: Any, mass: Any, span: Any, drag
     state : casadi expression
         (13,): m, m/s, 1, rad/s; gravity is along the third axis.
     thrusts : casadi expression
-        Of the rotors (4,), N.
+        Thrusts of the rotors (4,), N.
     inertia : casadi expression
-        Principal moments (3,), kg m^2.
+        Principal moments of inertia (3,), kg m^2.
     mass : casadi expression or float
-        kg.
+        Mass, kg.
     span : casadi expression or float
-        Between opposite rotors, m.
+        Distance between opposite rotors, m.
     drag : casadi expression or float
-        Torque about the third axis over thrust, m.
+        Ratio of the torque about the third axis to the thrust, m.
     """
     moment = ca.vertcat(
         (thrusts[3] - thrusts[1]) * span / 2,
@@ -101,25 +101,25 @@ def rocket(state: Any, force: Any, inertia: Any, mass: Any, length: Any) -> Any:
     state : casadi expression
         (13,): m, m/s, 1, rad/s; gravity is along the first axis, which is the rocket's.
     force : casadi expression
-        Thrust in the body's frame (3,), N.
+        Thrust in the body frame (3,), N.
     inertia : casadi expression
-        Principal moments (3,), kg m^2.
+        Principal moments of inertia (3,), kg m^2.
     mass, length : casadi expression or float
-        kg, m.
+        Mass in kg, length in m.
     """
     moment = ca.cross(ca.vertcat(-length / 2, 0, 0), force)
     return _free_body(state, force, moment, inertia, mass, ca.vertcat(-GRAVITY, 0, 0))
 
 
 def rotation(q: Any) -> Any:
-    """Matrix (3, 3) from the body's coordinates to the inertial ones, of a unit quaternion q."""
+    """Rotation matrix (3, 3) from body to inertial coordinates for a unit quaternion q."""
     axis = q[1:]
     cross = ca.skew(axis)
     return ca.DM.eye(3) + 2 * q[0] * cross + 2 * ca.mtimes(cross, cross)
 
 
 def _free_body(state: Any, force: Any, moment: Any, inertia: Any, mass: Any, gravity: Any) -> Any:
-    """Newton's and Euler's laws: force and moment in the body's frame, gravity in the inertial."""
+    """Newton-Euler equations: force and moment in the body frame, gravity in the inertial."""
     velocity, q, rates = state[3:6], state[6:10], state[10:13]
     acceleration = ca.mtimes(rotation(q), force) / mass + gravity
     turning = ca.vertcat(-ca.dot(q[1:], rates), q[0] * rates + ca.cross(q[1:], rates)) / 2
@@ -128,7 +128,7 @@ def _free_body(state: Any, force: Any, moment: Any, inertia: Any, mass: Any, gra
 
 
 def _solved(mass: Any, right: Any) -> Any:
-    """The two accelerations by Cramer's rule: short expressions, without pivoting."""
+    """Solve for two accelerations by Cramer's rule, which gives short expressions."""
     a, b, d = mass[0, 0], mass[0, 1], mass[1, 1]
     determinant = a * d - b * b
     return ca.vertcat(

@@ -1,8 +1,8 @@
 """Balance on a seat that tilts sideways: equations (3.18) to (3.20) of the dissertation.
 
-Angles from the vertical, both absolute and in the same sense: theta1 of the lower body and seat,
-theta2 of the upper body. The lumbar torque u turns the upper body towards +theta2 and reacts on
-the lower body; d is the perturbation that the robot adds to the seat. With h = m2 l12 l2 and
+Both angles are absolute, from the vertical and in the same sense: theta1 of the lower body and
+seat, theta2 of the upper body. The lumbar torque u turns the upper body towards +theta2 and reacts
+on the lower body; d is the perturbation torque of the robot on the seat. With h = m2 l12 l2 and
 x = theta1 - theta2,
 
     (J1 + m1 l1^2 + m2 l12^2) theta1'' + h cos(x) theta2'' = - h sin(x) theta2'^2
@@ -10,14 +10,13 @@ x = theta1 - theta2,
     (J2 + m2 l2^2) theta2'' + h cos(x) theta1'' = h sin(x) theta1'^2
         + m2 g l2 sin(theta2) + k_h x + c_h x' + u
 
-The command reaches u through a delay and a muscle, `plants.actuation`. States, in this order:
+The command drives u through a delay and a muscle (`plants.actuation`). States, in this order:
 theta1, theta2 (rad), theta1_rate, theta2_rate (rad/s), delay_1 ... delay_n and muscle_torque
-(Nm). Ten states in all at the default order 5 of the delay. Inputs: command, perturbation (Nm).
-Outputs: theta1, theta2 (rad). That the command is the input means that a bound on it acts before
-delay and muscle.
+(N m); ten states at the default order 5 of the delay. Inputs: command, perturbation (N m). Outputs:
+theta1, theta2 (rad). A bound on the command acts before delay and muscle.
 
-The coordinates of the delay states, and with them any weight on those states and the gain from
-them, depend on the realisation of the delay; the body states, the torque and their gains do not.
+The coordinates of the delay states, and therefore weights on them and gains from them, depend on
+the realisation of the delay; body states, torque and their gains do not.
 """
 
 from __future__ import annotations
@@ -65,25 +64,25 @@ def seated_balance_plant(
     parameters : SeatedBalanceParameters, optional
         The defaults if omitted.
     sample_time : float
-        s.
+        Sample time in s.
     delay_order : int
         Order of the Padé approximant of the delay, see `plants.actuation.pade_delay`.
 
     Returns
     -------
     control.StateSpace
-        Discrete, with ``5 + delay_order`` states, the inputs command and perturbation in Nm, the
-        outputs theta1 and theta2 in rad; order and units in the module's text.
+        Discrete, with ``5 + delay_order`` states, the inputs command and perturbation in N m, the
+        outputs theta1 and theta2 in rad; order and units as in the module's docstring.
 
     Raises
     ------
     ValueError
-        When the sample time or the order is out of range.
+        If the sample time or the order is out of range.
     """
     sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
     plant = continuous_seated_balance_plant(parameters, delay_order)
     n, m = plant.B.shape
-    # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also where A is singular.
+    # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also for singular A.
     held = scipy.linalg.expm(np.block([[plant.A, plant.B], [np.zeros((m, n + m))]]) * sample_time)
     return _named(held[:n, :n], held[:n, n:], sample_time, "seated_balance")
 
@@ -91,7 +90,7 @@ def seated_balance_plant(
 def continuous_seated_balance_plant(
     parameters: SeatedBalanceParameters | None = None, delay_order: int = 5
 ) -> Any:
-    """Return the linear plant in continuous time: the exact Jacobian at upright rest.
+    """Return the linear plant in continuous time: the exact linearisation at upright rest.
 
     Parameters
     ----------
@@ -108,7 +107,7 @@ def continuous_seated_balance_plant(
     Raises
     ------
     ValueError
-        When the order is out of range.
+        If the order is out of range.
     """
     parameters = parameters or SeatedBalanceParameters()
     chain = delayed_muscle(parameters.tau_d, parameters.tau_m, delay_order)
@@ -123,7 +122,7 @@ def continuous_seated_balance_plant(
 
 @functools.cache
 def _slopes_at_rest() -> ca.Function:
-    """All parameters, in their order -> slopes at rest of the bodies' rate by state and input."""
+    """Function from all parameters to the Jacobians of the body dynamics at rest."""
     known = fields(SeatedBalanceParameters)
     values, state, inputs = ca.SX.sym("p", len(known)), ca.SX.sym("x", 4), ca.SX.sym("u", 2)
     named = {each.name: values[place] for place, each in enumerate(known)}
@@ -136,7 +135,7 @@ def _slopes_at_rest() -> ca.Function:
 def nonlinear_dynamics(
     parameters: SeatedBalanceParameters | None = None, delay_order: int = 5
 ) -> ca.Function:
-    """Return the nonlinear bodies driven through the linear delay and muscle.
+    """Return the nonlinear body dynamics with linear delay and muscle.
 
     Parameters
     ----------
@@ -148,13 +147,13 @@ def nonlinear_dynamics(
     Returns
     -------
     casadi.Function
-        (state (5 + delay_order), input (2)) -> state rate; order and units in the module's text.
-        `plants.integration.runge_kutta_step` makes samples of it.
+        (state (5 + delay_order), input (2)) -> state rate; order and units as in the module's
+        docstring. `plants.integration.runge_kutta_step` integrates it over a sample.
 
     Raises
     ------
     ValueError
-        When the order is out of range.
+        If the order is out of range.
     """
     parameters = parameters or SeatedBalanceParameters()
     chain = delayed_muscle(parameters.tau_d, parameters.tau_m, delay_order)
@@ -172,7 +171,7 @@ def nonlinear_dynamics(
 
 
 def body_dynamics(parameters: SeatedBalanceParameters | None = None) -> ca.Function:
-    """Return the nonlinear equations of the two bodies alone.
+    """Return the nonlinear dynamics of the two bodies without delay and muscle.
 
     Parameters
     ----------
@@ -183,7 +182,7 @@ def body_dynamics(parameters: SeatedBalanceParameters | None = None) -> ca.Funct
     -------
     casadi.Function
         (state (4): angles in rad, then their rates in rad/s; input (2): lumbar torque u,
-        perturbation d in Nm) -> state rate (4).
+        perturbation d in N m) -> state rate (4).
     """
     state, inputs = ca.SX.sym("state", 4), ca.SX.sym("input", 2)
     rate = _body_rate(parameters or SeatedBalanceParameters(), state, inputs)

@@ -1,9 +1,9 @@
-"""One sample of the seated body by its full equations, with the way of the command solved exactly.
+"""One sample of the nonlinear seated body, with delay and muscle solved exactly.
 
-Delay and muscle are linear and nothing acts on them but the command, which is held: the torque at
-the nodes of a Runge-Kutta step is known in closed form, and only the two bodies are integrated:
-the step need not follow the fast states of the delay. Equations (3.18) to (3.20) of the
-dissertation; the step is that of Hairer, Nørsett and Wanner 1993, section II.1.
+Delay and muscle are linear and driven only by the held command, so the torque at the nodes of a
+Runge-Kutta step has a closed form. Only the two bodies are integrated, and the step size need not
+resolve the fast delay states. Equations (3.18) to (3.20) of the dissertation; Runge-Kutta step of
+Hairer, Nørsett and Wanner 1993, section II.1.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ def seated_balance_body(
     delay_order: int = 5,
     substeps: int = 1,
 ) -> ca.Function:
-    """Return one sample of the nonlinear plant, its inputs held.
+    """Return the function of one sample of the nonlinear plant with held inputs.
 
     Parameters
     ----------
     parameters : SeatedBalanceParameters, optional
         The defaults if omitted.
     sample_time : float
-        s.
+        Sample time in s.
     delay_order : int
         Order of the Padé approximant of the delay.
     substeps : int
-        Runge-Kutta steps in the sample.
+        Number of Runge-Kutta steps per sample.
 
     Returns
     -------
     casadi.Function
-        (state (5 + delay_order), input (2): command and perturbation in Nm) -> next state; order
+        (state (5 + delay_order), input (2): command and perturbation in N m) -> next state; order
         and units as in `plants.seated_balance`.
 
     Raises
     ------
     ValueError
-        When an argument is out of range.
+        If an argument is out of range.
     """
     parameters = parameters or SeatedBalanceParameters()
     sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
@@ -59,7 +59,7 @@ def seated_balance_body(
     state, inputs = ca.SX.sym("state", 4 + n), ca.SX.sym("input", 2)
     command, perturbation = inputs[0], inputs[1]
     generator = np.block([[chain.A, chain.B[:, None]], [np.zeros((1, n + 1))]])
-    # exp(generator t) has the chain's state after t in its first n rows, the last is the torque.
+    # The first n rows of exp(generator t) give the chain's state after t; row n is the torque.
     held = ca.vertcat(state[4:], command)
 
     def rate(body: ca.SX, half_steps: int) -> ca.SX:

@@ -1,6 +1,6 @@
-"""What the seated-balance plant is made of: its parameters and its limits, with their origins.
+"""Parameters and limits of the seated-balance plant with their sources.
 
-They stand for those of Table 3.2, which are lost.
+They replace those of Table 3.2, which are not available.
 """
 
 from __future__ import annotations
@@ -17,18 +17,10 @@ __all__ = ["Quantities", "SeatedBalanceLimits", "SeatedBalanceParameters", "quan
 def quantity(
     default: float, unit: str, origin: str, known: float | str = 0.0, **limit: float
 ) -> Any:
-    """Declare a dataclass field with its unit, its origin, how well it is known, and its limits.
+    """Declare a dataclass field with unit, origin, uncertainty and limits in its metadata.
 
-    Parameters
-    ----------
-    default : float
-        Value when none is given.
-    unit, origin : str
-        Kept in the metadata of the field.
-    known : float or str
-        Standard deviation between persons of whom no more is known: in the unit, or as "5 %".
-    **limit : float
-        ``least``, ``above``, ``most`` of `plants._checks.finite_number`.
+    `known` is the standard deviation between persons, in the unit or as "5 %"; `limit` has the
+    bounds ``least``, ``above`` and ``most`` of `plants._checks.finite_number`.
     """
     return field(
         default=default, metadata={"unit": unit, "origin": origin, "known": known, "limit": limit}
@@ -36,12 +28,12 @@ def quantity(
 
 
 class Quantities:
-    """Base of frozen dataclasses of quantities: checks every field, keeps it as a float."""
+    """Base class of frozen dataclasses that checks all fields and converts them to float."""
 
     @property
     def uncertainty(self) -> dict[str, float | str]:
-        """How well each is known that is positive and not known exactly, by name."""
-        each = fields(self)  # type: ignore[arg-type]  # as below
+        """Standard deviations by name, of positive quantities that are not exact."""
+        each = fields(self)  # type: ignore[arg-type]  # the subclasses are dataclasses
         known = {one.name: one.metadata["known"] for one in each}
         return {name: how for name, how in known.items() if how and getattr(self, name) > 0}
 
@@ -50,59 +42,59 @@ class Quantities:
             given = getattr(self, each.name)
             unit = each.metadata["unit"]
             number = finite_number(each.name, given, f"give it in {unit}", **each.metadata["limit"])
-            object.__setattr__(self, each.name, number)  # the only way into a frozen dataclass
+            object.__setattr__(self, each.name, number)  # the dataclass is frozen
 
 
 @dataclass(frozen=True)
 class SeatedBalanceParameters(Quantities):
-    """A person on a seat that tilts sideways: two bodies, lumbar joint, robot, delay, muscle.
+    """Parameters of a person on a tilting seat: bodies, joint, robot, delay, muscle.
 
-    The lower body (pelvis, legs and seat) turns about the pivot of the seat, the upper body
-    (trunk above the navel, head and arms) about the lumbar joint. The defaults stand for a man of
-    79.7 kg and 1.66 m; the dissertation's own values (Table 3.2) are lost. The metadata of each
-    field hold its unit and its origin: *regressed* on body mass and height, *measured* by others,
-    or *chosen* here for want of a source; and its standard deviation from person to person.
+    The lower body (pelvis, legs and seat) turns about the pivot of the seat, the upper body (trunk
+    above the navel, head and arms) about the lumbar joint. The defaults are those of a man of
+    79.7 kg and 1.66 m; the dissertation's own values (Table 3.2) are not available. The metadata of
+    each field has its unit, its standard deviation between persons, and its origin: *regressed* on
+    body mass and height, *measured* by others, or *chosen* here without a source.
 
-    Regressed inertias of limbs have a standard error of 13 to 21 % (Yeadon and Morlock 1989), of
-    the trunk less; masses by X-ray absorption differ from regressions by 3 to 10 % (Rossi 2013),
-    more in obese persons. Stiffness and delay scatter as their sources do, below. The deviations
-    of l1, c_h and tau_m are judgement: nobody has measured them.
+    Regressed inertias of limbs have a standard error of 13 to 21 % (Yeadon and Morlock 1989), those
+    of the trunk less; masses by X-ray absorption differ from regressions by 3 to 10 % (Rossi 2013),
+    more in obese persons. The deviations of stiffness and delay reflect the range of their sources;
+    those of l1, c_h and tau_m are assumed.
 
     Attributes
     ----------
     m1 : float
-        Mass of the lower body, kg. Regressed: de Leva 1996, pelvis and legs 50.89 % of the body,
-        and 20 kg of seat (chosen).
+        Mass of the lower body, kg. Regressed: de Leva 1996, pelvis and legs 50.89 % of body mass,
+        plus a seat of 20 kg (chosen).
     m2 : float
-        Mass of the upper body, kg. Regressed: de Leva 1996, 49.11 % of the body.
+        Mass of the upper body, kg. Regressed: de Leva 1996, 49.11 % of body mass.
     l1 : float
-        Height of the centre of mass of the lower body above the pivot, m; below it if negative.
+        Height of the centre of mass of the lower body above the pivot, m; negative if below.
         Regressed, with a chosen layout of the seat.
     l2 : float
         Height of the centre of mass of the upper body above the lumbar joint, m. Regressed, with
-        the arms folded (chosen).
+        folded arms (chosen).
     l12 : float
         Height of the lumbar joint above the pivot, m. Regressed, with a pivot 0.05 m below the
         surface of the seat (chosen).
     J1 : float
-        Moment of inertia of the lower body about its centre of mass, frontal plane, kg m^2.
-        Regressed, with a seat of 0.25 m radius of gyration (chosen).
+        Moment of inertia of the lower body about its centre of mass in the frontal plane, kg m^2.
+        Regressed, with a radius of gyration of the seat of 0.25 m (chosen).
     J2 : float
-        Moment of inertia of the upper body about its centre of mass, frontal plane, kg m^2.
+        Moment of inertia of the upper body about its centre of mass in the frontal plane, kg m^2.
         Regressed.
     k_h : float
-        Stiffness of the lumbar joint, Nm/rad. Measured: passive lateral bending, the data of
-        Gombatto in the review PMC9293810, Table 3, 14 Nm/rad in the first quarter of the range
-        and 36 to 43 in the second; a value in between.
+        Stiffness of the lumbar joint, N m/rad. Measured in passive lateral bending: data of
+        Gombatto in the review PMC9293810, Table 3, 14 N m/rad in the first quarter of the range and
+        36 to 43 in the second; a value in between.
     c_h : float
-        Damping of the lumbar joint, Nms/rad. Chosen.
+        Damping of the lumbar joint, N m s/rad. Chosen.
     k_r : float
-        Stiffness that the robot gives the seat, Nm/rad. Chosen; the dissertation sets twice the
+        Stiffness of the seat by the robot, N m/rad. Chosen; the dissertation sets twice the
         critical stiffness of each subject.
     c_r : float
-        Damping that the robot gives the seat, Nms/rad. Chosen.
+        Damping of the seat by the robot, N m s/rad. Chosen.
     tau_d : float
-        Delay from command to muscle, s. Chosen; 0.06 to 0.1 is plausible.
+        Delay from command to muscle, s. Chosen; plausible range 0.06 to 0.1.
     tau_m : float
         Time constant of the muscle, s. Chosen.
     gravity : float
@@ -111,8 +103,8 @@ class SeatedBalanceParameters(Quantities):
     Raises
     ------
     ValueError
-        When a value is not a finite number in its range: lengths of the upper body, masses,
-        inertias and times are positive, stiffness, damping and gravity are not negative.
+        If a value is not finite or out of range: l2, l12, masses, inertias and times are positive;
+        stiffness, damping and gravity are not negative.
     """
 
     m1: float = quantity(60.6, "kg", "regressed", "3 %", above=0.0)
@@ -133,7 +125,7 @@ class SeatedBalanceParameters(Quantities):
 
 @dataclass(frozen=True)
 class SeatedBalanceLimits(Quantities):
-    """What bounds the motion and the command, each symmetric about upright and rest.
+    """Limits of motion and command, symmetric about upright and rest.
 
     Attributes
     ----------
@@ -144,13 +136,14 @@ class SeatedBalanceLimits(Quantities):
     theta1_rate, theta2_rate : float
         Angular velocities, rad/s. Chosen.
     command : float
-        Lumbar torque, Nm. Chosen: about half of what a man can do sideways (McNeill 1980, low
-        confidence). A perturbation of 5 Nm never reaches it: the saturating benchmark takes 6 Nm.
+        Lumbar torque, N m. Chosen: about half of a man's maximum sideways (McNeill 1980, low
+        confidence). A perturbation of 5 N m never reaches it; the benchmark with saturation uses
+        6 N m.
 
     Raises
     ------
     ValueError
-        When a limit is not a positive finite number.
+        If a limit is not a positive finite number.
     """
 
     theta1: float = quantity(math.radians(12.0), "rad", "measured", above=0.0)

@@ -1,4 +1,4 @@
-"""The seated-balance plant of a person, by the arguments that a configuration file gives.
+"""Seated-balance plant of a person from the arguments in a configuration file.
 
 Body: `plants.anthropometry`, after de Leva 1996. Plant: `plants.seated_balance`.
 """
@@ -23,17 +23,17 @@ __all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_f
 def seated_parameters_for(
     mass: float = 79.7, height: float = 1.66, sex: Sex = "male", **parameters: float
 ) -> SeatedBalanceParameters:
-    """Parameters regressed on body mass (kg), height (m) and sex, but for the `parameters` given.
+    """Parameters from body mass (kg), height (m) and sex, except the given `parameters`.
 
     Raises
     ------
     ValueError
-        When an argument is out of range or no parameter has that name.
+        If an argument is out of range or a name is unknown.
     """
     known = [item.name for item in fields(SeatedBalanceParameters)]
     unknown = [name for name in parameters if name not in known]
     if unknown:
-        raise ValueError(f"{unknown[0]}: is no parameter of the seat; known: {', '.join(known)}")
+        raise ValueError(f"{unknown[0]}: is not a parameter of the seat; use {', '.join(known)}")
     return replace(from_anthropometry(mass, height, sex), **parameters)
 
 
@@ -45,27 +45,27 @@ def seated_balance_for(
     delay_order: int = 5,
     **parameters: float,
 ) -> Any:
-    """Return the plant of a person as a discrete control.StateSpace, with the body that moves.
+    """Return the plant of a person as a discrete control.StateSpace, with its nonlinear body.
 
-    Its parameters, and how well they are known, are those of `SeatedBalanceParameters`.
+    Parameters and their standard deviations are those of `SeatedBalanceParameters`.
 
     Parameters
     ----------
     mass, height : float
-        kg, m.
+        Body mass in kg and height in m.
     sex : {"male", "female"}
-        Whose segments are taken.
+        Sample of body segments.
     sample_time : float
-        s.
+        Sample time in s.
     delay_order : int
-        Of the Padé approximant.
+        Order of the Padé approximant.
     **parameters : float
-        Fields of `SeatedBalanceParameters` that are known better, in their units.
+        Fields of `SeatedBalanceParameters` that replace the regressed values.
 
     Raises
     ------
     ValueError
-        As `seated_parameters_for` and `seated_balance_plant`.
+        See `seated_parameters_for` and `seated_balance_plant`.
     """
     found = seated_parameters_for(mass, height, sex, **parameters)
     system = seated_balance_plant(found, sample_time, delay_order)
@@ -74,7 +74,7 @@ def seated_balance_for(
         step = seated_balance_body(found, sample_time, delay_order)
         return with_linear_part(step, system.A, system.B)
 
-    system.body = body  # a twentieth of a second that the linear plant alone does not take
+    system.body = body  # made only on demand: takes 0.05 s
     return with_uncertainty(system, asdict(found), found.uncertainty)
 
 
@@ -86,22 +86,22 @@ def seated_balance_step_for(
     delay_order: int = 5,
     **parameters: float,
 ) -> ca.Function:
-    """Return one sample of the nonlinear plant of a person, by Runge and Kutta's method.
+    """Return the function of one Runge-Kutta sample of the nonlinear plant of a person.
 
     Parameters
     ----------
     mass, height, sex, sample_time, delay_order, **parameters
-        As in `seated_balance_for`; kg, m and s. The sample is 1 ms by default.
+        See `seated_balance_for`. The default sample time is 1 ms.
 
     Returns
     -------
     casadi.Function
-        (state (5 + delay_order), input (2): command and perturbation in Nm) -> next state.
+        (state (5 + delay_order), input (2): command and perturbation in N m) -> next state.
 
     Raises
     ------
     ValueError
-        As `seated_parameters_for` and `nonlinear_dynamics`.
+        See `seated_parameters_for` and `nonlinear_dynamics`.
     """
     found = seated_parameters_for(mass, height, sex, **parameters)
     return runge_kutta_step(nonlinear_dynamics(found, delay_order), sample_time)

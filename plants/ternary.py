@@ -4,12 +4,12 @@ A register of n stages over the three-element field GF(3) is shifted by
 
     new = c_1 r_1 + c_2 r_2 + ... + c_n r_n   (mod 3),    r_1 the newest stage,
 
-and gives each new value; 0, 1, 2 stand for 0, +1, -1. When x^n - c_1 x^(n-1) - ... - c_n is
-primitive the period is 3^n - 1, the second half of a period is the first with its sign changed,
-and the autocorrelation is zero at every shift that is not a multiple of half a period.
+and outputs each new value; 0, 1, 2 mean 0, +1, -1. If x^n - c_1 x^(n-1) - ... - c_n is primitive,
+the period is 3^n - 1, the second half of a period is the negative of the first, and the
+autocorrelation is zero at every shift that is not a multiple of half a period.
 
 Source: Peterka, J Neurophysiol 88, 2002, whose register of five stages is the default. There the
-sequence is the velocity of a tilting platform; here it is the torque itself.
+sequence is the velocity of a tilting platform; here it is the torque.
 """
 
 from __future__ import annotations
@@ -30,21 +30,20 @@ if TYPE_CHECKING:
 
 __all__ = ["MAX_STAGES", "maximal_recurrence", "ternary_sequence", "ternary_torque"]
 
-# At 24 stages the search takes half a second, and a period lasts 1100 years at a dwell of 0.125 s.
-#: Largest register that is searched for.
+#: Largest number of stages; the search for 24 stages takes half a second.
 MAX_STAGES = 24
 
-# Five stages in posture research: new = r3 - r4 - r5, started at [2 0 2 0 2].
+# Register of Peterka: new = r3 - r4 - r5, started at [2 0 2 0 2].
 _PUBLISHED = {5: (0, 0, 1, 2, 2)}
 
 
 @cache
 def maximal_recurrence(stages: int) -> tuple[int, ...]:
-    """Return the feedback of a register whose period is the greatest, 3^stages - 1.
+    """Return the feedback of a register with the maximal period 3^stages - 1.
 
-    Five stages have Peterka's feedback; for others the first primitive polynomial is taken, in
-    the order of fewest taps, then of their places. Each candidate is proved by the order of its
-    companion matrix: that is 3^stages - 1 exactly when the polynomial is primitive.
+    Five stages have Peterka's feedback; other registers the first primitive polynomial, ordered by
+    number and place of taps. A polynomial is primitive exactly if the order of its companion matrix
+    is 3^stages - 1, which is verified.
 
     Parameters
     ----------
@@ -54,18 +53,18 @@ def maximal_recurrence(stages: int) -> tuple[int, ...]:
     Returns
     -------
     tuple of int
-        c_1 ... c_n in 0, 1, 2, the newest stage first.
+        c_1 ... c_n in 0, 1, 2, newest stage first.
 
     Raises
     ------
     ValueError
-        When the number of stages is out of range.
+        If the number of stages is out of range.
     """
     stages = whole_number("stages", stages, "5 is usual", least=1, most=MAX_STAGES)
     period = 3**stages - 1
     primes = _prime_factors(period)
     candidates = [_PUBLISHED[stages]] if stages in _PUBLISHED else _feedbacks(stages)
-    # Primitive polynomials exist for every degree, so that one is always found.
+    # Primitive polynomials exist for every degree.
     return next(c for c in candidates if _has_order(c, period, primes))
 
 
@@ -81,24 +80,24 @@ def ternary_sequence(
     Parameters
     ----------
     stages : int
-        Stages of the register, from 1 to ``MAX_STAGES``.
+        Number of stages of the register, from 1 to ``MAX_STAGES``.
     length : int, optional
-        Number of values; a whole period, 3^stages - 1, by default.
+        Number of values; default: one period, 3^stages - 1.
     start : sequence of int, optional
-        First contents of the register, newest stage first, each 0, 1 or 2 and not all 0. By
-        default 2, 0, 2, 0, ..., Peterka's.
+        Initial contents of the register, newest stage first, each 0, 1 or 2 and not all 0.
+        Default: 2, 0, 2, 0, ..., as in Peterka.
     seed : int, optional
-        Draws the start instead. Every start lies on the one cycle of the register, so a seed
-        shifts the sequence in time and changes nothing else.
+        Seed of a random start. All starts lie on the same cycle, so a seed only shifts the sequence
+        in time.
 
     Returns
     -------
-    ndarray of int, shape (length,)
+    ndarray of int of shape (length,)
 
     Raises
     ------
     ValueError
-        When an argument is out of range, or both a start and a seed are given.
+        If an argument is out of range, or both a start and a seed are given.
     """
     feedback = maximal_recurrence(stages)
     period = 3**stages - 1
@@ -125,19 +124,19 @@ def ternary_torque(
     start: Sequence[int] | None = None,
     seed: int | None = None,
 ) -> Array:
-    """Sample a ternary torque that is held for ``dwell`` between the steps of its register.
+    """Return samples of a ternary torque with hold time ``dwell``.
 
     The defaults are those of the seated-balance benchmark: 242 steps of 0.125 s, cut at 30 s.
 
     Parameters
     ----------
     amplitude : float
-        Nm, not negative.
+        Amplitude in N m, not negative.
     dwell : float
-        Time in s for which each value is held, at least one sample. It need not be a whole
-        number of samples: sample k has the value at time k / rate.
+        Hold time of each value in s, at least one sample. It need not be a whole number of samples:
+        sample k has the value at time k / rate.
     duration : float
-        s.
+        Duration in s.
     rate : float
         Samples per s.
     stages, start, seed
@@ -146,19 +145,18 @@ def ternary_torque(
     Returns
     -------
     Array
-        Torque in Nm (samples,), samples = round(duration * rate).
+        Torque in N m (samples,), samples = round(duration * rate).
 
     Raises
     ------
     ValueError
-        When an argument is out of range.
+        If an argument is out of range.
     """
     amplitude = finite_number("amplitude", amplitude, "give it in Nm", least=0.0)
     rate = finite_number("rate", rate, "give it in samples per second", above=0.0)
     duration = finite_number("duration", duration, "give a sample or more, in s", least=1.0 / rate)
     dwell = finite_number("dwell", dwell, "hold for a sample or more, in s", least=1.0 / rate)
-    # A step that starts at a sample belongs to it: 1e-9 of a dwell is more than the rounding of
-    # k / (rate dwell) and less than any step of the clock.
+    # 1e-9: a step that starts at a sample belongs to it in spite of rounding of k / (rate dwell).
     steps = np.floor(np.arange(round(duration * rate)) / (rate * dwell) + 1e-9).astype(np.int64)
     sequence = ternary_sequence(stages, int(steps[-1]) + 1, start=start, seed=seed)
     return amplitude * sequence[steps].astype(np.float64)
@@ -181,7 +179,7 @@ def _start(stages: int, start: Sequence[int] | None, seed: int | None) -> list[i
 
 
 def _feedbacks(stages: int) -> Iterator[tuple[int, ...]]:
-    """Every feedback with a tap at the oldest stage, fewest taps first."""
+    """All feedbacks with a tap at the oldest stage, fewest taps first."""
     for taps in range(stages):
         for places in itertools.combinations(range(stages - 1), taps):
             for signs in itertools.product((1, 2), repeat=taps + 1):

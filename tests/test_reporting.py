@@ -1,4 +1,4 @@
-"""What a run leaves behind: figures, page, result.json, and files whole or not at all."""
+"""Reports: figures, page, result.json, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
 
 
 def without_scripts(page: str) -> str:
-    """The page without its scripts, which are those that its policy lets run."""
+    """Page without scripts; all scripts are allowed by its content security policy."""
     found = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     policy = re.findall(r"script-src ([^\"]*)", page)[0].split()
     seals = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in found]
@@ -87,7 +87,7 @@ def test_the_page_needs_nothing_else(page: str) -> None:
 
 
 def test_the_library_of_curves_is_the_one_that_was_looked_at() -> None:
-    """uPlot 1.6.31 as it was published, with its licence beside it."""
+    """uPlot 1.6.31 is unchanged and has its licence."""
     place = Path(impc.reporting.__file__).parent / "vendor"
     files = {path.name: path.read_bytes() for path in place.iterdir()}
     seals = {name: hashlib.sha256(one).hexdigest()[:16] for name, one in files.items()}
@@ -102,7 +102,7 @@ EVIL = '<script>alert("1")</script>&'
 
 
 class Texts(HTMLParser):
-    """The texts of a page as a browser reads them."""
+    """Texts of a page as parsed by a browser."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ def hostile(narrow: bool) -> Figure:
 
 
 def every_block() -> Report:
-    """Each kind of block, each of its texts hostile."""
+    """All kinds of blocks with hostile texts."""
     lines = (EVIL, Markup("<code>{}</code>").format(EVIL))
     alert = Alert(Level.AMBER, EVIL, EVIL, EVIL, (EVIL,))
     blocks: tuple[Block, ...] = (
@@ -176,7 +176,7 @@ def test_every_block_is_escaped_and_there() -> None:
 
 
 def test_a_drawing_follows_the_page_and_stands_alone() -> None:
-    """Its colours are variables on the page, and colours in the file; the same bytes each time."""
+    """Colours are variables on the page and values in the file; output is reproducible."""
     report = every_block()
     page, files = report.page(), report.files(pdf=True)
     svg = files[f"figures/{EVIL}.svg"].decode()

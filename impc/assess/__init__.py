@@ -1,1 +1,1 @@
-"""What one more function says of an estimate: agreement, intervals, sets of weights, intent."""
+"""Assessment of estimates: goodness of fit, intervals, sets of weights, intent."""

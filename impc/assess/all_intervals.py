@@ -1,8 +1,8 @@
-"""How far the numbers of a fit can be trusted: what came from the recordings and what did not.
+"""Uncertainty of a fit: intervals of all requested kinds and the set of weights.
 
-Always: intervals of the gain and the parameters from their covariance, and the set of weights with
-the fitted gain. When the settings ask for them: bootstrap, profile likelihoods, the input limit as
-an unknown, other horizons (docs/fitting.md, docs/what-may-be-concluded.md).
+Always: intervals of gain and parameters from their covariance, and the weights with the fitted
+gain. On request: bootstrap, profile likelihoods, input limit, other horizons
+(docs/why/intervals.md).
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-#: (stage, compute, default) -> what it finds, or the default where it fails.
+#: (stage, compute, default) -> result, or the default if it fails.
 Attempt = Callable[[str, Callable[[], Any], Any], Any]
 
 
 class Asked(Protocol):
-    """What of all this is wanted: the part of a fit's settings that is read here."""
+    """Requested analyses: the part of the fit settings that this module reads."""
 
     @property
     def replicates(self) -> int:
@@ -48,35 +48,35 @@ class Asked(Protocol):
 
     @property
     def seed(self) -> int:
-        """Of the bootstrap."""
+        """Seed of the bootstrap."""
 
     @property
     def profiles(self) -> Sequence[str]:
-        """Names of the numbers whose profile likelihood is wanted."""
+        """Names of the numbers to profile."""
 
     @property
     def unknown_limit(self) -> bool:
-        """Whether the limit of each input is estimated too."""
+        """Whether to estimate the limit of each input."""
 
     @property
     def horizons(self) -> Sequence[int]:
-        """Other horizons to compare with, in samples."""
+        """Other horizons to compare, in samples."""
 
     @property
     def settle(self) -> float:
-        """Time at the start of a trial that does not count, s."""
+        """Time at the start of a held-out trial that serves to fit its initial state, s."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What is known beside the fit itself."""
+    """Results of all requested analyses."""
 
-    intervals: tuple[Interval, ...]  # By every method that was asked for; the sandwich's come first
-    # The set of weights with the fitted gain; None when its programs fail
+    intervals: tuple[Interval, ...]  # By every requested method; sandwich intervals first
+    # Set of weights with the fitted gain; None if its programs fail
     weights: WeightsSummary | None
-    weights_reason: str  # Why there is none; empty otherwise
-    limits: tuple[LimitEstimate, ...]  # One an input, when asked for
-    # Other horizons and no limit, when horizons are given; the fit itself comes first
+    weights_reason: str  # Why there is none; otherwise empty
+    limits: tuple[LimitEstimate, ...]  # One per input, if requested
+    # The fit itself, no limit, other horizons; empty unless requested
     alternatives: tuple[Alternative, ...]
 
 
@@ -103,7 +103,7 @@ def assess(
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
     attempt: Attempt,
 ) -> Uncertainty:
-    """Run what the settings ask for."""
+    """Run the requested analyses."""
     intervals = list(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     require_numbers(estimate, settings.profiles)
     for name in settings.profiles:

@@ -1,12 +1,8 @@
-"""What is said of every estimate, whatever its method: one function each, in one list.
+"""Registry of the measures computed for every estimate, independent of its method.
 
-`impc fit`, `impc compare`, `impc cohort` and `impc.report` show them in their tables and write them
-into result.json under `methods.<method>.<assessment>` (docs/results.md). What takes a fit of its
-own (intervals, other horizons) is asked for in the settings of a fit, and stands in
-`impc.assess.all_intervals`.
-
-Their measures are those of docs/comparing.md: VAF (3.24), largest input, share of samples beyond a
-bound.
+`impc fit`, `impc compare`, `impc cohort` and `impc.report` print them in their tables and write
+them to result.json under `methods.<method>.<assessment>` (docs/ref/results.md). For analyses that
+need further fits (intervals, other horizons) see `impc.assess.all_intervals`.
 """
 
 from __future__ import annotations
@@ -35,24 +31,23 @@ if TYPE_CHECKING:
 class MethodFit(Frozen):
     """One method on all recordings."""
 
-    estimate: Estimate  # What it found; its problem has the bounds that the method knows
-    bounds: Bounds  # Those of the subject
-    runs: tuple[Simulation, ...]  # One a trial; empty without a gain
-    vaf: Array  # (3.24) over all trials, % (p,); NaN when a simulation does not reach the end
-    trial_vaf: Array  # (trials, p), the same for each
-    # (trials, p), VAF of each trial predicted from the others; NaN where there is no gain or the
-    # simulation ends early; (0, p) where none was left out, as `evaluate_method` has it
+    estimate: Estimate  # Estimate; its problem has the bounds that the method uses
+    bounds: Bounds  # Bounds of the subject
+    runs: tuple[Simulation, ...]  # One per trial; empty without a gain
+    vaf: Array  # (3.24) over all trials, % (p,); NaN if a simulation stops early
+    trial_vaf: Array  # (trials, p), per trial
+    # (trials, p), VAF of each trial predicted from the others; NaN without a gain or if the
+    # simulation stops early; (0, p) if not computed, as by `evaluate_method`
     held_out: Array
     largest_input: Array  # Largest magnitude of each input (m,)
-    # Share of the samples that were reached at which an input bound is exceeded, by more than 1e-6
-    # of it
+    # Share of simulated samples that exceed an input bound by more than 1e-6 of it
     exceeded: float
-    # For each trial the time in s at which the loop left every reasonable range
+    # Time in s at which the simulation of each trial stopped early; None if complete
     fell: tuple[float | None, ...]
 
     @property
     def name(self) -> str:
-        """Of the method."""
+        """Name of the method."""
         return self.estimate.method
 
     @property
@@ -62,13 +57,13 @@ class MethodFit(Frozen):
 
     @property
     def commands(self) -> Array:
-        """Those of all samples that were reached (samples, m), in the units of the inputs."""
+        """Commands of all simulated samples (samples, m), in input units."""
         none = np.empty((0, self.estimate.problem.plant.m))
         return np.concatenate([none, *(run.applied for run in self.runs)])
 
 
 def evaluate_method(estimate: Estimate, bounds: Bounds) -> MethodFit:
-    """Simulate all recordings with what a method found."""
+    """Simulate all recordings with an estimate."""
     problem = estimate.problem
     if estimate.K is None:
         return _without_gain(estimate, bounds)
@@ -123,28 +118,27 @@ def _pooled_vaf(problem: Problem, runs: tuple[Simulation, ...]) -> Array:
 
 @dataclass(frozen=True)
 class Assessment:
-    """One function of a method's estimate and its simulation of all trials (docs/results.md)."""
+    """One measure of an estimate and its simulation of all trials (docs/ref/results.md)."""
 
-    name: str  # In result.json and in the heads of CSV files
-    sentence: str  # For readers who do not know it
-    # Plant -> names of what it has a number for, (k,): outputs, inputs, or `whole` for one number
-    # of the method
+    name: str  # Key in result.json and head of CSV columns
+    sentence: str  # Explanation for readers who do not know it
+    # Plant -> names of the k signals with a value: outputs, inputs, or `whole` for a single value
     signals: Callable[[Plant], tuple[str, ...]]
-    find: Callable[[MethodFit], Array]  # MethodFit -> the numbers (k,); NaN where there is none
+    find: Callable[[MethodFit], Array]  # MethodFit -> values (k,); NaN if undefined
 
     def keys(self, plant: Plant) -> list[str]:
-        """Heads of its columns in a table."""
+        """Column names in a table."""
         return [f"{self.name}_{name}".rstrip("_") for name in self.signals(plant)]
 
 
 def _held_out(fit: MethodFit) -> Array:
-    """Mean over trials."""
+    """Mean over held-out trials."""
     missing = np.full(fit.vaf.shape, np.nan)
     return np.mean(fit.held_out, axis=0) if len(fit.held_out) else missing
 
 
 def whole(_: Plant) -> tuple[str, ...]:
-    """One number for the method."""
+    """A single value for the method."""
     return ("",)
 
 
@@ -157,7 +151,7 @@ def _condition(fit: MethodFit) -> Array:
     return np.array([np.nan if weights is None else condition_number(weights)])
 
 
-#: By name, in the order of the tables.
+#: Measures by name, in the order of the tables.
 ASSESSMENTS: dict[str, Assessment] = {
     item.name: item
     for item in (
@@ -169,8 +163,8 @@ ASSESSMENTS: dict[str, Assessment] = {
         ),
         Assessment(
             "held_out_vaf",
-            "VAF of each trial predicted from the others, after the time that serves to find where "
-            "it starts; the mean over trials, %.",
+            "VAF of each trial predicted from the other trials, without the first part of the "
+            "trial, which serves to estimate its initial state; mean over trials, %.",
             lambda plant: plant.outputs,
             _held_out,
         ),
@@ -188,7 +182,7 @@ ASSESSMENTS: dict[str, Assessment] = {
         ),
         Assessment(
             "first_fall",
-            "Time at which the first of the trials leaves every reasonable range, s.",
+            "Time at which the first simulated trial stops before its end, s.",
             whole,
             _first_fall,
         ),
@@ -203,7 +197,7 @@ ASSESSMENTS: dict[str, Assessment] = {
 
 
 def assessed(fit: MethodFit) -> Mapping[str, dict[str, float] | float]:
-    """Every assessment of a method by its name: a number, or a number for each signal by name."""
+    """All measures of a method by name: a number, or one number per signal."""
     plant = fit.estimate.problem.plant
     found: dict[str, dict[str, float] | float] = {}
     for item in ASSESSMENTS.values():

@@ -1,19 +1,17 @@
-"""The set of all weights with a given gain and a condition number up to a limit.
+"""Set of all weights with a given gain and a bounded condition number.
 
-    { X = blkdiag(Q, R) : X in the fibre of the gain,  trace R = m,  kappa(X) <= limit }
+    { X = blkdiag(Q, R) : X in the space of the gain,  trace R = m,  kappa(X) <= limit }
 
-is convex: kappa(X) <= limit says that some t has  t I <= X <= limit t I.  Nothing that the
-recordings say of the weights can be finer than this set (docs/equivalent-weights.md, section 2).
-A linear function of the weights (an entry, a difference of two cost weights) has a range over the
-set that two semidefinite programs find, so that a statement such as "the cost weight of x_1 is
-above that of x_2" holds for every member, or for none, or for some. Each end has a member that is
-there, and a proof that none is beyond.
+is convex: kappa(X) <= limit means that t I <= X <= limit t I for some t. Recordings cannot identify
+the weights beyond this set (docs/why/equivalent_weights.md). A linear function of the weights (an
+entry, a difference of two costs) has a range over the set that two semidefinite programs compute,
+so that a statement such as "x_1 costs more than x_2" holds for every member, none, or some. Each
+end has a member that attains it and a proof that no member lies beyond.
 
-They are written as seen from the analytic centre LL' of the fibre, L^-1 X L^-T, in which
-tr(L^-1 X L^-T) is the same for every X of one scale: all members lie within n + m of it, which
-bounds the variables and makes the dual bounds proofs (`solve_semidefinite`). As seen from the
-member of least condition number, a corner of the cone, members of the seat's set lie at 2e4 and
-farther: what the programs then returned was 1.4e-3 from the optimum and called solved.
+The programs use the coordinates L^-1 X L^-T of the analytic centre LL', in which tr(L^-1 X L^-T) is
+the same for every X of one scale. All members then lie within n + m of it, which bounds the
+variables and makes the dual bounds proofs (`solve_semidefinite`). In the coordinates of the
+least-condition member, members lie so far out that the programs are inaccurate.
 """
 
 from __future__ import annotations
@@ -42,27 +40,27 @@ if TYPE_CHECKING:
     from impc.inverse.solution_set import GainFibre
     from impc.model.weights import Weights
 
-# Relative gap of the programs, and share of the way by which their points may be drawn too far.
+# Relative gap of the programs, and tolerance of the step back into the set.
 _GAP, _CLOSE = 1e-10, 1e-11
 
 
 @dataclass(frozen=True)
 class WeightsSet(Frozen):
-    """The set of the module's text, ready for programs over it."""
+    """Set of weights, ready for programs over it."""
 
     fibre: GainFibre
-    least: EquivalentWeights  # The member of least condition number
+    least: EquivalentWeights  # Member of least condition number
     limit: float  # Largest condition number in the set
-    # blkdiag(Q, R) = first + sum_i y_i level_i spans the members: (n + m, n + m) and (k, n + m, n +
-    # m), the levels orthonormal as seen from the analytic centre
+    # Members are blkdiag(Q, R) = first + sum_i y_i level_i, (n + m, n + m) and (k, n + m, n + m),
+    # levels orthonormal in the coordinates of the centre
     first: Array
     level: Array
-    inverse: Array  # L^-1 of that centre, (n + m, n + m)
-    reach: float  # No member has a larger |y|
+    inverse: Array  # L^-1 of the centre, (n + m, n + m)
+    reach: float  # Upper bound of |y| over all members
 
     @cached_property
     def cones(self) -> list[Cone]:
-        """t l I <= X <= limit t l I in the variables (y, t), with l I at most I as seen."""
+        """t l I <= X <= limit t l I in the variables (y, t), with scaling l."""
         n, size = self.fibre.plant.n, len(self.first)
         seen_first = self.inverse @ self.first @ self.inverse.T
         seen = self.inverse @ self.level @ self.inverse.T
@@ -83,12 +81,12 @@ class WeightsSet(Frozen):
 def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -> WeightsSet:
     """Prepare the set of weights with condition number up to `ratio` times the least."""
     if not 1 < ratio < np.inf:
-        raise InputError("ratio", f"got {ratio}", "give a number above 1")
+        raise InputError("ratio", f"expected a number above 1, got {ratio}", "pass e.g. ratio=10")
     least = least_condition_weights(fibre, rough=rough)
     n, m = fibre.plant.n, fibre.plant.m
     try:
         centre = analytic_centre(fibre).weights
-    except WeightsError:  # the cost on some combination of states is free but for the limit
+    except WeightsError:  # some combination of states has a free cost
         centre = None
     view = least.weights if centre is None else centre
     inverse = inverse_factor(fibre, view)
@@ -108,7 +106,7 @@ def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -
 
 
 def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
-    """Largest tr(L^-1 X L^-T) of a semidefinite X with trace R = m; `raw` is orthonormal as seen.
+    """Largest tr(L^-1 X L^-T) of a semidefinite X with trace R = m; `raw` is orthonormal.
 
     At the analytic centre it is alpha tr(G'RG) for all X = sum c_k raw_k, up to an error e'c of the
     centre; |c| is at most that trace again, and tr(G'RG) at most m times the largest value of GG'.
@@ -120,40 +118,42 @@ def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
     error = float(np.linalg.norm(seen - alpha * scale))
     if error >= 0.5:
         raise SolverError(
-            "analytic centre", f"is off by {error:.2g} of a trace", "scale the states and inputs"
+            "analytic centre",
+            f"not accurate enough (relative error {error:.2g})",
+            "rescale the states and inputs",
         )
     return alpha * m * float(np.linalg.norm(fibre.G, 2)) ** 2 / (1 - error)
 
 
 @dataclass(frozen=True)
 class End:
-    """The member at which a program ends, its value, and what no member goes beyond."""
+    """End of a range: member, value, and bound over all members."""
 
-    value: float  # Of the function at the member
-    weights: Weights  # The member, at trace R = m
+    value: float  # Value of the function at the member
+    weights: Weights  # Member, at trace R = m
     prove: Callable[[], float]  # Computes `bound`
 
     @cached_property
     def bound(self) -> float:
-        """What no member goes beyond, from the dual program."""
+        """Bound that no member exceeds, from the dual program."""
         return self.prove()
 
 
 @dataclass(frozen=True)
 class Range:
-    """Least and largest value of a linear function over the set, each with a member that has it."""
+    """Least and largest value of a linear function over the set."""
 
     least: End
     most: End
 
     @property
     def low(self) -> float:
-        """The least value."""
+        """Least value."""
         return self.least.value
 
     @property
     def high(self) -> float:
-        """The largest value."""
+        """Largest value."""
         return self.most.value
 
 
@@ -161,7 +161,7 @@ class Range:
 def linear_ranges(
     found: WeightsSet, directions: Array, *, tolerance: float = _GAP
 ) -> tuple[Range, ...]:
-    """Range over the set of each trace(direction blkdiag(Q, R)); `directions` (k, n + m, n + m)."""
+    """Range over the set of trace(direction X) for `directions` (k, n + m, n + m)."""
     ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
     half = len(directions)
     return tuple(
@@ -173,7 +173,7 @@ def linear_ranges(
 def linear_maxima(
     found: WeightsSet, directions: Array, *, tolerance: float = _GAP
 ) -> tuple[End, ...]:
-    """Largest value over the set of each trace(direction blkdiag(Q, R))."""
+    """Largest value over the set of each trace(direction X)."""
     return tuple(_negative(end) for end in _minima(found, -directions, tolerance))
 
 
@@ -181,7 +181,7 @@ def linear_maxima(
 def entry_ranges(
     found: WeightsSet, states: Sequence[int] | None = None
 ) -> dict[tuple[int, int], Range]:
-    """Range of every entry Q_ij, i >= j, of the given states (indices), of all by default."""
+    """Range of every entry Q_ij, i >= j, of the given state indices (default: all)."""
     size = len(found.first)
     chosen = sorted(range(found.fibre.plant.n) if states is None else states)
     pairs = [(i, j) for position, i in enumerate(chosen) for j in chosen[: position + 1]]
@@ -192,12 +192,12 @@ def entry_ranges(
 
 
 def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]:
-    """Ends of least trace(direction X), of directions (k, n + m, n + m)."""
+    """Members of least trace(direction X), for directions (k, n + m, n + m)."""
     ends = [_same_for_all(found, direction) for direction in directions]
     slopes = np.tensordot(directions, found.level, ([1, 2], [1, 2]))
     scales = np.linalg.norm(slopes, axis=1)
     identified = np.flatnonzero(scales)
-    if len(identified) == 0:  # or there is but one member
+    if len(identified) == 0:  # constant, or a single member
         return ends
     objectives = np.pad(slopes[identified] / scales[identified, None], ((0, 0), (0, 1)))
     each = solve_each(
@@ -230,7 +230,7 @@ def _bound(constant: float, scale: float, solved: SemidefiniteSolution) -> float
 
 
 def _member(found: WeightsSet, y: Array) -> Array:
-    """The point of a program, drawn towards the centre until it is a member beyond doubt."""
+    """Solution of a program, moved towards the centre until it is certainly a member."""
     X = found.first + np.tensordot(y[: len(found.level)], found.level, 1)
     X = (X + X.T) / 2
     n = found.fibre.plant.n
@@ -241,13 +241,13 @@ def _member(found: WeightsSet, y: Array) -> Array:
         return np.asarray(centre + share * (X - centre))
 
     def room(share: float) -> float:
-        """What the limit leaves, as `condition_number` sees it: concave along the segment."""
+        """Slack of the condition number: concave along the segment."""
         values = np.linalg.eigvalsh(at(share))
         return found.limit * float(values[0]) - float(values[-1])
 
     if room(1.0) >= 0:
         return at(1.0)
-    if room(0.0) <= 0:  # no other is a member
+    if room(0.0) <= 0:  # the centre is the only member
         return at(0.0)
     share, back = float(scipy.optimize.brentq(room, 0.0, 1.0, xtol=_CLOSE)), _CLOSE
     while room(share) < 0:

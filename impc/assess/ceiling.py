@@ -1,12 +1,12 @@
-"""The part of a movement that repeats: what any deterministic controller can explain at most.
+"""Noise ceiling: the largest VAF that a deterministic controller can reach.
 
-Where a perturbation comes again, in other trials or as a periodic one in the same, a controller
-without noise of its own does the same each time. With R repetitions y_rt of n samples the noise has
-the variance of what differs between them, and the ceiling of the VAF (3.24) is
+If a perturbation repeats, across trials or periodically within one, a noise-free controller
+responds identically each time. With R repetitions y_rt of n samples, the variance between them
+estimates the noise, and the ceiling of the VAF (3.24) is
 
     1 - s^2 / mean y^2,      s^2 = sum_rt (y_rt - mean_r y_rt)^2 / (n (R - 1)).
 
-The interval follows from how s^2 scatters over pieces of time, which are taken as independent.
+The interval follows from the scatter of s^2 over pieces of time, assumed independent.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.recordings import Recording
 
-# Perturbations are the same up to this share of their size: that of a recorded torque's noise.
+# Relative difference up to which perturbations are equal: noise of a recorded torque.
 _SAME = 0.02
-# Pieces of time, at least so many samples long each; fewer of them give no interval.
+# Pieces of time, least samples per piece, and least number of pieces for an interval.
 _PIECES, _SHORTEST, _FEWEST = 20, 25, 5
 
 
 @dataclass(frozen=True)
 class Ceiling(Frozen):
-    """The largest VAF of each output that a controller without noise can have."""
+    """Largest VAF of each output that a noise-free controller can reach."""
 
     vaf: Array  # % (p,)
-    low: Array  # Ends at 95 % (p,)
+    low: Array  # 95 % interval (p,)
     high: Array
-    repetitions: int  # Of the perturbation, in all
+    repetitions: int  # Repetitions of the perturbation in total
 
 
 def ceiling(problem: Problem, settle: float) -> Ceiling | None:
-    """The ceiling of recordings whose perturbation repeats; None where it does not.
+    """Noise ceiling of recordings with a repeated perturbation; None without repetition.
 
-    The first `settle` seconds of each trial do not count: there it comes from another state.
+    The first `settle` seconds of each trial are excluded: its initial state differs.
     """
     first = round(settle / problem.plant.dt)
     groups = [_repetitions(group, first) for group in _alike(problem.recordings, first)]
@@ -65,7 +65,7 @@ def ceiling(problem: Problem, settle: float) -> Ceiling | None:
 
 
 def _alike(recordings: Sequence[Recording], first: int) -> list[list[Recording]]:
-    """The recordings in groups of the same drive, as far as all of a group last."""
+    """Groups of recordings with the same driving signals, over their common length."""
     groups: list[list[Recording]] = []
     for trial in recordings:
         if trial.has_gaps or trial.samples <= first or not np.any(_drive(trial)):
@@ -80,7 +80,7 @@ def _alike(recordings: Sequence[Recording], first: int) -> list[list[Recording]]
 
 
 def _drive(trial: Recording) -> Array:
-    """What moves the person (samples, d + targets)."""
+    """Driving signals: disturbances and targets (samples, d + targets)."""
     return np.hstack([trial.disturbance, trial.target])
 
 
@@ -93,7 +93,7 @@ def _same(one: Array, other: Array) -> bool:
 
 
 def _repetitions(group: list[Recording], first: int) -> list[Array]:
-    """Outputs (samples, p) of each repetition: the trials, or the periods of them all."""
+    """Outputs (samples, p) of each repetition: trials, or periods of all trials."""
     samples = min(trial.samples for trial in group)
     period = _period(_drive(group[0])[:samples])
     outputs = [trial.without_offset[:samples] for trial in group]
@@ -105,10 +105,9 @@ def _repetitions(group: list[Recording], first: int) -> list[Array]:
 
 
 def _period(drive: Array) -> int | None:
-    """Samples after which a drive repeats, at least `_SHORTEST`; None where it does not.
+    """Period of a signal in samples, at least `_SHORTEST`; None if it does not repeat.
 
-    Of every lag at once: the squares of what differs are those of both parts less twice their
-    correlation.
+    All lags at once: squared differences are both parts' squares minus twice the correlation.
     """
     moving, n = drive - drive.mean(axis=0), len(drive)
     size = np.linalg.norm(moving, axis=0)
@@ -127,7 +126,7 @@ def _period(drive: Array) -> int | None:
 
 
 def _sums(group: list[Array]) -> list[Array]:
-    """Squares of what differs, as noise, and of all, summed in pieces of time (2, p) each."""
+    """Squared differences (as noise) and squares, summed over pieces of time, (2, p) each."""
     outputs = np.stack(group)
     apart = outputs - outputs.mean(axis=0)
     count = int(np.clip(outputs.shape[1] // _SHORTEST, 1, _PIECES))

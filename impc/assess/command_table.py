@@ -1,4 +1,4 @@
-"""The gain of a fit beside the one by regression on recorded commands, with its intervals."""
+"""Fitted gain next to the gain by regression on recorded commands, with intervals."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ if TYPE_CHECKING:
 
 @checked
 def command_regression(estimate: Estimate) -> pd.DataFrame:
-    """Gain by regression of recorded commands on the states, with 95 % intervals, beside a fit's.
+    """Compare a fitted gain with the gain by regression on recorded commands.
 
-    Only samples count at which the fitted controller meets no bound within its horizon. The
-    intervals are for recording noise of the commands of any colour, and for noise of the person
-    that is white: the states follow any other. Noise in recorded states makes this gain too small.
-    Where the two differ by much, an assumption of one fails (docs/fitting.md).
+    Only samples count at which the fitted controller has no active bound over its horizon. The 95 %
+    intervals assume recording noise in the commands (any autocorrelation) and white noise of the
+    subject; coloured noise is correlated with the states and biases them. Noise in recorded states
+    shrinks the regression gain. If both gains differ by much, an assumption of one of them fails.
 
     Parameters
     ----------
     estimate : Estimate
-        Of recordings with commands.
+        Fit of recordings with commands.
 
     Returns
     -------
     pandas.DataFrame
-        A row for each entry of the gain, by name: `unit`, `fitted`, `regression`, `low`, `high`.
+        One row per entry of the gain, by name: `unit`, `fitted`, `regression`, `low`, `high`.
 
     Raises
     ------
     DataError
-        When no commands were recorded.
+        If no commands were recorded.
     SolverError
-        When the samples without a bound do not determine a gain, or the plant does not follow its
-        commands.
+        If the samples with inactive bounds do not determine a gain, or the plant driven by the
+        commands does not follow the recordings.
 
     Examples
     --------
@@ -59,13 +59,13 @@ def command_regression(estimate: Estimate) -> pd.DataFrame:
     >>> impc.command_regression(found).round(3).loc["K.u[0].x[0]", "regression"]
     np.float64(0.538)
     """
-    import pandas as pd  # noqa: PLC0415  # a third of a second
+    import pandas as pd  # noqa: PLC0415
 
     plant = estimate.problem.plant
     found = regress_commands(estimate.problem, estimate.gain, estimate.metric)
     table = np.concatenate(found.deviations)
     inverse = np.linalg.inv(table.T @ table)
-    # Row t of the sum is (1 (x) x_t (X'X)^-1), an entry of K by an entry of the residual.
+    # Row t of the sum is (1 (x) x_t (X'X)^-1): an entry of K by an entry of the residual.
     along = [np.einsum("tn,ij->tijn", part @ inverse, np.eye(plant.m)) for part in found.deviations]
     columns = [part.reshape(len(part), plant.m, -1) for part in along]
     spread = spread_of_sum(residual_noise(found.residuals), columns)

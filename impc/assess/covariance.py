@@ -1,22 +1,20 @@
-"""How far a fitted gain is determined: standard deviations under noise of any colour.
+"""Covariance of a fitted gain under autocorrelated noise (sandwich estimator).
 
 To first order a least-squares estimate under stationary noise e_t has the covariance (White 1980,
-Newey and West 1987: the "sandwich", here with a Jacobian that is known; docs/fitting.md)
+Newey and West 1987: HAC or "sandwich"; docs/why/intervals.md)
 
     H^-1 cov( sum_t J_t' e_t ) H^-1,     H = sum_t J_t' J_t,
 
-J_t being the derivative of the outputs at sample t with respect to everything that was fitted, and
-the middle as `residual_noise` estimates it from the residuals. With white noise it is the
-Cramér-Rao bound.
+where J_t is the derivative of the outputs at sample t by all fitted quantities, and the middle is
+estimated from the residuals by `residual_noise`. With white noise it is the Cramér-Rao bound.
 
-Beside the gain everything else that was fitted is unknown: initial states, physical parameters
-and, for several inputs, the metric S, which is independent of the gain. The prior of a search
-(`fit_gain`) is left out: the result says what the recordings determine, and in a direction that
-they hardly do it is wide. What has a stated uncertainty keeps its prior, as rows below those that
-were recorded, J_0 = s / deviation with white noise s of their own (docs/fitting.md).
+Fitted with the gain are initial states, physical parameters and, with several inputs, the metric S.
+The prior of the search (`fit_gain`) is left out, so that unidentified directions have wide
+intervals. Parameters with a stated uncertainty keep their prior as further rows
+J_0 = s / SD with white noise s.
 
-To first order a direction that is not identified has no part in those that are; to second order it
-has, and it may be wrong by as much as a gain can be. `curvature` adds that (docs/fitting.md).
+To first order unidentified directions do not affect the identified ones; `curvature` adds their
+second-order effect, with errors up to one whitened unit.
 """
 
 from __future__ import annotations
@@ -43,18 +41,16 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-#: A direction with a larger deviation, of the natural size of a gain, is not identified: there the
-#: prior
-#: of a search and the curvature of the problem count beside the recordings.
+#: Largest standard error, in whitened units, of an identified direction. Beyond it the prior of the
+#: search and the curvature of the problem matter.
 IDENTIFIED = 0.2
-#: An entry is individually identified when what is not identified could move it by less than this
-#: share of its
-#: deviation, were it wrong by the natural size of a gain. Of 275 intervals of carts with three
-#: inputs (VAF 70 %) for which that share was .2 to .25, and not in the deviation, 90 % held.
+#: An entry is individually identified if an error of one whitened unit in all unidentified
+#: directions shifts it by less than this share of its standard error. At shares of 0.2 to 0.25, 90
+#: % of 275 intervals covered the true value (carts with three inputs, VAF 70 %).
 FOREIGN = 0.2
-#: An interval of 95 % of a normal number is so many deviations on either side.
+#: Half width of a 95 % normal interval in standard errors.
 TWO_SIDED = 1.959964
-# Of an entry's natural size: a smaller share in a direction is rounding's.
+# Share of the norm of an entry in a direction, below which it is rounding.
 _SHARE = 1e-6
 _SEEN = 1e-10
 _STEPS = (1.0, 0.5, 0.25, 0.125)
@@ -62,54 +58,50 @@ _STEPS = (1.0, 0.5, 0.25, 0.125)
 
 @dataclass(frozen=True)
 class GainCovariance(Frozen):
-    """What the recordings say of the gain at a fit.
+    """Covariance of the gain at a fit.
 
-    Directions are of the gain in natural coordinates, G^-1 K T with x = T z and u = G v, row by row
-    (`gain_fibre`): a step of 1 moves the command by one unit of the white input noise that T stands
-    for. No optimal gain is far beyond 1 on this scale.
+    Directions are those of the gain in whitened coordinates, G^-1 K T with x = T z and u = G v, row
+    by row (`gain_fibre`): a unit step moves the command by one SD of the white input noise that
+    defines T. Optimal gains are of order 1 on this scale.
     """
 
-    T: Array  # Natural coordinates of states (n, n) and inputs (m, m)
+    T: Array  # Whitened coordinates of states (n, n) and inputs (m, m)
     G: Array
-    # Of the scaled residual's derivative with respect to G^-1 K T, once everything else has taken
-    # what it can; largest first (m * n,)
+    # Of the derivative by G^-1 K T after projection on all other unknowns, largest first (m * n,)
     singular_values: Array
     directions: Array  # Right singular vectors, one a row (m * n, m * n)
-    # Standard deviation along each direction (m * n,); infinite below 1e-6 of the largest singular
+    # Standard error along each direction (m * n,); infinite below 1e-6 of the largest singular
     # value
     deviations: Array
-    # Standard deviation of each entry of K (m, n), in its unit; infinite when a direction without a
-    # value takes part in it
+    # Standard error of each entry of K (m, n), in its unit; infinite if a direction without a value
+    # contributes
     entries: Array
-    # What the directions that are not identified could move each entry by, were they wrong by the
-    # natural size of a gain, over its deviation by those that are (m, n)
+    # Shift of each entry by an error of one whitened unit in all unidentified directions, over its
+    # standard error from the identified ones (m, n)
     foreign: Array
-    parameters: Array  # Standard deviation of the logarithm of each physical parameter (k,)
-    # Of the variance of each entry, what each parameter with a stated uncertainty causes (m, n, k)
+    parameters: Array  # Standard error of the log of each parameter (k,)
+    # Share of the variance of each entry due to each parameter with a stated uncertainty (m, n, k)
     shares: Array
-    noise: ResidualNoise  # The colour of the residuals
-    spread: Array  # Covariance of steps along the directions with a finite deviation (k, k)
+    noise: ResidualNoise  # Autocorrelation model of the residuals
+    spread: Array  # Covariance of steps along directions with a finite value (k, k)
 
     def along(self, step: Array) -> Array:
-        """A step of the gain (m, n) as steps along the directions (m * n,)."""
+        """Coordinates of a gain step (m, n) along the directions (m * n,)."""
         return np.asarray(self.directions @ np.ravel(np.linalg.solve(self.G, step @ self.T)))
 
     def combinations(self, rows: Array) -> tuple[Array, Array]:
-        """Standard deviations of linear combinations of the entries, and what is foreign (k,).
-
-        `rows` (k, m * n): factors of the entries of K, row by row. As `entries` and `foreign`.
-        """
+        """Standard errors (k,) of combinations `rows` (k, m * n) of entries, and `foreign`."""
         back = rows @ np.kron(self.G, np.linalg.inv(self.T).T) @ self.directions.T
         return _entries(back, self.deviations, self.spread)
 
     @property
     def identified(self) -> BoolArray:
-        """Which directions the recordings identify (m * n,)."""
+        """Mask of the identified directions (m * n,)."""
         return np.asarray(self.deviations < IDENTIFIED)
 
     @property
     def individually_identified(self) -> BoolArray:
-        """Which entries of K they identify individually, not only with others (m, n)."""
+        """Mask of the individually identified entries of K (m, n)."""
         return np.asarray(self.foreign < FOREIGN)
 
 
@@ -125,7 +117,7 @@ def gain_covariance(
 ) -> GainCovariance:
     """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
 
-    The `scale` is the deviation of the noise, that of the residual if omitted.
+    `scale` is the noise SD; None: that of the residual.
     """
     m, n = problem.plant.m, problem.plant.n
     T, G = natural_coordinates(problem.plant, gain)
@@ -136,8 +128,8 @@ def gain_covariance(
     in_units = np.kron(G, np.linalg.inv(T).T)
     on_gain = found.dK.reshape(-1, m * n) @ in_units
     metric_columns = _identified_metric(found.along_metric(metric, metric_directions(metric)))
-    # What the rest can explain is taken out of the gain's columns; the gain's
-    # block of the inverse of H is that of what is left.
+    # Project the gain columns on the complement of the others: this gives the block of the inverse
+    # of H.
     rest = _span(problem, found, metric_columns, found.dparameters)
     others = _span(problem, found, on_gain, metric_columns)
     seen = rest.without(on_gain)
@@ -180,7 +172,7 @@ def gain_covariance(
 
 
 def spread_of_rows(problem: Problem, noise: ResidualNoise, columns: Array, scale: float) -> Array:
-    """Covariance of columns' e (k, k): noise of its colour, and white of `scale` in prior rows."""
+    """Covariance of columns' e (k, k): coloured noise, white of SD `scale` in prior rows."""
     below = columns[sum(problem.trial_sizes) :]
     return spread_of_sum(noise, by_trial(problem, columns)) + scale**2 * below.T @ below
 
@@ -188,9 +180,9 @@ def spread_of_rows(problem: Problem, noise: ResidualNoise, columns: Array, scale
 def _shares(along: Array, back: Array) -> Array:
     """Share of each parameter in the variance of each entry (entries, k), for white noise.
 
-    `along` (r, d + k) are derivatives along d directions of the gain and by k parameters; `back`
-    (entries, d). By how much the variance would fall, were that parameter known, all others as they
-    are.
+    By how much the variance would decrease if that parameter were known, the others unchanged.
+    `along` (r, d + k): derivatives along d gain directions and by k parameters; `back` (entries,
+    d).
     """
     size, d = np.linalg.norm(along, axis=0), back.shape[1]
     size[size == 0] = 1.0
@@ -202,10 +194,9 @@ def _shares(along: Array, back: Array) -> Array:
 
 
 def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array:
-    """What steps of the gain (k, m, n), forth and back, do to the residual (2 k, r).
+    """Change of the residual (2 k, r) by steps of the gain (k, m, n), both ways.
 
-    A step that cannot be simulated is halved, and what it does scaled by the square: the first
-    order of a step that is not identified has no part in those that are.
+    A step that cannot be simulated is halved; its effect is scaled as second order.
     """
     here, shifts = residual_only(problem, gain, metric), []
     for index, sign in itertools.product(range(len(steps)), (1.0, -1.0)):
@@ -218,7 +209,7 @@ def _shifts(problem: Problem, gain: Array, metric: Array, steps: Array) -> Array
 
 
 def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Array]:
-    """Deviations of the entries, and the share in each of what is not identified."""
+    """Standard errors of the entries, and the relative shift by unidentified directions."""
     usable, identified = np.isfinite(deviations), deviations < IDENTIFIED
     own = spread[np.ix_(identified[usable], identified[usable])]
     by_itself = np.sqrt(np.maximum(np.diag(back[:, identified] @ own @ back[:, identified].T), 0.0))
@@ -234,28 +225,28 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
 
 
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
-    """The `rows` (r, ...) of all trials as one (samples, q, ...) array a trial; none below."""
+    """Split `rows` (r, ...) into one (samples, q, ...) array per trial, prior rows dropped."""
     q, ends = len(problem.measured), np.cumsum(problem.trial_sizes)
     parts = np.split(rows, ends)[:-1]
     return [part.reshape(len(part) // q, q, *rows.shape[1:]) for part in parts]
 
 
 def _identified_metric(alone: Array) -> Array:
-    """Columns of what is identified of S `alone` (r, k)."""
+    """Orthonormal columns of the identified part of the metric `alone` (r, k)."""
     metric, sizes, _ = np.linalg.svd(alone, full_matrices=False)
-    # Rounding leaves 1e-15 where S is not identified: inputs that are never at a bound.
+    # Unidentified S (inputs that never saturate) leaves rounding of 1e-15.
     return np.asarray(metric[:, sizes > _SEEN * np.max(sizes, initial=0.0)])
 
 
 def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
-    """What initial states and the columns `shared` can explain."""
+    """Span of initial states, offsets and the columns `shared`."""
     return trial_span(found.own, problem.row_sizes, np.hstack(shared))
 
 
 def _parameter_deviations(
     problem: Problem, own: Array, others: TrialSpan, colour: ResidualNoise, scale: float
 ) -> Array:
-    """Standard deviations of the logarithms (derivatives `own`), all else being fitted too."""
+    """Standard errors of the log-parameters with derivatives `own`, all else fitted too."""
     count = own.shape[1]
     if count == 0:
         return np.zeros(0)

@@ -1,16 +1,15 @@
-"""What recordings would identify that nobody has made yet: intervals before anyone is measured.
+"""Expected interval widths of a planned experiment.
 
-A presumed subject is simulated, and the recordings are taken as they come out without noise. At the
-truth the residual is then zero, and the derivatives of the outputs are those of the recordings to
-come. With noise of known size and colour, e_t in the recorder, they give the deviations of gain
-and cost weights as `covariance` and `structured_weights` have them, and the misfit that grows away
-from the truth gives the ends of profiles:
+An assumed subject is simulated without noise. At the truth the residual is then zero, and the
+derivatives of the outputs are those of the future recordings. With recording noise e_t of known
+size and autocorrelation they give standard errors of gain and cost weights (`covariance`,
+`structured_weights`), and the growth of the misfit away from the truth gives profile intervals:
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),      m(v*) = 0
 
-which is the profile of the recordings on average, up to the count of what is fitted
-(docs/planning.md). What has a stated uncertainty keeps it, as a prior in both; deviations for a
-body that is known better, or for less noise, follow from the same derivatives.
+which is the average profile of such recordings up to the number of fitted quantities
+(docs/howto/plan.md). Stated uncertainties enter as priors; standard errors for a better-known body
+or less noise follow from the same derivatives.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ if TYPE_CHECKING:
     from impc.assess.structured_weights import Tangent
     from impc.inverse.problem import Problem
 
-# A root nearer to one is a drift, not noise.
+# A larger coefficient is a drift, not noise.
 _LARGEST_ROOT = 0.999
-# Of all outputs: a limit that moves them by less is never met.
+# Relative change of the outputs below which a limit counts as never reached.
 _UNSEEN = 1e-12
-# Of the noise, what is left of it by ten times as many trials, and by more than will ever be made.
+# Noise relative to the plan, for ten times the trials and for practically infinitely many.
 _TENFOLD, _NO_NOISE = 10**-0.5, 1e-2
 #: Multiples of the planned trials for which standard errors are computed.
 MULTIPLES = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
@@ -49,52 +48,52 @@ MULTIPLES = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 
 @dataclass(frozen=True)
 class BodyShare(Frozen):
-    """What the stated uncertainty of the body adds to the deviations of unknowns (count,)."""
+    """Contribution of the stated uncertainty of the body to the standard errors (count,)."""
 
-    exact: Array  # The deviations, were all that is stated known exactly
+    exact: Array  # Standard errors if all stated parameters were known exactly
     tenfold: Array  # With ten times as many trials
-    floor: Array  # With ten thousand times as many: what no number of trials removes
+    floor: Array  # With ten thousand times as many trials: the limit that trials cannot lower
     names: tuple[str, ...]  # Parameters with a stated uncertainty (k,)
-    measured: Array  # Were one of them known exactly, all others as stated (k, count)
+    measured: Array  # With one of them known exactly, the others as stated (k, count)
 
 
 @dataclass(frozen=True)
 class Expectation(Frozen):
-    """What the recordings of a problem would identify."""
+    """Expected precision of the fit of a problem."""
 
-    cost_weights: WeightCovariance  # Of the unknowns of the structure, to first order
-    # Of each unknown, by its profile; by its deviation where products of features have cost weights
+    cost_weights: WeightCovariance  # For the unknowns of the structure, to first order
+    # For each unknown: profile, or normal if products of features have cost weights
     intervals: tuple[WeightInterval, ...]
-    # Of a gain that is fitted without a structure, to second order as a fit prints it
+    # For a gain fitted without a structure, to second order as reported by a fit
     gain: GainCovariance
-    # Standard deviation of the logarithm of the limit of each input (m,), with a free gain;
-    # infinite where it is never met, or the input has none
+    # Standard error of the log of each input limit (m,), with a free gain; infinite if never
+    # reached or absent
     limits: Array
-    body: BodyShare | None  # None where no uncertainty is stated
-    # Standard deviations with so many times the trials (multiples, count)
+    body: BodyShare | None  # None without stated uncertainties
+    # Standard errors with multiples of the trials (multiples, count)
     by_trials: Array
 
     @property
     def deviations(self) -> Array:
-        """Standard deviation of each unknown of the structure (count,), to first order."""
+        """Standard error of each unknown of the structure (count,), to first order."""
         return np.asarray(self.cost_weights.each)
 
     def narrower(self, deviations: Array) -> Array:
-        """Share by which other deviations (..., count) are less; 0 where there is none to begin."""
+        """Relative reduction by other standard errors (..., count); 0 if infinite now."""
         planned, other = np.broadcast_arrays(self.deviations, deviations)
         kept = np.ones(other.shape)
         return np.asarray(1 - np.divide(other, planned, out=kept, where=np.isfinite(planned)))
 
     @property
     def log_determinant(self) -> float:
-        """Of the unknowns' covariance, infinite if one is not identified: least where D-optimal."""
+        """Log determinant of the covariance of the unknowns (D-optimality), or infinity."""
         if not np.all(np.isfinite(self.cost_weights.deviations)):
             return np.inf
         return 2 * float(np.sum(np.log(self.cost_weights.deviations)))
 
     @property
     def mean_variance(self) -> float:
-        """Of the unknowns: the least is A-optimal."""
+        """Mean variance of the unknowns (A-optimality)."""
         return float(np.mean(self.deviations**2))
 
 
@@ -106,23 +105,29 @@ def expected_intervals(
     *,
     root: float = 0.0,
 ) -> Expectation:
-    """Intervals that a fit of such recordings would have.
+    """Compute the intervals that a fit of planned recordings would have.
 
     Parameters
     ----------
     problem : Problem
-        Its recordings are those of the presumed subject, without noise; with a structure.
-    cost_weights : array_like
-        The subject's unknowns of that structure (count,), logarithms of cost weights.
-    deviation : array_like
-        Standard deviation of the noise in the recorder, in the outputs' units, one or (p,).
-    root : float
-        Of first-order noise: its correlation from one sample to the next, 0 for white.
+        Problem with a structure; its recordings are noise-free simulations of the assumed subject.
+    cost_weights : array_like of shape (count,)
+        Unknowns of the structure for that subject: logarithms of the cost weights.
+    deviation : float or array_like of shape (p,)
+        Standard deviation of the recording noise, in output units.
+    root : float, default 0
+        Correlation of the noise from one sample to the next (first-order autoregression); 0 for
+        white.
+
+    Returns
+    -------
+    Expectation
+        Standard errors and intervals of the cost weights, the gain and the input limits.
 
     Raises
     ------
     InputError
-        When the problem has no structure, a deviation is not positive, or a root is not in [0, 1).
+        If the problem has no structure, a deviation is not positive, or root is not in [0, 0.999].
 
     Examples
     --------
@@ -141,16 +146,22 @@ def expected_intervals(
     """
     structure, p = problem.structure, len(problem.plant.outputs)
     if structure is None:
-        raise InputError("structure", "the problem has none", "give Problem(..., structure=...)")
+        raise InputError(
+            "structure", "the problem has no structure", "pass Problem(..., structure=...)"
+        )
     given = np.asarray(deviation, dtype=np.float64)
     size = np.full(p, given) if given.ndim == 0 else with_shape("deviation", given, (p,))
     if not np.all((size > 1e-50) & (size < 1e50)):
-        raise InputError("deviation", f"got {size}", "give a positive noise for each output")
+        raise InputError(
+            "deviation", f"expected positive noise SDs, got {size}", "pass one per output"
+        )
     if not 0 <= root <= _LARGEST_ROOT:
-        raise InputError("root", f"got {root:g}", f"give 0 or more, at most {_LARGEST_ROOT}")
+        raise InputError(
+            "root", f"expected 0 <= root <= {_LARGEST_ROOT}, got {root:g}", "pass 0 for white noise"
+        )
     coloured = ResidualNoise(frozen(np.full(p, root)), frozen((1 - root**2) * np.eye(p)[None]))
     plain = ResidualNoise(frozen(np.zeros(p)), frozen(np.eye(p)[None]))
-    # In units of the noise, so that its variance is one.
+    # In units of the noise: its variance is one.
     scaled = replace(problem, output_scale=size)
     unknowns = finite_array("cost_weights", cost_weights, (structure.count,))
     at = tangent(structure, scaled, unknowns, noise=1.0)
@@ -167,9 +178,9 @@ def expected_intervals(
 
 
 def _deviations(at: Tangent, colour: ResidualNoise, *known: int, noise: float = 1.0) -> Array:
-    """Standard deviations of the unknowns with parameters that are `known`, or less `noise`."""
+    """Standard errors of the unknowns with parameters `known`, or with less `noise`."""
     slopes = np.delete(np.array(at.on_parameters), known, axis=1)
-    # The rows of a prior are in units of the noise.
+    # Prior rows are in units of the noise.
     slopes[sum(at.problem.trial_sizes) :] *= noise
     less = replace(at, on_parameters=frozen(slopes))
     found = weight_covariance(less, lambda *_: colour, lambda *_: colour)
@@ -205,7 +216,7 @@ def _intervals(at: Tangent, found: WeightCovariance) -> tuple[WeightInterval, ..
 
 
 def _limits(at: Tangent, colour: ResidualNoise) -> Array:
-    """Deviations of the logarithms without their own prior, all else and a free gain fitted."""
+    """Standard errors of the log limits without their own prior, with a free gain."""
     problem, found = at.problem, np.full(at.problem.plant.m, np.inf)
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     for control, limit in enumerate(np.array(problem.bounds.u_max)):

@@ -1,10 +1,10 @@
-"""From the perturbation to the movement at each frequency: the subject's and the model's.
+"""Frequency response from the perturbation to the outputs, recorded and modelled.
 
-H = S_dy / S_dd by Welch's averages over pieces of all trials and over bands of frequencies, with
-the coherence. The model is estimated in the same way from what it moves, so that windows and limits
-act on both alike. What is above the frequencies that the movement follows is left out. With
-coherence c from n independent pieces the magnitude has a standard error of sqrt((1 - c) / (2 n c))
-of itself (Bendat and Piersol 2010, 9.90).
+H = S_dy / S_dd by Welch's method over pieces of all trials and bands of frequencies, with
+coherence. The model is estimated in the same way from its simulated outputs, so that windows and
+limits affect both equally. Frequencies above those that the outputs follow are left out. With
+coherence c from n independent pieces the magnitude has a relative standard error of sqrt((1 - c) /
+(2 n c)) (Bendat and Piersol 2010, 9.90).
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.recordings import Recording
 
-# Seconds of a piece, its least number of samples, and pieces below which there is no coherence.
+# Length of a piece in s, its least number of samples, and the least number of pieces.
 _PIECE, _LEAST, _FEWEST = 10.0, 32, 4
-# Of the largest power of the perturbation: frequencies with less are not driven.
+# Least power of a driven frequency relative to the largest.
 _DRIVEN = 1e-3
-# Bands in a row without coherence, at which the movement no longer follows.
+# Consecutive bands without coherence that end the response.
 _GAP = 3
-# Width of a band over which spectra are averaged, of its frequency.
+# Width of an averaging band relative to its frequency.
 _WIDTH = 0.1
 
 
 @dataclass(frozen=True)
 class FrequencyResponse(Frozen):
-    """Responses of the outputs to what drives most."""
+    """Responses of the outputs to the strongest driving signal."""
 
-    signal: str  # What drives: a disturbance, or the target of an output
+    signal: str  # Driving signal: a disturbance, or the target of an output
     frequencies: Array  # Hz (f,)
-    recorded: Array  # Magnitude, in the units of output over signal (f, p), and phase, degrees
+    recorded: Array  # Magnitude in output units over signal units (f, p); phase in degrees
     recorded_phase: Array
     modelled: Array
     modelled_phase: Array
-    coherence: Array  # Of what was recorded (f, p)
-    errors: Array  # Standard error of the recorded magnitude, of itself (f, p)
-    threshold: Array  # Coherence that chance exceeds in 5 of 100 (f,)
+    coherence: Array  # Of the recorded outputs (f, p)
+    errors: Array  # Relative standard error of the recorded magnitude (f, p)
+    threshold: Array  # 95 % quantile of the coherence without any relation (f,)
 
 
 def frequency_response(problem: Problem, runs: Sequence[Simulation]) -> FrequencyResponse | None:
-    """Of the trials without gaps; None where they are too short or nothing drives."""
+    """Response over the trials without gaps; None if too short or not driven."""
     plant = problem.plant
     trials, whole = _usable(problem, runs)
     if not trials:
@@ -81,7 +81,7 @@ def frequency_response(problem: Problem, runs: Sequence[Simulation]) -> Frequenc
     driven, own = averaged(drive, drive).real, averaged(outputs, outputs).real
     across = averaged(drive, outputs)
     coherence = np.clip(np.abs(across) ** 2 / np.maximum(driven * own, 1e-300), 1e-12, 1.0)
-    independent = np.maximum(1.0, 0.6 * count * sizes)  # half of a piece is that of its neighbour
+    independent = np.maximum(1.0, 0.6 * count * sizes)  # neighbouring pieces overlap by half
     threshold = 1 - 0.05 ** (1 / np.maximum(independent - 1, 1))
     known = np.any(coherence > threshold, axis=1) & (driven[:, 0] > _DRIVEN * driven.max())
     gaps = np.flatnonzero(np.convolve(~known, np.ones(_GAP), "valid") == _GAP)
@@ -105,7 +105,7 @@ def frequency_response(problem: Problem, runs: Sequence[Simulation]) -> Frequenc
 def _usable(
     problem: Problem, runs: Sequence[Simulation]
 ) -> tuple[list[Recording], list[Simulation]]:
-    """The trials without gaps whose simulation reaches their end, with it."""
+    """Trials without gaps whose simulation is complete, with it."""
     pairs = [
         (trial, run)
         for trial, run in zip(problem.recordings, runs, strict=True)
@@ -124,7 +124,7 @@ def _spectrum(first: list[Array], second: list[Array], length: int, dt: float) -
 
 
 def _bands(frequencies: Array) -> IntArray:
-    """Where each band begins: single frequencies first, then a share of themselves wide."""
+    """First index of each band: single frequencies, then bands of relative width."""
     found = [1]
     for k in range(2, len(frequencies)):
         if frequencies[k] >= (1 + _WIDTH) * frequencies[found[-1]]:

@@ -1,14 +1,14 @@
-"""The input limit of a subject, fitted: what value explains the recordings, or that none shows.
+"""Estimate the input limit, or report that the recordings do not reveal one.
 
-For a limit L the gain, initial states and parameters are fitted again; m(L) is the misfit that is
-left, m(inf) that without a limit. With s^2 the variance of a residual and f the factor by which the
-colour of the residuals widens the deviation of L (f = 1 for white ones),
+For a limit L the gain, initial states and parameters are refitted; m(L) is the misfit, m(inf) that
+without a limit. With the residual variance s^2 and the factor f by which autocorrelation widens the
+variance of L (f = 1 for white residuals),
 
     D(L) = (m(L)^2 - m(L*)^2) / (s^2 f)
 
-is chi-squared with one degree of freedom at the true limit. Where D(inf) is below its quantile the
-recordings do not identify whether there is a limit at all; they still say that it is not below the
-least L that D allows (docs/fitting.md).
+is chi-squared with one degree of freedom at the true limit. If D(inf) is below its quantile the
+recordings do not identify whether there is a limit; they still give a lower end, the least L that D
+allows.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
 
-# The limit is searched to this share of itself.
+# Relative accuracy of the limit.
 _RESOLUTION = 1e-4
-# Growth of the steps towards an end of the interval, and how exact the end is, of the last step.
+# Growth of the steps towards an end, and accuracy of the end relative to the last step.
 _GROWTH, _NEARLY = 2.0, 0.02
 _GRID, _NEAR = np.geomspace(0.3, 1.05, 10), np.array([0.8, 0.9, 1.0, 1.1, 1.25])
 _ROUNDS = 5
@@ -50,23 +50,23 @@ _ROUNDS = 5
 
 @dataclass(frozen=True)
 class LimitEstimate(Frozen):
-    """What recordings say of the limit of one input."""
+    """Estimate of the limit of one input."""
 
-    value: float | None  # The limit that fits best; None when none is determined
-    low: float  # Interval of the given level; `high` is infinite when no limit is determined
+    value: float | None  # Limit that fits best; None if not identified
+    low: float  # Interval; `high` is infinite if no limit is identified
     high: float
-    level: float  # Between 0 and 1, 0.95 for 95 %
-    # D(inf): how much worse no limit explains the recordings; compare with the quantile
+    level: float  # Confidence level between 0 and 1
+    # D(inf): loss of fit without a limit; compare with `quantile`
     against_none: float
-    quantile: float  # Of chi-squared at that level
-    reason: str  # In words
-    # Limits that were tried (t,), in the input's unit, and D at each (t,), for a picture
+    quantile: float  # Chi-squared quantile at that level
+    reason: str  # Result in words
+    # Limits tried (t,), in the unit of the input, and D at each (t,), for figures
     limits: Array
     distances: Array
 
 
 def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
-    """The problem with |u_control| <= limit, or without that bound for an infinite limit."""
+    """Problem with |u_control| <= limit, or without that bound for an infinite limit."""
     bounds = problem.bounds
     u_min, u_max = np.array(bounds.u_min), np.array(bounds.u_max)
     u_min[control], u_max[control] = -limit, limit
@@ -77,9 +77,13 @@ def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
 
 
 def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
-    """Fit the symmetric limit of one input; the others keep theirs."""
+    """Estimate the symmetric limit of one input; other limits stay fixed."""
     if not 0 <= control < fitted.problem.plant.m:
-        raise InputError("control", f"got {control}", f"there are {fitted.problem.plant.m} inputs")
+        raise InputError(
+            "control",
+            f"expected an index below {fitted.problem.plant.m}, got {control}",
+            "choose an input of the plant",
+        )
     search, best = _searched(fitted, control)
     free = search.fit(np.inf)
     top = max(_typical_peak(search.fitted, control), search.limit_of(best))
@@ -91,7 +95,7 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
     def distance(limit: float) -> float:
         return (search.misfit(limit) ** 2 - search.least()[1].misfit ** 2) / unit
 
-    for _ in range(_ROUNDS):  # on its way the profile may pass a better limit
+    for _ in range(_ROUNDS):  # the profile may find a better limit
         value, best = search.least()
         none = (free.misfit**2 - best.misfit**2) / unit
         determined = none > quantile
@@ -105,8 +109,8 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
         reason = f"a limit of {value:.3g} explains the recordings better than none"
     else:
         reason = (
-            f"no limit explains the recordings as well as any: if there is one it is at least "
-            f"{low:.3g}; the command of the best regulator without one peaks at {top:.3g}"
+            f"the fit without a limit is not significantly worse; a limit, if there is one, is at "
+            f"least {low:.3g}; without a limit the fitted command peaks at {top:.3g}"
         )
     return LimitEstimate(
         value if determined else None,
@@ -122,27 +126,29 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
 
 
 def _searched(fitted: Estimate, control: int) -> tuple[_Search, GainFit]:
-    """The best limit, and the search that found it.
+    """Best limit, and the search that found it.
 
-    The first round goes over a grid below the largest command that the best regulator without a
-    limit uses. The limit found then gets a controller of its own, fitted from the beginning, from
-    which the next round searches nearby: a gain fitted under a wrong limit is a poor start.
+    The search starts at the given limit, or without one at the best of a grid below the largest
+    command of the best regulator. Each round searches near the last limit and refits the controller
+    at the limit found, because a gain fitted under a wrong limit is a poor start.
     """
-    loose = fit_controller(with_limit(fitted.problem, np.inf, control))
-    search = _Search(loose, control)
-    peak = _typical_peak(loose, control)
-    limit = search.limit_of(search.best(peak * _GRID))
+    limit, near = float(fitted.problem.bounds.u_max[control]), fitted
+    if not np.isfinite(limit):
+        search = _Search(fitted, control)
+        limit = search.limit_of(search.best(_typical_peak(fitted, control) * _GRID))
+        near = fit_controller(with_limit(fitted.problem, limit, control))
     for _ in range(_ROUNDS):
-        search = _Search(fit_controller(with_limit(fitted.problem, limit, control)), control)
+        search = _Search(near, control)
         best = search.best(limit * _NEAR)
         before, limit = limit, search.limit_of(best)
         if abs(limit - before) < 0.01 * before:
             break
+        near = fit_controller(with_limit(fitted.problem, limit, control))
     return search, best
 
 
 class _Search:
-    """Fits at limits, remembered: each starts from the nearest one before it."""
+    """Cached fits at limits; each starts from the nearest previous one."""
 
     def __init__(self, fitted: Estimate, control: int) -> None:
         self.fitted, self.control = fitted, control
@@ -152,7 +158,11 @@ class _Search:
     def fit(self, limit: float) -> GainFit:
         found = self._try(limit)
         if found is None:
-            raise SolverError("limit", f"no gain holds with {limit:g}", "check plant and bounds")
+            raise SolverError(
+                "limit",
+                f"no stabilising gain found with the limit {limit:g}",
+                "check plant and bounds",
+            )
         return found
 
     def misfit(self, limit: float) -> float:
@@ -160,7 +170,7 @@ class _Search:
         return 1e3 * np.sqrt(self.samples) if found is None else found.misfit
 
     def best(self, grid: Array) -> GainFit:
-        """The best of a grid, refined by Brent's method between its neighbours."""
+        """Best of a grid, refined by Brent's method between its neighbours."""
         values = [self.misfit(limit) for limit in grid]
         index = int(np.argmin(values))
         ends = grid[max(index - 1, 0)], grid[min(index + 1, len(grid) - 1)]
@@ -170,11 +180,13 @@ class _Search:
         return self.least()[1]
 
     def least(self) -> tuple[float, GainFit]:
-        """The best of all finite limits that were tried."""
+        """Best of all finite limits tried."""
         fits = [fit for fit in self.tried.values() if fit is not None]
         finite = [fit for fit in fits if np.isfinite(self.limit_of(fit))]
         if not finite:
-            raise SolverError("limit", "no gain holds with any limit tried", "check the plant")
+            raise SolverError(
+                "limit", "no stabilising gain found with any limit tried", "check the plant"
+            )
         best = min(finite, key=lambda fit: fit.misfit)
         return self.limit_of(best), best
 
@@ -187,7 +199,7 @@ class _Search:
         return self.tried[limit]
 
     def _fit(self, limit: float) -> GainFit | None:
-        """From the nearest fit that holds, or from the given one."""
+        """Refit from the nearest previous fit, or from the given one."""
         known = [(key, fit) for key, fit in self.tried.items() if fit is not None]
         near = sorted(known, key=lambda item: abs(min(item[0], 1e9) - min(limit, 1e9)))
         starts = [(np.array(fit.K), np.array(fit.S), fit.problem) for _, fit in near[:1]]
@@ -202,20 +214,20 @@ class _Search:
                     max_evaluations=30,
                     prior=1.0,
                 )
-            except (SolverError, WeightsError):  # it falls with that limit; the next may not
+            except (SolverError, WeightsError):  # diverges with that limit; try the next start
                 continue
         return None
 
 
 def _typical_peak(fitted: Estimate, control: int) -> float:
-    """What the command of the weights' regulator exceeds at one sample in two hundred."""
+    """99.5 % quantile of |command| under the fitted controller."""
     runs = simulated(fitted.problem, fitted.gain, fitted.metric)
     command = np.concatenate([np.abs(run.applied[:, control]) for run in runs])
     return float(np.quantile(command, 0.995))
 
 
 def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
-    """Variance of the limit for the colour that the residuals show, over that for white ones."""
+    """Variance of the limit for autocorrelated residuals, relative to white ones."""
     problem, K, S = fit.problem, np.array(fit.K), np.array(fit.S)
     found = evaluate(problem, K, S)
     others = found.dK.reshape(len(found.residual), -1)
@@ -231,7 +243,7 @@ def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
 
 
 def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control: int = 0) -> Array:
-    """Derivative of the residual with respect to the symmetric limit of one input (r,)."""
+    """Derivative of the residual by the symmetric limit of one input (r,)."""
     controller = controller_for(problem, gain, metric)
     rows = bound_rows(controller.bounds, problem.plant)
     of_input = np.isclose(np.abs(rows.b), limit) & ~np.any(rows.E, axis=1)
@@ -243,7 +255,7 @@ def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control
 def _crossing(
     distance: Callable[[float], float], inside: float, outside: float, quantile: float
 ) -> float:
-    """Limit between two at which D passes the quantile; the outer one when it does not."""
+    """Limit between two at which D crosses the quantile; the outer one if it does not."""
     step = _RESOLUTION * inside
     while step < abs(outside - inside):
         there = inside + np.sign(outside - inside) * step

@@ -1,17 +1,17 @@
-"""Gains that the recordings allow beside the fitted one, and what of the intent holds for them too.
+"""Draw gains within the uncertainty of the fit, and check statements for each.
 
-A statement over all weights with *the* fitted gain forgets that the gain is an estimate. Here gains
-are drawn, each that of some weights X = L exp(D) L', LL' = blkdiag(Q, R) those of the fit:
+A statement over all weights with *the* fitted gain ignores the uncertainty of that gain. Here gains
+are drawn, each of weights X = L exp(D) L', where LL' = blkdiag(Q, R) is the fit:
 
     log p(D) = -1/2 sum_i (d_i' vec(G^-1 (K(X) - K) T) / s_i)^2 - 1/2 |D|^2 / ln(10)^2 + const
 
-K the estimate (`gain_estimate`), d_i, s_i, G and T those of its `GainCovariance`; what the
-recordings do not identify is limited to weights of the same order of magnitude by the second term.
-Draws are made by elliptical slice sampling (Murray, Adams and MacKay 2010) about the linearised
-posterior, so that the curvature of K(X) counts.
+K is the estimate (`gain_estimate`), d_i, s_i, G and T those of its `GainCovariance`; the second
+term limits unidentified directions to weights of the same order of magnitude. Sampling is
+elliptical slice sampling (Murray, Adams and MacKay 2010) about the linearised posterior, so that
+the curvature of K(X) counts.
 
-The range of 39 draws holds the next one in 38 of 40 cases: 95 %. A statement is made when it holds
-for all weights with the fitted gain and, of those drawn, in all but one at most.
+The range of 39 draws covers the next one in 38 of 40 cases (95 %). A statement is supported if it
+holds for all weights with the fitted gain and with at least 38 of the 39 drawn gains.
 """
 
 from __future__ import annotations
@@ -40,43 +40,41 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-#: Draws whose range is an interval of 95 %.
+#: Number of draws whose range is a 95 % interval.
 DRAWS = 39
-# Of the logarithm of weights that nothing identifies: a factor of ten.
+# Prior SD of log weights: a factor of ten.
 _DECADE = np.log(10.0)
-# Steps of the sampler between two draws that are used.
+# Sampler steps between two draws.
 _STEPS = 6
-# Share of P that the last doubling may add: the next would add its square.
+# Convergence of P: the next doubling would add the square of this share.
 _ENOUGH = 1e-9
 _DOUBLINGS = 60
-# Of a drawn gain's programs: the range of 39 draws is itself a rough one, and a program takes four
-# fifths of the time of those for the fitted gain.
+# Tolerance of the programs for a drawn gain: the range of 39 draws is itself approximate.
 _ROUGH = 1e-6
-# Natural units of the gain: an exact recording is no sharper than rounding and search leave it.
+# Least standard error in whitened units: exact data are limited by rounding and search.
 _SHARPEST = 1e-6
 
 
 @dataclass(frozen=True)
 class WeightRange:
-    """Cost weight of a typical excursion of a state, d^2 Q_ii at trace R = m."""
+    """Cost of a typical excursion of a state, d^2 Q_ii at trace R = m."""
 
-    state: str  # Its name
-    low: float  # Over all weights with the fitted gain, in the cost's unit
+    state: str  # Name of the state
+    low: float  # Over all weights with the fitted gain, in units of the cost
     high: float
-    low_drawn: float  # Over all weights with any gain drawn: 95 %
+    low_drawn: float  # Over all weights with any drawn gain: 95 %
     high_drawn: float
 
 
 @dataclass(frozen=True)
 class DrawnSet:
-    """The weights of a drawn gain, and what holds for all of them."""
+    """Weights of a drawn gain, and what holds for all of them."""
 
-    # Those of least condition number; None where the programs fail: nothing is known of this gain's
-    # weights
+    # Member of least condition number; None if the programs fail
     least: Weights | None
-    # Least and largest cost weight of a typical excursion of each state that was asked for
+    # Least and largest cost of a typical excursion of each requested state
     cost_weights: tuple[tuple[float, float], ...]
-    agrees: tuple[bool, ...]  # Whether each statement that was asked for says the same here
+    agrees: tuple[bool, ...]  # Whether each requested statement also holds here
 
 
 def drawn_gains(
@@ -86,7 +84,7 @@ def drawn_gains(
     covariance: GainCovariance,
     count: int = DRAWS,
 ) -> tuple[LqrSolution, ...]:
-    """Regulators whose gains the recordings allow; `gain` (m, n)."""
+    """Regulators with gains within the uncertainty of `gain` (m, n)."""
     rng = np.random.default_rng(0)
     n = plant.n
     factor: Array = np.asarray(np.linalg.cholesky(weights.block), dtype=np.float64)
@@ -94,7 +92,7 @@ def drawn_gains(
     deviations = np.maximum(np.array(covariance.deviations), _SHARPEST)
     basis, left, values = _directions(centre, factor, covariance, deviations)
     spread = 1 / np.sqrt(values**2 + 1 / _DECADE**2)
-    # The linearised posterior has its mean where weights come nearest to the estimate.
+    # The linearised posterior has its mean at the weights nearest to the estimate.
     wrong = covariance.along(centre.K - gain) / deviations
     mean = -spread * values * (left.T @ wrong)[: len(values)]
 
@@ -104,7 +102,7 @@ def drawn_gains(
         return X[:n, :n], X[n:, n:]
 
     def excess(a: Array) -> float:
-        """Logarithm of the density over that of the linearised posterior, in which a ~ N(0, I)."""
+        """Log density relative to the linearised posterior, in which a ~ N(0, I)."""
         K = _gain(plant, *weights_at(a))
         if K is None:
             return -np.inf
@@ -124,7 +122,7 @@ def drawn_gains(
 def _directions(
     centre: LqrSolution, factor: Array, covariance: GainCovariance, deviations: Array
 ) -> tuple[Array, Array, Array]:
-    """Steps D that move the gain (k, n + m, n + m), and the left singular vectors and values."""
+    """Steps D that move the gain (k, n + m, n + m), left singular vectors, singular values."""
     n, m = centre.plant.n, centre.plant.m
     basis = block_basis(n, m)
     moved = factor @ basis @ factor.T
@@ -132,7 +130,7 @@ def _directions(
     dK = np.einsum("abij,kij->kab", slopes.Q, moved[:, :n, :n])
     dK += np.einsum("abij,kij->kab", slopes.R, moved[:, n:, n:])
     derivative = np.array([covariance.along(one) for one in dK]).T
-    # Along what leaves the gain as it is nothing need move: the set of weights has all of it.
+    # Steps that keep the gain are covered by the set of weights.
     _, _, moving = np.linalg.svd(derivative, full_matrices=False)
     left, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
     return np.tensordot(rows, np.tensordot(moving, basis, 1), 1), left, values
@@ -141,7 +139,7 @@ def _directions(
 def with_confidence(
     statements: tuple[Statement, ...], sets: tuple[DrawnSet, ...]
 ) -> tuple[Statement, ...]:
-    """Statements with the share of the drawn gains for which they hold as well."""
+    """Statements with the share of drawn gains for which they hold too."""
     shares = np.mean([one.agrees for one in sets], axis=0)
     return tuple(
         item if item.holds is None else replace(item, confidence=float(share))
@@ -152,7 +150,7 @@ def with_confidence(
 def weights_over_gains(
     own: Mapping[str, tuple[float, float]], sets: tuple[DrawnSet, ...]
 ) -> tuple[WeightRange, ...]:
-    """Cost weights of some states, over the weights of the fitted gain and of those drawn."""
+    """Costs of some states over the weights of the fitted gain and of all drawn gains."""
     result = []
     for position, (name, (low, high)) in enumerate(own.items()):
         ends = [one.cost_weights[position] for one in sets]
@@ -170,11 +168,11 @@ def set_of_gain(
     states: tuple[str, ...],
     statements: tuple[Statement, ...],
 ) -> DrawnSet:
-    """What holds for all weights of a drawn gain; `metrics` (k, m, m); `sizes` (n,)."""
+    """Evaluate the statements for all weights of a drawn gain; `metrics` (k, m, m)."""
     tried = [item for item in statements if item.holds is not None]
     try:
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
-        # Nothing is searched from these: only how far they reach is asked for.
+        # Rough solutions suffice: only the extent of the set is needed.
         found = weights_set(gain_fibre(plant, solution.K, own), ratio, rough=True)
         penalised = np.array([weight_direction(plant, sizes, name) for name in states])
         ranges = linear_ranges(found, penalised, tolerance=_ROUGH)
@@ -188,7 +186,7 @@ def set_of_gain(
 
 
 def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
-    """The linear function that is below zero for every member of a set where a statement holds."""
+    """Linear function that is negative for every member if the statement holds."""
     if item.kind == "order":
         direction = weight_direction(plant, sizes, item.first)
         direction -= weight_direction(plant, sizes, item.second)
@@ -200,11 +198,7 @@ def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
 
 
 def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
-    """K (m, n) to eight digits by doubling (Chu et al. 2004); None where it does not converge.
-
-    The sampler asks for three thousand gains, in a third of the time of `solve_lqr`; those that it
-    returns are solved for to the last digit.
-    """
+    """K (m, n) to eight digits by doubling (Chu et al. 2004); None without convergence."""
     A, B, P = plant.A, plant.B, Q
     G = B @ np.linalg.solve(R, B.T)
     n, unit = len(A), np.eye(len(A))
@@ -225,7 +219,7 @@ def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
 def _slice(
     a: Array, here: float, excess: Callable[[Array], float], rng: np.random.Generator
 ) -> tuple[Array, float]:
-    """One step of elliptical slice sampling from N(0, I) times exp(excess); `here` is excess(a)."""
+    """One step of elliptical slice sampling from N(0, I) exp(excess); `here` is excess(a)."""
     other = rng.standard_normal(len(a))
     level = here + np.log(rng.uniform())
     angle = rng.uniform(0, 2 * np.pi)

@@ -1,20 +1,19 @@
-"""What can be said of a subject's intent whatever weights are chosen, and what cannot.
+"""Statements about the control intent that hold for all equivalent weights.
 
-All weights with the fitted gain and a condition number up to a multiple of the least are equally
-good explanations (`weights_set`). A statement about them is worth making if it holds for every one.
+All weights with the fitted gain and a condition number up to a multiple of the least explain the
+recordings equally well (`weights_set`). A statement is useful if it holds for every one of them.
 
-    cost weight     d_i^2 Q_ii: what a typical excursion d_i of state i costs
-    order     cost weight of i above cost weight of j: the sign of a linear function, decided
-    exactly sense     Q_ij above or below zero: the two states are penalised together or against
-    each other direction the dominant eigenvector of D Q D; its widest angle to that of the least
-    condition
-              number is searched for, not proved: a member that far exists, farther ones may
+    cost       d_i^2 Q_ii: cost of a typical excursion d_i of state i
+    order      cost of i above cost of j: the sign of a linear function, decided exactly
+    sense      Q_ij above or below zero: equal or opposite signs of two states cost more
+    direction  dominant eigenvector of D Q D; the widest angle to that of the least-condition
+               member is searched, not proved: farther members may exist
 
-The direction is also read from weights that three rules choose; the angle between them says how
-much of it the rule chose: with Q = T diag(q) T' (3.23) the state cost is sum q_i z_i^2, z = T'x,
+The direction is also computed for weights chosen by three rules; the angle between them shows how
+much it depends on the rule. With Q = T diag(q) T' (3.23) the state cost is sum q_i z_i^2, z = T'x,
 and its dominant part is the last, q_n (v'x)^2 (3.26).
 
-docs/equivalent-weights.md, sections 3 and 5, and docs/what-may-be-concluded.md.
+See docs/why/equivalent_weights.md and docs/why/conclusions.md.
 """
 
 from __future__ import annotations
@@ -41,9 +40,9 @@ if TYPE_CHECKING:
 
 
 _FRANK_WOLFE = 12
-# A range that ends this near to zero, of its width, does not decide the sign.
+# A range that ends this close to zero, relative to its width, leaves the sign undecided.
 _TOUCHES = 1e-6
-# 38 of 39, see `intent_draws`.
+# 38 of 39 draws, see `intent_draws`.
 _AGREE = 38 / 39 - 1e-9
 
 
@@ -53,25 +52,24 @@ class Statement:
 
     first: str  # Names of the states
     second: str
-    says: str  # In words
-    holds: bool | None  # True or False for every member of the set; None when members disagree
-    # Range of the linear function whose sign decides, relative to the cost weight of `first` in the
-    # member of least condition number
+    says: str  # Statement in words
+    holds: bool | None  # True or False if all members agree; otherwise None
+    # Range of the linear function whose sign decides, over the cost of `first` in the member of
+    # least condition number
     low: float
     high: float
     kind: str  # "order" or "sense"
-    # Share of the gains that the recordings allow for which it holds as well (`intent_draws`); None
-    # when that was not looked into, or it does not hold at the fitted gain
+    # Share of the drawn gains for which it holds too (`intent_draws`); None if not checked
     confidence: float | None = None
 
     @property
     def made(self) -> bool:
-        """Whether it may be said of the subject, at 95 %: all drawn gains but one agree."""
+        """Whether the statement is supported at 95 %: at least 38 of 39 drawn gains agree."""
         return self.confidence is not None and self.confidence >= _AGREE
 
 
 def weight_direction(plant: Plant, sizes: Array, state: str) -> Array:
-    """The linear function trace(. blkdiag(Q, R)) that is the weight of a state (n + m, n + m)."""
+    """Linear function trace(. blkdiag(Q, R)) giving the cost of a state (n + m, n + m)."""
     index = plant.states.index(state)
     direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
     direction[index, index] = sizes[index] ** 2
@@ -81,7 +79,7 @@ def weight_direction(plant: Plant, sizes: Array, state: str) -> Array:
 def order_statements(
     found: WeightsSet, sizes: Array, states: tuple[str, ...]
 ) -> tuple[Statement, ...]:
-    """Whether one state's cost weight is above another's, for every pair of the given ones."""
+    """Whether one state costs more than another, for every pair of the given states."""
     names = found.fibre.plant.states
     pairs = list(itertools.combinations(states, 2))
     if not pairs:
@@ -103,7 +101,7 @@ def sense_statements(
     states: tuple[str, ...],
     ranges: Mapping[tuple[int, int], Range],
 ) -> tuple[Statement, ...]:
-    """Whether two states are penalised together (Q_ij > 0: one sign costs more); `sizes` (n,)."""
+    """Whether equal signs of two states cost more (Q_ij > 0); `sizes` (n,)."""
     names = found.fibre.plant.states
     statements = []
     for one, other in itertools.combinations(states, 2):
@@ -116,16 +114,15 @@ def sense_statements(
 
 
 def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weights]:
-    """Widest angle found between dominant directions of D Q D, in degrees, and who has it.
+    """Widest angle found between dominant directions of D Q D, degrees, and its weights.
 
-    D = diag(sizes), the typical excursions (n,) in the units of the states.
-
-    The direction of the member of least condition number against others: from it and from the
-    members at the ends of the ranges of the largest cost weights, each improved by steps of Frank
-    and Wolfe (the derivative of an eigenvector is linear in Q, so a step is one program).
+    D = diag(sizes), the typical excursions (n,) in the units of the states. The direction of the
+    member of least condition number is compared with others: from it and from the members at the
+    ends of the ranges of the largest costs, Frank-Wolfe steps increase the angle (the derivative of
+    an eigenvector is linear in Q, so that each step is one program).
     """
     n = found.fibre.plant.n
-    if n == 1:  # one state has one direction
+    if n == 1:  # a single state
         return 0.0, found.least.weights
     D = np.diag(np.asarray(sizes, dtype=np.float64))
     centre = dominant_direction(D @ found.least.weights.Q @ D)
@@ -145,7 +142,7 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
 
 
 def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Array:
-    """Turn the dominant direction away from the centre's, along segments to extreme members."""
+    """Increase the angle to the centre's direction along segments to extreme members."""
     n, X = found.fibre.plant.n, start
     for _ in range(_FRANK_WOLFE):
         gradient = np.zeros_like(X)
@@ -161,13 +158,13 @@ def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Ar
 
 
 def _turning(Q: Array, centre: Array) -> Array:
-    """Gradient of 1 - (v'centre)^2 with respect to Q, v the dominant eigenvector."""
+    """Gradient of 1 - (v'centre)^2 by Q, v the dominant eigenvector."""
     values, vectors = np.linalg.eigh(Q)
     v, others = vectors[:, -1], vectors[:, :-1]
     gaps = np.maximum(values[-1] - values[:-1], 1e-9 * values[-1])
     weight = others @ ((others.T @ centre) / gaps)
     gradient = -2 * float(v @ centre) * np.outer(weight, v)
-    if np.linalg.norm(gradient) < 1e-9 / values[-1]:  # at the centre itself: any way out
+    if np.linalg.norm(gradient) < 1e-9 / values[-1]:  # at the centre: any direction
         gradient = np.outer(others[:, -1], v) / values[-1]
     return np.asarray((gradient + gradient.T) / 2)
 
@@ -199,15 +196,15 @@ def _statement(
     return Statement(one, other, says, holds, low / unit, high / unit, kind)
 
 
-# Entries of a direction below this are not named in a sentence.
+# Smaller entries of a direction are not named in a sentence.
 _NAMED = 0.05
 
 
 @dataclass(frozen=True)
 class Reading(Frozen):
-    """The intent as one choice of weights shows it."""
+    """Control intent according to one choice of weights."""
 
-    rule: str  # How the weights were chosen among those with the gain
+    rule: str  # Rule by which the weights were chosen
     weights: Weights  # In plant units, scaled to R[0, 0] = 1
     condition: float  # kappa(blkdiag(Q, R)) in plant units
     eigenvalues: Array  # Of Q, ascending (n,)
@@ -222,26 +219,26 @@ class Reading(Frozen):
 
 @dataclass(frozen=True)
 class Intent(Frozen):
-    """Readings of the intent behind one gain; the first is the dissertation's."""
+    """Control intent of one gain by several rules; the first is that of the dissertation."""
 
     readings: tuple[Reading, ...]
-    missing: tuple[str, ...]  # Choices that could not be made, and why
-    # Typical size of each state (n,): its root-mean-square in the recordings' simulation
+    missing: tuple[str, ...]  # Rules that failed, with the reason
+    # Typical size of each state (n,): RMS in the simulated recordings
     sizes: Array
 
     @property
     def reported(self) -> Reading:
-        """The first reading."""
+        """Intent by the first rule."""
         return self.readings[0]
 
     @property
     def widest_angle(self) -> float:
-        """Largest angle between the reported dominant direction and another reading's, degrees."""
+        """Largest angle between the dominant directions of the first and another rule, degrees."""
         return max(item.angle for item in self.readings)
 
 
 def intent(plant: Plant, gain: Array, metrics: Array, sizes: Array, fallback: Weights) -> Intent:
-    """Read the intent from the weights that have a gain."""
+    """Compute the intent from the weights that have a gain, by each rule."""
     readings: list[Reading] = []
     missing: list[str] = []
     try:
@@ -262,10 +259,9 @@ def intent(plant: Plant, gain: Array, metrics: Array, sizes: Array, fallback: We
 
 
 def dominant_sentence(reading: Reading, plant: Plant, sizes: Array) -> str:
-    """(3.26) in words: the dominant cost, its share, and which states it weighs.
+    """Sentence with the dominant cost (3.26), its share and the states that it penalises.
 
-    A state counts by v_i times its typical size, so that units do not decide: `sizes` (n,) in the
-    units of the states.
+    States count by v_i times their typical size `sizes` (n,), so that units do not matter.
     """
     v = reading.dominant
     terms = [
@@ -283,8 +279,8 @@ def dominant_sentence(reading: Reading, plant: Plant, sizes: Array) -> str:
     ]
     return (
         f"The dominant cost is {reading.eigenvalues[-1]:.3g} ({' '.join(terms)})^2, "
-        f"{100 * share:.0f} % of the trace of Q; at the size that the states have in the "
-        f"recordings it weighs {', '.join(named)}."
+        f"{100 * share:.0f} % of the trace of Q. At the typical size of the states in the "
+        f"recordings it penalises {', '.join(named)}."
     )
 
 
@@ -297,7 +293,7 @@ def _rules(
     fibre = gain_fibre(plant, gain, metrics)
 
     def of_least_trace() -> Weights:
-        """Up to ten times the least condition number: the infimum is not attained."""
+        """Least trace up to ten times the least condition number (the infimum is not attained)."""
         squares = np.diag(np.append(np.asarray(sizes) ** 2, np.zeros(plant.m)))
         return linear_maxima(weights_set(fibre), -squares[None])[0].weights
 

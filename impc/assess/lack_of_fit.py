@@ -1,28 +1,27 @@
-"""Whether the residuals of a fit follow what drove it, and which error of the model explains that.
+"""Test whether residuals depend on the perturbation, and which model error explains it.
 
-Noise knows nothing of the perturbation. Where the body or its controller is another than the fit's,
-a part of the residuals lies along the derivative of the outputs with respect to that error. Each
-error that was not fitted is a group of such columns c (r, d), made by a forcing f_t that goes
-through the local loop, x the fit's own trajectory and G_t the local gain of the controller,
+Noise is independent of the perturbation. If body or controller differ from the model, part of the
+residuals lies along the derivative of the outputs by that error. Each error that was not fitted is
+a group of columns c (r, d), made by a forcing f_t of the local loop, with the fitted trajectory x
+and the local gain G_t of the controller:
 
     dx_{t+1} = (A_t + B_t G_t) dx_t + f_t,      c_t = C dx_t:
 
     delay               f = -B (u_t - u_{t-1}), a command that arrives one sample late
-    limit               the derivative with respect to the limit of the command
-    lean                f = B in one trial, a constant push that the person gives or takes
+    limit               derivative by the command limit
+    lean                f = B in one trial, a constant push by or on the subject
     offset              c = 1 in one output and trial
     perturbation        f = E d_t, its size or the inertia that it moves
     stiffness           f = E y_t and E (y_t - y_{t-1}), stiffness and damping where it acts
-    further mode        f = E d_{t-l}, answers that come later than the model's
+    further mode        f = E d_{t-l}, responses later than those of the model
     nonlinear body      f = (B, E) (y^2, y^3)
 
-The test is made at the fit with its prior, so that a stated uncertainty explains what it can. All
-rows are whitened by the residuals' autoregression of order one, and M is what gain, metric, initial
-states and parameters cannot make up for. With U an orthonormal basis of M c, e the residual and V
-the long-run covariance of U'e (`long_run_covariance`), T = (U'e)' V^-1 (U'e) is chi-squared with d
-degrees of freedom where the model holds; F's distribution with as many independent samples as the
-colour leaves takes its place. Holm's correction holds the level over all groups
-(docs/fitting.md has level and power).
+The test uses the fit with its prior, so that stated uncertainties explain what they can. Rows are
+whitened by a first-order autoregression of the residuals, and M projects on the complement of gain,
+metric, initial states and parameters. With U an orthonormal basis of M c, e the residual and V the
+long-run covariance of U'e (`long_run_covariance`), T = (U'e)' V^-1 (U'e) is chi-squared with d
+degrees of freedom under the model; the F distribution with the effective number of independent
+samples replaces it. Holm's correction keeps the level over all groups.
 """
 
 from __future__ import annotations
@@ -65,13 +64,13 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.model.recordings import Recording
 
-#: Probability of any alarm where the model holds, by the distributions named above. Persons who all
-#: but fall have heavier tails: at this level 4 % of 161 carts gave one, at .05 it was 7 %.
+#: Probability of any alarm under a correct model, by these distributions. Trials close to a fall
+#: have heavier tails: at this level 4 % of 161 carts gave an alarm, at 0.05 7 %.
 LEVEL = 0.02
 DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
 PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
 MODE, NONLINEAR = "a further mode", "a nonlinear body"
-#: Parameters of a family by which some of them can be fitted, as their names begin.
+#: Names of the fitted parameters that replace a test, by their beginning.
 PARAMETERS = {DELAY: plant_family.DELAY, LIMIT: plant_family.LIMIT, PUSH: STRENGTH}
 _CURES = {
     DELAY: with_delay_unknown,
@@ -80,45 +79,45 @@ _CURES = {
     OFFSET: with_offsets_unknown,
     PUSH: with_strength_unknown,
 }
-# Samples, in shares of the shortest trial, at which an answer may come later.
+# Later responses that are tested, in shares of the shortest trial.
 _LATER = (0.005, 0.01, 0.02, 0.04)
-# Of a column: less that the fit cannot make up for is nothing to test.
+# Least share of a column that the fit cannot compensate.
 _LEFT = 1e-3
-# Trials that are tested, at most.
+# Largest number of trials tested.
 _MOST = 12
-# Residuals below this share of the outputs are rounding; fewer samples are no test.
+# Residuals below this share of the outputs are rounding; least number of samples.
 _EXACT, _FEWEST = 1e-7, 100
 
 
 @dataclass(frozen=True)
 class ModelError(Frozen):
-    """One kind of error of the model, and what the residuals say of it."""
+    """One kind of model error, with its test."""
 
     name: str
-    probability: float  # Of as much where the model holds
-    evidence: float  # Minus its logarithm
-    # How large the error is that explains it, with its standard deviation, in samples of delay or
-    # shares of a limit or perturbation; NaN for a group of several columns
+    probability: float  # p-value
+    evidence: float  # -log(p-value)
+    # Estimated size of the error and its standard error, in samples of delay or shares of a limit
+    # or perturbation; NaN for a group of several columns
     size: float
     deviation: float
 
 
 @dataclass(frozen=True)
 class LackOfFit(Frozen):
-    """The test of every kind of error."""
+    """Tests of all kinds of model error."""
 
-    errors: tuple[ModelError, ...]  # Those that can be tested, the most probable culprit first
-    alarm: bool  # Whether any is found, all together
-    untestable: tuple[str, ...]  # Kinds that the fit makes up for, whatever their size
+    errors: tuple[ModelError, ...]  # Testable kinds, smallest p-value first
+    alarm: bool  # Whether any test rejects, after Holm's correction
+    untestable: tuple[str, ...]  # Kinds that other fitted quantities compensate completely
 
     @property
     def culprit(self) -> ModelError | None:
-        """The error that explains most, where there is an alarm."""
+        """Error with the smallest p-value, if there is an alarm."""
         return self.errors[0] if self.alarm else None
 
 
 def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
-    """Test the model of a fit; None where there is too little to test, or an exact fit."""
+    """Test the model of a fit; None for an exact fit, gaps or too few samples."""
     problem, K, S = _some_trials(estimate.problem), np.array(estimate.K), np.array(estimate.S)
     found = evaluate(problem, K, S)
     samples = sum(trial.samples for trial in problem.recordings)
@@ -142,20 +141,20 @@ def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
 
 
 def with_culprit(problem: Problem, found: LackOfFit | None) -> Problem | None:
-    """The problem with the unknown that it was found to lack; None where there is none to add."""
+    """Problem with the unknown that the test suggests; None if there is none to add."""
     culprit = None if found is None else found.culprit
     cure = None if culprit is None else _CURES.get(culprit.name)
     return None if cure is None else cure(problem)
 
 
 def _some_trials(problem: Problem) -> Problem:
-    """Every k-th trial of many: each has columns of its own, and a few show any error."""
+    """Every k-th trial, at most `_MOST`: each trial adds columns, and a few suffice."""
     every = -(-len(problem.recordings) // _MOST)
     return replace(problem, recordings=problem.recordings[::every])
 
 
 class _Tested:
-    """Whitened columns without what the fit makes up for, and the noise of the rest."""
+    """Whitened columns after projection on the fitted quantities, and their noise."""
 
     def __init__(
         self, problem: Problem, found: Evaluation, K: Array, S: Array, columns: Array
@@ -180,7 +179,7 @@ class _Tested:
         self.noise = residual_noise(by_trial(problem, left), everything)
 
     def _basis(self, part: IntArray) -> Array:
-        """Orthonormal basis of what some columns have that the fit cannot make up for."""
+        """Orthonormal basis of the part of some columns that the fit cannot compensate."""
         size = np.linalg.norm(self.seen[:, part], axis=0)
         usable = part[size > _LEFT * self.whole[part]]
         scaled = self.seen[:, usable] / np.linalg.norm(self.seen[:, usable], axis=0)
@@ -190,7 +189,7 @@ class _Tested:
         return np.asarray(left[:, values > _LEFT])
 
     def of(self, name: str, part: IntArray) -> ModelError | None:
-        """The test of one group of columns."""
+        """Test one group of columns; None if the fit compensates all of it."""
         U = self._basis(part)
         d = U.shape[1]
         if d == 0:
@@ -209,14 +208,14 @@ class _Tested:
         return ModelError(name, float(np.exp(-evidence)), evidence, size, deviation)
 
     def _independent(self) -> float:
-        """How many independent samples are as good as those that were recorded."""
+        """Effective number of independent samples."""
         slow = float(np.max(np.clip(self.root, 0.0, None)))
         samples = sum(trial.samples for trial in self.problem.recordings)
         return max(samples * (1 - slow) / (1 + slow), 10.0)
 
 
 def _whitened(problem: Problem, found: Evaluation) -> tuple[Evaluation, Array]:
-    """The same in rows whose noise is white, and the roots of their autoregression (p,)."""
+    """Evaluation with whitened rows, and the autoregression coefficients (p,)."""
     root = np.array(residual_noise(by_trial(problem, found.residual)).root)
     names = ("residual", "dK", "dS", "own", "dparameters")
     parts = {name: _white_rows(problem, getattr(found, name), root) for name in names}
@@ -224,7 +223,7 @@ def _whitened(problem: Problem, found: Evaluation) -> tuple[Evaluation, Array]:
 
 
 def _white_rows(problem: Problem, rows: Array, root: Array) -> Array:
-    """x_t - a x_{t-1} of each trial and output; the first as its variance asks."""
+    """x_t - a x_{t-1} of each trial and output; the first sample scaled to equal variance."""
     parts = []
     for part in by_trial(problem, rows):
         a = root.reshape(-1, *[1] * (part.ndim - 2))
@@ -236,7 +235,7 @@ def _white_rows(problem: Problem, rows: Array, root: Array) -> Array:
 
 
 def _columns(problem: Problem, K: Array, S: Array) -> list[tuple[str, Array]]:
-    """Derivatives of the residual along each kind of error, by name."""
+    """Derivatives of the residual by each kind of error, by name."""
     controller = controller_for(problem, K, S)
     prepared = prepare_loop(
         controller, directions(controller, problem.plant.n, x0=np.eye(len(K.T)))
@@ -259,7 +258,7 @@ def _columns(problem: Problem, K: Array, S: Array) -> list[tuple[str, Array]]:
 
 
 def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -> dict[str, Array]:
-    """Those that a forcing makes, in one trial (rows, d); `local` (steps, m, n) are G_t."""
+    """Columns made by a forcing, for one trial (rows, d); `local` (steps, m, n) are G_t."""
     plant, u, d = problem.plant, np.array(run.u), np.array(trial.disturbance[: len(run.u)])
     y = run.x[:-1] @ plant.C.T
     y = y / np.maximum(np.sqrt(np.mean(y**2, axis=0)), 1e-300)
@@ -297,12 +296,12 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
 
 
 def _through(slopes: Array, column: Array) -> Array:
-    """A forcing (steps, n) by a signal (steps, inputs) through slopes (steps, n, inputs)."""
+    """Forcing (steps, n) of a signal (steps, inputs) through slopes (steps, n, inputs)."""
     return np.asarray(np.einsum("tni,ti->tn", slopes, column))
 
 
 def _single(signals: Array) -> list[Array]:
-    """Each signal (steps, i) by itself, the others zero."""
+    """Each signal (steps, i) alone, the others zero."""
     return [signals * unit for unit in np.eye(signals.shape[1])]
 
 
@@ -316,7 +315,7 @@ def _later(signal: Array, steps: int) -> Array:
 
 
 def _along_limits(problem: Problem, controller: Controller) -> Array:
-    """Derivatives by the logarithm of the limit of each control that has one (r, k)."""
+    """Derivatives by the log of each finite control limit (r, k)."""
     rows = bound_rows(controller.bounds, problem.plant)
     moves = [column for k in range(problem.plant.m) if np.any(column := rows.along_limit(k))]
     if not moves:
@@ -326,7 +325,7 @@ def _along_limits(problem: Problem, controller: Controller) -> Array:
 
 
 def _offsets(problem: Problem) -> Array:
-    """One in each output of each trial that is not fitted anyway (r, k)."""
+    """Unit offset in each output and trial that is not fitted (r, k)."""
     names = problem.plant.outputs
     places = [k for k, name in enumerate(names) if name not in problem.offsets]
     parts, count = [], len(problem.recordings)

@@ -1,7 +1,7 @@
-"""What a lasting tilt ends up with: the command once nerves and muscles have settled.
+"""Steady opposing command for a lasting deflection of one state.
 
-States that the body does not act on (a delay, a muscle) follow the command alone. With u constant
-they settle at x_a = D u, D = (I - A_aa)^-1 B_a, and u = -K_i x_i - K_a x_a gives
+States that only the command drives (delay, muscle) settle under a constant u at x_a = D u,
+D = (I - A_aa)^-1 B_a, and u = -K_i x_i - K_a x_a gives
 
     u = -(I + K_a D)^-1 K_i x_i.
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LastingResponse:
-    """Opposing command of one control for a state that stays at 1, all others at rest."""
+    """Steady opposing command of one control for a state held at 1, all others at rest."""
 
     state: str
     control: str
     value: float
-    low: float  # At 95 %
+    low: float  # 95 % interval
     high: float
     identified: bool
 
 
 def follows_command(plant: Plant) -> BoolArray:
-    """Which states follow the command alone (n,): those of nerves and muscles."""
+    """Mask of the states (n,) driven by the command alone, such as nerves and muscles."""
     inside = ~np.any(plant.E != 0, axis=1) & ~np.any(plant.C != 0, axis=0)
     while True:
         left = inside & ~np.any(plant.A[:, ~inside] != 0, axis=1)
@@ -46,14 +46,14 @@ def follows_command(plant: Plant) -> BoolArray:
 
 
 def lasting_responses(estimate: GainEstimate) -> tuple[LastingResponse, ...]:
-    """Of every output that is a state; none where no state follows the command alone."""
+    """For each output that is a state; empty if no state is driven by the command alone."""
     plant, K = estimate.problem.plant, np.array(estimate.K)
     inner = follows_command(plant)
     outer = [int(np.argmax(row != 0)) for row in plant.C if np.count_nonzero(row) == 1]
     if not np.any(inner) or not outer:
         return ()
     settled = np.eye(int(np.count_nonzero(inner))) - plant.A[np.ix_(inner, inner)]
-    if np.linalg.cond(settled) > 1 / np.finfo(float).eps:  # it integrates the command
+    if np.linalg.cond(settled) > 1 / np.finfo(float).eps:  # integrates the command
         return ()
     D = np.linalg.solve(settled, plant.B[inner])
     W = np.linalg.inv(np.eye(plant.m) + K[:, inner] @ D)

@@ -1,4 +1,4 @@
-"""What other limits of the command would leave unexplained: a curve, each point fitted anew."""
+"""Unexplained variance as a function of the command limit, gain refitted at each point."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-# Of the limit, outwards from it in both directions: each starts from its neighbour.
+# Limits relative to that of the fit; each fit starts from its neighbour.
 _BELOW, _ABOVE = (0.9, 0.75), (1.15, 1.5)
-# More change what is left by a tenth of itself, and take three times as long.
+# More evaluations change the unexplained variance by a tenth and take three times as long.
 _EVALUATIONS = 6
 
 
@@ -31,26 +31,26 @@ class LimitCurve(Frozen):
     control: str
     given: float  # The limit of the fit
     limits: Array  # In the unit of the control (t,), ascending
-    unexplained: Array  # 100 - VAF, % (t, p); NaN where no gain was found
+    unexplained: Array  # 100 - VAF, % (t, p); NaN without a gain
 
     @property
     def left(self) -> Array:
-        """Unexplained of all outputs (t,); infinite where no gain was found."""
+        """Unexplained variance summed over outputs (t,); infinite without a gain."""
         return np.asarray(np.nan_to_num(self.unexplained, nan=np.inf).sum(axis=1))
 
     @property
     def best(self) -> int:
-        """Place of the limit that leaves least."""
+        """Index of the limit with the least unexplained variance."""
         return int(np.argmin(self.left))
 
     @property
     def own(self) -> int:
-        """Place of the limit of the fit."""
+        """Index of the limit of the fit."""
         return int(np.argmin(np.abs(self.limits - self.given)))
 
 
 def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
-    """Around the limit of a fit, where the command reaches it; None where it does not."""
+    """Curve around a finite symmetric limit; None if there is none."""
     problem = fitted.problem.with_body_fixed()
     limit = float(problem.bounds.u_max[control])
     if not np.isfinite(limit) or problem.bounds.u_min[control] != -limit or problem.plant.commands:
@@ -67,7 +67,7 @@ def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
                     max_evaluations=_EVALUATIONS,
                     prior=1.0,
                 )
-            except (SolverError, WeightsError):  # no gain near balances with so little
+            except (SolverError, WeightsError):  # no stabilising gain with so low a limit
                 points[share * limit] = np.full(len(problem.plant.outputs), np.nan)
                 break
             here = found.problem, np.array(found.K), np.array(found.S)

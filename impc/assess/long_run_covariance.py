@@ -1,9 +1,9 @@
-"""The noise that the residuals of a fit show: its colour, and what it does to an estimate.
+"""Autocorrelation of the residuals and its effect on standard errors (HAC).
 
-Residuals e_t of p outputs are taken as stationary. Each output is first whitened by an
-autoregression of order one (Andrews and Monahan, Econometrica 60, 1992, 953), then the
-autocovariances of what is left, eps_t, are summed under Parzen's window, which keeps every sum
-non-negative, with the bandwidth of Andrews (Econometrica 59, 1991, 817):
+Residuals e_t of p outputs are modelled as stationary. Each output is prewhitened by a first-order
+autoregression (Andrews and Monahan, Econometrica 60, 1992, 953), then the autocovariances of eps_t
+are summed under Parzen's window, which keeps sums non-negative, with the bandwidth of Andrews
+(Econometrica 59, 1991, 817):
 
     e_t = diag(a) e_{t-1} + eps_t,        Gamma_l = w_l E[eps_{t+l} eps_t'].
 
@@ -11,14 +11,13 @@ The covariance of sum_t J_t' e_t is then
 
     sum_{t,s} W_t' Gamma_{t-s} W_s,        W_t = J_t + diag(a) W_{t+1}.
 
-Residuals of a fit are smaller than the noise, and most along what was fitted, which is slow: the
-lags that a fit takes away add up. With S the covariance of the noise and Z an orthonormal basis of
-what was fitted, e = (I - Z Z') noise has the covariance
+Residuals are smaller than the noise, mostly along the slow fitted columns. With S the covariance of
+the noise and Z an orthonormal basis of the fitted columns, e = (I - Z Z') noise has the covariance
 
     S - (Z Z' S + S Z Z' - Z Z' S Z Z'),
 
-and what stands in brackets, for the S of the residuals themselves, is given back lag by lag
-(docs/fitting.md).
+and the bracket, with S estimated from the residuals, is added back lag by lag
+(docs/why/intervals.md).
 """
 
 from __future__ import annotations
@@ -38,37 +37,36 @@ if TYPE_CHECKING:
 
     Taken = tuple[Array, Array]
 
-# Andrews and Monahan: a root nearer to one is not distinguished from one, and would be taken too
-# seriously.
+# Andrews and Monahan: larger roots cannot be distinguished from one.
 _LARGEST_ROOT = 0.97
-# Samples before the first over which noise still has an effect: 0.97^250 is 5e-4.
+# Samples before the first in which noise still matters: 0.97^250 is 5e-4.
 _BEFORE = 250
-# Lags up to which plain sums take less time than Fourier transforms: with eight, a seventh.
+# Up to this number of lags direct sums are faster than Fourier transforms.
 _FEW_LAGS = 32
-# Of giving back what a fit takes, which is identified by the colour that is sought.
+# Iterations of the correction for the fit, which depends on the estimated S.
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class ResidualNoise(Frozen):
-    """A model of residuals."""
+    """Autocorrelation model of residuals."""
 
-    root: Array  # a, one for each output (p,)
+    root: Array  # a of each output (p,)
     gammas: Array  # Tapered autocovariances of eps, lags 0 to `bandwidth`, (lags, p, p)
 
     @property
     def bandwidth(self) -> int:
-        """Lags of eps that count."""
+        """Largest lag of eps that counts."""
         return len(self.gammas) - 1
 
 
 def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
-    """Estimate the colour of residuals; `trials` (samples, p)."""
+    """Estimate the autocorrelation of residuals; `trials` (samples, p)."""
     return _restored(_first_order, trials, fitted)
 
 
 def white_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
-    """As `residual_noise` if the residuals were white: outputs may be correlated, samples not."""
+    """Model of white residuals: correlated between outputs, not between samples."""
     return _restored(_white, trials, fitted)
 
 
@@ -112,9 +110,9 @@ def _first_order(trials: list[Array], taken: list[Taken]) -> ResidualNoise:
 
 
 def _taken(noise: ResidualNoise, fitted: TrialSpan, trials: list[Array]) -> list[Taken]:
-    """What a fit takes of S, the covariance of the noise, trial by trial.
+    """Part of the noise covariance S that a fit removes, per trial.
 
-    Z and M = S Z - Z (Z' S Z) / 2, (samples, p, k): in each trial Z M' + M Z' is taken.
+    Z and M = S Z - Z (Z' S Z) / 2, (samples, p, k): Z M' + M Z' is removed in each trial.
     """
     root, parts, row = np.asarray(noise.root), [], 0
     for own, trial in zip(fitted.own, trials, strict=True):
@@ -132,11 +130,11 @@ def _taken(noise: ResidualNoise, fitted: TrialSpan, trials: list[Array]) -> list
 
 
 def _given_back(taken: list[Taken], largest: int) -> Array:
-    """Sums of lagged products that a fit has taken, as `_lagged`."""
+    """Sums of lagged products that a fit has removed, as `_lagged`."""
     count = taken[0][0].shape[1] if taken else 1
     result = np.zeros((largest + 1, count, count))
     for pair in taken:
-        # One output after the other: each sum is then over one piece of memory.
+        # One output at a time, so that each sum runs over contiguous memory.
         one, two = (np.ascontiguousarray(np.swapaxes(part, 0, 1)) for part in pair)
         for ahead, behind in ((one, two), (two, one)):
             for lag, i, j in np.ndindex(result.shape):
@@ -146,12 +144,12 @@ def _given_back(taken: list[Taken], largest: int) -> Array:
 
 
 def _whitened(part: Array, root: Array) -> Array:
-    """eps_t = part_t - root part_{t-1} of a part (samples, p, ...), but for the first sample."""
+    """eps_t = part_t - root part_{t-1} of a part (samples, p, ...) without its first sample."""
     return np.asarray(part[1:] - root.reshape(-1, *[1] * (part.ndim - 2)) * part[:-1])
 
 
 def _to_innovations(columns: Array, root: Array) -> Array:
-    """W_t = columns_t + diag(a) W_{t+1}, some samples before the first included."""
+    """W_t = columns_t + diag(a) W_{t+1}, including samples before the first."""
     before = np.zeros((_BEFORE if np.any(root) else 0, *columns.shape[1:]))
     return _filtered(np.concatenate([before, columns])[::-1], root)[::-1]
 
@@ -187,7 +185,7 @@ def _convolved(columns: Array, gammas: Array) -> Array:
 
 
 def _roots(trials: list[Array], taken: list[Taken]) -> Array:
-    """Roots of the outputs of residuals, from which a fit has `taken`."""
+    """Autoregression coefficients of residuals, corrected for what the fit has `taken`."""
     above = sum(np.sum(part[1:] * part[:-1], axis=0) for part in trials)
     below = sum(np.sum(part[:-1] ** 2, axis=0) for part in trials)
     back = np.diagonal(_given_back(taken, 1), axis1=1, axis2=2)

@@ -1,20 +1,15 @@
-"""The gain that recordings identify: what a fit prints with intervals, and how precise it is.
+"""Gain reported with intervals: the weights' gain, updated along identified directions.
 
-The weights of a fit are chosen with a penalty on their condition number, which moves their gain,
-and they are confined to gains that some weights have. A gain without weights that is free in every
-direction is no better: along those that are hardly identified it drifts, often to the edge
-of stability, where every derivative is another one and deviations come out too small
-(docs/fitting.md has the measurements). So the gain of the weights is moved along the directions
-that the recordings identify (`gain_covariance.IDENTIFIED`), by plain least squares together with S,
-initial states and parameters, and along no other:
+The gain of fitted weights is biased by the penalty on their condition number, and an unrestricted
+gain drifts along hardly identified directions, often to the edge of stability, where standard
+errors are too small. Therefore the weights' gain is updated by ordinary least squares, jointly with
+S, initial states and parameters, along the identified directions only (`covariance.IDENTIFIED`):
 
-    K = K_weights + sum over identified directions i of  w_i  direction_i      in natural
-    coordinates
+    K = K_weights + sum over identified directions i of  w_i  direction_i    (whitened coordinates)
 
-The directions are taken anew at the gain that was found, until the misfit stays. Along them the
-estimate is that of least squares without prior, and the interval from its covariance is its own.
-Parameters are searched in logarithms and are positive: their intervals are value * exp(+- z
-deviation). docs/fitting.md says how often each interval covers the truth.
+Directions are recomputed at the new gain until the misfit stays. Along them the estimate is that of
+least squares without a prior, which its covariance describes. Parameters are positive and searched
+in logarithms: their intervals are value * exp(+- z SE). See docs/why/intervals.md.
 """
 
 from __future__ import annotations
@@ -48,25 +43,25 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 
-# On 60 random plants 51 searches ended after two rounds, 9 after three.
+# Of 60 random plants 51 searches ended after two rounds, 9 after three.
 _ROUNDS = 4
 _EVALUATIONS = 40
-# Nats at which a search ends, and a round is the last.
+# Nats at which a search, and the iteration of rounds, ends.
 _TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
 class IdentifiedGain:
-    """The gain that the recordings identify."""
+    """Gain that the recordings identify."""
 
-    problem: Problem  # At the initial states and parameters found with this gain
-    K: Array  # (m, n); the weights' along what the recordings do not identify
-    S: Array  # (m, m); the weights' where the recordings do not identify it
+    problem: Problem  # At the initial states and parameters fitted with this gain
+    K: Array  # (m, n); that of the weights along unidentified directions
+    S: Array  # (m, m); that of the weights where not identified
     misfit: float  # 2-norm of the residual
 
     @property
     def parameters(self) -> Array:
-        """Physical parameters in their units (k,); k is 0 where none are fitted."""
+        """Physical parameters in their units (k,); empty if none are fitted."""
         family = self.problem.family
         if family is None:
             return np.zeros(0)
@@ -75,16 +70,16 @@ class IdentifiedGain:
 
 @dataclass(frozen=True)
 class GainEstimate(IdentifiedGain):
-    """The gain that the recordings identify, and how far it is determined."""
+    """Identified gain with its covariance."""
 
     linear: GainCovariance  # To first order
-    covariance: GainCovariance  # For noise of the colour that the residuals show, with curvature
-    # The same if what has a stated uncertainty were exactly as it was found; None without any
+    covariance: GainCovariance  # HAC covariance with curvature
+    # The same with stated uncertainties set to zero; None if there are none
     exact: GainCovariance | None = None
 
 
 def gain_estimate(fitted: Estimate) -> GainEstimate:
-    """Estimate the gain behind a fit, and how far it is determined."""
+    """Estimate the identified gain of a fit, and its covariance."""
     here = _search(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     problem, at = here.problem, (frozen(here.K), frozen(here.S))
     fixed, found = problem.with_body_fixed(), here.evaluation
@@ -100,14 +95,14 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
 
 
 def identified_gain(problem: Problem, gain: Array, metric: Array) -> IdentifiedGain:
-    """Estimate the gain behind recordings from one near it: that of the weights of a fit."""
+    """Estimate the identified gain, starting from a gain near it."""
     here = _search(problem, gain, metric)
     return IdentifiedGain(here.problem, frozen(here.K), frozen(here.S), here.misfit)
 
 
 @dataclass(frozen=True)
 class _Here(IdentifiedGain):
-    """A gain of the search, with what the recordings say of it to first order."""
+    """Gain of the search with its first-order covariance."""
 
     evaluation: Evaluation
     linear: GainCovariance
@@ -118,7 +113,7 @@ def _search(problem: Problem, gain: Array, metric: Array) -> _Here:
     explained = here.misfit <= EXPLAINED * recorded_size(problem)
     for _ in range(0 if explained else _ROUNDS):
         there = _round(here)
-        if there is None:  # it leaves what can be described: the last gain stands
+        if there is None:  # no covariance there: keep the last gain
             break
         before, here = here, there
         same = np.count_nonzero(here.linear.identified) == np.count_nonzero(
@@ -137,10 +132,9 @@ def _described(problem: Problem, gain: Array, metric: Array, evaluation: Evaluat
 
 
 def _round(here: _Here) -> _Here | None:
-    """Least squares over the identified directions and everything beside the gain.
+    """Least squares over the identified directions and all unknowns other than the gain.
 
-    What is beside the gain has the normal prior of any search (`fit_gain`): it is not printed with
-    an interval, and some of it nothing determines.
+    The latter keep the prior of any search (`fit_gain`): some of them are not identified.
     """
     space = Coordinates(here.problem, here.K, here.S)
     space.evaluated(space.start, here.evaluation)
@@ -157,29 +151,27 @@ def _round(here: _Here) -> _Here | None:
     return _described(there.problem, there.K, there.S, space.evaluated(z)[0])
 
 
-#: Of an interval, where none is asked for.
+#: Default confidence level.
 LEVEL = 0.95
-#: Standard error of the logarithm of a parameter from which on it is not identified.
+#: Largest standard error of the log of an identified parameter.
 PARAMETER = 0.5
 
 
 @dataclass(frozen=True)
 class Interval:
-    """One interval."""
+    """Confidence interval of one number."""
 
     name: str  # K.<control>.<state>, the name of a parameter, or u_max.<control>
-    # sandwich: normal, for the colour that the residuals show; block: of a bootstrap; profile: see
-    # `profiles`
+    # sandwich: normal with HAC standard error; block: bootstrap; profile: profile likelihood
     method: str
     level: float  # Between 0 and 1, 0.95 for 95 %
-    value: float | None  # The estimate; None when nothing determines it
-    low: float  # Infinite where the recordings set no end
+    value: float | None  # Estimate; None if not identified
+    low: float  # Infinite if the recordings set no end
     high: float
-    # Whether this number is individually identified: an entry of the gain by `GainCovariance`, a
-    # parameter when the standard error of its logarithm is below 0.5. Where it is not, a
-    # covariance's interval is that of a plain least-squares estimate, while the value is kept near
-    # where the search began: it covers the truth more often than its level. A bootstrap's has no
-    # ends.
+    # Whether the number is individually identified: gain entries by `GainCovariance`, parameters if
+    # the standard error of the log is below 0.5. If not, a sandwich interval is that of ordinary
+    # least squares, while the value stays near its start, so that coverage exceeds the level; a
+    # bootstrap interval is infinite.
     identified: bool = True
 
     @property
@@ -216,7 +208,7 @@ def covariance_intervals(
         for name, value, deviation, stated in zip(
             family.names, estimate.parameters, covariance.parameters, family.stated, strict=True
         ):
-            if stated:  # what was stated is no result of the recordings
+            if stated:  # a stated value is not a result
                 continue
             low, high = _around(value, z * float(deviation))
             identified = bool(deviation < PARAMETER)
@@ -225,19 +217,19 @@ def covariance_intervals(
 
 
 def _around(value: Array, half: float) -> tuple[float, float]:
-    """value * exp(-+ half); 0 and infinity when nothing is known."""
-    if half > 700:  # exp overflows: the logarithm is as good as free
+    """value * exp(-+ half); 0 and infinity if unknown."""
+    if half > 700:  # exp would overflow
         return 0.0, float("inf")
     return float(value * np.exp(-half)), float(value * np.exp(half))
 
 
 def interval_table(fitted: Estimate) -> pd.DataFrame:
-    """Intervals of the gain and of fitted parameters, for the noise that the residuals show."""
+    """Intervals of the gain and of fitted parameters, with HAC standard errors."""
     return _table(gain_estimate(fitted))
 
 
 def continuous_interval_table(fitted: Estimate) -> pd.DataFrame:
-    """The same of the gain in continuous time, to first order (delta method)."""
+    """`interval_table` for the continuous-time gain, to first order (delta method)."""
     found = gain_estimate(fitted)
     K, slopes = continuous_gain(found.problem.plant, found.K)
     entries, foreign = found.covariance.combinations(slopes)

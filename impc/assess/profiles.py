@@ -1,20 +1,18 @@
-"""Profile likelihood of one number behind a fit: an entry of the gain, or a physical parameter.
+"""Profile likelihood of one entry of the gain or one physical parameter.
 
-The number is held at a value v and everything else - the rest of the gain, initial states, other
-parameters - is fitted again. With m(v) the misfit that is left, s^2 the variance of a residual and
-f >= 1 the factor by which the colour of the residuals widens the variance of the number,
+The number is fixed at v and everything else (rest of the gain, initial states, other parameters) is
+refitted. With the misfit m(v), the residual variance s^2 and the factor f >= 1 by which
+autocorrelation widens the variance of the number,
 
     D(v) = (m(v)^2 - m(v*)^2) / (s^2 f)
 
 is chi-squared with one degree of freedom at the true value, and {v : D(v) <= q} is an interval that
-need not be symmetric and is not fooled by curvature. It ends nowhere if the misfit stays: then the
-recordings do not determine the number. The input limit has a module of its own, `unknown_limit`.
-docs/fitting.md says how often the interval covers the truth.
+need not be symmetric. Without an end the recordings do not identify the number. For the input limit
+see `input_limits`.
 
-A parameter's logarithm is affine in the coordinates z of the search (`Coordinates`), an entry of K
-in those of the gain while the metric stands. With a' the number's derivative at the start, the
-search goes on in the null space of a', and each point is brought back to the number along one
-direction.
+A log-parameter is affine in the coordinates z of the search (`Coordinates`), an entry of K in those
+of the gain at a fixed metric. With a' the derivative of the number at the start, the search runs in
+the null space of a', and each point is moved back to the fixed number along one direction.
 """
 
 from __future__ import annotations
@@ -39,10 +37,9 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
 
-# A prior this much wider than any gain that can be keeps free directions from drifting off.
+# Prior width, far beyond any possible gain, that keeps free directions from drifting.
 _WIDTH = 100.0
-# Steps, in deviations, of the walk that looks for the ends; where D is still low at the last one
-# the recordings set no end.
+# Steps, in standard errors, towards an end; if D stays low there is no end.
 _STEPS = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
 _END = 1e-3
 _ROUNDS = 6
@@ -52,14 +49,14 @@ _ROUNDS = 6
 class Profile(Frozen):
     """Profile of one number."""
 
-    interval: Interval  # Method "profile"
-    # Values tried (t,), ascending, in the number's unit, and D at each (t,), for a picture
+    interval: Interval  # Interval with method "profile"
+    # Values tried (t,), ascending, and D at each (t,), for figures
     values: Array
     distances: Array
 
 
 def profile_likelihood(estimate: GainEstimate, name: str) -> Profile:
-    """Profile an entry of K (name K.<control>.<state>) or a parameter fitted with it."""
+    """Profile an entry of K (K.<control>.<state>) or a fitted parameter."""
     require_numbers(estimate, [name])
     search = _Search(estimate, name)
     quantile = float(scipy.special.chdtri(1, 1 - LEVEL))
@@ -75,17 +72,17 @@ def profile_likelihood(estimate: GainEstimate, name: str) -> Profile:
 
 
 def require_numbers(estimate: GainEstimate, names: Sequence[str]) -> None:
-    """Require that every name is of an entry of K or a parameter that was fitted."""
+    """Raise InputError unless each name is an entry of K or a fitted parameter."""
     family = estimate.problem.family
     known = [*entry_names(estimate.problem.plant), *(() if family is None else family.names)]
     for name in names:
         if name not in known:
-            said = f"known: {', '.join(known)}"
-            raise InputError(f"profile of {name}", "there is no such number", said)
+            said = f"choose from: {', '.join(known)}"
+            raise InputError(f"profile of {name}", "no such entry or parameter", said)
 
 
 class _Search:
-    """Fits with the number held, remembered; offsets are from the fit's, in z units."""
+    """Cached fits with the number fixed; offsets from the fit are in units of z."""
 
     def __init__(self, estimate: GainEstimate, name: str) -> None:
         problem = estimate.problem
@@ -93,7 +90,7 @@ class _Search:
         self.held, self.number = _functional(estimate, self.space, name)
         _, direction = self.held(self.space.start)
         self.null = scipy.linalg.null_space(direction[None])
-        # Along the gain, or the parameter, alone: there the number is affine.
+        # Only along gain or parameter, where the number is affine.
         own = (
             slice(0, self.space.ends[0]) if np.any(direction[: self.space.ends[0]]) else slice(None)
         )
@@ -111,7 +108,7 @@ class _Search:
         self.deviation, self.factor = _spread(estimate, name)
 
     def squared(self, offset: float) -> float:
-        """m^2 with the number at this offset, from the nearest fit before."""
+        """m^2 with the number at this offset, started from the nearest previous fit."""
         if offset not in self.tried:
             if self.tried:
                 near = min(self.tried, key=lambda known: abs(known - offset))
@@ -137,7 +134,7 @@ class _Search:
         return self.tried[offset][0]
 
     def _at(self, offset: float, w: Array) -> tuple[Array, Array]:
-        """The point with the number at the offset, and its derivative with respect to w."""
+        """Point with the number at the offset, and its derivative by w."""
         z = self.space.start + offset * self.unit + self.null @ w
         value, slope = self.held(z)
         here = float(slope @ self.unit)
@@ -149,15 +146,15 @@ class _Search:
         return min(self.tried, key=lambda offset: self.tried[offset][0])
 
     def distance(self, offset: float) -> float:
-        """D."""
+        """D at an offset."""
         least = self.tried[self.best_offset()][0]
         return float((self.squared(offset) - least) / (self.noise**2 * self.factor))
 
     def ends(self, quantile: float) -> list[float]:
-        """Offsets at which D passes the quantile on either side of its minimum.
+        """Offsets at which D crosses the quantile on either side of its minimum.
 
-        The search itself had a prior, which the profile does not feel: its minimum may be
-        elsewhere, and a walk may find it. Then the walks begin again from there.
+        The search had a prior that the profile ignores, so its minimum may lie elsewhere; if a step
+        finds a better one, the bracketing restarts there.
         """
         ends: list[float] = []
         for _ in range(_ROUNDS):
@@ -169,7 +166,7 @@ class _Search:
         return ends
 
     def _refine(self) -> None:
-        """Look for the minimum between the neighbours of the best offset so far."""
+        """Refine the minimum between the neighbours of the best offset."""
         if not np.isfinite(self.deviation):
             return
         tried, best = sorted(self.tried), self.best_offset()
@@ -183,7 +180,7 @@ class _Search:
         )
 
     def _end(self, origin: float, sign: float, quantile: float) -> float:
-        """Offset at which D passes the quantile, infinite when it does not."""
+        """Offset at which D crosses the quantile, infinite if it does not."""
         if not np.isfinite(self.deviation):
             return sign * np.inf
         inside = origin
@@ -198,7 +195,7 @@ class _Search:
 def _functional(
     estimate: GainEstimate, space: Coordinates, name: str
 ) -> tuple[Callable[[Array], tuple[float, Array]], Callable[[float], float]]:
-    """The offset of the number at z with its derivative, and the number at an offset."""
+    """Functions: offset of the number at z with its derivative; number at an offset."""
     entries = entry_names(estimate.problem.plant)
     if name in entries:
         control, state = divmod(entries.index(name), space.n)
@@ -225,7 +222,7 @@ def _functional(
 
 
 def _spread(estimate: GainEstimate, name: str) -> tuple[float, float]:
-    """Deviation in units of the offset, and the factor f of the residuals' colour."""
+    """Standard error in units of the offset, and the autocorrelation factor f."""
     coloured = estimate.covariance
     at = estimate.problem, np.array(estimate.K), np.array(estimate.S)
     white = gain_covariance(*at, white_noise, curvature=True)

@@ -1,16 +1,12 @@
-"""Bootstrap of a fitted controller: simulate, add residuals drawn again, fit again.
+"""Block bootstrap of a fitted controller: simulate, add resampled residuals, refit.
 
-The disturbance is known and the same in every replicate; only the residuals are drawn, in blocks of
-the residuals of all trials, laid end to end (Künsch 1989). The length of a block is that of Politis
-and White (2004) for a first-order process, (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest of the
-outputs.
+The disturbance is the same in every replicate. Residuals are drawn in moving blocks from those of
+all trials (Künsch 1989). The block length is that of Politis and White (2004) for a first-order
+process, (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest over the outputs. Parameters with a stated
+uncertainty are redrawn about the estimate.
 
-A parameter of the body with a stated uncertainty is known from a measurement that might have come
-out otherwise: a replicate draws that too, about the estimate.
-
-Replicate k draws from the k-th child of the seed: the same numbers in any order, on any machine.
-Its search begins at the estimate and moves the gain alone (`identified_gain`): fitting weights anew
-would take most of its time, and their gain is not what is printed.
+Replicate k uses the k-th child of the seed, so that results do not depend on order or machine. The
+refit starts at the estimate and moves only the gain (`identified_gain`).
 """
 
 from __future__ import annotations
@@ -36,22 +32,22 @@ if TYPE_CHECKING:
 class Replicate(Frozen):
     """Estimates of one replicate."""
 
-    K: Array  # (m, n), of `identified_gain`
+    K: Array  # (m, n), see `identified_gain`
     parameters: Array  # Physical parameters in their units (k,)
 
 
 @dataclass(frozen=True)
 class BootstrapModel(Frozen):
-    """The estimate that replicates are drawn from."""
+    """Estimate from which replicates are drawn."""
 
-    problem: Problem  # At its initial states and parameters
+    problem: Problem  # At the estimated initial states and parameters
     K: Array  # (m, n)
     S: Array  # (m, m)
-    measured: tuple[Array, ...]  # Simulated without noise, (samples, q) of each trial
+    measured: tuple[Array, ...]  # Noise-free simulation, (samples, q) per trial
 
 
 def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapModel:
-    """Simulate an estimate once, for all replicates; `gain` (m, n); `metric` (m, m)."""
+    """Simulate an estimate once for all replicates; `gain` (m, n); `metric` (m, m)."""
     runs = simulated(problem, gain, metric)
     pairs = zip(problem.recordings, runs, strict=True)
     measured = tuple(frozen(modelled(problem, trial, run)) for trial, run in pairs)
@@ -59,7 +55,7 @@ def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapMo
 
 
 def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
-    """One replicate, by its number."""
+    """Replicate with number `index`."""
     recordings = model.problem.recordings
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
     pairs = list(zip(recordings, model.measured, strict=True))
@@ -67,7 +63,7 @@ def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
     drawn, p = block_residuals(residuals, rng), len(model.problem.plant.outputs)
     trials = []
     for (trial, values), noise in zip(pairs, drawn, strict=True):
-        new = values + noise + 0 * recorded(model.problem, trial)  # what is missing stays so
+        new = values + noise + 0 * recorded(model.problem, trial)  # missing values stay missing
         commands = new[:, p:] if len(trial.commands) else trial.commands
         trials.append(replace(trial, outputs=frozen(new[:, :p]), commands=frozen(commands)))
     problem = _body_measured_again(model.problem, rng)
@@ -76,7 +72,7 @@ def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
 
 
 def _body_measured_again(problem: Problem, rng: np.random.Generator) -> Problem:
-    """The same body, whose uncertain parameters have other nominal values."""
+    """Same plant with redrawn nominal values of the uncertain parameters."""
     if problem.family is None or not np.any(problem.stated):
         return problem
     error = problem.parameter_units * rng.standard_normal(len(problem.stated))
@@ -88,7 +84,7 @@ def _body_measured_again(problem: Problem, rng: np.random.Generator) -> Problem:
 def bootstrap_intervals(
     estimate: GainEstimate, replicates: Sequence[Replicate], method: str, level: float
 ) -> tuple[Interval, ...]:
-    """Percentile intervals of entries of K and of free parameters; no ends if not identified."""
+    """Percentile intervals of gain entries and free parameters; infinite if unidentified."""
     problem, free = estimate.problem, ~estimate.problem.stated
     names = [*entry_names(problem.plant), *np.array(problem.parameter_names)[free].tolist()]
     values = np.append(np.ravel(estimate.K), estimate.parameters[free])
@@ -97,8 +93,7 @@ def bootstrap_intervals(
     identified = np.append(
         np.ravel(estimate.covariance.individually_identified), np.ones(np.count_nonzero(free), bool)
     )
-    # Replicates stay where the search began along what is not identified: their spread says
-    # nothing.
+    # Replicates stay at the start along unidentified directions: their spread has no meaning.
     low, high = np.where(identified, low, -np.inf), np.where(identified, high, np.inf)
     return tuple(
         Interval(name, method, level, float(value), float(one), float(other), bool(known))
@@ -107,7 +102,7 @@ def bootstrap_intervals(
 
 
 def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Draw as many `residuals` (samples, p) of each trial again, in moving blocks."""
+    """Resample the `residuals` (samples, p) of each trial in moving blocks."""
     centred = [part - np.mean(part, axis=0) for part in residuals]
     length = block_length(residuals)
     drawn = []
@@ -122,7 +117,7 @@ def block_residuals(residuals: list[Array], rng: np.random.Generator) -> list[Ar
 
 
 def block_length(residuals: list[Array]) -> int:
-    """Samples of a block for `residuals` (samples, p), by the rule of the module's text."""
+    """Block length in samples for `residuals` (samples, p)."""
     above = sum(np.sum(part[1:] * part[:-1], axis=0) for part in residuals)
     below = sum(np.sum(part**2, axis=0) for part in residuals)
     root = np.clip(np.divide(above, below, out=np.zeros_like(below), where=below > 0), -0.99, 0.99)

@@ -1,4 +1,4 @@
-"""Several tests at once: the correction of their p-values by Holm (1979)."""
+"""Holm's correction of p-values (1979)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from impc.arrays import Array
 
 
 def holm(p: Array) -> Array:
-    """Return the p-values of several tests, each as if it were one of all that could be made.
+    """Holm-corrected p-values (k,) of `p` (k,); NaN stay NaN.
 
-    statsmodels has the same, and collects the garbage of the whole process at every call.
-
-    `p` (k,); returns (k,).
+    statsmodels' version runs a full garbage collection at every call.
     """
     order = np.argsort(p)[: np.count_nonzero(np.isfinite(p))]
     corrected = np.full(len(p), np.nan)

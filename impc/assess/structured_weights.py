@@ -1,14 +1,13 @@
-"""How far the weights of a structure are identified: deviations for any colour of the residuals.
+"""Standard errors of the weights of a structure under autocorrelated noise.
 
-As `covariance` has it for a gain: with J_t the derivative of the outputs at sample t with respect
-to the unknowns, once initial states and physical parameters have taken what they can,
+As `covariance` for a gain: with J_t the derivative of the outputs at sample t by the unknowns,
+after projection on initial states and physical parameters,
 
     cov = H^-1 cov( sum_t J_t' e_t ) H^-1,      H = sum_t J_t' J_t,
 
-of the logarithms of cost weights, and of the correlations where products of features have cost
-weights too (`Structure.reported`). A physical parameter moves the gain too, because the weights
-stay. A cost weight of zero is at its limit and is left out; `weight_profiles` gives its upper end
-(docs/structures.md).
+for log cost weights, and for correlations where products of features have cost weights
+(`Structure.reported`). A physical parameter moves the gain because the weights stay fixed. A cost
+weight of zero is at its bound and left out; `weight_profiles` gives its upper end.
 """
 
 from __future__ import annotations
@@ -45,54 +44,53 @@ if TYPE_CHECKING:
 
     NoiseModel = Callable[[list[Array], TrialSpan], ResidualNoise]
 
-#: A combination of logarithms is identified when its interval of 95 % ends within this factor.
+#: A combination of logarithms is identified if its 95 % interval ends within this factor.
 IDENTIFIED_FACTOR = 10.0
-# Of an unknown: a smaller share in a direction without a value is rounding's.
+# Share of an unknown in a direction without a value, below which it is rounding.
 _SHARE = 1e-3
 
 
 @dataclass(frozen=True)
 class Tangent(Frozen):
-    """The residual of a structured fit, and where it can move."""
+    """Residual of a structured fit and its derivatives."""
 
     structure: Structure
-    problem: Problem  # At the initial states and the parameters
-    solution: LqrSolution  # The regulator of the weights
+    problem: Problem  # At the fitted initial states and parameters
+    solution: LqrSolution  # Riccati solution of the weights
     cost_weights: Array  # Unknowns (count,); minus infinity is a cost weight of zero
     residual: Array  # (r,)
     found: Evaluation
-    # Derivative with respect to the unknowns (r, count), or to a cost weight itself where it is
-    # zero
+    # Derivative by the unknowns (r, count), or by the cost weight itself where it is zero
     on_cost_weights: Array
-    on_parameters: Array  # With respect to the parameters, the weights held (r, k)
-    noise: float  # Root-mean-square of the noise: of the residual, where recordings were made
+    on_parameters: Array  # By the parameters at fixed weights (r, k)
+    noise: float  # Noise SD; from recordings, the RMS residual
 
     @property
     def moving(self) -> BoolArray:
-        """Unknowns that are not cost weights of zero (count,)."""
+        """Mask of unknowns other than zero cost weights (count,)."""
         return np.isfinite(self.cost_weights)
 
     def without_nuisance(self, columns: Array, *beside: Array) -> Array:
-        """What initial states, parameters and others cannot make up of columns."""
+        """Columns after projection on initial states, parameters and others."""
         return self.span(*beside).without(columns)
 
     def span(self, *beside: Array) -> TrialSpan:
-        """What initial states, parameters and columns `beside` (r, b) can make up."""
+        """Span of initial states, parameters and columns `beside` (r, b)."""
         sizes = self.problem.row_sizes
         return trial_span(self.found.own, sizes, np.hstack([self.on_parameters, *beside]))
 
     def colour(self, model: NoiseModel, fitted: TrialSpan) -> ResidualNoise:
-        """That of the residuals that a fit of all in a span leaves."""
+        """Autocorrelation model of the residuals after a fit of the span."""
         rows = sum(self.problem.trial_sizes)
         residuals = by_trial(self.problem, np.array(self.residual))
         return model(residuals, fitted.upper(len(residuals), rows))
 
     def spread(self, noise: ResidualNoise, columns: Array) -> Array:
-        """Covariance of columns' residual (k, k) for noise of a colour."""
+        """Covariance (k, k) of columns' residual for this noise."""
         return spread_of_rows(self.problem, noise, columns, self.noise)
 
     def gain_columns(self) -> tuple[Array, Array]:
-        """Derivatives with respect to gain and metric."""
+        """Derivatives by gain and metric."""
         gain, metric = np.array(self.solution.K), np.array(self.solution.S)
         T, G = natural_coordinates(self.problem.plant, gain)
         on_metric = self.found.along_metric(metric, metric_directions(metric))
@@ -102,9 +100,9 @@ class Tangent(Frozen):
 def tangent(
     structure: Structure, problem: Problem, cost_weights: Array, noise: float | None = None
 ) -> Tangent:
-    """Residual and derivatives at `cost_weights` (count,) and a problem's other unknowns.
+    """Residual and derivatives at `cost_weights` (count,), prior rows last.
 
-    The last rows are those of stated uncertainties. The `noise` is that of the residual if omitted.
+    `noise` is the noise SD; None: that of the residual.
     """
     solution = solve_lqr(problem.plant, structure.weights(cost_weights))
     K, S = np.array(solution.K), np.array(solution.S)
@@ -131,25 +129,23 @@ def tangent(
 
 @dataclass(frozen=True)
 class WeightCovariance(Frozen):
-    """What the recordings say of the unknowns of a structure, to first order."""
+    """Covariance of the unknowns of a structure, to first order."""
 
     structure: Structure
-    # As identified: logarithms of cost weights, and correlations (count,); minus infinity for a
-    # cost weight of 0
+    # Reported values: log cost weights (minus infinity: zero), correlations (count,)
     values: Array
-    # Of the residual's derivative with respect to those that move, once initial states and
-    # parameters have taken what they can; largest first (a,)
+    # Of the derivative by free unknowns, nuisance eliminated, largest first (a,)
     singular_values: Array
     directions: Array  # Right singular vectors over all unknowns, one a row (a, count)
-    # Standard deviation along each (a,); infinite below 1e-6 of the largest singular value
+    # Standard error along each (a,); infinite below 1e-6 of the largest singular value
     deviations: Array
-    # Over all unknowns (count, count), without the directions that have no deviation
+    # Over all unknowns (count, count), without directions of infinite standard error
     covariance: Array
-    # Standard deviation of each unknown (count,); infinite where a direction without a value takes
-    # part, and for a cost weight of zero
+    # Standard error of each unknown (count,); infinite if unidentified directions contribute or the
+    # cost weight is zero
     each: Array
-    white: Array  # The covariance as if the residuals were white (count, count)
-    noise: ResidualNoise  # The colour of the residuals
+    white: Array  # Covariance for white residuals (count, count)
+    noise: ResidualNoise  # Autocorrelation model of the residuals
 
     @property
     def rank(self) -> int:
@@ -158,11 +154,11 @@ class WeightCovariance(Frozen):
 
     @property
     def identified(self) -> BoolArray:
-        """Which directions are known to within a factor of `IDENTIFIED_FACTOR` at 95 % (a,)."""
+        """Mask of directions (a,) known to within a factor of `IDENTIFIED_FACTOR` at 95 %."""
         return np.asarray(TWO_SIDED * self.deviations < np.log(IDENTIFIED_FACTOR))
 
     def spread(self, combination: Array) -> tuple[float, float]:
-        """Deviation of a combination of unknowns (count,), and over that for white residuals."""
+        """Standard error of a combination (count,), and its ratio to that for white residuals."""
         own, plain = (
             float(np.sqrt(max(float(combination @ matrix @ combination), 0.0)))
             for matrix in (self.covariance, self.white)
@@ -176,7 +172,7 @@ class WeightCovariance(Frozen):
 def weight_covariance(
     at: Tangent, noise: NoiseModel = residual_noise, white: NoiseModel = white_noise
 ) -> WeightCovariance:
-    """Covariance of the unknowns of a structured fit; `noise, white` (samples, p)."""
+    """Covariance of the unknowns of a structured fit, for two noise models."""
     values, chain = at.structure.reported(at.cost_weights)
     moving = at.moving
     slopes = np.linalg.inv(chain[np.ix_(moving, moving)])

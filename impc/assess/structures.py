@@ -1,23 +1,19 @@
-"""What recordings say of structures: weights with intervals, whether each is true, which is better.
+"""Fit and test cost structures: intervals, score test, comparison by AIC.
 
-Each structure is fitted from the weights that fit at all, and again without each trial in turn. The
-criterion is Akaike's for the innovations of the residuals (`variance_accounted_for`), with two
-combination of unknowns that the recordings identify (docs/structures.md).
+Each structure is fitted, starting from the fitted weights, and again without each trial. Akaike's
+criterion is that of the innovations of the residuals (`variance_accounted_for`), plus 2 for each
+identified combination of unknowns (docs/howto/weights.md).
 
-Is a structure true? A score test of it against any gain, for residuals of any colour.
+The score test compares a structure with an unrestricted gain, for autocorrelated residuals. At the
+fit of the structure the residual e has no part along its columns. Let U be an orthonormal basis of
+what a free gain adds beyond these, initial states and parameters. If the structure holds,
 
-At the fit of the structure the residual e has no part along the structure's own columns. Let U be
-an orthonormal basis of what the gain, moved freely, could do to the outputs beyond that, and beyond
-initial states and parameters. If the structure holds, U'e is a sum of noise alone, and
+    T = (U'e)' V^-1 U'e,      V = cov(U'e) for the autocorrelation of the residuals
 
-    T = (U'e)' V^-1 U'e,      V = cov(U'e) for the colour that the residuals show
-
-is chi-squared with as many degrees of freedom as U has columns (docs/structures.md). Nothing is
-fitted outside of the structure: a free gain drifts along what is hardly identified, and a ratio
-of misfits is no chi-squared for coloured residuals. Only directions are used that the recordings
-say of a gain (`covariance.IDENTIFIED`), which depends on their derivatives and not on e. What a
-cost weight of zero would do below zero is one of them: a structure is refused too when it wants
-negative cost weights.
+is chi-squared with as many degrees of freedom as U has columns. No fit outside the structure is
+needed. Only directions of the gain are used that the recordings identify (`covariance.IDENTIFIED`),
+which depends on derivatives and not on e. A zero cost weight contributes the direction towards
+negative values: a structure that needs negative cost weights is rejected too.
 """
 
 from __future__ import annotations
@@ -57,46 +53,46 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Ratio:
-    """What one feature costs over another, both at the size that they have in the recordings."""
+    """Cost ratio of two features at their RMS in the recordings."""
 
     first: str  # Labels of the features
     second: str
-    interval: WeightInterval  # Of the logarithm of the ratio
+    interval: WeightInterval  # Interval of the log ratio
 
 
 @dataclass(frozen=True)
 class StructureFit(Frozen):
-    """A structure fitted to recordings, and what they say of it."""
+    """Structure fitted to recordings, with its uncertainty and test."""
 
     structure: Structure
-    estimate: Estimate | None  # None when no regulator of it can be simulated
-    reason: str  # Why there is none; empty otherwise
-    # Root-mean-square of each feature of the states in the simulation (k,), in its unit
+    estimate: Estimate | None  # None if no controller of it can be simulated
+    reason: str  # Why there is none; otherwise empty
+    # RMS of each state feature in the simulation (k,), in its unit
     sizes: Array
-    effort: float  # Mean square of the first feature of the inputs
+    effort: float  # Mean square of the first input feature
     covariance: WeightCovariance | None
-    # Of each unknown, as identified: of logarithms of cost weights, or of correlations
+    # For each unknown as reported: log cost weight or correlation
     intervals: tuple[WeightInterval, ...]
-    # Of each two features that have a cost weight, when they are penalised one by one
+    # For each pair of penalised features, unless products are penalised too
     ratios: tuple[Ratio, ...]
     test: StructureTest | None
-    vaf: Array  # Of each output, all trials together (p,), %
-    held_out: Array  # Mean over trials left out, of each output (p,), %; NaN when none is
+    vaf: Array  # Over all trials, per output (p,), %
+    held_out: Array  # Mean over held-out trials per output (p,), %; NaN without
     aic: float  # Akaike's criterion
 
     @property
     def refused(self) -> bool:
-        """Whether the recordings refuse it, or nothing of it can be simulated."""
+        """Whether the recordings reject the structure, or it cannot be simulated."""
         return self.test is None or self.test.refused
 
     @property
     def identified(self) -> int:
-        """Number of combinations of its unknowns that the recordings identify."""
+        """Number of identified combinations of its unknowns."""
         return 0 if self.covariance is None else int(np.count_nonzero(self.covariance.identified))
 
 
 def no_structure(structure: Structure, outputs: int, reason: str) -> StructureFit:
-    """A structure that cannot be simulated, and the `reason`; recordings have so many `outputs`."""
+    """Result for a structure that cannot be simulated, with the `reason`."""
     nothing, missing = frozen(np.full(outputs, np.nan)), frozen(np.zeros(0))
     return StructureFit(
         structure, None, reason, missing, np.nan, None, (), (), None, nothing, nothing, np.inf
@@ -112,7 +108,7 @@ def assess_structure(
     *,
     held_out: bool,
 ) -> StructureFit:
-    """Say what recordings identify of a structure."""
+    """Compute intervals, test, VAF and AIC of a fitted structure."""
     there, cost_weights = found.problem, np.array(found.cost_weights)
     at = tangent(structure, there, cost_weights)
     covariance = weight_covariance(at)
@@ -141,9 +137,9 @@ def assess_structure(
 
 
 def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
-    """Akaike's criterion of an estimate: innovations for `roots` (p,), and 2 an identified unknown.
+    """Akaike's criterion: innovations for `roots` (p,), plus 2 per identified unknown.
 
-    What is below rounding is no difference: 1e-9 of an output's size is added to the innovations.
+    Noise of 1e-9 of the output scale is added, so that rounding makes no difference.
     """
     floor = np.random.default_rng(0)
     residuals = [
@@ -167,7 +163,7 @@ def _left_out(problem: Problem, structure: Structure, end: Estimate, settle: flo
 
 
 def _moving(cost_weights: Array) -> Array:
-    """Cost weights of zero made small instead: a search may find that other trials want them."""
+    """Replace zero cost weights by small ones, so that a search can increase them."""
     least = np.min(cost_weights[np.isfinite(cost_weights)])
     return np.where(np.isfinite(cost_weights), cost_weights, least - np.log(100.0))
 
@@ -190,7 +186,7 @@ def _intervals(
     ratios = []
     for i, j in itertools.permutations(np.flatnonzero(at.moving[: len(structure.labels)]), 2):
         shift = 2 * float(np.log(sizes[i] / sizes[j]))
-        if at.cost_weights[i] - at.cost_weights[j] + shift >= 0:  # the dearer one first
+        if at.cost_weights[i] - at.cost_weights[j] + shift >= 0:  # larger cost first
             found = profiles.interval(rows[i] - rows[j])
             moved = WeightInterval(
                 found.value + shift, found.low + shift, found.high + shift, found.level
@@ -199,20 +195,20 @@ def _intervals(
     return intervals, tuple(ratios)
 
 
-#: Of the test.
+#: Level of the test.
 SIGNIFICANCE = 0.05
-# Of the geometric mean of two cost weights: the departure whose detection is identified.
+# Size of the tested cross term, relative to the geometric mean of both cost weights.
 _CROSS = 0.5
 
 
 @dataclass(frozen=True)
 class CrossTerm:
-    """A departure from the structure, and how probably the test would refuse it."""
+    """Departure from the structure, and the power of the test against it."""
 
-    # Features that are penalised together too, with half the geometric mean of their cost weights
+    # Features with a cross term of half the geometric mean of their cost weights
     first: str
     second: str
-    power: float  # Probability that the test refuses it at its level, between 0 and 1
+    power: float  # Probability that the test rejects at its level, between 0 and 1
 
 
 @dataclass(frozen=True)
@@ -220,21 +216,21 @@ class StructureTest(Frozen):
     """Result of `structure_test`."""
 
     statistic: float  # T
-    # Degrees of freedom; 0 where the recordings identify nothing of the gain beyond the structure,
-    # or the structure explains them to the last digit
+    # Degrees of freedom; 0 if the recordings identify nothing of the gain beyond the structure, or
+    # the fit is exact
     freedom: int
-    # Of a T at least as large if the structure holds; 1 where there is nothing to test
+    # p-value; 1 if there is nothing to test
     probability: float
-    powers: tuple[CrossTerm, ...]  # For each pair of features that both have a cost weight
+    powers: tuple[CrossTerm, ...]  # For each pair of penalised features
 
     @property
     def refused(self) -> bool:
-        """Whether the recordings refuse the structure."""
+        """Whether the recordings reject the structure at the 5 % level."""
         return self.probability < SIGNIFICANCE
 
 
 def structure_test(at: Tangent) -> StructureTest:
-    """Test a structure at its fit, against all gains."""
+    """Score test of a structure at its fit against an unrestricted gain."""
     on_gain, on_metric = at.gain_columns()
     fitted = at.span(np.array(at.on_cost_weights[:, at.moving]))
     beyond = fitted.without(np.hstack([on_gain, on_metric, at.found.dparameters]))
@@ -258,7 +254,7 @@ def structure_test(at: Tangent) -> StructureTest:
 
 
 def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]:
-    """What the test would see: how far cost weights one by one stay from what a cross term does."""
+    """Power of the test against cross terms, from their distance to the structure."""
     structure, near = at.structure, NearFit(at)
     if structure.coupled:
         return ()

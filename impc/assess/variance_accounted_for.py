@@ -1,14 +1,14 @@
-"""How well a simulation agrees with a recording, and how well other models do.
+"""Agreement of simulation and recording (VAF, whiteness), and comparison of models (AIC).
 
-VAF (3.24), also of trials that were left out, and whether what is left is noise. Models (other
-horizons, no limit) are compared by Akaike's criterion too. Residuals are coloured, so the
-likelihood is that of their innovations under one autoregression of order one for each output, taken
-from the fit itself; over T rows of innovations with covariance V
+VAF (3.24), also of held-out trials. Models (other horizons, no limit) are compared by Akaike's
+criterion. Residuals are autocorrelated, so the likelihood is that of their innovations under one
+first-order autoregression per output, estimated from the fit; over T rows of innovations with
+covariance V
 
     AIC = T log det V + 2 k,
 
-k numbers fitted. Every alternative fits as many, so only differences count. Below 2 nobody says
-two models apart; above 10 the worse one has no support (Burnham and Anderson 2002, 70).
+with k fitted numbers. All alternatives fit equally many, so only differences count: below 2 the
+models are not distinguished; above 10 the worse one has no support (Burnham and Anderson 2002, 70).
 """
 
 from __future__ import annotations
@@ -39,39 +39,39 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
 
 
-# One second of lags shows a rhythm that was missed; fewer than ten show nothing.
+# One second of lags reveals a missed rhythm; at least ten lags.
 _LEAST_LAGS = 10
 
 
 @dataclass(frozen=True)
 class TrialAgreement(Frozen):
-    """One trial against its simulation."""
+    """Agreement of one trial with its simulation."""
 
     vaf: Array  # (3.24) of each output, % (p,)
-    centred_vaf: Array  # The same with the means removed, 1 - var(y - y_sim)/var(y), % (p,)
-    # p-value of Ljung and Box's test that the residual is white, one second of lags (p,)
+    centred_vaf: Array  # With means removed: 1 - var(y - y_sim)/var(y), % (p,)
+    # p-value of the Ljung-Box test of white residuals over one second of lags (p,)
     whiteness: Array
-    rms: Array  # Root-mean-square residual in the outputs' units (p,)
-    saturated: float  # Share of the samples at which an input bound is reached
+    rms: Array  # RMS residual in output units (p,)
+    saturated: float  # Share of samples with an active input bound
 
 
 @checked(recorded="~i j", simulated="i j")
 def vaf(recorded: Array, simulated: Array) -> Array:
-    """Variance accounted for (3.24): (1 - sum (y - y_sim)^2 / sum y^2) 100 %, one for each column.
+    """Variance accounted for (3.24), 100 % (1 - sum (y - y_sim)^2 / sum y^2), by column.
 
     Parameters
     ----------
-    recorded, simulated : Array
-        y and y_sim (samples, p), in one unit.
+    recorded, simulated : array_like of shape (samples, p)
+        Outputs y and y_sim in the same units. Missing samples (NaN) do not count.
 
     Returns
     -------
-    Array
-        % (p,); NaN where the recorded output is zero throughout. Missing samples do not count.
+    ndarray of shape (p,)
+        VAF in %; NaN if the recorded output is zero throughout.
 
     Examples
     --------
-    A simulation that is a tenth too small leaves a hundredth of the sum of squares.
+    A simulation that is 10 % too small leaves 1 % of the sum of squares.
 
     >>> import impc
     >>> recorded = [[1.0], [-2.0], [0.5]]
@@ -86,7 +86,7 @@ def vaf(recorded: Array, simulated: Array) -> Array:
 
 @checked(recorded="~i j", simulated="i j")
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
-    """As `vaf`, with the means removed from what was recorded and from what is left."""
+    """VAF with the means of the recording and of the residual removed, % (p,)."""
     left = np.nanvar(recorded - simulated, axis=0)
     total = np.nanvar(recorded, axis=0)
     share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
@@ -95,12 +95,14 @@ def centred_vaf(recorded: Array, simulated: Array) -> Array:
 
 @checked(residual="i j", lags=1)
 def whiteness(residual: Array, lags: int) -> Array:
-    """p-values (p,) of Ljung and Box's test (1978) that columns of a residual are white.
+    """p-values (p,) of the Ljung-Box test (1978) over the first `lags` autocorrelations.
 
-    The first `lags` autocorrelations are tested together; NaN where nothing is left to test.
+    NaN for a constant column.
     """
     if lags >= len(residual):
-        raise InputError("lags", f"got {lags} of {len(residual)} samples", "give fewer")
+        raise InputError(
+            "lags", f"expected fewer than {len(residual)} lags, got {lags}", "reduce lags"
+        )
     values = []
     for column in residual.T:
         if np.ptp(column) == 0:
@@ -111,7 +113,7 @@ def whiteness(residual: Array, lags: int) -> Array:
 
 
 def _ljung_box(noise: Array, lags: int) -> float:
-    """p of Q = N (N + 2) sum_k rho_k^2 / (N - k); statsmodels' takes half a second to be loaded."""
+    """p-value of Q = N (N + 2) sum_k rho_k^2 / (N - k); avoids the slow import of statsmodels."""
     count, places = len(noise), np.arange(1, lags + 1)
     rho = np.array([noise[k:] @ noise[: count - k] for k in places]) / (noise @ noise)
     statistic = count * (count + 2) * np.sum(rho**2 / (count - places))
@@ -121,7 +123,7 @@ def _ljung_box(noise: Array, lags: int) -> float:
 def agreement(
     plant: Plant, trial: Recording, run: Simulation, u_min: Array, u_max: Array
 ) -> TrialAgreement:
-    """Compare a trial with its simulation from the first sample to the last."""
+    """Compare a trial with its simulation over all samples."""
     simulated = run.x @ plant.C.T
     residual = np.nan_to_num(trial.without_offset - simulated)
     lags = min(max(round(1 / plant.dt), _LEAST_LAGS), trial.samples // 5)
@@ -136,22 +138,22 @@ def agreement(
 
 @checked(u="i m", u_min="~m", u_max="~m")
 def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
-    """Share of samples at which any input stands on a bound, to 1e-6 of it."""
+    """Share of samples with an input at its bound, to 1e-6 of it."""
     near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
     return float(np.count_nonzero(np.any(near, axis=1)) / max(len(u), 1))
 
 
 @dataclass(frozen=True)
 class HeldOut(Frozen):
-    """One trial as the fit of the others predicts it."""
+    """Agreement of one trial with its prediction from the other trials."""
 
-    # (3.24) after the settling time, % (p,); NaN when the simulation does not reach the end
+    # (3.24) after the settling time, % (p,); NaN if the simulation stops early
     vaf: Array
-    centred_vaf: Array  # The same with the means removed, % (p,)
+    centred_vaf: Array  # With means removed, % (p,)
 
 
 def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
-    """VAF of a trial under the controller that was found without it."""
+    """VAF of a held-out trial under the controller fitted without it."""
     gain, metric = np.array(other.gain), np.array(other.metric)
     fixed = other.problem.with_nuisance_fixed()
     alone = replace(fixed, recordings=(trial,), offsets=other.problem.offsets)
@@ -177,10 +179,10 @@ class Alternative:
 
     name: str  # "as fitted", "no limit" or "horizon N"
     horizon: int  # In samples
-    misfit: float  # 2-norm of the residual; infinite when no controller was found
-    aic: float  # Above the least of all alternatives
-    held_out: float  # Mean VAF over outputs and trials left out, %; NaN with a single trial
-    reason: str  # Why there is no controller; empty otherwise
+    misfit: float  # 2-norm of the residual; infinite without a controller
+    aic: float  # Difference to the least AIC of all alternatives
+    held_out: float  # Mean VAF over outputs and held-out trials, %; NaN with one trial
+    reason: str  # Why there is no controller; otherwise empty
 
 
 def fit_alternatives(
@@ -190,7 +192,7 @@ def fit_alternatives(
     settle: float,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[Alternative, ...]:
-    """Fit again without the limit, if there is one, and with each other horizon."""
+    """Refit without the limit, if there is one, and with each other horizon."""
     posed = [("as fitted", problem)]
     if np.any(np.isfinite(problem.bounds.u_max)):
         posed.append(("no limit", problem.without_bounds()))
@@ -209,7 +211,7 @@ def fit_alternatives(
 
 
 def verdict(one: Alternative, other: Alternative) -> str:
-    """What the recordings say of one against the other, in a sentence."""
+    """Sentence that compares two alternatives by AIC."""
     if one.reason or other.reason:
         failed = one if one.reason else other
         return f"{failed.name}: no controller ({failed.reason})"
@@ -218,9 +220,9 @@ def verdict(one: Alternative, other: Alternative) -> str:
     pair = f"{better.name} and {worse.name}"
     if distance < _SAME:
         return f"the recordings do not distinguish {pair} (AIC differs by {distance:.1f})"
-    strength = "rule out" if distance > _RULED_OUT else "speak weakly against"
+    strength = "rule out" if distance > _RULED_OUT else "give weak evidence against"
     return (
-        f"the recordings {strength} {worse.name} beside {better.name} (AIC +{distance:.0f}, "
+        f"the recordings {strength} {worse.name} compared with {better.name} (AIC +{distance:.0f}, "
         f"held-out VAF {worse.held_out - better.held_out:+.2f} points)"
     )
 
@@ -247,7 +249,7 @@ def _left_out(problem: Problem, found: Estimate, index: int, settle: float) -> A
 
 
 def residuals_of(found: Estimate, problem: Problem) -> list[Array]:
-    """Scaled residuals (samples, p) of each trial of a problem under the controller found."""
+    """Scaled residuals (samples, p) of each trial of a problem under the fitted controller."""
     flat = residual_only(problem, found.gain, found.metric)
     ends = np.cumsum(problem.trial_sizes)[:-1]
     parts = np.split(flat, ends)
@@ -258,7 +260,7 @@ def residuals_of(found: Estimate, problem: Problem) -> list[Array]:
 
 
 def innovations_criterion(residuals: list[Array], roots: Array) -> float:
-    """Akaike's criterion for residuals (samples, p) of trials, no unknown counted."""
+    """Akaike's criterion of residuals (samples, p) per trial, without the term 2 k."""
     innovations = np.concatenate([part[1:] - roots * part[:-1] for part in residuals])
     covariance = innovations.T @ innovations / len(innovations)
     return float(len(innovations) * np.linalg.slogdet(covariance)[1])

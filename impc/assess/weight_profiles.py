@@ -1,25 +1,27 @@
-"""Intervals of cost weights, and of ratios of two, by profile likelihood.
+"""Profile-likelihood intervals of cost weights and of their ratios.
 
-With a combination a'z of the unknowns held at v, all other cost weights are fitted again: in the
-quadratic form of the gain near the fit, then in that near the end. With m(v) the least misfit,
+With a combination a'z of the unknowns fixed at v, all other cost weights are refitted: in the
+quadratic approximation of the misfit near the fit, then in that near the end. With the least misfit
+m(v),
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),
 
-s^2 the variance of a residual and f the factor by which their colour widens the variance of a'z.
-The interval is {v : D(v) <= q}, q chi-squared's quantile. It has no lower end where the cost weight
-may be zero: the answer is "at most" (docs/structures.md).
+s^2 the residual variance and f the factor by which autocorrelation widens the variance of a'z. The
+interval is {v : D(v) <= q}, q a chi-squared quantile. Without a lower end the cost weight may be
+zero, and the statement is "at most" (docs/howto/weights.md).
 
-The recordings identify a gain; what is far from linear is the way from cost weights to gains. So
-near a fit the misfit is taken as a quadratic form of gain and metric, known from one simulation,
+The recordings identify a gain; the nonlinear part is the map from cost weights to gains. Near a fit
+the misfit is therefore a quadratic form of gain and metric, computed from one simulation,
 
     m^2(z) = |q + R (k(z) - k)|^2 + rest,       k = (G^-1 K T, S),
 
-R and q the triangle and the residual in the columns of k, without what initial states and
-parameters can make up for, these to first order; `rest` is what no gain near by makes up.
+R and q the triangular factor and residual in the columns of k after projection on initial states
+and parameters (to first order); `rest` is the part that no nearby gain explains.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -41,18 +43,18 @@ if TYPE_CHECKING:
     from impc.assess.structured_weights import Tangent, WeightCovariance
     from impc.model.riccati import LqrSolution
 
-# A cost weight about its value in the fit: far wider than any interval that has an end.
+# Prior SD of a log cost weight about the fit: far wider than any finite interval.
 _SPREAD = 20.0
 _TRIES = 30
 
 
 class NearFit:
-    """The quadratic form near a fit."""
+    """Quadratic approximation of the misfit near a fit."""
 
     def __init__(self, at: Tangent) -> None:
         self.at = at
         size, m = len(at.residual), at.problem.plant.m
-        # In natural units of the gain, so that the triangle is as well conditioned as can be.
+        # Whitened units of the gain: best conditioned.
         T, G = natural_coordinates(at.problem.plant, np.array(at.solution.K))
         self.right, self.left = T, np.linalg.inv(G)
         units = np.eye(at.solution.K.size).reshape(-1, *at.solution.K.shape)
@@ -62,13 +64,13 @@ class NearFit:
         seen = at.without_nuisance(np.hstack(columns))
         self.triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
         self.here = self._place(at.solution)
-        # R'q = (columns)'residual: what of the residual lies in the columns.
+        # R'q = columns' residual.
         residual = at.without_nuisance(np.array(at.residual)[:, None])[:, 0]
         self.inside = np.linalg.pinv(self.triangle.T) @ (seen.T @ residual)
         self.rest = float(residual @ residual - self.inside @ self.inside)
 
     def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
-        """Least m^2 from z along columns, and the unknowns there."""
+        """Least m^2 from z over steps along columns, and its minimiser."""
         moving = np.isfinite(z)
         offset, rest = self.inside, self.rest
         if aim is not None:
@@ -93,7 +95,7 @@ class NearFit:
         def derivative(step: Array) -> Array:
             try:
                 slopes = seen(step)[1]
-            except WeightsError:  # only where a search begins: it ends there
+            except WeightsError:  # only at the start: the search ends there
                 slopes = np.zeros((len(self.triangle), along.shape[1]))
             return np.vstack([slopes, weight * np.eye(along.shape[1])])
 
@@ -106,7 +108,7 @@ class NearFit:
         return float(data @ data) + rest, _moved(z, moving, along @ step)
 
     def _natural(self, gains: Array) -> Array:
-        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
+        """G^-1 K T (..., m, n) of gains K (..., m, n)."""
         return np.asarray(self.left @ gains @ self.right)
 
     def _place(self, solution: LqrSolution) -> Array:
@@ -118,7 +120,7 @@ class NearFit:
         return np.concatenate([gain, (S * len(S) / np.trace(S)).ravel()])
 
     def _form(self, z: Array, moving: Array) -> tuple[Array, Array]:
-        """R (k(z) - k) and its derivative with respect to the unknowns that move."""
+        """R (k(z) - k) and its derivative by the free unknowns."""
         problem, structure = self.at.problem.with_nuisance_fixed(), self.at.structure
         solution = solve_lqr(problem.plant, structure.weights(z))
         dK, dS = regulator_slopes(problem, structure, z, solution)
@@ -135,33 +137,33 @@ def _moved(z: Array, moving: Array, step: Array) -> Array:
     return there
 
 
-# Logarithms: beyond a factor of e^12 in cost weight there is no end.
+# Largest log cost weight searched: beyond a factor of e^12 the interval has no end.
 _FARTHEST = 12.0
-# Of a step: how near to its end an interval ends.
+# Accuracy of an end, relative to the step.
 _END = 1e-2
-# An end stays when new recordings there move it by less than this share of a deviation.
+# Accept an end if refitting there moves it by less than this share of a standard error.
 _STAYS, _ROUNDS = 0.05, 12
-# D where there is no regulator.
+# D without a Riccati solution.
 _HUGE = 1e12
 
 
 @dataclass(frozen=True)
 class WeightInterval:
-    """An interval of a cost weight or of a ratio of two."""
+    """Interval of a log cost weight or of the log ratio of two."""
 
-    value: float  # Its logarithm in the fit; minus infinity for a cost weight of zero
-    # Ends of the logarithm: minus infinity where the cost weight may be zero, or sets no end
+    value: float  # Logarithm at the fit; minus infinity: cost weight zero
+    # Ends of the logarithm; minus infinity if the cost weight may be zero
     low: float
     high: float
-    level: float  # Between 0 and 1
+    level: float  # Confidence level between 0 and 1
 
     def holds(self, value: float) -> bool:
-        """Whether a logarithm, `value`, lies in it."""
+        """Whether a logarithm `value` lies in the interval."""
         return self.low <= value <= self.high
 
 
 class WeightProfiles:
-    """Intervals from the misfit near a fit, and near each end."""
+    """Profile-likelihood intervals from quadratic approximations at the fit and at each end."""
 
     def __init__(self, at: Tangent, covariance: WeightCovariance) -> None:
         self.at, self.covariance, self.near = at, covariance, NearFit(at)
@@ -170,7 +172,7 @@ class WeightProfiles:
         self.base = self.near.least(np.array(at.cost_weights), np.eye(int(np.sum(at.moving))))[0]
 
     def interval(self, combination: Array, level: float = LEVEL) -> WeightInterval:
-        """Interval of a'z; `combination` (count,)."""
+        """Interval of a'z for a `combination` a (count,)."""
         deviation, wider = self.covariance.spread(combination)
         quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
         moving, cost_weights = self.at.moving, np.array(self.at.cost_weights)
@@ -185,7 +187,7 @@ class WeightProfiles:
         return WeightInterval(value, low, high, level)
 
     def zero(self, index: int, level: float = LEVEL) -> WeightInterval:
-        """Interval of the cost weight `index` that is zero in the fit: at most its upper end."""
+        """Interval of a cost weight `index` that is zero at the fit: only an upper end."""
         near = np.array(self.at.cost_weights)
         near[index] = self._smallest_seen(index)
         line = _Line(np.eye(len(near))[index], near, float(near[index]), 0.5)
@@ -193,17 +195,16 @@ class WeightProfiles:
         return WeightInterval(-np.inf, -np.inf, high, level)
 
     def _smallest_seen(self, index: int) -> float:
-        """Logarithm of the cost weight that moves the outputs by a tenth of a deviation."""
+        """Log cost weight that moves the outputs by a tenth of a noise SD."""
         column = self.at.without_nuisance(np.array(self.at.on_cost_weights[:, index])[:, None])
         size = max(float(np.linalg.norm(column)), 1e-300)
         return float(np.log(0.1 * self.at.noise / size))
 
     def _end(self, line: _Line, quantile: float) -> float:
-        """Where D passes the quantile along a line, or infinity.
+        """Value at which D crosses the quantile along a line, or infinity.
 
-        Recordings answer a gain that is far from the fit's otherwise than one that is near: they
-        are simulated again where the end is found, until it stays, between places with less and
-        with more. Where the body falls, or there is no regulator, is more.
+        The approximation is recomputed at the end found, until the end stays between a point with
+        smaller and one with larger D. Divergence and a missing Riccati solution count as larger.
         """
         inside, outside = line.cost_weights, None
         end, there = self._passing(self.near, line, line.cost_weights, quantile)
@@ -225,7 +226,7 @@ class WeightProfiles:
         return end
 
     def _form(self, cost_weights: Array) -> NearFit | None:
-        """The quadratic form elsewhere, in the noise of the fit; None where there is none."""
+        """Quadratic approximation elsewhere, noise of the fit; None if infeasible."""
         try:
             at = self.at
             there = tangent(at.structure, at.problem, cost_weights, at.noise)
@@ -238,13 +239,14 @@ class WeightProfiles:
     def _passing(
         self, form: NearFit, line: _Line, here: Array, quantile: float
     ) -> tuple[float, Array]:
-        """Where D of a form passes the quantile, looked for from a place in growing steps.
+        """Crossing of D and the quantile for one approximation, bracketed by growing steps.
 
-        Away from the fit where D is less there, towards it where it is more. The root of D is all
-        but linear; each place is looked for from the nearest one that is known.
+        Outwards if D is smaller at the starting point, else inwards. sqrt(D) is almost linear; each
+        point starts from the nearest known one.
         """
         known = {line.value: line.cost_weights, line.at(here): here}
 
+        @functools.cache  # a second search from another start may end elsewhere
         def excess(value: float) -> float:
             if value == line.value:
                 return -float(np.sqrt(quantile))
@@ -268,14 +270,14 @@ class WeightProfiles:
     def _distance(
         self, form: NearFit, row: Array, value: float, near: Array
     ) -> tuple[float, Array]:
-        """D for white residuals with the combination held, and the unknowns there."""
+        """D for white residuals with the combination fixed, and the minimiser."""
         moving = np.isfinite(near)
         own = row[moving]
         z = near.copy()
         z[moving] += (value - float(own @ near[moving])) / float(own @ own) * own
         best, there = form.least(z, scipy.linalg.null_space(own[None]))
         for index in np.flatnonzero(~moving[: len(self.at.structure.labels)]):
-            # A cost weight of zero may be worth having once another is held elsewhere.
+            # A zero cost weight may become positive when another is fixed elsewhere.
             other = z.copy()
             other[index] = self._smallest_seen(int(index))
             free = row[np.isfinite(other)]
@@ -286,7 +288,7 @@ class WeightProfiles:
 
 
 class _Line(NamedTuple):
-    """A combination of unknowns (count,), these and its value in the fit, a step to an end."""
+    """Combination of unknowns, unknowns and value at the fit, and a signed step."""
 
     row: Array
     cost_weights: Array
@@ -294,18 +296,18 @@ class _Line(NamedTuple):
     step: float
 
     def at(self, cost_weights: Array) -> float:
-        """Value of the combination elsewhere."""
+        """Value of the combination at other unknowns."""
         finite = np.isfinite(cost_weights)
         return float(self.row[finite] @ cost_weights[finite])
 
     def between(self, inside: Array, value: float, outside: Array | None) -> bool:
-        """Whether a value lies between those of two places; with one, beyond that."""
+        """Whether a value lies between those of two points (or beyond `inside`)."""
         side = np.sign(self.step)
         nearest = side * self.at(inside) <= side * value
         return bool(nearest and (outside is None or side * value < side * self.at(outside)))
 
 
 def _middle(one: Array, other: Array) -> Array:
-    """Half-way between unknowns; as in the first where one of the two is no number."""
+    """Midpoint of two sets of unknowns; the first where either is infinite."""
     both = np.isfinite(one) & np.isfinite(other)
     return np.where(both, (one + np.where(both, other, 0.0)) / 2, one)

@@ -1,7 +1,7 @@
-"""What the recordings leave open of the weights of one gain, in a form that a page can print.
+"""Summary of the set of equivalent weights, for reports.
 
-Every number is over all weights with the gain whose condition number, in the units of the plant, is
-at most a multiple of the least (`weights_set`; docs/equivalent-weights.md, section 5).
+All numbers are over the weights with the gain whose condition number, in the units of the plant, is
+at most a multiple of the least (`weights_set`; docs/why/equivalent_weights.md).
 """
 
 from __future__ import annotations
@@ -32,16 +32,15 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
-#: Multiple of the least condition number up to which weights are taken as equally good.
+#: Largest condition number in the set, as a multiple of the least.
 RATIO = 10.0
-# States whose entries and statements are computed: the recorded ones, then those that cost most at
-# their typical size.
+# Number of states shown: recorded ones, then those that cost most at their typical size.
 _NAMED = 4
 
 
 @dataclass(frozen=True)
 class EntryRange:
-    """Range of Q_ij over the set, i and j by name."""
+    """Range of Q_ij over the set."""
 
     first: str  # Names of the states i and j
     second: str
@@ -51,20 +50,20 @@ class EntryRange:
 
 @dataclass(frozen=True)
 class WeightsSummary:
-    """The set of weights of a gain."""
+    """Set of equivalent weights of a gain."""
 
-    dimension: int  # Free directions of the weights that have the gain, scale not counted
-    least_condition: float  # Condition numbers: the least, and the largest in the set
+    dimension: int  # Free directions of the weights without scale
+    least_condition: float  # Least condition number, then the largest in the set
     limit: float
-    entries: tuple[EntryRange, ...]  # Of the states that are recorded or cost most
+    entries: tuple[EntryRange, ...]  # Entries of the states that are recorded or cost most
     statements: tuple[Statement, ...]  # Order and sense of these states
-    # Widest angle found between the dominant direction of D Q D in the least conditioned member and
-    # in another, degrees; D the typical sizes of the states
+    # Widest angle found between the dominant directions of D Q D of the least-condition member and
+    # another, degrees; D = typical sizes of the states
     widest_angle: float
-    drawn: int  # Number of gains drawn beside the fitted one, for all that follows
-    cost_weights: tuple[WeightRange, ...]  # Of the named states; empty without draws
-    # Widest angle, over the drawn gains, of the dominant direction of the least conditioned member
-    # from that of the fitted gain, degrees; NaN without draws
+    drawn: int  # Number of drawn gains
+    cost_weights: tuple[WeightRange, ...]  # Costs of the named states; empty without draws
+    # Widest angle over the drawn gains between the dominant direction of their least-condition
+    # member and that of the fitted gain, degrees; NaN without draws
     angle_of_gain: float
 
 
@@ -75,7 +74,7 @@ def summarise_weights(
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
 ) -> WeightsSummary:
-    """Run the programs over the set of weights of a gain."""
+    """Summarise the set of weights of a gain and of drawn gains."""
     found = weights_set(gain_fibre(plant, gain, metrics), RATIO)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
@@ -114,7 +113,7 @@ def weights_summary_or_reason(
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
 ) -> tuple[WeightsSummary | None, str]:
-    """The summary, or None and why there is none."""
+    """Summary and "", or None and the reason."""
     try:
         return summarise_weights(plant, gain, metrics, sizes, draws=draws), ""
     except (WeightsError, SolverError) as error:
@@ -126,7 +125,7 @@ def _angle_of_gain(found: WeightsSet, sets: tuple[DrawnSet, ...], sizes: Array) 
         return float("nan")
     D = np.diag(np.asarray(sizes))
     own = dominant_direction(D @ found.least.weights.Q @ D)
-    # Without a least conditioned member the direction is anywhere.
+    # Without a member the direction is unknown: 90 degrees.
     return max(
         90.0 if one.least is None else angle_between(own, dominant_direction(D @ one.least.Q @ D))
         for one in sets
@@ -134,7 +133,7 @@ def _angle_of_gain(found: WeightsSet, sets: tuple[DrawnSet, ...], sizes: Array) 
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:
-    """States that are recorded, then those that cost most."""
+    """Recorded states, then those with the largest costs."""
     cost_weights = np.diag(weights.Q) * np.asarray(sizes) ** 2
     recorded = [index for index, name in enumerate(plant.states) if name in plant.outputs]
     others = [int(index) for index in np.argsort(-cost_weights, kind="stable")]

@@ -1,23 +1,21 @@
-"""Whether any cost weights explain the gain that recordings identify, and how far they do.
+"""Test whether any cost weights explain the gain, and count identified directions.
 
     D = sum over identified directions i of  ((K - K(Q, R)) along i / s_i)^2
 
-K is the best gain of any kind, K(Q, R) the best one that weights have, s_i the standard errors for
-noise of the colour that the residuals show. If the true gain is that of some weights, D is at most
-chi-squared with as many degrees of freedom as there are directions. If D is much larger, no weights
-explain the recordings, and what any of them say of the subject's intent is void. Where residuals
-contradict the model itself, noise is not all that moves the gain: then weights have to leave more
-than a twentieth more, too.
+K is the best unrestricted gain, K(Q, R) the best one that weights have, s_i the HAC standard
+errors. If the true gain belongs to some weights, D is at most chi-squared with as many degrees of
+freedom as directions. A much larger D rejects all weights, and then no statement about the intent
+holds. If the residuals contradict the model itself, noise is not the only source of gain errors:
+weights are then rejected only if their misfit is also more than 5 % larger.
 
-Whether weights have K itself is a linear matrix inequality. With one input and an invertible A
-there is an explanation: the return difference of an optimal regulator keeps (docs/theory.md,
-section 2)
+Whether weights have K itself is a linear matrix inequality. With one input and an invertible A, the
+return difference of an optimal regulator explains the result (docs/why/theory.md):
 
     |1 + K (zI - A)^-1 B|^2  >=  R / S  =  det(A - BK) / det A      for all |z| = 1.
 
-The closed loop depends on (Q, R) through K and the scale-free S only, so the derivative of the
-outputs with respect to the weights has at most n m + m (m + 1)/2 - 1 directions, whatever was
-recorded (n m + m - 1 when A is invertible). The rest of them was chosen by the condition number.
+The closed loop depends on (Q, R) only through K and S up to scale, so the derivative of the outputs
+by the weights has rank at most n m + m (m + 1)/2 - 1 for any recording (n m + m - 1 for invertible
+A). The condition number fixes the other directions by convention.
 """
 
 from __future__ import annotations
@@ -54,24 +52,24 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
 
 
-# Probability below which the true gain is said to have no weights.
+# p-value below which weights are rejected.
 _LEVEL = 1e-3
-# How much more, of the misfit, weights have to leave where the model is contradicted.
+# Relative misfit that weights must exceed if the residuals contradict the model.
 _MORE = 1.05
 _FREQUENCIES = 2000
 
 
 @dataclass(frozen=True)
 class ReturnDifference:
-    """The inequality of one input."""
+    """Return-difference inequality (one input)."""
 
-    least: float  # The least |1 + K (zI - A)^-1 B|^2, and det(A - BK) / det A
+    least: float  # min |1 + K (zI - A)^-1 B|^2, then det(A - BK) / det A
     needed: float
-    frequency: float  # Where it is least, Hz
+    frequency: float  # Frequency of the minimum, Hz
 
     @property
     def kept(self) -> bool:
-        """Whether it holds, to rounding."""
+        """Whether the inequality holds, to rounding."""
         return self.least >= self.needed * (1 - 1e-9)
 
 
@@ -80,40 +78,42 @@ class WeightsTest:
     """Result of `weights_test`."""
 
     statistic: float  # D
-    freedom: int  # Directions of the gain that are identified
-    p_value: float  # Of chi-squared: an upper limit
-    more: float  # Misfit of the weights, of that of the gain
+    freedom: int  # Number of identified directions of the gain
+    p_value: float  # Upper limit, from chi-squared
+    more: float  # Misfit of the weights over that of the gain
     contradicted: bool  # Whether the residuals contradict the model
-    exist: bool  # Whether positive definite weights have the identified gain itself
-    difference: ReturnDifference | None  # Of that gain, with one input and an invertible A
+    exist: bool  # Whether positive definite weights have the identified gain exactly
+    difference: ReturnDifference | None  # For that gain; one input and invertible A only
 
     @property
     def rejected(self) -> bool:
-        """Whether no cost weights explain the gain."""
+        """Whether all cost weights are rejected as an explanation of the gain."""
         return self.p_value < _LEVEL and (not self.contradicted or self.more > _MORE)
 
     @property
     def sentence(self) -> str:
-        """The finding where weights are rejected; empty otherwise."""
+        """Conclusion if weights are rejected; otherwise empty."""
         if not self.rejected:
             return ""
         text = (
-            "No cost weights explain this gain: the nearest that has any differs from it by "
-            f"chi-squared {self.statistic:.3g} along {self.freedom} identified directions."
+            "No cost weights explain this gain: the nearest gain that has cost weights differs "
+            f"from it along {self.freedom} identified directions (chi-squared "
+            f"{self.statistic:.3g})."
         )
         found = self.difference
         if found is None or found.kept:
             return text
         return (
-            f"{text} An optimal controller has a return difference of {found.needed:.3g} or more "
-            f"at every frequency; here it is {found.least:.3g} at {found.frequency:.3g} Hz."
+            f"{text} An optimal controller has a squared return difference of at least "
+            f"{found.needed:.3g} at every frequency; here it is {found.least:.3g} at "
+            f"{found.frequency:.3g} Hz."
         )
 
 
 def weights_test(
     fitted: Estimate, estimate: GainEstimate, *, contradicted: bool = False
 ) -> WeightsTest:
-    """Compare the gain of the fitted weights with the gain that is identified."""
+    """Compare the gain of the fitted weights with the identified gain."""
     covariance, plant = estimate.covariance, estimate.problem.plant
     identified = covariance.identified
     steps = covariance.along(estimate.K - fitted.gain)[identified]
@@ -123,7 +123,7 @@ def weights_test(
     p_value = float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
     try:
         exist = weights_margin(gain_fibre(plant, estimate.K)).exist
-    except (WeightsError, SolverError):  # unstable, or at the edge of what a program can determine
+    except (WeightsError, SolverError):  # unstable, or numerically undecided
         exist = False
     more = 1.0 if exact else fitted.misfit / estimate.misfit
     difference = return_difference(plant, estimate.K)
@@ -131,13 +131,13 @@ def weights_test(
 
 
 def return_difference(plant: Plant, gain: Array) -> ReturnDifference | None:
-    """The inequality at a gain (1, n); None for several inputs, or a singular A."""
+    """Return-difference inequality of a gain (1, n); None for several inputs or singular A."""
     A, B, n = plant.A, plant.B, plant.n
     if plant.m > 1 or np.linalg.matrix_rank(A) < n:
         return None
     angles = np.linspace(0, np.pi, _FREQUENCIES)
     circle = np.exp(1j * angles)[:, None, None] * np.eye(n)
-    with np.errstate(divide="ignore", invalid="ignore"):  # at a pole the ratio has no bound
+    with np.errstate(divide="ignore", invalid="ignore"):  # unbounded at a pole
         sizes = np.abs(np.linalg.det(circle - A + B @ gain) / np.linalg.det(circle - A)) ** 2
     place = int(np.nanargmin(sizes))
     needed = float(np.linalg.det(A - B @ gain) / np.linalg.det(A))
@@ -146,13 +146,13 @@ def return_difference(plant: Plant, gain: Array) -> ReturnDifference | None:
     )
 
 
-# Exact derivatives leave singular values of 1e-13 where nothing is determined.
+# Exact derivatives leave singular values of 1e-13 in unidentified directions.
 _DETERMINED = 1e-8
 
 
 @dataclass(frozen=True)
 class OtherWeights:
-    """Weights other than the reported ones, and the misfit of the same recordings with them."""
+    """Weights other than the reported ones, with their misfit on the same recordings."""
 
     weights: Weights
     condition: float  # kappa(blkdiag(Q, R))
@@ -163,34 +163,40 @@ class OtherWeights:
 class Identifiability(Frozen):
     """Result of `identifiability`."""
 
-    # Of the outputs' derivative with respect to relative changes of blkdiag(Q, R) (s,), largest
-    # first. Relative: in the coordinates D of dX = L D L', X = L L'.
+    # Of the derivative of the outputs by relative changes D of blkdiag(Q, R), dX = L D L' with X =
+    # L L' (s,), largest first
     singular_values: Array
-    free: int  # Directions of (Q, R), scale not counted
-    # How many of them the recordings determine: singular values above 1e-8 of the largest, and
-    # above 1e-10 of the recorded outputs
+    free: int  # Directions of (Q, R) without scale
+    # Number of identified directions: singular values above 1e-8 of the largest and above 1e-10 of
+    # the recorded outputs
     rank: int
-    chosen: int  # How many the condition number chose: free - rank
-    tolerance: float  # That share of the largest
-    # Other weights that explain the recordings equally well; empty where they cannot be found in
-    # double precision
+    chosen: int  # Directions fixed by convention: free - rank
+    tolerance: float  # The threshold 1e-8
+    # Other weights with the same gain; empty if they cannot be computed in double precision
     others: tuple[OtherWeights, ...]
 
 
 @checked
 def identifiability(problem: Problem, weights: Weights) -> Identifiability:
-    """Count what the recordings determine at the given weights.
+    """Count the weight directions that the recordings identify.
 
     Parameters
     ----------
     problem : Problem
+        Recordings and closed loop.
     weights : Weights
-        Positive definite; the result of a fit.
+        Positive definite weights, such as the result of a fit.
+
+    Returns
+    -------
+    Identifiability
+        `free` directions of (Q, R) without scale, `rank` identified ones, `chosen` = free - rank
+        fixed by convention, singular values, and examples of other weights with the same gain.
 
     Raises
     ------
     WeightsError
-        When the weights have no stabilising Riccati solution.
+        If the weights have no stabilising Riccati solution.
 
     Examples
     --------
@@ -221,7 +227,7 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
 
 
 def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> Array:
-    """Of the derivative along a `basis` of the weights; all but a few rows are gone before."""
+    """Singular values of the derivative by a `basis` of the weights, from compressed rows."""
     parts = [found.dK, found.dS]
     rows = triangular_rows([part.reshape(len(part), -1) for part in parts])
     first = int(np.prod(found.dK.shape[1:]))
@@ -231,14 +237,14 @@ def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> 
     )
     residual = Residual(np.zeros(len(rows)), dK, dS, usable=True)
     values = np.linalg.svd(weight_jacobian(solution, residual, basis), compute_uv=False)
-    # More directions than gain and metric have entries leave the outputs as they are.
+    # Further directions do not move the outputs.
     return np.pad(values, (0, min(len(found.residual), len(basis)) - len(values)))
 
 
 def _others(problem: Problem, fibre: GainFibre) -> tuple[OtherWeights, ...]:
     try:
         return tuple(_explain(problem, item) for item in other_weights(fibre, 2))
-    except (WeightsError, SolverError):  # weights at the edge of what a program can determine
+    except (WeightsError, SolverError):  # numerically at the edge of the cone
         return ()
 
 

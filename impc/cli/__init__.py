@@ -1,1 +1,1 @@
-"""The command line: a module for each command, which parses, calls and prints."""
+"""Command line: each command's module parses arguments, calls the study and prints."""

@@ -1,4 +1,4 @@
-"""`impc cohort` and `impc reliability`: studies of many subjects, on this machine or a cluster."""
+"""`impc cohort` and `impc reliability`: studies of many subjects."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
     from impc.studies.reliability.analysis import Trials
     from impc.studies.scheduler import Cluster
 
-# Of the settings that ask for more, those that a worker takes.
+# Settings with extra computations that a worker supports.
 _USED = ("replicates", "structure")
-# Seconds between two lines of cohort.log that give the time left.
+# Seconds between two progress lines in cohort.log.
 _LOGGED = 10.0
 
 
 @click.command("cohort")
 @click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
 @code_options("plant")
-@out_option("cohort", "results, tables and report; the same folder again goes on")
+@out_option("cohort", "results, tables and report; give the same folder again to continue")
 @page_options
 @scheduler_options
 @yes_option
@@ -61,8 +61,8 @@ def command(
 ) -> None:
     """Fit every subject, visit and condition of a study, with bootstrap replicates.
 
-    Ends with status 1 when a subject could not be fitted, and names the reason. It may be stopped
-    at any time: what is done is kept, and the same command goes on from there.
+    Ends with status 1 if a subject could not be fitted, and names the reason. If you interrupt it,
+    the same command continues from the last finished task.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.files.reading import require_distinct  # noqa: PLC0415
@@ -79,7 +79,7 @@ def command(
     study = replace(study, plant=source.name)
     unused = unused_columns(study, source)
     if unused:
-        click.echo(f"not passed to the plant, which does not take them: {', '.join(unused)}")
+        click.echo(f"columns that the plant has no argument for: {', '.join(unused)} (not used)")
     tasks, unreadable = study_tasks(study, source)
     store = Store(out, {name: task.digest for name, task in tasks.items()})
     for unit, reason in unreadable.items():
@@ -91,7 +91,7 @@ def command(
     for line in failures.lines:
         click.echo(line, err=True)
     fitted = len(study.units) - len(failures.units)
-    click.echo(f"{fitted} of {len(study.units)} fits made; {out / 'report.html'}")
+    click.echo(f"{fitted} of {len(study.units)} fits done; {out / 'report.html'}")
     if open_page:
         click.launch(str(out / "report.html"))
     if failures:
@@ -101,7 +101,7 @@ def command(
 def _run(
     study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster, yes: bool
 ) -> Failures:
-    """Do what is left, with a bar, and a message about what is kept when it is interrupted."""
+    """Run the remaining tasks with a progress bar; an interruption prints what is kept."""
     import psutil  # noqa: PLC0415
 
     from impc.cli.console import require_consent  # noqa: PLC0415
@@ -116,7 +116,7 @@ def _run(
 
     def said(_: int) -> str:
         finished, _ = work_kept(study, store)
-        return f"{finished} of {total} tasks are kept in {store.folder}; the same command goes on"
+        return f"{finished} of {total} tasks are kept in {store.folder}; the same command continues"
 
     with progress(total, "task", said) as tell, connected(cluster) as pool:
 
@@ -136,7 +136,7 @@ def _run(
         if kept < total:
             one, units = study_effort(tasks)
             effort = one.shared(units * (total - kept) / total, pool.threads)
-            if cluster.scheduler:  # memory is not this machine's
+            if cluster.scheduler:  # the memory of other machines is unknown
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)
         failures = run_study(study, tasks, store, pool, stated)
@@ -156,7 +156,7 @@ def _run(
     "--last",
     type=click.IntRange(min=1),
     default=3,
-    help="How many of a visit's trials count, the last ones.",
+    help="Use the last N trials of each visit.",
 )
 def reliability_command(
     study_file: Path,
@@ -167,7 +167,7 @@ def reliability_command(
     pdf: bool,
     open_page: bool,
 ) -> None:
-    """Reliability of a study of several subjects, visits, conditions and trials.
+    """Analyse test-retest reliability over subjects, visits, conditions and trials.
 
     The study file is that of `impc cohort`.
     """

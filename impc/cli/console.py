@@ -1,7 +1,6 @@
-"""What commands say: a question before hours of work, a bar meanwhile, the files at the end.
+"""Terminal output of commands: confirmation prompt, progress bar, list of written files.
 
-The bar becomes lines where none can be drawn, as in a pipe or a log. With IMPC_QUIET=1 in the
-environment there is neither, for scripts that read what is said.
+If stderr is not a terminal, lines replace the bar. IMPC_QUIET=1 in the environment hides both.
 """
 
 from __future__ import annotations
@@ -25,20 +24,20 @@ if TYPE_CHECKING:
 
     from impc.studies.effort import Effort
 
-# What is begun without a question: two hours, and what a machine of 8 GB has to spare.
+# Seconds and GB above which a command asks first: two hours, half of a machine with 8 GB.
 _LONG, _MUCH = 7200.0, 4.0
 
 
-# Files of one kind that are named one by one.
+# Largest number of files of one kind that are listed by name.
 _NAMED = 4
-#: What to do about a large request of a fit.
+#: Remedy for a fit that is too large.
 FEWER = "lower horizon, replicates or profiles in [fit], or shorten the trials"
-#: What to do about one of a selection of parameters.
+#: Remedy for a parameter selection that is too large.
 FEWER_STARTS = "lower replicates or starts in [select], or shorten the trials"
 
 
 def require_consent(effort: Effort, given: bool, lower: str = FEWER) -> None:
-    """Ask before a large request is begun, unless consent is `given` by --yes."""
+    """Ask for confirmation before a large request, unless it is `given` by --yes."""
     import psutil  # noqa: PLC0415  # --help needs none
 
     from impc.errors import InputError  # noqa: PLC0415
@@ -51,14 +50,14 @@ def require_consent(effort: Effort, given: bool, lower: str = FEWER) -> None:
     takes = f"would take about {effort.seconds / 3600:.3g} hours"
     problem = needs if effort.seconds <= _LONG else takes
     asked = sys.stdin is not None and sys.stdin.isatty()
-    if asked and click.confirm(f"impc: this request {problem}; go on?", err=True):
+    if asked and click.confirm(f"impc: this request {problem}; continue?", err=True):
         return
-    raise InputError("this request", problem, f"{lower}; or say --yes")
+    raise InputError("this request", problem, f"{lower}; or pass --yes")
 
 
-# Seconds between two lines, and from the start to the first: what is quick says nothing.
+# Seconds between two lines, and from the start to the first line.
 _PAUSE = 10.0
-# The clock of a bar goes on while a step takes long, in seconds.
+# Seconds between two updates of the bar's clock.
 _TICK = 1.0
 
 
@@ -66,12 +65,13 @@ _TICK = 1.0
 def progress(
     total: int, unit: str, kept: Callable[[int], str] | None = None
 ) -> Iterator[Callable[..., None]]:
-    """A bar while the block lasts; the block gets what is called with each step done.
+    """Show a bar during the block; yield a function to call with the name of each done step.
 
-    It is called with the step's name, and `found=True` where an earlier run had done it.
+    Pass it `found=True` for a step that an earlier run did. `kept(count)` is the message that an
+    interruption prints.
     """
     quiet = os.environ.get("IMPC_QUIET", "") not in ("", "0")
-    count = begun = 0  # the bar's own stands still where there is no bar
+    count = begun = 0  # a disabled bar does not count
     began = said = time.monotonic()
     # disable=None: no bar where stderr is a file.
     with (
@@ -84,13 +84,13 @@ def progress(
             count, begun = count + 1, begun + found
             bar.set_postfix_str(name, refresh=False)
             if found and not bar.disable:
-                bar.initial += 1  # no part of the rate
+                bar.initial += 1  # not part of the rate
             bar.update()
             now = time.monotonic()
             if bar.disable and not quiet and now - said >= _PAUSE:
                 said = now
                 left = (now - began) * (total - count) / max(count - begun, 1)
-                # The first step may have compiled what the others use: it says nothing of them.
+                # No estimate from the first step: it may include compilation.
                 time_left = f", about {left:.0f} s left" if count - begun > 1 else ""
                 which = f" ({name})" if name else ""
                 line = f"{count} of {total} {unit}s{which}{time_left}"
@@ -106,7 +106,7 @@ def progress(
 
 @contextmanager
 def _ticking(bar: tqdm[Any]) -> Iterator[None]:
-    """Draw a bar anew each second, so that nobody takes a long step for a stop."""
+    """Redraw the bar every second, so that a long step does not look like a hang."""
     if bar.disable:
         yield
         return
@@ -126,7 +126,7 @@ def _ticking(bar: tqdm[Any]) -> Iterator[None]:
 
 
 def print_files(out: Path, written: Sequence[Path], open_page: bool = False) -> None:
-    """Name the page first, then the other files `written` to the folder `out`."""
+    """Print the path of the report first, then the other files `written` to the folder `out`."""
     page = out / "report.html"
     if page in written:
         click.echo(f"Open {one_line(page)}")
@@ -142,6 +142,6 @@ def print_files(out: Path, written: Sequence[Path], open_page: bool = False) -> 
 
 
 def print_next(command: str, out: Path, *names: str) -> None:
-    """Say in one line what to type next: `command` with files of the folder `out`."""
+    """Print the next command to type: `command` with the files `names` of the folder `out`."""
     folder = shlex.quote(one_line(out))
     click.echo(f"next: {command.format(*(f'{folder}/{name}' for name in names))}")

@@ -1,8 +1,7 @@
-"""How every command ends: one line on stderr for whatever goes wrong, and a status that says what.
+"""Turn every failure of a command into one stderr line and an exit status.
 
-What nobody has foreseen is a defect: its line names the place in the code and a log for the report.
-
-The exit statuses of the `impc` command (docs/troubleshooting.md has the table).
+An unexpected exception is a defect: its line names the place in the code and a log file. The table
+of exit statuses is in docs/ref/cli.md.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class ExitStatus(IntEnum):
-    """What a script may ask of a command that has ended."""
+    """Exit statuses of the `impc` command."""
 
     DONE = 0
     PARTIAL = 1
@@ -38,7 +37,7 @@ class ExitStatus(IntEnum):
 
 
 def ended(run: Callable[[], Any]) -> int:
-    """Do the work of `run`, and say in one line what went wrong; the exit status."""
+    """Call `run`, print any failure in one line, and return the exit status."""
     heard: list[str] = []
     try:
         with _quiet(heard):
@@ -51,16 +50,16 @@ def ended(run: Callable[[], Any]) -> int:
     except (ImpcError, click.ClickException) as error:
         stated = error.format_message() if isinstance(error, click.ClickException) else error
         return _say(f"error: {stated}", ExitStatus.BAD_INPUT)
-    except BaseException as error:  # the net itself
+    except BaseException as error:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             where = error.filename or "output"
-            return _say(f"error: {where}: {error.strerror}; make room", ExitStatus.BAD_INPUT)
+            return _say(f"error: {where}: {error.strerror}; free disk space", ExitStatus.BAD_INPUT)
         return _defect(error, heard)
 
 
 @contextlib.contextmanager
 def interruptions() -> Iterator[None]:
-    """Turn what click would end the program for into what `ended` says."""
+    """Convert the exceptions that click handles itself into those that `ended` reports."""
     try:
         yield
     except KeyboardInterrupt as interruption:
@@ -68,64 +67,64 @@ def interruptions() -> Iterator[None]:
     except SystemExit as error:
         raise RuntimeError(f"sys.exit({error.code!r}) was called") from error
     except BrokenPipeError as error:
-        if _frames(error)[-1][0].startswith("click"):  # nobody reads the output any more
+        if _frames(error)[-1][0].startswith("click"):  # the reader closed the output pipe
             raise click.exceptions.Exit(ExitStatus.UNREAD) from None
         raise RuntimeError("a pipe broke") from error
 
 
 def _frames(error: BaseException) -> list[tuple[str, int]]:
-    """Module and line of every call that led to an error."""
+    """Module and line of each call in the traceback of an error."""
     steps = traceback.walk_tb(error.__traceback__)
     return [(str(frame.f_globals.get("__name__", "?")), line) for frame, line in steps]
 
 
 @contextlib.contextmanager
 def own_process() -> Iterator[None]:
-    """Settings of a process that is all ours; not for a command that is called from Python.
+    """Process-wide settings of the `impc` program; not for commands called from Python.
 
-    The first interruption ends the work in order; a second one, while it does, ends it at once.
-    What libraries say in passing of threads and of objects that are being deleted is not shown.
+    The first interruption stops the work cleanly, a second one ends the process at once. Library
+    messages about threads and about objects being deleted are hidden.
     """
     import threading  # noqa: PLC0415
 
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # a name that the terminal's encoding lacks is no fault
+        if hasattr(stream, "reconfigure"):  # escape characters that the encoding lacks
             stream.reconfigure(errors="backslashreplace")
     sys.unraisablehook = lambda _: None
     threading.excepthook = lambda _: None
     with contextlib.suppress(ValueError):  # not the main thread
         signal.signal(signal.SIGINT, _interrupt)
-        # After all that may take long: Python itself would end by the signal, and not with 130.
+        # Ignored during exit: Python would otherwise die of the signal instead of returning 130.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     yield
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()
         return
-    # What nobody takes would be tried again, and said, when the interpreter ends.
+    # Otherwise the interpreter flushes again at exit and prints the failure.
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _interrupt(_signum: int, _frame: object) -> None:
-    """The first interruption raises, the second ends the process."""
+    """Raise at the first interruption; the second ends the process."""
     signal.signal(signal.SIGINT, _end_at_once)
     raise KeyboardInterrupt
 
 
 def _end_at_once(_signum: int, _frame: object) -> None:
     if not _SAID:
-        os.write(2, b"impc: interrupted twice; ended at once\n")
+        os.write(2, b"impc: interrupted twice; stopped at once\n")
     os._exit(ExitStatus.INTERRUPTED)
 
 
-# Whether the line of this process is written: there is only one.
+# The line that this process has printed, if any: it prints only one.
 _SAID: list[str] = []
 
 
 def _say(message: str, status: ExitStatus) -> ExitStatus:
     line = f"impc: {one_line(message)}"
     _SAID.append(line)
-    with contextlib.suppress(OSError, ValueError):  # stderr is full or closed: the status is left
+    with contextlib.suppress(OSError, ValueError):  # stderr is full or closed
         click.echo(line, err=True)
     return status
 
@@ -142,7 +141,7 @@ def _defect(error: BaseException, heard: list[str]) -> ExitStatus:
 
 
 def _logged(error: BaseException, heard: list[str]) -> str:
-    """Write all that is known to a log that only the user can read, and say where it is."""
+    """Write the traceback to a log that only the user can read; return the text that names it."""
     import platform  # noqa: PLC0415  # --help needs none of these
     import tempfile  # noqa: PLC0415
 
@@ -157,7 +156,7 @@ def _logged(error: BaseException, heard: list[str]) -> str:
         handle, path = tempfile.mkstemp(prefix="impc-", suffix=".log")
         with open(handle, "w", encoding="utf-8", errors="backslashreplace") as stream:
             stream.write("\n".join(lines))
-    except Exception as fault:  # a full disk, no memory: the line is said all the same
+    except Exception as fault:  # full disk or memory: the line is printed without a log
         if path:
             with contextlib.suppress(OSError):
                 os.remove(path)
@@ -167,7 +166,7 @@ def _logged(error: BaseException, heard: list[str]) -> str:
 
 @contextlib.contextmanager
 def _quiet(heard: list[str]) -> Iterator[None]:
-    """Keep what libraries warn of for the log; warnings that are errors are raised as before."""
+    """Collect warnings of libraries for the log; warnings set to errors are still raised."""
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: heard.append(f"{record.name}: {record.getMessage()}")  # type: ignore[method-assign]
     logging.getLogger().addHandler(handler)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.example.cases import CaseResult
 
-# The library knows no plant: the example's is named by its import path, ``module:function``.
+# impc does not import `plants`: the plant is named by its import path, ``module:function``.
 _EXAMPLE_PLANT = "plants:yalmip_example"
 
 
@@ -32,10 +32,10 @@ _EXAMPLE_PLANT = "plants:yalmip_example"
 @page_options
 @solver_option
 def command(case: str, out: Path, solver: str | None, pdf: bool, open_page: bool) -> None:
-    """Run the simulation example of the dissertation.
+    """Run the simulation example of the dissertation with all methods.
 
-    The dissertation's own matrices, initial state and bound are lost; a plant that shows
-    everything its text says stands in for them.
+    The dissertation does not give matrices, initial state and bound; a plant with the properties
+    that its text describes replaces them.
     """
     # Imported here: the libraries take seconds to load, and --help and --version need none.
     from impc.control.named_solver import COMPILED, require_solver  # noqa: PLC0415

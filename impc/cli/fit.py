@@ -1,4 +1,4 @@
-"""`impc fit` and `impc compare`: the control intent of a subject, by one method or by all."""
+"""`impc fit` and `impc compare`: the controller of a subject, by one method or by all."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @click.command("fit")
-@subject_arguments("What the columns mean, and settings; `impc inspect FILE` writes one.")
+@subject_arguments("Meaning of the columns, and settings; `impc inspect FILE` drafts this file.")
 @out_option("fit", "report.html, result.json, tables and the figures")
 @page_options
 def command(
@@ -37,8 +37,8 @@ def command(
 ) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
-    What is done when you interrupt it is kept in the folder: the same command goes on from there.
-    Where the plant is an impc.OptimalControlProblem, its parameters are fitted (docs/nonlinear.md).
+    If you interrupt it, the same command continues from the last finished step. If the plant is an
+    impc.OptimalControlProblem, its parameters are fitted (docs/howto/nonlinear.md).
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.console import require_consent  # noqa: PLC0415
@@ -72,7 +72,7 @@ def command(
         click.echo(unknown, err=True)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
     truth = read_truth(files, problem.plant)
-    # One more: the page with its figures takes ten seconds.
+    # One more stage: the report with its figures takes ten seconds.
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
 
         def remembered(memory: FitMemory) -> FitProgress:
@@ -93,7 +93,7 @@ def command(
 
 
 def _print_falls(fallen: AllFellError, out: Path, open_page: bool) -> None:
-    """The page where no trial is left."""
+    """Write and print the report for recordings that all end in a fall."""
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.fit.report import fallen_report  # noqa: PLC0415
 
@@ -105,7 +105,7 @@ def _print_falls(fallen: AllFellError, out: Path, open_page: bool) -> None:
 def _own_problem(
     files: tuple[Path, ...], plant_name: str, config: Path, out: Path, solver: str | None
 ) -> bool:
-    """Fit, write and print, if the plant is an optimal control problem; else do nothing."""
+    """Fit, write and print if the plant is an optimal control problem; return whether it is."""
     from impc.cli.plant import find_plant  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.digests import gather_inputs  # noqa: PLC0415
@@ -119,7 +119,7 @@ def _own_problem(
 
     configuration = read_configuration(config)
     source = find_plant(plant_name, configuration.plant)
-    problem = made_by(source) if ":" in source.name else None  # a file holds matrices
+    problem = made_by(source) if ":" in source.name else None  # files hold matrices only
     if not isinstance(problem, OptimalControlProblem):
         return False
     with progress(2, "stage") as done:
@@ -141,7 +141,7 @@ def _own_problem(
 
 
 def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
-    """Verdict, gain, methods and, of simulated recordings, the true gain."""
+    """Print verdict, gain, methods and, for simulated recordings, the true gain."""
     from impc.reporting.verdict import WIDTH  # noqa: PLC0415
     from impc.studies.fit.findings import per_unit_finding, truth_sentence  # noqa: PLC0415
     from impc.studies.fit.verdict import GAIN, forbidden  # noqa: PLC0415
@@ -156,7 +156,7 @@ def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
 
 
 @click.command("compare")
-@subject_arguments("What the columns mean, and settings, as for `impc fit`.")
+@subject_arguments("Meaning of the columns, and settings, as for `impc fit`.")
 @out_option("compare", "report.html, result.json, tables and the figure")
 @page_options
 def compare_command(
@@ -171,8 +171,8 @@ def compare_command(
 ) -> None:
     """Compare feedback gain, inverse LQR and inverse MPC, one file a trial.
 
-    Each method is fitted to all trials and to all but each one. What is done when you interrupt it
-    is kept in the folder: the same command goes on from there.
+    Each method is fitted to all trials, and once without each trial. If you interrupt it, the same
+    command continues from the last finished fit.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.console import require_consent  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""`impc inspect`: what a recording holds, and a configuration for it."""
+"""`impc inspect`: describe a recording and draft a configuration for it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 @click.option(
     "--plant",
     "plant_name",
-    help=f"Whose signals to look for: {', '.join(KNOWN)}, module:function, or a file.",
+    help=f"Plant whose signals are looked for: {', '.join(KNOWN)}, module:function, or a file.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="Write the configuration there, and not to the screen; no file is written over.",
+    help="Write the configuration to this file instead of the screen; never overwrites a file.",
 )
 @click.option(
     "--config",
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 )
 def command(file: Path, plant_name: str | None, out: Path | None, config: Path | None) -> None:
     """Show what a recording holds and write a commented configuration for it."""
-    from impc.files.formats import read_table  # noqa: PLC0415  # libraries that --help needs not
+    from impc.files.formats import read_table  # noqa: PLC0415  # not needed for --help
     from impc.files.inspection import open_places, summary  # noqa: PLC0415
 
     if config is not None:
@@ -61,7 +61,7 @@ def _draft(table: Table, plant_name: str | None) -> str:
         return draft_configuration(table)
     source = find_plant(plant_name, {})
     plant = make_plant(source, ())
-    # Without a configuration nothing says which input is the command: the first.
+    # Without a configuration the first input is taken for the command.
     wanted = Wanted(
         plant.outputs,
         plant.controls[1:],
@@ -74,19 +74,19 @@ def _draft(table: Table, plant_name: str | None) -> str:
 
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:
-    """Read the file as `impc fit` does, and say what the checks found."""
+    """Read the file as `impc fit` does, and print what the checks found."""
     from impc.errors import InputError  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
     from impc.files.reading import read_recordings  # noqa: PLC0415
 
     if plant_name is None:
-        raise InputError("--config", "is given without --plant", "name the plant")
+        raise InputError("--config", "is given without --plant", "add --plant NAME")
     configuration = read_configuration(config)
     plant = make_plant(find_plant(plant_name, configuration.plant), configuration.recorded)
     (trial,) = read_recordings([file], configuration, plant)
     click.echo(f"{trial.label}: {trial.samples} samples at {1 / plant.dt:g} per second")
-    for finding in trial.findings or ("Nothing was found.",):
+    for finding in trial.findings or ("The checks found no problems.",):
         click.echo(finding)
 
 
@@ -94,7 +94,7 @@ def _require_new(out: Path | None) -> None:
     from impc.errors import OutputError  # noqa: PLC0415
 
     if out is not None and out.exists():
-        raise OutputError(str(out), "exists already", "give another name, or remove it")
+        raise OutputError(str(out), "already exists", "choose another name, or remove it")
 
 
 def _write(out: Path, text: str) -> None:
@@ -106,6 +106,6 @@ def _write(out: Path, text: str) -> None:
             made = True
             file.write(text)
     except OSError as error:
-        if made:  # half of it
+        if made:  # incomplete
             out.unlink(missing_ok=True)
-        raise unwritable(str(out), error, "give another path") from None
+        raise unwritable(str(out), error, "choose another path") from None

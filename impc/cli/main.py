@@ -1,4 +1,4 @@
-"""The `impc` command: finds the subcommand asked for and turns its failure into one line."""
+"""The `impc` program: dispatch to its commands and report failures in one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impc.cli.ending import ExitStatus, ended, interruptions, own_process
 from impc.jit import keep_caches, say_when_compiling
 from impc.settings_files import ignore_settings_files
 
-# Where each command is, loaded when it is asked for: name -> module and its function.
+# Command -> module and function; imported only when the command is used.
 _COMMANDS = {
     "cohort": ("impc.cli.cohort", "command"),
     "compare": ("impc.cli.fit", "compare_command"),
@@ -31,7 +31,7 @@ _COMMANDS = {
 
 
 class _Program(click.Group):
-    """Ends every expected failure with one line on stderr: no usage text, no traceback."""
+    """Group of commands that ends every expected failure with one line on stderr."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
@@ -48,8 +48,8 @@ class _Program(click.Group):
             return super().make_context(*args, **kwargs)
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        # Matrices of ten rows: a second thread of linear algebra costs more than it does. Before
-        # numpy is imported, and only in this program; a value of the user's own stands.
+        # The matrices are small: more threads of linear algebra slow the program. Must be set
+        # before numpy is imported; the user's own value is kept.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
         def work() -> Any:
@@ -77,19 +77,19 @@ class _Program(click.Group):
 @click.version_option(package_name="impc", prog_name="impc")
 @click.pass_context
 def main(context: click.Context) -> None:
-    """Inverse model predictive control: the weights behind a recorded closed loop."""
+    """Inverse model predictive control: infer the controller behind recorded movements."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
 
 
 @click.command("warm")
 def warm() -> None:
-    """Compile what the other commands run, once: some minutes, after which none compiles.
+    """Compile the inner loops of all other commands once; takes some minutes.
 
-    `make env` ends with it; after an installation by pip it is yours to call. Without it the first
-    command compiles what it needs and says so.
+    `make env` calls it; after an installation by pip, call it yourself. Without it, the first
+    command that needs compiled code compiles it and says so.
     """
-    say_when_compiling(lambda _: None)  # nobody has to be said here
+    say_when_compiling(lambda _: None)  # this command prints its own lines
     from impc.control.warm import compiled_parts  # noqa: PLC0415  # loads numba
 
     for part in compiled_parts():

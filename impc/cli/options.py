@@ -1,7 +1,4 @@
-"""Options that several commands have alike.
-
-Numbers as options: click lets nan and infinity through every range.
-"""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -21,43 +18,40 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
-#: Numbers drawn for trial k of a seed follow from 100 seed + k, which has to be one of 64 bits.
+#: Trial k is drawn with the seed 100 seed + k, which must fit into 64 bits.
 LARGEST_SEED = 10**15
 
-#: --seed of everything that is simulated.
+#: --seed of the commands that simulate.
 seed_option = click.option(
     "--seed",
     type=click.IntRange(0, LARGEST_SEED),
     default=0,
-    help="All numbers drawn follow from it.",
+    help="Seed of all random numbers.",
 )
 
 #: --solver; the names are those of `impc.control.named_solver`, which is not loaded for --help.
 solver_option = click.option(
     "--solver",
-    help="What solves the controller's quadratic programs: compiled (the package's own, and the "
-    "default), or daqp, qpoases or ipopt of CasADi. Of an optimal control problem of your own: "
-    "ipopt, sqpmethod or fatrop.",
+    help="Solver of the controller's quadratic programs: compiled (part of impc; default), or "
+    "daqp, qpoases or ipopt of CasADi. For your own optimal control problem: ipopt, sqpmethod or "
+    "fatrop.",
 )
 
-#: --yes of what may take hours, see `impc.cli.console`.
+#: --yes of commands that may take hours, see `impc.cli.console`.
 yes_option = click.option(
-    "--yes", is_flag=True, help="Do not ask before what takes hours or much memory."
+    "--yes", is_flag=True, help="Do not ask before a request of hours or much memory."
 )
 
 
 def page_options(command: F) -> F:
-    """Add --pdf and --open to a `command` that writes a page."""
-    pdf = click.option("--pdf", is_flag=True, help="Write the figures as PDF too.")
-    shown = click.option("--open", "open_page", is_flag=True, help="Open the page in the browser.")
+    """Add --pdf and --open to a `command` that writes a report."""
+    pdf = click.option("--pdf", is_flag=True, help="Also write the figures as PDF.")
+    shown = click.option("--open", "open_page", is_flag=True, help="Open the report in a browser.")
     return pdf(shown(command))
 
 
 def out_option(folder: str, holds: str) -> Callable[[F], F]:
-    """--out: a `folder` inside results/ by default; its help says what it `holds`.
-
-    The command holds its folder while it runs, and owns what it wrote there (`owned`).
-    """
+    """Add --out, by default `folder` inside results/; the command locks it (`owned`)."""
 
     def added(command: F) -> F:
         @functools.wraps(command)
@@ -79,7 +73,7 @@ def out_option(folder: str, holds: str) -> Callable[[F], F]:
 
 
 def _command_name(context: click.Context) -> str:
-    """Without the program's own, which is `impc` or `python -m impc` for the same command."""
+    """Name of the command without the program's, which is `impc` or `python -m impc`."""
     names = list[str]()
     while context.parent is not None:
         names.insert(0, str(context.info_name))
@@ -88,15 +82,15 @@ def _command_name(context: click.Context) -> str:
 
 
 def subject_arguments(config: str) -> Callable[[F], F]:
-    """FILES, --plant and --config of one subject, of the help `config`; --solver and --yes."""
+    """Add FILES, --plant, --config (with the help text `config`), --solver and --yes."""
     options = (
         click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path)),
         click.option(
             "--plant",
             "plant_name",
             required=True,
-            help=f"{', '.join(KNOWN)}; module:function of your own; or a .mat, .npz or .json state "
-            "space.",
+            help=f"{', '.join(KNOWN)}; your own module:function; or a .mat, .npz or .json file "
+            "with a state-space model.",
         ),
         click.option("--config", required=True, type=click.Path(path_type=Path), help=config),
         solver_option,
@@ -106,19 +100,19 @@ def subject_arguments(config: str) -> Callable[[F], F]:
 
 
 def scheduler_options(command: F) -> F:
-    """Add --scheduler, its certificates, and --workers to a `command`."""
+    """Add --scheduler, --tls-ca, --tls-cert, --tls-key and --workers to a `command`."""
     path = click.Path(path_type=Path)
     options = (
         click.option(
             "--scheduler", help="Address of a running Dask scheduler, such as tls://host:8786."
         ),
-        click.option("--tls-ca", type=path, help="Certificate of whoever signed the scheduler's."),
-        click.option("--tls-cert", type=path, help="Certificate to show to the scheduler."),
-        click.option("--tls-key", type=path, help="Its private key."),
+        click.option("--tls-ca", type=path, help="CA certificate that signed the scheduler's."),
+        click.option("--tls-cert", type=path, help="Client certificate for the scheduler."),
+        click.option("--tls-key", type=path, help="Private key of the client certificate."),
         click.option(
             "--workers",
             type=click.IntRange(1, 1024),
-            help="Workers on this machine; one a core by default.",
+            help="Number of workers on this machine; by default one per core.",
         ),
     )
 
@@ -141,27 +135,27 @@ def scheduler_options(command: F) -> F:
 
 
 def code_options(kind: str) -> Callable[[F], F]:
-    """--plant and --allow-plant, or --model and --allow-model: consent to run what a file names."""
+    """Add --plant and --allow-plant (or --model ...): consent to run code that a file names."""
     name = click.option(
-        f"--{kind}", f"{kind}_name", help=f"The {kind}, in place of the one that the study names."
+        f"--{kind}", f"{kind}_name", help=f"Replaces the {kind} that the study names."
     )
     allow = click.option(
         f"--allow-{kind}",
         "allowed",
         is_flag=True,
-        help=f"Run the code that the study names as its {kind}.",
+        help=f"Allow running the code that the study names as its {kind}.",
     )
     return lambda command: name(allow(command))
 
 
 class Number(click.FloatRange):
-    """A number between two others; `nan` and `inf` are none."""
+    """A finite number in a range; click itself accepts nan and inf in every range."""
 
     name = "number"
 
     def convert(self, value: Any, param: Parameter | None, ctx: Context | None) -> float:
-        """The number that `value` says; click gives `param` and `ctx` for its message."""
+        """Convert `value` to a float; `param` and `ctx` are for click's message."""
         found = float(super().convert(value, param, ctx))
         if not math.isfinite(found):
-            self.fail(f"{value} is no number to compute with.", param, ctx)
+            self.fail(f"{value} is not a finite number.", param, ctx)
         return found

@@ -1,4 +1,4 @@
-"""`impc plan`: what an experiment would identify, before anyone is measured."""
+"""`impc plan`: predict which parameters a planned experiment would identify."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 @click.option(
     "--like",
     type=click.Path(path_type=Path),
-    help="Results of `impc fit` that give plant, settings, cost weights and noise of the assumed "
-    "person; CONFIG replaces what it names.",
+    help="Folder of an `impc fit` result: plant, settings, cost weights and noise of the assumed "
+    "subject. Keys in CONFIG take precedence.",
 )
 @out_option("plan", "report.html, result.json, tables and the figures")
 @page_options
@@ -47,10 +47,10 @@ def command(
     pdf: bool,
     open_page: bool,
 ) -> None:
-    """Plan an experiment for an assumed person, from the [plan] table of CONFIG.
+    """Plan an experiment for an assumed subject, from the [plan] table of CONFIG.
 
-    The file may be the one that `impc fit` reads later: [plant] and [fit] mean the same there. What
-    is done when you interrupt it is kept in the folder: the same command goes on from there.
+    CONFIG may be the file that `impc fit` reads later: [plant] and [fit] mean the same. If you
+    interrupt the command, the same command continues from the last finished step.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.cli.console import require_consent  # noqa: PLC0415
@@ -105,7 +105,7 @@ def command(
 def _assumed(
     configuration: Configuration, plant_name: str | None, like: Path | None
 ) -> tuple[Configuration, str]:
-    """The configuration with what the results of a fit add to it, and the plant's name."""
+    """Configuration completed by the results of a fit (--like), and the name of the plant."""
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
     from impc.studies.plan.like import filled  # noqa: PLC0415
 
@@ -137,9 +137,9 @@ def _person(
     plant, family = asked_plant(source, recorded, fit)
     if not plant.disturbances:
         known = ", ".join(plant.controls)
-        raise InputError("[plan] perturbed", "names no input of the plant", f"known: {known}")
+        raise InputError("[plan] perturbed", "names no input of the plant", f"choose from: {known}")
     if "data" in fit.bounded_states.values():
-        raise InputError("[fit] bounded_states", 'is "data"', "give numbers: there are no data yet")
+        raise InputError("[fit] bounded_states", 'is "data"', "give numbers: a plan has no data")
     structure, cost_weights = assumed_cost_weights(plant, settings, fit)
     bounds = fit_bounds(plant, fit, ())
     controller = Controller(
@@ -164,7 +164,7 @@ def _person(
 def _perturbation(
     plant: Plant, configuration: Configuration, settings: PlanSettings, files: list[Path]
 ) -> Perturbation:
-    """Ternary, one sequence a disturbance, or what was recorded, one file after the other."""
+    """Ternary sequences, one for each disturbance, or the recorded `files` in turn."""
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import read_table  # noqa: PLC0415

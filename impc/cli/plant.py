@@ -1,4 +1,4 @@
-"""A plant by name, and a subject: the one place where the library meets plants."""
+"""Find a plant by name and read the recordings of a subject."""
 
 from __future__ import annotations
 
@@ -19,27 +19,28 @@ if TYPE_CHECKING:
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
 
-#: Short names of plants, by their import paths: the library itself knows no plant.
+#: Short name -> import path of a plant; the package `impc` itself contains no plants.
 KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor_plant"}
 
 
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
-    """The plant of a short name, an import path ``module:function`` or a file.
-
-    `arguments` are those of its function.
-    """
+    """The plant of a short name, an import path ``module:function`` or a file."""
     from impc.errors import InputError  # noqa: PLC0415
     from impc.files.plant_sources import plant_source  # noqa: PLC0415
 
     for key, value in arguments.items():
         if not _kept(value):
             kind = type(value).__name__
-            raise InputError(f"[plant] {key}", f"is a {kind} that no result can keep", "see docs")
+            raise InputError(
+                f"[plant] {key}",
+                f"is a {kind} that result.json cannot hold",
+                "use numbers below 2^63, texts, lists or tables",
+            )
     return plant_source(KNOWN.get(name, name), arguments)
 
 
 def _kept(value: object) -> bool:
-    """Whether result.json can hold it: no date, no integer beyond 64 bits, at no depth."""
+    """Whether result.json can hold it: no date and no integer beyond 64 bits at any depth."""
     if isinstance(value, dict):
         return all(map(_kept, value.values()))
     if isinstance(value, list):
@@ -50,14 +51,14 @@ def _kept(value: object) -> bool:
 
 
 def load_plant(path: str) -> Plant:
-    """Make the plant of an import path ``module:function`` without arguments."""
+    """Call the function of an import path ``module:function`` without arguments."""
     from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
 
     return make_plant(plant_source(path, {}), ())
 
 
 def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
-    """The plant of a study, when the command line consents to it."""
+    """The plant of a study, if the command line consents to running it."""
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
 
     where = f"{study_file}: study.plant"
@@ -66,7 +67,7 @@ def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool
 
 
 class AllFellError(Exception):
-    """Nothing is left to fit: the falls, and where a page on them comes from."""
+    """All trials ended in a fall: nothing is left to fit."""
 
     def __init__(self, falls: tuple[str, ...], provenance: Provenance) -> None:
         super().__init__("; ".join(falls))
@@ -79,16 +80,16 @@ class Subject:
 
     problem: Problem
     settings: FitSettings
-    source: PlantSource  # Of the plant
-    inputs: Inputs  # Digests of all files that went in
+    source: PlantSource
+    inputs: Inputs  # Digests of all input files
     command: str  # The command line, without folders
     files: tuple[str, ...]  # Names of the recordings
-    angles: str = "degrees"  # "degrees" or "radians", as [report] says
-    falls: tuple[str, ...] = ()  # Trials that ended in a fall, and when
+    angles: str = "degrees"  # Unit on pages, [report] angles: "degrees" or "radians"
+    falls: tuple[str, ...] = ()  # Trials that ended in a fall, with the time
 
     @property
     def provenance(self) -> Provenance:
-        """Where what is made of it now comes from."""
+        """Provenance of a result that is made now."""
         from impc.reporting.provenance import Provenance  # noqa: PLC0415
 
         source = self.source
@@ -103,10 +104,7 @@ def read_subject(
     config: Path,
     solver: str | None = None,
 ) -> Subject:
-    """Read recordings, one file a trial; those that end in a fall are left out.
-
-    Raises AllFellError where none is left.
-    """
+    """Read the trials that did not end in a fall; AllFellError if there are none."""
     from impc.control.named_solver import require_solver  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.digests import gather_inputs  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""The person on the seat: what the commands that simulate one have alike."""
+"""Seated subject: functions shared by the commands that simulate one."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-#: Import paths of the linear plant, and of a step of the nonlinear one.
+#: Import paths of the linear plant, and of the time step of the nonlinear one.
 PLANT, STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
-#: Import path of the torque on the seat.
+#: Import path of the perturbation torque on the seat.
 TORQUE = "plants:ternary_torque"
-#: Of the controller, in samples of 0.01 s.
+#: Horizon of the controller, in samples of 0.01 s.
 HORIZON = 20
-#: The columns of `seat_table` for a configuration.
+#: Configuration of the columns that `seat_table` writes.
 SIGNALS = """\
 [signals.theta1]
 column = "seat_angle"
@@ -52,7 +52,7 @@ def random_person(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def numbered(subjects: int) -> Iterator[str]:
-    """Names of so many `subjects`, 01, 02 and so on, with a bar."""
+    """Yield the names 01, 02, ... of the `subjects`, with a progress bar."""
     width = max(2, len(str(subjects)))
     with progress(subjects, "subject") as done:
         for number in range(1, subjects + 1):
@@ -61,7 +61,7 @@ def numbered(subjects: int) -> Iterator[str]:
 
 
 def seat_weights(plant: Plant, cost_weight: float = 1.0) -> Weights:
-    """The intent: one direction of angles and rates of `plant` at a `cost_weight`, little else."""
+    """True weights: Q is almost one direction of angles and rates, scaled by `cost_weight`."""
     import numpy as np  # noqa: PLC0415
 
     from impc.model.weights import Weights  # noqa: PLC0415
@@ -74,7 +74,7 @@ def seat_weights(plant: Plant, cost_weight: float = 1.0) -> Weights:
 
 
 def seat_controller(person: dict[str, Any], limit: float, cost_weight: float = 1.0) -> Controller:
-    """The controller of a `person`: torque `limit` (Nm), `cost_weight` of angles and rates."""
+    """Controller of a `person`: torque `limit` (N m), `cost_weight` of angles and rates."""
     from impc.control.controller import Controller  # noqa: PLC0415
     from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
     from impc.model.bounds import Bounds  # noqa: PLC0415
@@ -85,12 +85,10 @@ def seat_controller(person: dict[str, Any], limit: float, cost_weight: float = 1
 
 
 def between_samples(torque: Array) -> Array:
-    """Mean torque from each sample to the next (samples,): what acts where it is linear between.
+    """Mean of `torque` (samples,) between neighbouring samples: linear interpolation.
 
-    So a recording is read again (docs/recordings.md). Held instead, the torque would come half a
-    sample late: 0.5 ms, which moves a fitted gain by eight of its deviations.
-
-    `torque` (samples,).
+    Recordings are read with the same interpolation (docs/howto/recordings.md). A torque held over
+    each sample would act half a sample late and bias the fitted gain.
     """
     import numpy as np  # noqa: PLC0415
 
@@ -98,7 +96,7 @@ def between_samples(torque: Array) -> Array:
 
 
 def seat_table(name: str, degrees: Array, torque: Array, rate: float) -> Table:
-    """The trial `name`: angles in `degrees` (samples, 2), `torque` in Nm (samples,) at a `rate`."""
+    """Table of a trial: angles in `degrees` (samples, 2), `torque` in N m, `rate` in Hz."""
     import numpy as np  # noqa: PLC0415
 
     from impc.files.table import make_table  # noqa: PLC0415
@@ -114,10 +112,7 @@ def seat_table(name: str, degrees: Array, torque: Array, rate: float) -> Table:
 
 
 def write_study(out: Path, command: str, study: str, truth: dict[str, Any], **more: str) -> None:
-    """Write study.toml, truth.json and `more` texts, by their stem and ending, and say what next.
-
-    `truth` has the settings, and the subjects by their names.
-    """
+    """Write study.toml, truth.json and `more` files (`stem_ending`); print the next command."""
     from impc.reporting.writer import write_files  # noqa: PLC0415
 
     texts = {"study.toml": study, "truth.json": json.dumps(truth, indent=1) + "\n"}

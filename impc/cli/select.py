@@ -1,4 +1,4 @@
-"""`impc select` and `impc key-parameters`: which parameters of a model recordings identify."""
+"""`impc select` and `impc key-parameters`: model parameters that recordings can identify."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def command(
     pdf: bool,
     open_page: bool,
 ) -> None:
-    """Sensitive parameters of a simulation model (chapter 4), subject by subject and in common.
+    """Select sensitive parameters of a simulation model (chapter 4), per subject and pooled.
 
-    [study] model names the model by import path, [model] its arguments, [select] the settings. It
-    may be stopped at any time: the same command goes on from there.
+    [study] model is the import path of the model, [model] has its arguments, [select] the settings.
+    If you interrupt the command, the same command continues from the last finished task.
     """
     from impc.cli.console import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
@@ -77,7 +77,7 @@ def command(
 
 
 def _print(page: Report, *columns: str) -> None:
-    """Verdict, and these columns of the table of estimates."""
+    """Print the verdict and these `columns` of the table of estimates."""
     from impc.checking import replace  # noqa: PLC0415
 
     click.echo(page.verdict.text())
@@ -92,7 +92,7 @@ def _print(page: Report, *columns: str) -> None:
 
 
 def kept_results(out: Path) -> Cache:
-    """Where results of single tasks wait in the folder `out` until the whole is done."""
+    """Cache in the folder `out` of the results of single tasks, until the study is complete."""
     from impc.studies.cache import Cache  # noqa: PLC0415
 
     return Cache(out / "in-progress")
@@ -102,14 +102,14 @@ def kept_results(out: Path) -> Cache:
 def study_runner(
     source: ModelSource, out: Path, cluster: Cluster, tasks: int
 ) -> Iterator[tuple[Runner, int]]:
-    """Workers with a progress bar, and how many; a message of what is kept when interrupted."""
+    """Yield a runner with a progress bar, and its number of workers."""
     from impc.studies.scheduler import connected  # noqa: PLC0415
     from impc.studies.selection.model_source import on_pool  # noqa: PLC0415
 
     kept = kept_results(out)
 
     def said(count: int) -> str:
-        return f"{count} of {tasks} tasks are kept in {kept.folder}; the same command goes on"
+        return f"{count} of {tasks} tasks are kept in {kept.folder}; the same command continues"
 
     with progress(tasks, "task", said) as tell, connected(cluster) as pool:
 
@@ -122,7 +122,7 @@ def study_runner(
 def read_model_study(
     path: Path, given: str | None, allowed: bool
 ) -> tuple[Study, ModelSource, dict[tuple[str, str], tuple[Trial, ...]], Inputs]:
-    """The study at `path`, its model, all recordings, and the digests of these."""
+    """The study at `path`, its model, all recordings, and the digests of its files."""
     from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
     from impc.files.reading import require_distinct  # noqa: PLC0415
@@ -147,10 +147,10 @@ def read_model_study(
     "--bound",
     type=Number(min=0, max=1e6, min_open=True),
     default=0.35,
-    help="Largest variance, in halves of the ranges, squared.",
+    help="Largest allowed variance of a parameter, in squared halves of its range.",
 )
-@click.option("--vaf", type=Number(), default=69.0, help="Least mean VAF, %.")
-@click.option("--icc", type=Number(), default=0.75, help="Least ICC(A,k).")
+@click.option("--vaf", type=Number(), default=69.0, help="Smallest allowed mean VAF, %.")
+@click.option("--icc", type=Number(), default=0.75, help="Smallest allowed ICC(A,k).")
 @page_options
 @scheduler_options
 @yes_option
@@ -167,10 +167,10 @@ def key_command(
     pdf: bool,
     open_page: bool,
 ) -> None:
-    """Key parameters of a study of several subjects and visits.
+    """Find key parameters (chapter 5) in a study of several subjects and visits.
 
-    The study file is that of `impc select`. It may be stopped at any time: the same command goes on
-    from there.
+    The study file is that of `impc select`. If you interrupt the command, the same command
+    continues from the last finished task.
     """
     from impc.cli.console import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415

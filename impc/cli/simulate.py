@@ -1,4 +1,4 @@
-"""`impc simulate`: recordings of a subject who is known, for everybody without data."""
+"""`impc simulate`: recordings of simulated subjects whose controller is known."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from impc.studies.simulated_people import SubjectTrial
 
 _FORMATS = ("csv", "tsv", "xlsx", "mat", "tdms", "c3d")
-# What a plain installation cannot write.
+# Formats that need an optional library.
 _LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
 _RATE = 1000.0
-#: What a person on the seat senses.
+#: Signals that the simulated subject senses.
 _SENSED = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _STOP = "limit = 12.0                 # mechanical stop, in this unit\n"
 
 
 @click.group("simulate")
 def command() -> None:
-    """Make recordings of a simulated subject, with the truth beside them."""
+    """Write recordings of a simulated subject, with the true values in truth.json."""
 
 
 @command.command("seated-balance")
@@ -51,60 +51,60 @@ def command() -> None:
     "--torque-limit",
     type=Number(min=0, max=1e6, min_open=True),
     default=6.0,
-    help="Largest torque of the subject, Nm.",
+    help="Largest torque of the subject, N m.",
 )
-@click.option("--trials", type=click.IntRange(1, 99), default=3)
-@click.option("--duration", type=Number(min=2, max=600), default=30.0, help="Of a trial, s.")
+@click.option("--trials", type=click.IntRange(1, 99), default=3, help="Number of trials.")
+@click.option("--duration", type=Number(min=2, max=600), default=30.0, help="Of each trial, s.")
 @click.option(
     "--amplitude",
     type=Number(min=0, max=1e6, min_open=True),
     default=5.0,
-    help="Of the ternary torque on the seat, Nm.",
+    help="Of the ternary torque on the seat, N m.",
 )
 @click.option(
     "--motor-noise",
     type=Number(min=0, max=1e6),
     show_default="0, with --observer 0.3",
-    help="Standard deviation of the noise on the torque, Nm: what a fit without [fit.observer] "
-    "takes for noise of the recorder.",
+    help="Standard deviation of the noise on the torque, N m; a fit without [fit.observer] treats "
+    "it as recording noise.",
 )
 @click.option(
     "--sensor-noise",
     type=Number(min=0, max=1e6),
     default=0.1,
-    help="Standard deviation of the noise on the angles, degrees.",
+    help="Standard deviation of the recording noise on the angles, degrees.",
 )
 @click.option(
     "--observer",
     is_flag=True,
-    help="The person senses angles and rates with noise, and acts on estimates.",
+    help="The subject senses angles and rates with noise, and acts on estimates of the states.",
 )
 @click.option(
     "--sensory-noise",
     type=Number(min=0, max=1e6, min_open=True),
     default=0.1,
-    help="Of such a person: how far one look (0.01 s) at an angle errs, degrees; at a rate ten "
-    "times that per second.",
+    help="With --observer: standard deviation of one sensed sample (0.01 s) of an angle, degrees; "
+    "of a rate, ten times that per second.",
 )
 @click.option(
     "--unknown-perturbation",
     is_flag=True,
-    help="Such a person does not know the torque on the seat, and estimates it.",
+    help="With --observer: the subject does not know the torque on the seat, and estimates it.",
 )
-@click.option("--mass", type=Number(), default=79.7, help="kg")
-@click.option("--height", type=Number(), default=1.66, help="m")
+@click.option("--mass", type=Number(), default=79.7, help="Body mass, kg.")
+@click.option("--height", type=Number(), default=1.66, help="Body height, m.")
 @click.option("--sex", type=click.Choice(["male", "female"]), default="male")
 @seed_option
 @click.option(
     "--formats",
     show_default="all that are installed",
-    help="Which of csv, tsv, xlsx, mat, tdms and c3d, with commas between.",
+    help="Comma-separated list of csv, tsv, xlsx, mat, tdms and c3d.",
 )
 def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
-    """A person on a seat that tilts sideways, holding it by a constrained controller.
+    """Simulate a subject who balances on a tilting seat with a bounded controller.
 
     1000 samples a second; the nonlinear plant of the dissertation with parameters from body mass
-    and height; the weights of the intent that truth.json says.
+    and height. truth.json holds the true gain and weights.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
@@ -126,7 +126,7 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
         share = 100 * trial.saturated
         click.echo(f"trial {number}: at the torque limit for {share:.1f} % of the time{fell}")
     print_files(out, written)
-    # Of several formats the first: the trials are the same in all.
+    # One format: the trials are the same in all.
     fit = "impc fit {} --plant seated-balance --config {}"
     print_next(fit, out, f"trial_*.{wanted[0]}", "subject.toml")
 
@@ -181,7 +181,7 @@ def _trials(
 
 
 def _observer(controller: Controller, given: dict[str, Any]) -> Observer | None:
-    """The person who senses with noise, where one is asked for."""
+    """The subject's observer, if --observer is given."""
     import numpy as np  # noqa: PLC0415
 
     from impc.output_feedback.observer import Observer  # noqa: PLC0415
@@ -200,7 +200,7 @@ def _observer(controller: Controller, given: dict[str, Any]) -> Observer | None:
 
 
 def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str, bytes]:
-    """One trial in every format: degrees and newton metres, as a laboratory writes them."""
+    """Encode one trial in every wanted format, in degrees and newton metres."""
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import encode_table  # noqa: PLC0415
@@ -210,7 +210,7 @@ def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str,
 
 
 def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
-    """What a fit of these recordings should find."""
+    """True values, for truth.json."""
     import importlib.metadata  # noqa: PLC0415
 
     weights = seat_weights(controller.plant)
@@ -226,9 +226,9 @@ def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _configuration(person: dict[str, Any], given: dict[str, Any]) -> str:
-    """A configuration that `impc fit` reads."""
+    """Text of subject.toml, which `impc fit` reads."""
     return f"""\
-# A simulated subject: what the columns of its recordings mean. truth.json holds what a fit seeks.
+# A simulated subject: meaning of the columns of its recordings. truth.json holds the true values.
 [recording]
 time = "time"
 subject = "simulated"
@@ -254,7 +254,7 @@ def _observer_table(given: dict[str, Any]) -> str:
 sensed = {json.dumps(_SENSED)}
 known = {json.dumps(not given["unknown_perturbation"])}
 
-[fit.structure]              # what may have a cost weight: not the delay, nor the muscle
+[fit.structure]              # no cost weights for the states of delay and muscle
 Q = "full"
 over = {json.dumps(_SENSED)}
 name = "posture"

@@ -1,4 +1,4 @@
-"""`impc simulate cohort`: two groups of simulated subjects that differ in one stated way."""
+"""`impc simulate cohort`: two groups of simulated subjects with different cost weights."""
 
 from __future__ import annotations
 
@@ -24,59 +24,61 @@ if TYPE_CHECKING:
     import numpy as np
 
 _RATE = 100.0
-# Steps of the body between two samples: a single one of 10 ms errs in the states of the delay.
+# Integration steps between two samples: one step of 10 ms is inaccurate in the delay states.
 _WITHIN = 10
-# Of the angles, degrees: what a recorder of 0.1 degrees at 1000 samples a second leaves at 100.
+# SD of the recorded angles, degrees: 0.1 degrees at 1000 samples/s, averaged to 100 samples/s.
 _NOISE = 0.03
 _STOP = 12.0  # deg
 _LIMIT = f"limit = {_STOP}\n"
-# Spread of the cost weights between subjects, and of one subject between visits: of their
-# logarithm.
+# SD of the logarithm of the cost weights between subjects, and between visits of one subject.
 _BETWEEN, _AGAIN = 0.2, 0.05
 
 
 @click.command("cohort")
 @out_option("cohort-data", "the recordings, study.toml, participants.tsv and truth.json")
 @click.option(
-    "--subjects", type=click.IntRange(2, 9999), default=30, help="In both groups together."
+    "--subjects", type=click.IntRange(2, 9999), default=30, help="Number in both groups together."
 )
-@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
-@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
-@click.option("--duration", type=Number(5, 600), default=30.0, help="s")
+@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Per subject.")
+@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Per visit.")
+@click.option("--duration", type=Number(5, 600), default=30.0, help="Of each trial, s.")
 @click.option(
     "--difference",
     type=Number(min=0.05, max=20),
     default=0.4,
-    help="The second group's cost weights of angles and rates over the first's; 1 for none.",
+    help="Ratio of the cost weights of angles and rates, second group to first; 1: no difference.",
 )
 @click.option(
     "--torque-limit",
     type=Number(min=1, max=1e6),
     default=6.0,
-    help="Largest lumbar torque of a subject, Nm.",
+    help="Largest lumbar torque of a subject, N m.",
 )
 @click.option(
     "--motor-noise",
     type=Number(min=0, max=1e6),
     default=0.0,
-    help="Standard deviation of the noise on the torque, Nm: what a fit takes for noise of the "
-    "recorder.",
+    help="Standard deviation of the noise on the torque, N m; a fit treats it as recording noise.",
 )
-@click.option("--replicates", type=click.IntRange(0, 1_000_000), default=20, help="In study.toml.")
+@click.option(
+    "--replicates",
+    type=click.IntRange(0, 1_000_000),
+    default=20,
+    help="Bootstrap replicates, written to study.toml.",
+)
 @seed_option
 def cohort(out: Path, **given: Any) -> None:
-    """Subjects on the seat, half of them in each of two groups, in folders named as BIDS has it.
+    """Simulate two groups of seated subjects, in folders with BIDS names.
 
-    The groups differ in one thing: what angles and rates cost the second one, compared with its
-    effort. Body mass and height differ between subjects, cost weights between subjects and visits.
-    100 samples a second.
+    The groups differ only in the cost weights of angles and rates relative to torque. Body mass and
+    height differ between subjects, cost weights between subjects and visits. 100 samples a second.
     """
     import numpy as np  # noqa: PLC0415
 
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
 
-    fit_settings({"replicates": given["replicates"]})  # what `impc cohort` would refuse
+    fit_settings({"replicates": given["replicates"]})  # fail here if `impc cohort` would
     require_writable(out)
     rng = np.random.default_rng(given["seed"])
     rows = ["participant_id\tgroup\tmass\theight\tsex"]
@@ -110,7 +112,7 @@ def _visit(
     given: dict[str, Any],
     rng: np.random.Generator,
 ) -> tuple[dict[str, bytes], list[list[float]], dict[str, float]]:
-    """All trials of a visit as files, the gain behind them, and when the subject fell in which."""
+    """All trials of a visit as files, the true gain, and the times of falls by file."""
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import encode_table  # noqa: PLC0415
@@ -123,7 +125,7 @@ def _visit(
     files, falls = {}, {}
     for run in range(1, given["trials"] + 1):
         pushed = torque(duration=given["duration"], rate=_RATE, seed=int(rng.integers(2**31)))
-        # Held: a recording on the controller's own clock is read as it stands.
+        # Held over each sample: recordings at the controller's rate are read without interpolation.
         trial = simulate_subject(
             controller,
             make,
@@ -137,14 +139,14 @@ def _visit(
         table = seat_table(file, np.degrees(trial.outputs[::_WITHIN]), pushed, _RATE)
         files[f"{file}.csv"] = encode_table(".csv", table)
         beyond = np.abs(trial.outputs[:, 0]) > np.radians(_STOP)
-        if beyond.any():  # the stop that study.toml names: the seat is on the floor
+        if beyond.any():  # beyond the mechanical stop that study.toml names
             falls[file] = float(trial.time[np.argmax(beyond)])
     return files, np.array(controller.K).tolist(), falls
 
 
 def _study(given: dict[str, Any]) -> str:
     return f"""\
-# A simulated cohort: `impc cohort study.toml --out DIR`. truth.json holds what it should find.
+# A simulated cohort: `impc cohort study.toml --out DIR`. truth.json holds the true values.
 [study]
 plant = "seated-balance"
 bids = "."                       # folders and files that are named sub-, ses-, task-, run-

@@ -1,4 +1,4 @@
-"""`impc simulate reliability-study` and `head-tracking`: subjects over visits and conditions."""
+"""`impc simulate reliability-study` and `impc simulate head-tracking`."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _RATE = 100.0
-# 242 steps of 0.12 s: one whole period of the register, so that its lines are lines.
+# 242 steps of 0.12 s are one period of the ternary sequence: a line spectrum without leakage.
 _DWELL, _DURATION = 0.12, 242 * 0.12
-# Price of angles and rates, size of the sway that the subject makes itself (N m), noise of the two
-# angles (degrees): open eyes, closed eyes, vibration of the trunk's muscles.
+# Factor of the cost weights of angles and rates, SD of the torque noise (N m), SD of the recording
+# noise of both angles (degrees): eyes open, eyes closed, vibration of the trunk muscles.
 _CONDITIONS = {
     "EO": (1.0, 4.0, (0.10, 0.30)),
     "EC": (0.6, 6.0, (0.12, 0.40)),
     "VIB": (0.75, 7.0, (0.15, 0.60)),
 }
-# Deviations of logarithms: of cost weights and of sway between subjects, of both at a visit, of
-# sway in a trial; each visit lowers the sway by the learning.
+# SD of logarithms: of cost weights and of sway between subjects, of both between visits, of sway
+# between trials; change of the log sway at each visit (learning).
 _COST_WEIGHT, _SWAY, _AT_A_VISIT, _TRIAL, _LEARNING = 0.8, 0.4, 0.25, 0.10, -0.03
-# Lean of seat and trunk at a visit, degrees: RMS is about upright and counts it.
+# SD of the mean lean of seat and trunk at a visit, degrees; RMS about upright includes it.
 _LEAN = (0.1, 0.8)
 
 
 @click.command("reliability-study")
 @out_option("reliability-data", "the recordings, study.toml and truth.json")
-@click.option("--subjects", type=click.IntRange(2, 999), default=30, help="How many.")
-@click.option("--visits", type=click.IntRange(2, 9), default=3, help="Of each subject.")
-@click.option("--trials", type=click.IntRange(2, 9), default=3, help="Of each visit and condition.")
+@click.option("--subjects", type=click.IntRange(2, 999), default=30, help="Number of subjects.")
+@click.option("--visits", type=click.IntRange(2, 9), default=3, help="Per subject.")
+@click.option("--trials", type=click.IntRange(2, 9), default=3, help="Per visit and condition.")
 @seed_option
 def reliability_study(out: Path, **given: Any) -> None:
-    """Thirty subjects, three visits, three conditions and three trials on the seat.
+    """Simulate a reliability study of seated subjects under three conditions.
 
-    Subjects differ in body; subjects and visits in what angles and rates cost and in how much the
-    body sways; visits in how the body leans; trials in the sway. Closed eyes and vibration change
-    cost weights, sway and noise. 29.04 s a trial, one period of the ternary torque, 100 samples a
-    second.
+    Bodies differ between subjects; cost weights of angles and rates between subjects and visits;
+    sway between subjects, visits and trials; mean lean between visits. Closed eyes and vibration
+    change cost weights, sway and noise. A trial lasts 29.04 s, one period of the ternary torque, at
+    100 samples a second.
     """
     import numpy as np  # noqa: PLC0415
 
@@ -99,7 +99,7 @@ def _cell(
     given: dict[str, Any],
     rng: np.random.Generator,
 ) -> list[bytes]:
-    """All trials of a subject's visit in one condition, as files."""
+    """Files of all trials of one subject, visit and condition."""
     import numpy as np  # noqa: PLC0415
 
     from impc.files.formats import encode_table  # noqa: PLC0415
@@ -120,12 +120,12 @@ def _cell(
 def _simulated(
     plant: Plant, K: Array, torque: Array, sway: float, rng: np.random.Generator
 ) -> Array:
-    """Outputs of x+ = (A - BK) x + E d + B w, after one period that is not recorded."""
+    """Outputs of x+ = (A - BK) x + E d + B w in the second period of the torque."""
     import numpy as np  # noqa: PLC0415
     import scipy.signal  # noqa: PLC0415
 
     driven = np.concatenate([torque, torque])
-    # Sway: noise of a time constant of half a second, as the command's.
+    # Sway: noise on the torque with a time constant of 0.5 s.
     white = rng.standard_normal((len(driven), plant.m))
     root = np.exp(-1 / (0.5 * _RATE))
     own = sway * scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
@@ -151,8 +151,8 @@ time = "time"
 
 _MODEL, _STEPS = "plants:head_neck_model", "plants:step_reference"
 _HEAD_RATE = 60.0
-# SD over subjects, of a parameter over its typical value; of one subject between visits; and of
-# the VAF that the noise leaves, % (table 4.3: 82.3 +- 7.7).
+# SD of the logarithm of a parameter between subjects, and between visits of one subject; mean and
+# SD of the VAF, % (table 4.3: 82.3 +- 7.7).
 _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
 
 
@@ -161,16 +161,16 @@ _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
 @click.option(
     "--axis", type=click.Choice(["yaw", "pitch"]), default="yaw", help="Of the head's rotation."
 )
-@click.option("--subjects", type=click.IntRange(1, 999), default=10, help="How many.")
-@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Of each subject.")
-@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Of each visit.")
-@click.option("--duration", type=Number(5, 300), default=30.0, help="Of a trial, s.")
+@click.option("--subjects", type=click.IntRange(1, 999), default=10, help="Number of subjects.")
+@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Per subject.")
+@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Per visit.")
+@click.option("--duration", type=Number(5, 300), default=30.0, help="Of each trial, s.")
 @seed_option
 def head_tracking(out: Path, **given: Any) -> None:
-    """Ten subjects of chapter 4; --subjects 40 --visits 2 for chapter 5.
+    """Simulate head tracking as in chapter 4; --subjects 40 --visits 2 for chapter 5.
 
-    Subjects differ in all twelve parameters, drawn about the nominal column of table 4.3 until the
-    loop is stable, and in the noise.
+    Subjects differ in all twelve parameters, drawn around the nominal values of table 4.3 such that
+    the loop is stable, and in the noise.
     """
     import numpy as np  # noqa: PLC0415
 
@@ -188,7 +188,7 @@ def head_tracking(out: Path, **given: Any) -> None:
     inside = (low + 1e-3 * (high - low), high - 1e-3 * (high - low))
 
     def drawn(about: Any, spread: float) -> Any:
-        """Parameters about others, such that 30 s of tracking stay within reason."""
+        """Draw parameters around `about` until 30 s of tracking stay below 20 degrees."""
         while True:
             theta = np.clip(about * np.exp(spread * rng.standard_normal(model.size)), *inside)
             probe = model.simulate(theta, steps(30.0, _HEAD_RATE, seed=0)[:, None])

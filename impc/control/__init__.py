@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from impc.settings_files import ignore_settings_files
 
-# Before a module of this package imports numba: by a settings file it would take compiled code from
-# the working folder.
+# Must run before a module of this package imports numba, whose settings file could load compiled
+# code from the working folder.
 ignore_settings_files("numba")

@@ -1,12 +1,9 @@
-"""One sample of whatever moves, a plant's body or its matrices; slopes along a trajectory.
+"""One sample of a nonlinear body or a linear plant, and slopes along a trajectory.
 
-docs/nonlinear.md has the equations.
-
-A body's list of operations is machine code, translated once for all samples by LLVM, which numba
-brings: a function of (constants, given, found) that reads and writes where they point to. The
-operations stand one behind the other without a branch, and none is taken together with another, so
-that every processor gives the same numbers. Parameters are among the constants, so that bodies
-which differ by them alone share their code (docs/nonlinear.md, "A body that is not linear").
+The operations of a body are translated by LLVM (which numba includes) to machine code without
+branches, a function of pointers (constants, given, found). Operations are not fused, so that all
+processors give the same numbers. Parameters are constants: bodies that differ only in them share
+their code (docs/howto/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -32,10 +29,7 @@ if TYPE_CHECKING:
 
 
 def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTape:
-    """A body for the compiled loop, empty where there is none.
-
-    With arrays of its own each time, because trials are simulated side by side.
-    """
+    """A body for the compiled loop, empty without one; own arrays, as trials run in parallel."""
     if body is None:
         none = np.zeros((0, 0))
         return BodyTape(0, np.zeros(0), np.zeros(0), np.zeros(0), none, none)
@@ -47,7 +41,7 @@ def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTap
 
 
 def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
-    """State (n,) after one sample from x (n,) with u (m,) and d (d,)."""
+    """State (n,) one sample after x (n,) with u (m,) and d (d,)."""
     if plant.body is None:
         linear: Array = plant.A @ x + plant.B @ u + plant.E @ d
         return linear
@@ -55,9 +49,9 @@ def next_state(plant: Plant, x: Array, u: Array, d: Array) -> Array:
 
 
 def pushes(along: Directions, x: Array, u: Array, d: Array) -> Array:
-    """What the parameters in the body add to each derivative of the next state.
+    """Contribution of the body's parameters to each derivative of the next state.
 
-    A direction without bodies nearby moves the body as it moves the matrices.
+    Directions without nearby bodies change the body as they change the matrices.
     """
     found = np.tensordot(x, along.A, ((1,), (1,))) + np.tensordot(u, along.B, ((1,), (1,)))
     found += np.tensordot(d, along.E, ((1,), (1,)))
@@ -94,7 +88,7 @@ def _matrices(plant: Plant) -> tuple[Array, Array, Array]:
 
 _NUMBER, _PLACE = ir.DoubleType(), ir.IntType(64)
 _ZERO, _ONE, _MINUS = (_NUMBER(value) for value in (0.0, 1.0, -1.0))
-# Of LLVM, which takes a sine and a cosine of one number together, and of the C library, by name.
+# LLVM intrinsics (LLVM merges a sine and cosine of one number), and functions of the C library.
 _CALLED = {
     **{"SIN": "llvm.sin", "COS": "llvm.cos", "SQRT": "llvm.sqrt", "FABS": "llvm.fabs"},
     **{"EXP": "exp", "LOG": "log", "POW": "pow", "CONSTPOW": "pow"},
@@ -103,7 +97,7 @@ _CALLED = {
     **{"FMIN": "fmin", "FMAX": "fmax", "HYPOT": "hypot", "LOG1P": "log1p", "EXPM1": "expm1"},
 }
 _OF_TWO = {"POW", "CONSTPOW", "ATAN2", "FMIN", "FMAX", "HYPOT"}
-# Of instructions, from a builder and two operands.
+# Instructions, from a builder and two operands.
 _WRITTEN: dict[str, Callable[[Any, Any, Any], Any]] = {
     "MUL": lambda to, a, b: to.fmul(a, b),
     "ADD": lambda to, a, b: to.fadd(a, b),
@@ -130,14 +124,14 @@ _one_at_a_time = threading.Lock()
 
 
 def address(body: Body, states: int, *, moving: bool) -> int:
-    """Where the machine code of a body begins; it stays there as long as the process."""
+    """Address of a body's machine code, valid as long as the process runs."""
     with _one_at_a_time:
         place, _ = _translated(body.code.tobytes(), len(body.constants), None if moving else states)
     return place
 
 
 def _of_states(code: list[list[int]], states: int) -> list[list[int]]:
-    """The operations that the next states need."""
+    """Operations that the next states need."""
     needed: set[int] = set()
     kept = []
     for line in code[::-1]:
@@ -155,7 +149,7 @@ def _of_states(code: list[list[int]], states: int) -> list[list[int]]:
 
 @functools.cache
 def _translated(code: bytes, constants: int, states: int | None) -> tuple[int, Any]:
-    """The address of a function of `states` alone, if any, and what keeps it there."""
+    """Address of the compiled function (of `states` outputs only, if given), and its owner."""
     lines: list[list[int]] = np.frombuffer(code, dtype=np.int64).reshape(-1, 4).tolist()
     if states is not None:
         lines = _of_states(lines, states)
@@ -168,7 +162,7 @@ def _translated(code: bytes, constants: int, states: int | None) -> tuple[int, A
     slots: dict[int, Any] = {}
 
     def read(slot: int) -> Any:
-        if slot not in slots:  # what is computed is written before it is read
+        if slot not in slots:  # computed values are written before they are read
             source, place = (held, slot) if slot < constants else (given, slot - constants)
             slots[slot] = builder.load(builder.gep(source, [_PLACE(place)]))
         return slots[slot]

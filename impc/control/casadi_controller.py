@@ -1,8 +1,7 @@
-"""The controller built in CasADi, with a quadratic program at every sample.
+"""Controller as a CasADi quadratic program that is solved at every sample.
 
-`closed_loop` is the fast path of the package. This module is the plain one: the program is written
-symbolically, solved by a named plugin from scratch at every sample, and says what happened. Tests
-hold the two against each other, and both against the program (3.1) written out in u.
+This plain implementation is the reference for the fast one in `closed_loop`: the symbolic program
+is solved by a named plugin from scratch at every sample.
 
     minimise over v_0..v_{N-1} (and slacks s >= 0 of soft rows)   sum v_k'S v_k / 2 + limit's
     subject to   T x + M v <= b + s
@@ -32,11 +31,11 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import Rows
     from impc.control.simulation import Scenario
 
-# Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take; its proximal
-# iterations called feasible programs infeasible. Its slacks get a quadratic cost of this share of
-# their cost weight instead: a relative excess s changes the cost weight by 1e-8 s.
+# Slacks are linear in the cost, so the Hessian is singular, which DAQP does not accept; with its
+# proximal iterations it declares feasible programs infeasible. Its slacks get a quadratic cost of
+# this share of their penalty: a relative excess s changes the penalty by 1e-8 s.
 _DAQP_SLACK = 1e-8
-# A row that is exceeded by this share of its bound is not kept, whatever the solver's flag says.
+# A row exceeded by more than this share of its bound counts as violated, whatever the solver says.
 _EXCEEDED = 1e-6
 
 
@@ -46,33 +45,31 @@ class MpcSolver:
 
     controller: Controller
     rows: Rows
-    name: str  # Name of the CasADi plugin
-    # The solver, taking the state as parameter ``p``. Rows are divided by their bounds: a call of
-    # it needs ``lbg=-inf, ubg=1``, and slacks that are at least zero, as in `solve_mpc`.
+    name: str  # CasADi plugin
+    # solver with the state as parameter ``p``; rows are divided by their bounds: call it with
+    # ``lbg=-inf, ubg=1`` and slacks >= 0, as `solve_mpc` does
     function: Any
-    soft: BoolArray  # Which rows have a slack (r,)
+    soft: BoolArray  # (r,), which rows have a slack
 
 
 @dataclass(frozen=True)
 class MpcStep:
-    """Answer of one program."""
+    """Solution of one program."""
 
-    # Input to apply (m,); the plain gain's when the status is a failure, for inspection only
-    u: Array
-    plan: Array  # Planned inputs (N, m)
-    states: Array  # Planned states (N + 1, n)
-    # UNSOLVED when the solver found no plan that keeps the hard rows; INFEASIBLE when it is proved
-    # that there is none. What a solver says of that is not believed: on a plant that runs away
-    # IPOPT and qpOASES call feasible programs infeasible.
+    u: Array  # (m,), input to apply; if the status is a failure, that of the plain gain
+    plan: Array  # (N, m), planned inputs
+    states: Array  # (N + 1, n), planned states
+    # UNSOLVED: no plan found that satisfies the hard rows; INFEASIBLE: proved that there is none.
+    # The solver's own claim is not used: on unstable plants IPOPT and qpOASES report feasible
+    # programs as infeasible.
     status: Status
-    # Largest violation of a hard row relative to its bound, recomputed from the answer
-    excess: float
-    failed_row: int  # Row of `Rows` that no plan keeps beside the others, -1 when there is none
+    excess: float  # largest violation of a hard row relative to its bound, recomputed
+    failed_row: int  # row of `Rows` that is incompatible with the others, or -1
 
 
 @checked
 def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
-    """Write the controller's program in CasADi and hand it to a solver."""
+    """Write the controller's program in CasADi and pass it to a solver."""
     if solver not in SOLVERS:
         raise InputError("solver", f"got {solver!r}", f"choose one of {', '.join(SOLVERS)}")
     rows = build_rows(controller)
@@ -100,7 +97,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
         ),
     }
     name, options = PLUGINS[solver]
-    if soft.any():  # qpOASES loses a program with a singular Hessian when it begins without bounds
+    if soft.any():  # qpOASES fails on a singular Hessian if it starts without active bounds
         options = {key: value for key, value in options.items() if key != "initialStatusBounds"}
     with silent():
         function = ca.qpsol("mpc", name, program, options)
@@ -109,7 +106,7 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
 
 @checked(x="n")
 def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
-    """Solve the program at a state; `x` (n,)."""
+    """Solve the program at state `x` (n,)."""
     controller, rows = mpc.controller, mpc.rows
     state = finite_array("x", x, (controller.plant.n,))
     width, slacks = rows.M.shape[1], int(mpc.soft.sum())
@@ -138,10 +135,10 @@ def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
 
 @checked
 def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
-    """Simulate with a program at every sample; the slow counterpart of `closed_loop.simulate`."""
+    """Simulate with a program at every sample; slow counterpart of `closed_loop.simulate`."""
     plant = mpc.controller.plant
     if given.signals or np.any(plant.observer):
-        raise InputError("target", "is given", "this way regulates to rest: use impc.simulate")
+        raise InputError("target", "is given, but is not supported here", "use impc.simulate")
     x, u = np.zeros((given.steps + 1, plant.n)), np.zeros((given.steps, plant.m))
     status = np.full(given.steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], failed_row = given.x0, -1
@@ -158,20 +155,21 @@ def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
 
 @checked
 def mpc_function(controller: Controller) -> ca.Function:
-    """One step of a controller as a `casadi.Function` of the state.
+    """Return one step of a controller as a `casadi.Function` of the state.
 
-    A branch: where the gain keeps every bound, the gain; elsewhere the quadratic program, solved by
-    DAQP. It is an ordinary graph of CasADi, with CasADi's derivatives, and may be saved, loaded and
-    turned into C (which is then linked with DAQP).
+    It applies the gain where that satisfies all bounds, and the solution of the quadratic program
+    (by DAQP) elsewhere. The function is an ordinary CasADi graph with CasADi's derivatives: it can
+    be saved, loaded, and exported to C (and then linked with DAQP).
 
     Parameters
     ----------
     controller : Controller
+        Controller to export.
 
     Returns
     -------
     casadi.Function
-        x (n, 1) -> u (m, 1); NaN where no plan that keeps the bounds was found.
+        x (n, 1) -> u (m, 1); NaN if no admissible plan was found.
 
     Examples
     --------

@@ -1,20 +1,18 @@
-"""A plant under the constrained controller, simulated and differentiated in one pass.
+"""Simulate and differentiate a plant under the constrained controller in one pass.
 
-At most samples v = 0 keeps every bound and the controller is the gain; only elsewhere a
-least-distance problem is solved (docs/theory.md, section 4). There, with the active rows a
+At most samples v = 0 satisfies all bounds and the controller is the gain; elsewhere a
+least-distance problem is solved (docs/why/theory.md, section 4). There, with the active rows a
 (multipliers lam) and one direction of change, written d,
 
     Gram_aa dlam = -N_a q + dM_a v - db_a + dT_a x + T_a dx,     q = dM'lam + dS v
     dv = -S^-1 q - N_a' dlam
 
 follows from the stationarity S v + M'lam = 0 and the tight rows T_a x + M_a v = b_a. The derivative
-is that of the active set at hand. At a sample where the active set is about to change (a row that
-is tight without a multiplier) it is one-sided: the row counts as inactive there. Such samples are
-counted in the result.
+is that of the current active set. Where the active set is about to change (a tight row without
+multiplier) it is one-sided: the row counts as inactive; the result counts such samples.
 
-Where the plant offers a body that is not linear, that one moves and the controller still predicts
-by A and B: x+ = f(x, u, d) and dx+ = f_x dx + f_u du + f_theta take the place of the linear
-recursion (docs/nonlinear.md).
+A nonlinear body replaces the linear recursion by x+ = f(x, u, d), dx+ = f_x dx + f_u du + f_theta,
+while the controller predicts with A and B (docs/howto/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -53,27 +51,27 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.simulation import Scenario
 
-# Asked where the compiled method has no answer.
+# Solver that is tried where the compiled method finds no solution.
 _SECOND = "daqp"
 
 
 @dataclass(frozen=True)
 class PreparedLoop:
-    """A controller with its rows and derivatives built; made by `prepare_loop`."""
+    """A controller with its rows and derivatives; made by `prepare_loop`."""
 
     controller: Controller
-    along: Directions  # The p directions of the derivatives
+    along: Directions  # the p directions of the derivatives
     rows: Rows
-    row_directions: RowDirections  # Derivatives of the rows
-    matrices: LoopMatrices  # Plant, gain and inverse metric
-    matrix_directions: LoopMatrices  # Derivatives of plant, gain and metric
-    unit: Array  # The nearer bound of each input (m,): what its error is measured by
-    program: Program | None  # For the controller's solver, where that is one of CasADi's
+    row_directions: RowDirections  # derivatives of the rows
+    matrices: LoopMatrices  # plant, gain and inverse metric
+    matrix_directions: LoopMatrices  # derivatives of plant, gain and metric
+    unit: Array  # (m,), nearer bound of each input, the scale of its error
+    program: Program | None  # for a CasADi solver
 
 
 @checked
 def simulate(controller: Controller, given: Scenario) -> Simulation:
-    """Simulate the plant of the controller; never raises for what happens on the way."""
+    """Simulate the closed loop; failures are reported by `Simulation.status`, not raised."""
     simulation, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
     return simulation
 
@@ -82,11 +80,27 @@ def simulate(controller: Controller, given: Scenario) -> Simulation:
 def simulate_and_differentiate(
     controller: Controller, given: Scenario, along: Directions
 ) -> tuple[Simulation, Sensitivity]:
-    """Simulate and differentiate in one pass; see `simulate` and the module's text.
+    """Simulate the closed loop and its derivatives in one pass.
+
+    Parameters
+    ----------
+    controller : Controller
+        Controller with its plant.
+    given : Scenario
+        Initial state, disturbance and targets, see `impc.scenario`.
+    along : Directions
+        The p directions of the derivatives, see `impc.directions`.
+
+    Returns
+    -------
+    Simulation
+        Trajectory and status of each sample.
+    Sensitivity
+        Derivatives of states and inputs along the directions.
 
     Examples
     --------
-    How the trajectory moves with the initial state: one direction for each of its entries.
+    Derivative of the trajectory with respect to the initial state, one direction per entry.
 
     >>> import impc
     >>> import numpy as np
@@ -105,10 +119,10 @@ def simulate_and_differentiate(
 def prepare_loop(
     controller: Controller, along: Directions, moves: tuple[Array, Array, Array] | None = None
 ) -> PreparedLoop:
-    """Build all that does not depend on the recording, so that several trials share it.
+    """Build everything that does not depend on the recording, so that trials share it.
 
-    `moves` are A (n, n), B (n, m) and E (n, d) of what moves in place of the plant; the controller
-    predicts by its own.
+    `moves`: A (n, n), B (n, m), E (n, d) of the simulated plant, if it differs from the one with
+    which the controller predicts.
     """
     plant = controller.plant
     A, B, E = (plant.A, plant.B, plant.E) if moves is None else moves
@@ -132,11 +146,10 @@ def run_loop(
 ) -> tuple[Simulation, Sensitivity]:
     """Simulate one recording of a prepared loop, with its derivatives.
 
-    Samples that were not reached repeat the last state, so that a search can go on with them. Where
-    `local`, the state at every sample moves along the directions of the first, whatever the others
-    did: `Sensitivity.u` then has the derivatives of the controller at each sample by itself. With
-    `proved` false the first sample that the rows do not solve ends the simulation: a search then
-    steps back.
+    Samples that are not reached repeat the last state, so that a search can continue. With `local`
+    the state at every sample has the directions of the first one: `Sensitivity.u` then holds the
+    derivatives of the controller at each sample separately. Without `proved` the simulation ends at
+    the first unsolved sample, without a proof of infeasibility.
     """
     plant, along = prepared.controller.plant, prepared.along
     steps, n, m, p = given.steps, plant.n, plant.m, along.count
@@ -163,7 +176,7 @@ def run_loop(
         t = int(np.count_nonzero(status <= Status.SOFTENED))
         if t == steps or status[t] == Status.DIVERGED or not (asked or proved):
             break
-        if program is None:  # a second opinion on a sample that the compiled method does not solve
+        if program is None:  # second solver for a sample that the compiled method did not solve
             program = build_program(_SECOND, prepared.rows)
         away, daway = x[t].copy(), dx[t].copy()
         deviate(aim, prepared.rows, prepared.row_directions, work, t, away, daway)
@@ -177,7 +190,7 @@ def run_loop(
 
 
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
-    """What parameters in the body add to the derivatives, along the trajectory."""
+    """Contribution of the body's parameters to the derivatives along the trajectory."""
     controller, along = prepared.controller, prepared.along
     moving = any(along.bodies) or np.any(along.A) or np.any(along.B) or np.any(along.E)
     if controller.plant.body is None or not moving:
@@ -195,7 +208,7 @@ def _ask_solver(
     u: Array,
     du: Array,
 ) -> tuple[Status, bool, int]:
-    """Write the input of one deviation, and its derivative, that the controller's solver finds."""
+    """Write the input of one deviation, and its derivative, found by the CasADi solver."""
     controller, rows = prepared.controller, prepared.rows
     fill_slack(work, x)
     slack = work.slack.copy()
@@ -224,7 +237,7 @@ def _ask_solver(
 
 
 def _writable(*matrices: Array) -> LoopMatrices:
-    """Copies, because read-only arrays are another type to numba and would be compiled again."""
+    """Writable copies: for numba read-only arrays are another type and would be recompiled."""
     return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
 
 
@@ -235,6 +248,6 @@ def _no_directions(rows: Rows) -> RowDirections:
 
 
 def _divergence(E: Array, given: Scenario) -> float:
-    """State norm that ends a simulation: a million times what drives it, and at least that."""
+    """State norm that ends a simulation: 1e6 times its excitation, at least 1e6."""
     pushes = E @ given.disturbance.T
     return 1e6 * max(1.0, float(np.max(np.abs(given.x0))), float(np.max(np.abs(pushes), initial=0)))

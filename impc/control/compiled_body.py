@@ -1,8 +1,8 @@
-"""Compiled code: one sample of a body that is not linear, with its derivative.
+"""Compiled code: one sample of a nonlinear body, with its derivative.
 
-The machine code of the body (`native_body`) writes the next state and its derivatives by state,
-input and disturbance; those along p directions follow by the chain rule, so that they are exact
-(docs/nonlinear.md). A division by zero is infinite here, and the loop then diverges.
+The body's machine code (`body_steps`) writes the next state and its derivatives by state, input and
+disturbance; those along p directions follow by the chain rule (docs/howto/nonlinear.md). A division
+by zero gives infinity, and the loop then diverges.
 """
 
 from __future__ import annotations
@@ -21,16 +21,14 @@ if TYPE_CHECKING:
 
 
 class BodyTape(NamedTuple):
-    """The operations of a `Body` as machine code, with what it reads and writes."""
+    """Machine code of a `Body` with its buffers."""
 
-    address: int  # Where it begins; 0 where the linear plant moves
+    address: int  # 0 for a linear plant
     constants: Buffer  # (c,)
-    given: Buffer  # Written at every sample: state, input and disturbance (g,)
-    found: Buffer  # Written by the code: the next state and behind it its slopes (n + n*g,)
-    # The same numbers as `found` has there: derivatives of the next state by what is given (n, g).
-    slopes: Buffer
-    # What moves beside it, in proportion to what is given: its slopes (n, g), or none (n, 0)
-    beside: Buffer
+    given: Buffer  # (g,), written at every sample: state, input and disturbance
+    found: Buffer  # (n + n*g,), written by the code: next state, then its slopes
+    slopes: Buffer  # (n, g), view of the slopes in `found`
+    beside: Buffer  # (n, g), slopes of an added linear part; or (n, 0)
 
 
 @njit(cache=True)
@@ -44,7 +42,7 @@ def move_body(
     ahead: Buffer,
     dahead: Buffer,
 ) -> None:
-    """x+ = f(x, u, d) and its derivative.
+    """Compute x+ = f(x, u, d) and its derivative.
 
     `x` (n,); `u` (m,); `disturbance` (d,); `dx` (n, p); `du` (m, p); `ahead` (n,); `dahead`
     (n, p).
@@ -55,11 +53,11 @@ def move_body(
         ahead[i] = body.found[i]
         for c in range(p):
             dahead[i, c] = 0.0
-    # Row after row of what moves: a sum over them would wait, each time, for its last term.
+    # Row by row: a sum over j would wait for its previous term each time.
     for j in range(n):
         for i in range(n):
             slope = body.slopes[i, j]
-            if slope != 0.0:  # a delay has one in a row
+            if slope != 0.0:  # a delay has one per row
                 for c in range(p):
                     dahead[i, c] += slope * dx[j, c]
     for j in range(len(u)):
@@ -71,7 +69,7 @@ def move_body(
 
 @njit(cache=True)
 def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahead: Buffer) -> None:
-    """The next state at every sample of a trajectory.
+    """Compute the next state at every sample of a trajectory.
 
     `x` (steps, n); `u` (steps, m); `disturbance` (steps, d); `ahead` (steps, n).
     """
@@ -82,7 +80,7 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
 
 @njit(cache=True)
 def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes: Buffer) -> None:
-    """Derivatives of one sample by all that is given, at every sample of a trajectory.
+    """Compute the derivatives of the next state at every sample of a trajectory.
 
     `x` (steps, n); `u` (steps, m); `disturbance` (steps, d); `slopes` (steps, n, n + m + d).
     """
@@ -100,7 +98,7 @@ def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
         body.given[n + i] = u[i]
     for i in range(len(disturbance)):
         body.given[n + m + i] = disturbance[i]
-    if body.beside.shape[1] > 0:  # it adds to those too that the code leaves as they are
+    if body.beside.shape[1] > 0:  # also clears entries that the code does not write
         body.slopes[:] = 0.0
     _call(body.address, body.constants, body.given, body.found)
     for j in range(body.beside.shape[1]):
@@ -110,7 +108,7 @@ def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
 
 
 def _called(context: Any, address: Any, constants: Any, given: Any, found: Any) -> Any:
-    """Call what begins at an address with pointers to three arrays."""
+    """Call the function at `address` with pointers to three arrays."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         arrays = zip(signature.args[1:], values[1:], strict=True)

@@ -1,18 +1,17 @@
-"""Compiled code: the least-distance problem, by a dual active-set method.
+"""Compiled code: dual active-set method for the least-distance problem.
 
-The problem is that of docs/theory.md, section 4,
+The problem of docs/why/theory.md, section 4,
 
     minimise  v'S v / 2 + sum_r limit_r s_r     subject to  M v <= d + s,  s >= 0
 
-(hard rows have limit = inf and no s). Its dual is a bounded least-squares problem in one
-multiplier a row,
+(hard rows have limit = inf and no s) has the dual
 
     minimise  lam' G lam / 2 + d' lam   subject to  0 <= lam <= limit,   G = M S^-1 M',
 
-with v = -S^-1 M' lam; the gradient d + G lam is the slack of the rows. The method is that of
-Goldfarb and Idnani (Math. Programming 27, 1983): start at v = 0, the answer without bounds, and
-raise the multiplier of the most violated row while the rows already active stay tight. A
-multiplier that would leave [0, limit] blocks the step; at its limit the row is given up softly. An
+with one multiplier per row and v = -S^-1 M' lam; the gradient d + G lam is the slack of the rows.
+Method of Goldfarb and Idnani (Math. Programming 27, 1983): start at v = 0, the solution without
+bounds, and raise the multiplier of the most violated row while the active rows stay tight. A
+multiplier that would leave [0, limit] blocks the step; at its limit the row is relaxed. An
 unblocked step along which the slack of the violated row does not change proves the rows
 inconsistent.
 """
@@ -24,14 +23,14 @@ import numpy as np
 from impc.arrays import Buffer
 from impc.jit import njit
 
-#: What `solve_dual` says first: an answer, rows that exclude each other, none within its steps.
+#: Status of `solve_dual`: solution found, rows proved inconsistent, step limit reached.
 CONVERGED, INCONSISTENT, UNFINISHED = 0, 1, 2
-#: A row is dependent on the active ones when less than this share of its length is new. The part is
-#: computed by orthogonalising twice, which leaves rounding of 1e-16; genuine neighbours in the
-#: terminal sets of tests/ differ by 1e-5 and more.
+#: A row depends on the active ones if less than this share of its length is new. The new part is
+#: orthogonalised twice, which leaves rounding of 1e-16; neighbouring rows in the terminal sets of
+#: tests/ differ by 1e-5 and more.
 DEPENDENT = 1e-9
-# Rounding of a slack, relative to the largest term in it. It matters where soft rows are given up:
-# their multipliers are the penalty, a million and more.
+# Rounding of a slack relative to its largest term; relevant for relaxed rows, whose multipliers are
+# the penalty, 1e6 and more.
 _ROUNDING = 1e-14
 
 
@@ -48,13 +47,13 @@ def solve_dual(
     basis: Buffer,
     begin: int,
 ) -> tuple[int, int]:
-    """Solve the dual, from the free rows of a problem with the same rows and another slack.
+    """Solve the dual, starting from the free rows of a problem with the same rows.
 
     `whitened` W = M L^-T (r, N m), S = L L'; `gram` W W' (r, r); `d`, `limit`, `tolerance` (r,).
     Written: `lam` (r,), the rows with 0 < lam < limit in `free` (a + 1,), the lower `factor` of
-    their Gram matrix (a + 1, a + 1) and their `basis` (a + 1, N m), a = min(r, N m). `begin` rows
-    of `free` are there with their factor. Returns a status, and how many rows are free or which
-    one was inconsistent, with the combination of rows that should prove it in `lam`.
+    their Gram matrix (a + 1, a + 1) and their `basis` (a + 1, N m), a = min(r, N m). On entry
+    `begin` rows of `free` are present with their factor. Returns a status, and the number of free
+    rows or the inconsistent row, with the combination of rows that should prove it in `lam`.
     """
     rows = len(d)
     slack, change, lengths = d.copy(), np.empty(len(d)), np.empty(len(d))
@@ -77,7 +76,7 @@ def solve_dual(
                 continue
             wrong = slack[r] if at_limit[r] else -slack[r]
             if wrong > tolerance[r] + noise * lengths[r]:
-                # Distance of v to the row, so that the choice does not depend on its scale.
+                # Distance of v to the row, so that the choice is independent of its scale.
                 distance = wrong / lengths[r] if lengths[r] > 0 else np.inf
                 if distance > worst:
                     row, worst = r, distance
@@ -116,7 +115,7 @@ def solve_dual(
                     lam[free[i]] = -step[i]
                 return INCONSISTENT, row
             lam[row] += sign * length
-            # Row after row of the symmetric matrix, because memory is read in that order.
+            # Row by row of the symmetric matrix, the order of memory.
             change[:] = gram[row]
             for i in range(count):
                 for r in range(rows):
@@ -154,10 +153,10 @@ def _begun(
     basis: Buffer,
     count: int,
 ) -> int:
-    """Write the multipliers with which some rows are tight; return how many rows are left.
+    """Write the multipliers with which some rows are tight; return how many rows remain.
 
-    Rows whose multiplier is not positive are dropped, the most negative first: what is left is the
-    answer to a problem that has these rows only, from which the dual method may go on.
+    Rows without a positive multiplier are dropped, the most negative first: the remaining rows
+    solve a problem with only these rows, from which the dual method may continue.
     """
     right = np.empty(count)
     while count > 0:
@@ -166,7 +165,7 @@ def _begun(
         substitute(factor, count, right)
         place, worst = -1, np.inf
         for i in range(count):
-            if not right[i] <= limit[free[i]]:  # nor where the slack is no number
+            if not right[i] <= limit[free[i]]:  # also false for NaN
                 return 0
             if right[i] < worst:
                 place, worst = i, right[i]
@@ -191,7 +190,7 @@ def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
 def _remove(
     whitened: Buffer, free: Buffer, count: int, place: int, factor: Buffer, basis: Buffer
 ) -> int:
-    """Drop the free row at `place` and factor the rows behind it again."""
+    """Drop the free row at `place` and refactor the rows behind it."""
     for i in range(place, count - 1):
         free[i] = free[i + 1]
         accept_row(i, append_row(whitened, free[i], i, factor, basis), factor, basis)
@@ -209,7 +208,7 @@ def refine(
     count: int,
     factor: Buffer,
 ) -> None:
-    """Solve once more for the final active set, so that the steps leave no rounding behind.
+    """Solve once more for the final active set, to remove accumulated rounding.
 
     `gram` (r, r); `d, limit` (r,); `at_limit` (r,); `lam` (r,); `free` (a + 1,); `factor` (a
     + 1, a + 1).
@@ -228,10 +227,10 @@ def refine(
 
 @njit(cache=True)
 def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Buffer) -> float:
-    """Write the coefficients of a row in the basis of the active ones; return what is new of it.
+    """Write the coefficients of a row in the basis of the active ones; return the new length.
 
-    The new part itself goes to basis[count], not normalised. Working with the rows instead of their
-    Gram matrix keeps twice as many digits of it.
+    The new part goes to basis[count], not normalised. Using rows instead of their Gram matrix keeps
+    twice as many digits of it.
 
     `whitened` (r, N m); `factor` (a + 1, a + 1); `basis` (a + 1, N m).
     """
@@ -256,7 +255,7 @@ def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Bu
 
 @njit(cache=True)
 def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None:
-    """Take the row of `append_row` into the basis.
+    """Accept the row of `append_row` into the basis.
 
     `factor` (a + 1, a + 1); `basis` (a + 1, N m).
     """

@@ -2,10 +2,9 @@
 
     u = -K x + v_0,    x+ = A x + B u + E d
 
-v is zero while the gain keeps every bound, and else the answer of the least-distance problem
-(`compiled_dual`); each answer is checked before it is given out. The letters and the checks are
-those of docs/theory.md, section 4; `closed_loop` has the equations of the derivatives. Where the
-body that moves is not linear, its machine code is called (`compiled_body`).
+v is zero while the gain satisfies all bounds, else the solution of the least-distance problem
+(`compiled_dual`), which is checked before use. Notation and checks: docs/why/theory.md, section 4;
+equations of the derivatives: `closed_loop`; nonlinear bodies: `compiled_body`.
 """
 
 from __future__ import annotations
@@ -32,82 +31,77 @@ from impc.jit import njit
 if TYPE_CHECKING:
     from impc.control.constraint_rows import RowDirections, Rows
 
-#: Of `closed_loop.Status`, by which what is compiled says how a sample ended.
+#: Values of `simulation.Status` that compiled code returns.
 FREE, ACTIVE, SOFTENED, INFEASIBLE, UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
-#: No entry of plant and estimate together goes beyond this: neither a state nor what is expected.
+#: Largest entry of plant and estimate, of states and of predictions.
 LARGEST = 1e100
-# A row is kept when it is exceeded by less than this share of its bound: a hundred times the
-# rounding of T x + M v, so that the quadratic program is never entered for rounding alone.
+# A row exceeded by less than this share of its bound is satisfied: 100 times the rounding of
+# T x + M v, so that the quadratic program is never solved because of rounding alone.
 _KEPT = 1e-13
-# Share of its bound within which a row is about to become active, or to become free.
+# Share of its bound within which a row is about to become active or inactive.
 _WEAK = 1e-8
-# The answer must keep every row, and say the first input, to this share of the bound, whatever the
-# multipliers are, or it is not given out.
+# A solution is accepted only if it satisfies every row, and determines the first input, to this
+# share of the bound.
 _CHECKED = 1e-9
-# Rounding of a row at the answer, relative to the sum of the magnitudes of its terms.
+# Rounding of a row at the solution, relative to the sum of the magnitudes of its terms.
 _ROW_ROUNDING = 1e-14
-# Rounding of v, relative to the same.
+# Rounding of v, relative to the same sum.
 _SUM_ROUNDING = 1e-15
 
 
 class LoopMatrices(NamedTuple):
-    """Plant, gain and inverse metric; or derivatives (those of S itself) along p directions."""
+    """Plant, gain and inverse metric; or derivatives (of S, not S^-1) along p directions."""
 
-    A: Buffer  # (n, n), (n, m) and (n, d); derivatives have a last axis more, (n, n, p) and so on
-    B: Buffer
-    E: Buffer
-    K: Buffer  # (m, n), derivatives (m, n, p)
+    A: Buffer  # (n, n); derivatives have a further last axis, (n, n, p) and so on
+    B: Buffer  # (n, m)
+    E: Buffer  # (n, d)
+    K: Buffer  # (m, n)
     S: Buffer  # S^-1 (m, m); derivatives are those of S, (m, m, p)
 
 
 class Aim(NamedTuple):
-    """What the controller regulates to, sample by sample; all of length 0 where that is rest.
+    """Set points of the controller, sample by sample; all of length 0 for rest.
 
-    Bounds are those of the deviations: what the target takes of each.
+    Bounds apply to the deviations, so each is reduced by what the target uses of it.
     """
 
-    x: Buffer  # Target states (steps, n) and commands (steps, m)
-    u: Buffer
-    # E x + F u of every bound at the target, of which some are known ahead (steps + ahead, c), and
-    # what an expected disturbance adds (steps, c)
-    taken: Buffer
-    held: Buffer
-    dx: Buffer  # Derivatives along p directions, (steps, n, p) and so on; or of length 0
+    x: Buffer  # (steps, n), target states
+    u: Buffer  # (steps, m), target commands
+    taken: Buffer  # (steps + ahead, c), E x + F u of every bound at the target, previews included
+    held: Buffer  # (steps, c), addition to `taken` by an estimated disturbance
+    dx: Buffer  # (steps, n, p), derivatives along p directions; or of length 0
     du: Buffer
     dtaken: Buffer
     dheld: Buffer
 
 
 class Workspace(NamedTuple):
-    """Arrays that one sample after the other uses."""
+    """Arrays that are reused from sample to sample."""
 
-    # Right sides of the rows at the sample (r,), less than b by what a target takes, and their
-    # derivatives (r, p)
+    # right sides of the rows at the sample (r,), reduced by the target, and derivatives (r, p)
     right: Buffer
     dright: Buffer
-    # Of the rows (r,), the violation of each that counts as kept (r,), the free rows (a + 1,)
+    # of the rows: slack (r,), violation that is accepted (r,), free rows (a + 1,)
     slack: Buffer
     kept: Buffer
     free: Buffer
-    factor: Buffer  # As in `solve_dual`, (a + 1, a + 1) and (a + 1, N m)
-    basis: Buffer
-    v: Buffer  # Inputs ahead beside the gain's, and what rounding makes of them (N m,)
-    rounding: Buffer
-    dv0: Buffer  # Derivatives of the first of them (m, p)
-    T: Buffer  # Columns of the rows, one after the other: (n, r) and (N m, r)
-    M: Buffer
-    # How many rows are free at the last sample (1,). The problem of the next one begins with them,
-    # for its plan is much like that of the one before.
-    active: Buffer
+    factor: Buffer  # (a + 1, a + 1), as in `solve_dual`
+    basis: Buffer  # (a + 1, N m), as in `solve_dual`
+    v: Buffer  # (N m,), planned inputs minus those of the gain
+    rounding: Buffer  # (N m,), rounding error of v
+    dv0: Buffer  # (m, p), derivatives of the first of them
+    T: Buffer  # (n, r), transposed rows
+    M: Buffer  # (N m, r), transposed rows
+    active: Buffer  # (1,), number of free rows at the last sample: warm start of the next problem
 
 
 @njit(cache=True)
 def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
-    """Arrays that `law` works in, for `m` inputs, given `rows` and their derivatives."""
+    """Allocate the workspace of `law` for `m` inputs."""
     count, width = rows.M.shape
     p = drows.b.shape[1]
     room = min(count, width) + 1
-    # One column of T and M after the other: sums over columns then run over all rows at once.
+    # T and M are stored by columns: sums over columns then run over all rows at once.
     return Workspace(
         rows.b.copy(),
         drows.b.copy(),
@@ -127,14 +121,14 @@ def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
 
 @njit(cache=True, inline="always")
 def dot(a: Buffer, b: Buffer) -> float:
-    """a'b, of two arrays of one length (k,)."""
+    """Scalar product a'b (arrays of the same length)."""
     total = 0.0
     for i in range(len(a)):
         total += a[i] * b[i]
     return total
 
 
-@njit(cache=True, nogil=True)  # trials left out are fitted side by side
+@njit(cache=True, nogil=True)  # held-out trials are fitted in parallel threads
 def run(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -187,7 +181,7 @@ def run(
             dx[t + 1] = dx[0]
         size = 0.0
         for i in range(x.shape[1]):
-            if not abs(x[t + 1, i]) <= size:  # nor where it is no number
+            if not abs(x[t + 1, i]) <= size:  # also true for NaN
                 size = abs(x[t + 1, i])
         if not size < divergence:
             status[t] = DIVERGED
@@ -200,7 +194,7 @@ def run(
 def deviate(
     aim: Aim, rows: Rows, drows: RowDirections, work: Workspace, t: int, x: Buffer, dx: Buffer
 ) -> None:
-    """Turn a state `x` (n,) and `dx` (n, p) at sample t into what the target leaves of it."""
+    """Convert a state `x` (n,) and `dx` (n, p) at sample t to deviations from the target."""
     if len(aim.x) == 0:
         return
     x -= aim.x[t]
@@ -216,7 +210,7 @@ def deviate(
 
 @njit(cache=True, inline="always")
 def return_to(aim: Aim, t: int, u: Buffer, du: Buffer) -> None:
-    """Add the target's command to `u` (m,) of the deviation, and to `du` (m, p)."""
+    """Add the target's command to `u` (m,) and `du` (m, p) of the deviation."""
     if len(aim.x):
         u += aim.u[t]
         if len(aim.dx):
@@ -235,7 +229,7 @@ def _advance(
     du: Buffer,
     t: int,
 ) -> None:
-    """x+ = A x + B u + E d and its derivative."""
+    """Compute x+ = A x + B u + E d and its derivative."""
     n, p = x.shape[1], dx.shape[2]
     for i in range(n):
         x[t + 1, i] = dot(loop.A[i], x[t]) + dot(loop.B[i], u) + dot(loop.E[i], disturbance)
@@ -258,7 +252,7 @@ def _advance(
 
 @njit(cache=True)
 def _hold(x: Buffer, dx: Buffer, t: int) -> None:
-    """Repeat the last state, so that what was not reached is finite."""
+    """Repeat the last state, so that samples that are not reached are finite."""
     x[t + 1 :] = x[t]
     dx[t + 1 :] = 0.0
 
@@ -278,7 +272,7 @@ def law(
     u: Buffer,
     du: Buffer,
 ) -> tuple[int, bool, int]:
-    """Write the input of one state, with its derivatives.
+    """Write the input for one state, with its derivatives.
 
     `x` (n,); `dx` (n, p); `u` (m,); `du` (m, p).
     """
@@ -301,7 +295,7 @@ def law(
 
 @njit(cache=True, inline="always")
 def _look(work: Workspace, b: Buffer, x: Buffer) -> tuple[bool, bool]:
-    """Write the slack of the gain; whether a row is broken, and whether one is about to be."""
+    """Write the slack of the gain; whether a row is violated, and whether one nearly is."""
     broken, near, slack, kept = False, False, work.slack, work.kept
     fill_slack(work, x)
     for r in range(len(slack)):
@@ -312,7 +306,7 @@ def _look(work: Workspace, b: Buffer, x: Buffer) -> tuple[bool, bool]:
 
 @njit(cache=True, inline="always")
 def fill_slack(work: Workspace, x: Buffer) -> None:
-    """slack = right - T'x, with T one column of the rows after the other."""
+    """Compute slack = right - T x (T stored by columns)."""
     slack, T = work.slack, work.T
     slack[:] = 0.0
     for i in range(len(x)):
@@ -335,7 +329,7 @@ def _solve(
     lam: Buffer,
     begin: int,
 ) -> tuple[int, bool, int]:
-    """Write v and dv0 of one sample; return its status, whether its rows are weak, and a row."""
+    """Write v and dv0 of one sample; return status, whether it is weakly active, and a row."""
     code, active = solve_dual(
         rows.W,
         rows.gram,
@@ -373,10 +367,10 @@ def answer_with(
     du: Buffer,
     lam: Buffer,
 ) -> tuple[int, bool]:
-    """Input of one sample and its derivative, where another solver has found the active set.
+    """Write the input of one sample and its derivative for a given active set.
 
     `unit` (m,); `x` (n,); `dx` (n, p); `tight` (a,); `given_up` (r,); `u` (m,); `du` (m, p);
-    `lam` (r,). The workspace has the right sides, and gets v.
+    `lam` (r,). The workspace contains the right sides and receives v.
     """
     active = len(tight)
     if active >= len(work.free):
@@ -411,7 +405,7 @@ def _apply(
     u: Buffer,
     du: Buffer,
 ) -> None:
-    """u = -K x + v_0 and its derivative."""
+    """Compute u = -K x + v_0 and its derivative."""
     p = dx.shape[1]
     for i in range(len(u)):
         u[i] = v[i] - dot(loop.K[i], x)
@@ -435,7 +429,7 @@ def answer(
     lam: Buffer,
     active: int,
 ) -> tuple[int, bool]:
-    """Write v and dv0 of `work` from the multipliers of one sample, where they give the input.
+    """Write v and dv0 of `work` from the multipliers of one sample, if they are accurate.
 
     `unit` (m,); `x` (n,); `dx` (n, p); `lam` (r,).
     """
@@ -453,7 +447,7 @@ def answer(
 
 @njit(cache=True)
 def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
-    """v = -N' lam, and what rounding made of it."""
+    """Compute v = -N' lam and its rounding error."""
     v, rounding = work.v, work.rounding
     v[:] = 0.0
     rounding[:] = 0.0
@@ -469,7 +463,7 @@ def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
 def _tighten(rows: Rows, work: Workspace, active: int) -> None:
     """Correct v so that the tight rows are tight.
 
-    The cost weight of a soft row is a million and more: what is left of v has lost as many digits.
+    The penalty of a soft row is 1e6 and more: v has lost as many digits.
     """
     slack, free, v = work.slack, work.free, work.v
     column = np.empty(active)
@@ -491,11 +485,11 @@ def _check(
     x: Buffer,
     unit: Buffer,
 ) -> tuple[bool, bool, bool]:
-    """Whether a soft row was given up, a row is tight without a multiplier, it is solved.
+    """Return whether a soft row is violated, a row is weakly active, and v is accepted.
 
-    It is identified when every row is kept, and every multiplier has its sign, to a share of the
-    bound that no multiplier enters, and when that and rounding move the first v by no more: by the
-    derivative of v along the right sides of the tight rows (docs/theory.md, section 4).
+    It is accepted if every row is satisfied, every multiplier has its sign, and rounding moves the
+    first v by no more than a share of the bound, according to the derivative of v with respect to
+    the right sides of the tight rows (docs/why/theory.md, section 4).
     """
     soft, near, m = False, False, len(unit)
     slack, free, factor, v = work.slack, work.free, work.factor, work.v
@@ -519,7 +513,7 @@ def _check(
             broken = not left > -_CHECKED * bound or pulled < -_CHECKED * bound
         if broken:
             return soft, near, False
-        # A multiplier moves v by lam N: weak when that is nothing beside the row's bound.
+        # A multiplier moves v by lam N: weak if that is negligible relative to the row's bound.
         near |= abs(left) < _WEAK * bound and pulled < _WEAK * bound
     column, moved = np.empty(active), np.empty(len(v))
     for i in range(m):
@@ -554,7 +548,7 @@ def _differentiate(
     x: Buffer,
     dx: Buffer,
 ) -> None:
-    """Write the derivative of the first v; the module `closed_loop` has the equations."""
+    """Write the derivative of the first v (equations in `closed_loop`)."""
     v, free, dv0 = work.v, work.free, work.dv0
     width, p = len(v), dx.shape[1]
     m, n = dv0.shape[0], len(x)
@@ -586,20 +580,20 @@ def _differentiate(
 
 @njit(cache=True, inline="always")
 def _reach(rows: Rows, r: int, m: int) -> int:
-    """Columns of M before those that row r, at its stage, cannot have."""
+    """Number of columns of M that can be nonzero in row r, by its stage."""
     return min(rows.M.shape[1], m * (rows.stage[r] + 1))  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
 def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer) -> None:
-    """Add dM' lam to q, and what the cost weight of soft rows does."""
+    """Add dM' lam to q, and the effect of the penalty of soft rows."""
     for r in range(len(lam)):
         if lam[r] != 0.0:
             for i in range(_reach(rows, r, m)):
                 for c in range(q.shape[1]):
                     q[i, c] += lam[r] * drows.M[r, i, c]
             if lam[r] == rows.limit[r]:
-                # The cost weight of a soft row is penalty / b: it moves with the bound.
+                # The penalty of a soft row is penalty / b: it depends on the bound.
                 for i in range(len(q)):
                     for c in range(q.shape[1]):
                         q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]

@@ -1,15 +1,15 @@
-"""The rows of the controller's least-distance problem, and their derivatives.
+"""Rows of the controller's least-distance problem, and their derivatives.
 
-Every constraint is one row (family c, stage k): the bound c of `bound_rows`, k samples ahead. With
-H = E - F K and the closed loop Phi = A - BK, the row says
+Every constraint is one row (family c, stage k): bound c of `bound_rows`, k samples ahead. With
+H = E - F K and the closed loop Phi = A - BK, the row is
 
     H_c Phi^k x + sum_{i < min(k, N)} H_c Phi^(k-1-i) B v_i + [k < N] F_c v_k  <=  b_c.
 
-Stages k < N are the bounds along the horizon. A row (c, j) of the maximal invariant set is the
-same row at the stage k = N + j, where no v is left: the terminal set needs no code of its own,
-and follows K through the same derivative. In short  T x + M v <= b  (docs/theory.md, section 3).
-The rows of a terminal set of the user's own are further bounds, E = H and F = 0, at stage N alone.
-Where each stage has its own gain, products Phi_{k-1} ... Phi_i stand in place of the powers.
+Stages k < N are the bounds along the horizon. A row (c, j) of the maximal invariant set is the same
+row at stage k = N + j, where no v is left: the terminal set depends on K through the same formula.
+In short  T x + M v <= b  (docs/why/theory.md, section 3). The rows of a user-supplied terminal set
+are further bounds, E = H and F = 0, at stage N only. If each stage has its own gain, products
+Phi_{k-1} ... Phi_i replace the powers.
 """
 
 from __future__ import annotations
@@ -32,26 +32,21 @@ if TYPE_CHECKING:
 
 
 class Rows(NamedTuple):
-    """T x + M v <= b, and what the solver needs of it.
-
-    A named tuple rather than a dataclass because compiled code takes it as it is.
-    """
+    """T x + M v <= b, with derived matrices (a named tuple, which compiled code accepts)."""
 
     T: Array  # (r, n)
-    M: Array  # (r, N m), the columns of one stage beside each other
-    N: Array  # M S^-1, (r, N m), with the metric S of each stage
-    W: Array  # M L^-T with S = L L', (r, N m): the rows in coordinates in which S is the identity
-    gram: Array  # W W' = M S^-1 M', (r, r)
+    M: Array  # (r, N m), the columns of each stage adjacent
+    N: Array  # (r, N m), M S^-1 with the metric S of each stage
+    W: Array  # (r, N m), M L^-T with S = L L': rows in coordinates in which S is the identity
+    gram: Array  # (r, r), W W' = M S^-1 M'
     b: Array  # (r,)
-    # Largest multiplier of each row (r,): infinite for a hard row, the cost weight of a unit of
-    # excess for a soft one
-    limit: Array
-    family: IntArray  # Which bound, and how many samples ahead (r,)
-    stage: IntArray
+    limit: Array  # (r,), largest multiplier: infinite if hard, penalty per unit of excess if soft
+    family: IntArray  # (r,), index of the bound
+    stage: IntArray  # (r,), samples ahead
 
 
 class RowDirections(NamedTuple):
-    """Derivatives of `Rows` along p directions, which are the last axis of every array."""
+    """Derivatives of `Rows` along p directions (last axis)."""
 
     T: Array  # (r, n, p)
     M: Array  # (r, N m, p)
@@ -60,18 +55,18 @@ class RowDirections(NamedTuple):
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions along which a closed loop is differentiated, the last axis of every array."""
+    """Directions along which a closed loop is differentiated (last axis of every array)."""
 
-    A: Array  # Plant matrices: (n, n, p), (n, m, p), (n, d, p)
-    B: Array
-    E: Array
-    K: Array  # Gain (m, n, p); where each stage has its own, one below the other (N m, n, p)
-    S: Array  # Metric (m, m, p), of the scaled metric of `Controller`; likewise (N m, m, p)
-    bounds: Array  # Right sides b of `bound_rows` (c, p)
-    C: Array  # Outputs (outputs, n, p) and the observer's rates (d, p): they move targets
-    observer: Array
-    x0: Array  # Initial state (n, p)
-    # For each direction, bodies nearby with factors (`PlantDifferential`); may be left empty
+    A: Array  # (n, n, p), plant matrices
+    B: Array  # (n, m, p)
+    E: Array  # (n, d, p)
+    K: Array  # (m, n, p), gain; (N m, n, p) if each stage has its own
+    S: Array  # (m, m, p), of the scaled metric of `Controller`; or (N m, m, p)
+    bounds: Array  # (c, p), right sides b of `bound_rows`
+    C: Array  # (outputs, n, p), moves targets
+    observer: Array  # (d, p), rates of the observer, move targets
+    x0: Array  # (n, p), initial state
+    # for each direction, nearby bodies with factors (`PlantDifferential`); may be empty
     bodies: tuple[tuple[tuple[float, Body], ...], ...] = ()
 
     @property
@@ -82,22 +77,29 @@ class Directions:
 
 @checked(count=(0, 1_000_000))
 def directions(controller: Controller, count: int, **given: Array) -> Directions:
-    """Return `count` directions with the given parts; those not given are zero.
+    """Return `count` directions with the given parts; all others are zero.
 
     Parameters
     ----------
+    controller : Controller
+        Controller whose loop is differentiated.
     count : int
         Number of directions p.
-    **given : Array
-        Fields of `Directions` by name, in any layout that reshapes to theirs: K to (m, n, p).
-        Of a controller with a terminal weight of its own the gains and metrics are not free: in
-        place of A, B, K and S it has the weights Q, R and P, (n, n, p), (m, m, p) and (n, n, p),
-        of which the symmetric parts count.
+    **given : ndarray
+        Parts by name, in any layout that reshapes to theirs, the last axis of length p: A, B, E, K,
+        S, bounds, C, observer or x0; for example K as (m, n, p). For a controller with its own
+        terminal weight Q, R and P, (n, n, p), (m, m, p) and (n, n, p), replace A, B, K and S; their
+        symmetric parts count.
+
+    Returns
+    -------
+    Directions
+        Arrays with p as last axis.
 
     Raises
     ------
     InputError, DataError
-        When a part is of another name or size.
+        If a part has an unknown name or wrong size.
 
     Examples
     --------
@@ -130,7 +132,7 @@ def directions(controller: Controller, count: int, **given: Array) -> Directions
     parts = {name: np.zeros((*shape, count)) for name, shape in shapes.items()}
     for name, values in given.items():
         if name not in shapes:
-            raise InputError(name, "is no part of a direction", f"give some of {', '.join(shapes)}")
+            raise InputError(name, "is no part of a direction", f"use {', '.join(shapes)}")
         if values.size != parts[name].size:
             problem = f"expected {parts[name].shape}, got {values.shape}"
             raise DataError(name, problem, "give a part for each direction")
@@ -146,7 +148,7 @@ def _stage_directions(stages: FiniteHorizonLqr, *changes: Array) -> dict[str, Ar
     dK, dS = finite_horizon_changes(stages, *((dX + dX.swapaxes(1, 2)) / 2 for dX in changes))
     m, trace = stages.S.shape[-1], np.trace(stages.S[0])
     share = np.trace(dS[0], axis1=1, axis2=2)[:, None, None] / trace
-    dS = (dS - share * stages.S[:, None]) * (m / trace)  # all in the scale of the first
+    dS = (dS - share * stages.S[:, None]) * (m / trace)  # scaled like the first
     below = (np.moveaxis(part, 1, -1) for part in (dK, dS))
     return {
         name: np.ascontiguousarray(part.reshape(len(part) * part.shape[1], *part.shape[2:]))
@@ -208,7 +210,7 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
 
 
 def families(controller: Controller) -> BoundRows:
-    """The bounds of one stage, then the rows of a terminal set of the user's own."""
+    """Bounds of one stage, followed by the rows of a user-supplied terminal set."""
     bounds, terminal = bound_rows(controller.bounds, controller.plant), controller.terminal
     if terminal is None or not terminal.own:
         return bounds
@@ -219,10 +221,10 @@ def families(controller: Controller) -> BoundRows:
 
 
 def _pairs(controller: Controller, bounds: BoundRows) -> tuple[IntArray, IntArray]:
-    """The pairs (family, stage) in order: the horizon first, then the terminal set.
+    """Pairs (family, stage): the horizon first, then the terminal set.
 
-    A state bound at stage 0 cannot be influenced. It stays while it is hard, so that a state
-    outside is reported; softened it would be a constant and is left out.
+    A state bound at stage 0 does not depend on the input. It is kept if hard, so that a state
+    outside is reported; a soft one would only add a constant.
     """
     terminal = controller.terminal
     own = len(terminal.h) if terminal is not None and terminal.own else 0
@@ -250,11 +252,11 @@ def _powers(controller: Controller, bounds: BoundRows, last: int) -> Array:
 def _unrolled(
     controller: Controller, bounds: BoundRows, family: IntArray, stage: IntArray, dK: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """T, M and along dK (p, N, m, n) their derivatives, back through x+ = (A - B K_k) x + B v."""
+    """T, M and their derivatives along dK (p, N, m, n), backwards by x+ = (A - B K_k) x + B v."""
     A, B, gains = controller.plant.A, controller.plant.B, controller.gains
     N, m, _ = gains.shape
     F, last = bounds.F[family], np.minimum(stage, N - 1)
-    T = bounds.E[family] - (F[:, None] @ gains[last])[:, 0]  # at stage N is no input, and F = 0
+    T = bounds.E[family] - (F[:, None] @ gains[last])[:, 0]  # stage N has no input and F = 0
     dT = -(F[:, None] @ dK[:, last])[:, :, 0]
     M, dM = np.zeros((len(T), N, m)), np.zeros((*dT.shape[:2], N, m))
     for k in reversed(range(N)):

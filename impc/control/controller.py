@@ -1,12 +1,12 @@
-"""The constrained controller as a value: what it stays near, and what keeps it away.
+"""The constrained controller: gain, metric, bounds, horizon and terminal set.
 
 With P from the Riccati equation, the cost of (3.1) along any input sequence is
 
     x_0'P x_0 + sum_k v_k' S v_k,      v_k = u_k + K x_k,   S = R + B'PB
 
-(docs/theory.md, section 2, has the proof), so a controller is its gain K, its metric S up to
-scale, its bounds, its horizon and its terminal set. The weights are one way to name K and S.
-With a terminal weight of the user's own the same holds with a gain and a metric for each stage.
+(proof: docs/why/theory.md, section 2), so a controller is determined by its gain K, its metric S up
+to scale, bounds, horizon and terminal set. Weights are one way to specify K and S. With another
+terminal weight the same holds with one gain and metric per stage.
 """
 
 from __future__ import annotations
@@ -39,66 +39,69 @@ if TYPE_CHECKING:
     from impc.model.riccati import FiniteHorizonLqr
     from impc.model.weights import Weights
 
-#: Samples; the rows of a horizon take memory in its square, 0.4 GB of these for two bounds.
+#: Samples; memory of the rows is quadratic in the horizon (0.4 GB at this one with two bounds).
 LONGEST_HORIZON = 5000
 
 
 @dataclass(frozen=True, init=False)
 class Controller(Value):
-    """minimise sum_{k<N} v_k'S v_k  subject to the bounds, x_N in the terminal set.
+    """Minimise sum_{k<N} v_k'S v_k subject to the bounds, with x_N in the terminal set.
 
     The constructor takes stage weights: it is the controller (3.1) with terminal weight (3.4).
-    `from_gain` takes the gain itself.
+    `from_gain` takes a gain instead.
 
     Parameters
     ----------
     plant : Plant
-        Discrete, stabilisable.
+        Discrete-time, stabilisable plant.
     weights : Weights
+        Stage weights Q and R.
     bounds : Bounds
+        Bounds of states and inputs.
     horizon : int
-        N >= 1, in samples.
+        Prediction horizon N >= 1, in samples.
     terminal_set : bool, pair of array_like, or TerminalSet
         Whether x_N must lie in the maximal invariant set of the regulator under the bounds, as in
-        the dissertation; or the set that it must lie in, {x : H x <= h} as a pair (H, h) of shapes
-        (r, n) and (r,), h > 0. Where it is not invariant, a later sample may have no answer.
+        the dissertation; or the set {x : H x <= h} as a pair (H, h) of shapes (r, n) and (r,),
+        h > 0. If that is not invariant, a later sample can be infeasible.
     softening, solver : optional
         See the attributes.
     terminal_weight : array_like, optional
-        P (n, n) of the cost x_N'P x_N, positive semidefinite, or 0 for no such cost. By default
-        that of the Riccati equation, whose gain has the maximal invariant set: with another give
-        ``terminal_set=False`` or a set of your own.
+        Weight P (n, n) of the terminal cost x_N'P x_N, positive semidefinite, or 0 for none. By
+        default that of the Riccati equation; any other requires ``terminal_set=False`` or a set of
+        your own.
 
     Attributes
     ----------
     plant : Plant
-        Discrete.
-    K : Array
-        Gain (m, n); u_k = -K x_k + v_k. The first of them where there is one for each stage.
-    S : Array
-        Metric (m, m), scaled to a mean diagonal of 1: its scale has no effect. Likewise the first.
+        Discrete-time plant.
+    K : ndarray of shape (m, n)
+        Gain in u_k = -K x_k + v_k; that of the first stage if each stage has its own.
+    S : ndarray of shape (m, m)
+        Metric, scaled to a mean diagonal of 1 (its scale has no effect); likewise of the first.
     bounds : Bounds
+        Bounds of states and inputs.
     horizon : int
-        N >= 1, in samples.
+        Prediction horizon N, in samples.
     terminal : TerminalSet or None
         Set that x_N must reach; None for no such constraint.
     softening : float or None
         None: state bounds and terminal set are hard. A number: exceeding one of their rows
-        E x <= b by s costs ``softening * U^2 * s / b`` with U the least finite input bound (1
-        where there is none). The penalty is exact: while it is larger than the multipliers the
-        answer is that of the hard problem whenever there is one. Input bounds are always hard.
+        E x <= b by s costs ``softening * U^2 * s / b``, where U is the smallest finite input bound
+        (1 without any). The penalty is exact: while it exceeds the multipliers, the solution is
+        that of the hard problem if that is feasible. Input bounds are always hard.
     solver : str
-        Which method finds the input where the gain breaks a bound: "compiled", the package's own,
-        or one of CasADi's by its name (`impc.control.named_solver.SOLVERS`).
+        Method where the gain violates a bound: "compiled" (built in), or "daqp", "qpoases" or
+        "ipopt" of CasADi.
     stages : FiniteHorizonLqr or None
-        Weights, gains and metrics of all stages, where the terminal weight is the user's own.
+        Weights, gains and metrics of all stages if a terminal weight was given.
 
     Raises
     ------
     PlantError, WeightsError, InputError
-        When the plant is continuous, no stabilising Riccati solution exists, the horizon is not a
-        positive whole number, a terminal weight is not semidefinite, a terminal set does not have
-        the origin inside, or there is no such solver.
+        If the plant is continuous, no stabilising Riccati solution exists, the horizon is not a
+        positive integer, a terminal weight is not semidefinite, the origin is not inside a terminal
+        set, or the solver is unknown.
 
     Examples
     --------
@@ -147,7 +150,7 @@ class Controller(Value):
             K, S = solution.K, solution.S
         elif terminal_set is True:
             problem = "True is the invariant set of the Riccati gain, not of this terminal weight"
-            raise InputError("terminal_set", problem, "give False, or a set of your own")
+            raise InputError("terminal_set", problem, "set False, or give a set of your own")
         else:
             P = terminal_matrix(plant, terminal_weight)
             stages = solve_finite_horizon(plant, weights, P, horizon)
@@ -170,8 +173,8 @@ class Controller(Value):
         if made is not None:
             same = (made.plant.A, plant.A), (made.plant.B, plant.B), (made.K[0], self.K)
             if len(made.K) != self.horizon or not all(np.array_equal(*pair) for pair in same):
-                problem = "its stage gains are of another plant, gain or horizon"
-                raise InputError("Controller", problem, "make it anew from weights")
+                problem = "its stage gains belong to another plant, gain or horizon"
+                raise InputError("Controller", problem, "construct it again from weights")
 
     @classmethod
     @checked(gain="m n", metric="m m", horizon=(1, LONGEST_HORIZON))
@@ -188,29 +191,34 @@ class Controller(Value):
         near: TerminalSet | None = None,
         solver: str = COMPILED,
     ) -> Controller:
-        """Controller that stays near u = -Kx; with its invariant set the gain must stabilise.
+        """Construct a controller from its gain, u = -K x away from the bounds.
 
         Parameters
         ----------
         plant : Plant
-            Discrete.
+            Discrete-time plant.
         gain : array_like
-            K (m, n).
+            Gain K (m, n); with the maximal invariant set it must stabilise the plant.
         bounds : Bounds
+            Bounds of states and inputs.
         horizon : int
-            N >= 1, in samples.
+            Prediction horizon N >= 1, in samples.
         metric : array_like, optional
-            S (m, m), positive definite; the identity by default, which is no choice for one input.
+            Metric S (m, m), positive definite; by default the identity. Irrelevant with one input.
         terminal_set, softening, solver
-            As in the constructor; a set of one's own is a pair of shapes (r, n) and (r,).
+            As in the constructor; a set of your own is a pair of shapes (r, n) and (r,).
         near : TerminalSet, optional
-            Set of a gain nearby: the same answer in less time, see `maximal_invariant_set`.
+            Terminal set of a similar gain, which saves time; see `maximal_invariant_set`.
+
+        Returns
+        -------
+        Controller
 
         Raises
         ------
         InputError
-            When the gain does not stabilise the plant, the metric is not positive definite, or
-            there is no such solver.
+            If the gain does not stabilise the plant, the metric is not positive definite, or the
+            solver is unknown.
         """
         plant.require_discrete()
         K = finite_array("gain", gain, (plant.m, plant.n))
@@ -246,28 +254,31 @@ class Controller(Value):
     def from_continuous_gain(
         cls, plant: Plant, gain: ArrayLike, bounds: Bounds, horizon: int, **settings: Any
     ) -> Controller:
-        """Controller of a gain of continuous feedback, u(t) = -Gx(t), such as publications give.
+        """Construct a controller from a gain of continuous feedback, u(t) = -Gx(t).
 
-        Its own gain K is that of a held command which is, over each sample, the average of what
-        u = -Gx would command from the state at its start. After one sample the states of the two
-        loops differ by the cube of the sample time, after any time by its square; the poles agree
-        as nearly, not exactly. `Estimate.continuous_gain` is the way back.
+        Its own gain K is that of a held command that equals, over each sample, the mean command of
+        u = -Gx from the state at its start. After one sample the states of both loops differ by the
+        cube of the sample time, after a fixed time by its square. `Estimate.continuous_gain` is the
+        inverse.
 
         Parameters
         ----------
         plant : Plant
-            Discrete: its continuous plant is found from it, as that of which it is sampled with a
-            zero-order hold.
+            Discrete-time plant, sampled from a continuous one with a zero-order hold.
         gain : array_like
-            G (m, n), in continuous time.
+            Continuous gain G (m, n).
         bounds, horizon, **settings
             As in `from_gain`.
+
+        Returns
+        -------
+        Controller
 
         Raises
         ------
         PlantError
-            When the plant is not sampled from a continuous one: it has a delay in whole samples,
-            or its controls are changes (`with_rates`).
+            If the plant is not sampled from a continuous one: it has a delay in whole samples, or
+            its controls are changes (`with_rates`).
         InputError
             As in `from_gain`.
 
@@ -299,23 +310,23 @@ class Controller(Value):
         x0 : array_like
             Initial state (n,).
         steps : int, optional
-            Needed when there is no disturbance; otherwise its length is taken.
+            Number of samples; required without a disturbance, whose length is used otherwise.
         disturbance : array_like, optional
-            (steps, d), or (steps,) for a single disturbance.
+            Disturbance (steps, d), or (steps,) for a single one.
         target : mapping, optional
             Set points of outputs or states by name, in their units: a number, or (steps + 1,).
 
         Returns
         -------
         Simulation
-            With a status for each sample. Samples that are not reached, because no input keeps the
-            bounds or the loop diverges, are NaN, and a warning names the first of them;
-            `require_complete` turns that into an error.
+            Trajectory with a status for each sample. Samples that are not reached, because no input
+            satisfies the bounds or the loop diverges, are NaN, and a warning names the first of
+            them; `require_complete` turns it into an error.
 
         Raises
         ------
         DataError
-            When something is not finite or of the wrong shape, or neither length is given.
+            If a value is not finite or of the wrong shape, or `steps` is missing.
 
         Examples
         --------
@@ -335,7 +346,7 @@ class Controller(Value):
         if status is Status.INFEASIBLE:
             bound, remedy = excluded_bound(self, run)
             said = f"no input sequence keeps {bound} ({remedy})"
-        warnings.warn(f"sample {end}: {said}; what follows is NaN", stacklevel=3)
+        warnings.warn(f"sample {end}: {said}; later samples are NaN", stacklevel=3)
         x, u = np.array(run.x), np.array(run.u)
         x[end + 1 :], u[end:] = np.nan, np.nan
         return replace(run, x=x, u=u)
@@ -349,14 +360,14 @@ class Controller(Value):
 
     @property
     def metrics(self) -> Array:
-        """Metric of each stage (N, m, m), all in the scale of the first."""
+        """Metric of each stage (N, m, m), scaled like the first."""
         if self.stages is not None:
             return np.asarray(self.stages.S * (len(self.S) / np.trace(self.stages.S[0])))
         return np.broadcast_to(self.S, (self.horizon, *self.S.shape))
 
     @property
     def penalty(self) -> float:
-        """Cost of a relative excess of 1, infinite when the rows are hard."""
+        """Cost of a relative excess of 1; infinite if the rows are hard."""
         if self.softening is None:
             return float("inf")
         sides = np.abs(np.concatenate([self.bounds.u_min, self.bounds.u_max]))

@@ -1,15 +1,13 @@
-"""Geometry of sets {z : Z z <= 1}: supports by linear programming, needed rows, corners.
+"""Geometry of sets {z : Z z <= 1}: supports by linear programming, redundant rows, corners.
 
-What `terminal_set` needs of it (Gilbert and Tan 1991).
-
-The support of a row d is max d z over the set, with d z itself capped at twice the bound so that
-the program is always bounded. Its dual,
+The support of a row d is max d z over the set (Gilbert and Tan 1991), with d z capped at twice the
+bound so that the program is bounded. Its dual,
 
     min r'mu   subject to   Z'mu = d,  mu >= 0      (r = 1, and 2 for the capped row d itself),
 
-always has a solution and only as many equations as z has entries, so its simplex bases are small.
-A basis that was optimal for a nearby set is tried first: it fixes z (the rows of the basis are
-active) and mu, and when both are feasible the two are optimal, by duality and without a program.
+always has a solution and only as many equations as z has entries, so that its simplex bases are
+small. A basis that was optimal for a nearby set is tried first: it determines z and mu, and if both
+are feasible they are optimal by duality.
 """
 
 from __future__ import annotations
@@ -27,24 +25,24 @@ if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray, IntArray
 
 
-# A direction that the normalised rows see less than this, relative to the best seen one, counts
-# as unbounded: rounding (2e-16) would move the set along it by more than 1e-6 of its size.
+# A direction that the normalised rows see less than this, relative to the best seen one, counts as
+# unbounded: rounding (2e-16) would move the set along it by more than 1e-6 of its size.
 _UNSEEN = 1e-10
-# A row whose support stays this far below its bound touches the set nowhere: all such rows can go
-# at once. The others may be duplicates of one another and go one by one. Also how clearly a ray
-# must show that a row is needed.
+# Rows whose support is this far below their bound do not touch the set and can be removed
+# together; others may duplicate each other and are removed one by one. Also the margin by which a
+# ray must show that a row is needed.
 _TOUCHING = 1e-6
-# Programs in one call of HiGHS: the seat's set takes 55 ms with 12, 129 with 1, 58 with 64.
+# Programs per call of HiGHS: the seat's set takes 55 ms with 12, 129 with 1, 58 with 64.
 _BATCH = 12
-# Feasibility of the programs, the smallest that HiGHS takes, and of a basis that is tried first.
+# Feasibility tolerance of the programs (the smallest of HiGHS) and of a basis that is tried first.
 _FEASIBLE = 1e-10
 
 
 def seen_directions(rows: Array) -> Array:
     """Coordinates x = T z, T (n, q), in which the rows (..., n) are orthonormal columns.
 
-    The set is then round to within a factor of the square root of the number of rows, as HiGHS
-    wants it: it drops matrix entries below 1e-9. Directions that no row sees are left out.
+    The set is then round up to the square root of the number of rows, as HiGHS requires: it drops
+    entries below 1e-9. Directions that no row sees are left out.
     """
     stack = rows.reshape(-1, rows.shape[-1])
     scale = np.max(np.abs(stack), axis=0, initial=0.0)
@@ -57,7 +55,7 @@ def seen_directions(rows: Array) -> Array:
 def supports(
     Z: Array, targets: Array, own: IntArray | None = None, hints: IntArray | None = None
 ) -> tuple[Array, IntArray]:
-    """Support of each target row d over {z : Z z <= 1, d z <= 2}."""
+    """Support of each target row d over {z : Z z <= 1, d z <= 2}, with its optimal basis."""
     count, q = targets.shape
     values, bases = np.zeros(count), np.full((count, q), -1)
     for start in range(0, count, _BATCH):
@@ -76,10 +74,9 @@ def supports(
 def redundant_rows(
     new: Array, Z: Array, tolerance: float, hints: IntArray | None
 ) -> tuple[BoolArray, IntArray]:
-    """Whether each row of new (c, q) exceeds 1 by no more than the tolerance where Z z <= 1.
+    """Whether each row of new (c, q) exceeds 1 by at most the tolerance where Z z <= 1.
 
-    A row that the ray along itself meets inside the set is clearly needed, without a program.
-
+    A row that the ray along itself meets inside the set is needed; no program is solved for it.
     `Z` (s, q); `hints` (c, q); returns (c,), (c, q).
     """
     reach = np.max(Z @ new.T, axis=0, initial=0.0)  # t * new leaves the set at t = 1 / reach
@@ -96,9 +93,8 @@ def needed_rows(
 ) -> tuple[IntArray, IntArray]:
     """Rows of Z z <= 1 (with -Z z <= 1 when mirrored) that do not follow from the others.
 
-    Of rows that follow from one another the earlier is kept. A row is also needed when a ray from
-    the origin meets it clearly before all others, which saves its program.
-
+    Of rows that follow from one another the earlier is kept. A row is also needed if a ray from the
+    origin clearly meets it before all others, which saves its program.
     `Z` (s, q); `hints` (s, q); returns (k,), (s, q).
     """
     kept, bases = np.arange(len(Z)), np.full(Z.shape, -1)
@@ -115,15 +111,15 @@ def needed_rows(
 
 
 def with_mirror(Z: Array, mirrored: bool) -> Array:
-    """Return the rows Z (s, q), and when mirrored their negatives behind them, (2 * s, q)."""
+    """Rows Z (s, q), when mirrored followed by their negatives, (2 * s, q)."""
     return np.concatenate([Z, -Z]) if mirrored else Z
 
 
 def _systems(Z: Array, targets: Array, own: IntArray | None) -> tuple[Array, Array]:
     """Rows (t, s + 1, q) and right sides (t, s + 1) of each program.
 
-    The last row is the capped target; when the target is a row of Z, that one is capped instead
-    and the last row is empty.
+    The last row is the capped target; if the target is a row of Z, that row is capped and the last
+    one is empty.
     """
     count, size = len(targets), len(Z)
     system = np.empty((count, size + 1, Z.shape[1]))
@@ -146,9 +142,9 @@ def _solve(system: Array, limits: Array, targets: Array) -> tuple[Array, Array]:
         limits.ravel(),
         A_eq=matrix,  # type: ignore[call-overload]  # the stubs know dense matrices only
         b_eq=targets.ravel(),
-        method="highs-ds",  # the dual simplex ends at a corner, exact to rounding
+        method="highs-ds",  # the dual simplex method ends at a vertex, exact to rounding
         options={
-            "presolve": False,  # costs more than it saves: 0.5 instead of 0.7 ms a program
+            "presolve": False,  # costs more than it saves: 0.7 instead of 0.5 ms per program
             "primal_feasibility_tolerance": _FEASIBLE,
             "dual_feasibility_tolerance": _FEASIBLE,
         },
@@ -156,7 +152,7 @@ def _solve(system: Array, limits: Array, targets: Array) -> tuple[Array, Array]:
     if result.status != 0:
         raise SolverError(
             "terminal set",
-            f"HiGHS ended a redundancy program with status {result.status}: {result.message:.80}",
+            f"HiGHS failed in a redundancy program (status {result.status}: {result.message:.80})",
             "check the scaling of the plant and of the gain",
         )
     values = np.sum(limits * result.x.reshape(count, size), axis=1)
@@ -164,11 +160,11 @@ def _solve(system: Array, limits: Array, targets: Array) -> tuple[Array, Array]:
 
 
 def _bases(system: Array, limits: Array, corners: Array) -> IntArray:
-    """Rows active at each corner (t, q), where they are exactly q; else -1."""
+    """Rows active at each corner (t, q), if there are exactly q; else -1."""
     q = system.shape[2]
     slack = limits - np.einsum("tsq,tq->ts", system, corners)
     simple = np.sum(slack <= 100 * _FEASIBLE, axis=1) == q
-    nearest = np.argsort(slack, axis=1)[:, :q]  # fewer than q where the set has fewer rows
+    nearest = np.argsort(slack, axis=1)[:, :q]  # fewer than q if the set has fewer rows
     bases = np.full(corners.shape, -1)
     bases[:, : nearest.shape[1]] = np.where(simple[:, None], nearest, -1)
     return bases
@@ -181,7 +177,7 @@ def _verified(
     known = np.all((hints >= 0) & (hints < system.shape[1]), axis=1)
     index = np.where(known[:, None], hints, 0)
     matrix = np.take_along_axis(system, index[:, :, None], axis=1)
-    # Rows have sizes near 1; a basis this flat is left to HiGHS, and keeps `solve` from failing.
+    # Rows have sizes near 1; nearly singular bases are left to HiGHS, and would make `solve` fail.
     known &= np.linalg.slogdet(matrix).logabsdet > -25.0
     matrix[~known] = np.eye(matrix.shape[1])
     right = np.take_along_axis(limits, index, axis=1)
@@ -206,7 +202,7 @@ def _first_hit(Z: Array, mirrored: bool, factor: float) -> BoolArray:
 
 
 def corners(rows: Array) -> Array:
-    """Corners (v, n) of the bounded set rows x <= 1; of two states counter-clockwise."""
+    """Corners (v, n) of the bounded set rows x <= 1; counter-clockwise for two states."""
     scale = np.max(np.abs(rows), axis=0, initial=0.0)
     rows = rows / np.where(scale > 0, scale, 1.0)
     n = rows.shape[1]
@@ -219,7 +215,7 @@ def corners(rows: Array) -> Array:
     else:
         found = np.zeros((0, n))
     if not len(found) or not np.all(np.isfinite(found)):
-        remedy = "bound the states or inputs that show that direction, from both sides"
+        remedy = "bound states or inputs on both sides in every direction"
         raise InputError("terminal set", "is unbounded and has no corners", remedy)
     if n == 2:
         found = found[np.argsort(np.arctan2(found[:, 1], found[:, 0]))]
@@ -227,7 +223,7 @@ def corners(rows: Array) -> Array:
 
 
 def _surround(rows: Array) -> bool:
-    """Whether normals in a plane leave no half of it free: no gap of neighbours reaches pi."""
+    """Whether normals in a plane surround the origin: no gap between neighbours reaches pi."""
     angles = np.sort(np.arctan2(rows[:, 1], rows[:, 0]))
     gaps = np.diff(angles, append=angles[:1] + 2 * np.pi)
     return bool(np.max(gaps, initial=0.0 if len(gaps) else np.inf) < np.pi - 1e-9)

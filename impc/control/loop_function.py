@@ -1,16 +1,15 @@
-"""The closed loop as a CasADi function, for programs of others.
+"""The closed loop as a CasADi function with exact Jacobian.
 
-The loop is the compiled one, or that of the controller's solver, behind `casadi.Callback`. Once it
-is simulated, each input is linear in small changes of its own state and of the controller (the
-active set's equations, docs/theory.md, section 4),
+The loop is simulated behind `casadi.Callback`. Each input is then linear in small changes of its
+own state and of the controller (equations of the active set, docs/why/theory.md, section 4),
 
     du_t = L_t dx_t + G_t dtheta,      dx_{t+1} = A dx_t + B du_t + E dd_t,
 
-A, B and E being the slopes of the plant's body at the sample, where it has one. theta are the
-entries of K and of the scaled metric. One pass over these is the Jacobian, which CasADi is given.
-The terminal set is made anew for every gain, by linear programs whose number depends on it: no
-graph of fixed size has it, and so the loop cannot be saved or turned into C. The controller at one
-state can (`casadi_controller.mpc_function`).
+where A, B and E are the slopes of a nonlinear body at the sample, if the plant has one, and theta
+are the entries of K and of the scaled metric. One pass over these equations gives the Jacobian.
+The terminal set is recomputed for every gain by a varying number of linear programs, which no graph
+of fixed size represents: the loop cannot be saved or exported to C. The controller at one state can
+(`casadi_controller.mpc_function`).
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
 
     Shapes = dict[str, tuple[int, int]]
 
-# CasADi's graphs do not keep alive what they call in Python: a function that is made stays.
+# CasADi does not keep Python callbacks alive; this list does.
 _alive: list[Any] = []
 
 
@@ -53,39 +52,40 @@ def closed_loop_function(
     *,
     of: str = "gain",
 ) -> ca.Function:
-    """Closed loop of a plant as a `casadi.Function` of its controller.
+    """Return the closed loop of a plant as a `casadi.Function` of its controller.
 
-    Matrices have one row for each sample, as everywhere in the package. Plant, bounds, horizon,
-    softening and solver are those of `controller`; a terminal set is made anew for each gain.
-    Where there is no controller (a gain that does not stabilise, weights that are not semidefinite)
-    all is NaN, and beyond a sample that has no input (`Status`) what follows is.
+    Matrices have one row per sample, as everywhere in the package. Plant, bounds, horizon,
+    softening and solver are those of `controller`; a terminal set is recomputed for each gain. The
+    result is NaN if there is no controller (the gain does not stabilise, or the weights are not
+    semidefinite), and from the first sample without an input (`Status`) on.
 
     Parameters
     ----------
     controller : Controller
+        Controller with its plant.
     steps : int, optional
-        Samples at which an input is applied. Needed when there is no disturbance; otherwise its
-        length is taken.
+        Number of samples with an input; required without a disturbance, whose length is used
+        otherwise.
     disturbance : array_like, optional
-        (steps, d), or (steps,) for a single one: a constant of the function, which then has no such
-        input. CasADi keeps the pattern of every derivative, and that of 3000 samples of a
-        disturbance takes a gigabyte.
+        Disturbance (steps, d), or (steps,) for a single one, as a constant of the function, which
+        then has no such input. CasADi stores the pattern of every derivative: that of 3000 samples
+        of a disturbance takes 1 GB.
     of : str
-        "gain": a function of K (m, n) and S (m, m), of which the symmetric part counts and the
-        scale does not. "weights": of Q (n, n) and R (m, m), of which the symmetric parts count.
+        "gain": function of K (m, n) and S (m, m), of which the symmetric part counts and the scale
+        does not. "weights": function of Q (n, n) and R (m, m), of which the symmetric parts count.
 
     Returns
     -------
     casadi.Function
         (K, S, x0, disturbance) -> (x, u), or (Q, R, x0, disturbance) -> (x, u), with x0 (n, 1),
-        disturbance (steps, d) where it is not given, x (steps + 1, n) and u (steps, m). Its
-        derivatives, forward and in reverse, are exact; at samples that are weakly active they are
-        one-sided. There are no second ones.
+        disturbance (steps, d) unless it is given, x (steps + 1, n) and u (steps, m). First
+        derivatives, forward and reverse, are exact, and one-sided at weakly active samples; there
+        are no second ones.
 
     Raises
     ------
     InputError, DataError
-        When `of` is neither, the disturbance is not one of the plant, or there is no length.
+        If `of` is unknown, the disturbance does not fit the plant, or `steps` is missing.
 
     Examples
     --------
@@ -103,14 +103,14 @@ def closed_loop_function(
     (1, 2)
     """
     if of not in ("gain", "weights"):
-        raise InputError("of", f"got {of!r}", "choose gain or weights")
+        raise InputError("of", f"got {of!r}", 'choose "gain" or "weights"')
     if controller.stages is not None:
         problem = "has a terminal weight of its own, and a gain for each stage"
-        raise InputError("controller", problem, "differentiate by impc.simulate_and_differentiate")
+        raise InputError("controller", problem, "use impc.simulate_and_differentiate")
     plant = controller.plant
     if np.any(plant.observer) or plant.ahead:
         raise InputError(
-            "plant", "has targets that move", "a function of the loop regulates to rest alone"
+            "plant", "has targets that move", "use a plant without observer and preview"
         )
     drive = scenario(plant, np.zeros(plant.n), steps, disturbance).disturbance
     loop = _loop_of_gain(controller, drive, disturbance is not None)
@@ -126,7 +126,7 @@ def closed_loop_function(
 
 
 class _Matrices(ca.Callback):
-    """Matrices from matrices, as CasADi calls what is evaluated; with their Jacobian."""
+    """Callback from matrices to matrices, optionally with its Jacobian."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class _Matrices(ca.Callback):
     ) -> None:
         ca.Callback.__init__(self)
         self._inputs, self._outputs, self._evaluate = inputs, outputs, evaluate
-        self._slopes = slopes  # Of each output by each input, (rows, columns, rows, columns)
+        self._slopes = slopes  # of each output by each input, (rows, columns, rows, columns)
         _alive.append(self)
         self.construct(name, {"enable_forward": False, "enable_reverse": False})
 
@@ -169,7 +169,7 @@ class _Matrices(ca.Callback):
     def get_jacobian(
         self, name: str, names: Sequence[str], identified: Sequence[str], _: Any
     ) -> ca.Function:
-        """Blocks of entries column after column; the outputs are inputs of it too."""
+        """Jacobian blocks, entries in column order; it also takes the outputs as inputs."""
         ins, outs = list(self._inputs.values()), list(self._outputs.values())
         blocks = [(a * b, rows * columns) for a, b in outs for rows, columns in ins]
 
@@ -186,7 +186,7 @@ class _Matrices(ca.Callback):
 
 
 def _loop_of_gain(controller: Controller, given: Array, fixed: bool) -> ca.Function:
-    """(K, S, x0) -> (x, u) under a disturbance, or (K, S, x0, disturbance) -> (x, u)."""
+    """Function (K, S, x0) -> (x, u) at a fixed disturbance, or with it as fourth input."""
     n, m, (steps, d) = controller.plant.n, controller.plant.m, given.shape
     inputs: Shapes = {"K": (m, n), "S": (m, m), "x0": (n, 1)}
     if not fixed:
@@ -204,7 +204,7 @@ class _GainLoop:
         self.near = controller.terminal
 
     def value(self, point: list[Array]) -> list[Array]:
-        """x (steps + 1, n) and u (steps, m)."""
+        """Compute x (steps + 1, n) and u (steps, m)."""
         plant, steps = self.controller.plant, len(self.given)
         law = self._law(*point)
         if law is None:
@@ -216,7 +216,7 @@ class _GainLoop:
         return [x, u]
 
     def slopes(self, point: list[Array]) -> list[list[Array]]:
-        """Of both by each part of the point."""
+        """Derivatives of both by each part of the point."""
         plant, (steps, d) = self.controller.plant, self.given.shape
         n, m = plant.n, plant.m
         K, S = slice(n, n + m * n), slice(n + m * n, n + m * n + m * m)
@@ -268,7 +268,7 @@ class _GainLoop:
                 near=self.near,
                 solver=given.solver,
             )
-        except ImpcError:  # there is no such controller, which NaN says
+        except ImpcError:  # no such controller: the caller returns NaN
             return None
         self.near = law.terminal
         return law
@@ -279,7 +279,7 @@ class _GainLoop:
 
 
 def _passed(closed: Array, start: Array, push: Callable[[int], Array]) -> Array:
-    """Derivatives of the states, one pass over the samples (steps + 1, n, columns)."""
+    """Propagate derivatives of the states over the samples (steps + 1, n, columns)."""
     x = np.empty((len(closed) + 1, *start.shape))
     x[0] = start
     for t, step in enumerate(closed):
@@ -288,7 +288,7 @@ def _passed(closed: Array, start: Array, push: Callable[[int], Array]) -> Array:
 
 
 def _scaled(S: Array) -> Array:
-    """Changes of the metric that a controller takes by the entries of S (m, m, m * m)."""
+    """Derivative of the scaled metric with respect to the entries of S (m, m, m * m)."""
     m, trace = len(S), np.trace(S)
     units = np.eye(m * m).reshape(m, m, -1)
     symmetric = (units + units.swapaxes(0, 1)) / 2
@@ -297,14 +297,14 @@ def _scaled(S: Array) -> Array:
 
 
 def _regulator_of_weights(plant: Plant) -> ca.Function:
-    """(Q, R) -> (K, S) by the Riccati equation."""
+    """Function (Q, R) -> (K, S) by the Riccati equation."""
     n, m = plant.n, plant.m
 
     def solved(point: list[Array]) -> LqrSolution | None:
         Q, R = ((part + part.T) / 2 for part in point)
         try:
             return solve_lqr(plant, Weights(Q, R))
-        except ImpcError:  # no weights, or none with a regulator, which NaN says
+        except ImpcError:  # invalid weights or no regulator: the caller returns NaN
             return None
 
     def value(point: list[Array]) -> list[Array]:

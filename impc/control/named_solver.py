@@ -1,16 +1,14 @@
-"""The least-distance problem of one sample, built and solved by CasADi with a solver by its name.
+"""The least-distance problem of one sample, solved by a named solver of CasADi.
 
-`compiled_dual` has a method of its own for it (docs/theory.md, section 4). Any other finds the same
-answer, and is asked for what only a solver can determine: which rows hold. With those the input and
-its derivative follow from the equations of the active set (`closed_loop`), and a solver whose own
-answer is not that one, to 1e-4 of its size, is not believed. What a solver says of its success is
-not asked for.
+The solver only determines the active set (docs/why/theory.md, section 4). The input and its
+derivative follow from the equations of the active set (`closed_loop`); a solver whose own solution
+differs from these by more than 1e-4 of its size is rejected. Its success flag is not used.
 
     minimise  z'z / 2 + cost weight sum(t)   subject to  A z <= d + t,  t >= 0 for soft rows
 
-is the problem in numbers of size one: z is v in coordinates in which S is the identity, over the
-distance of a typical row; rows are divided by their bounds. Soft rows enter it only where the hard
-problem has no answer, or one whose multipliers exceed the cost weight of the rows.
+is the problem in scaled numbers: z is v in coordinates in which S is the identity, divided by the
+distance of a typical row; rows are divided by their bounds. Soft rows are softened only if the hard
+problem is infeasible or its multipliers exceed the penalty.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ if TYPE_CHECKING:
 
     from impc.control.constraint_rows import Rows
 
-#: The package's own method, see `compiled_dual`.
+#: Name of the built-in method, see `compiled_dual`.
 COMPILED = "compiled"
 _IPOPT: dict[str, Any] = {
     "print_time": False,
@@ -52,12 +50,11 @@ _IPOPT: dict[str, Any] = {
         "jac_d_constant": "yes",
     },
 }
-#: Plugin of CasADi and its options, of each solver that may be asked for.
-# Active-set methods end at round-off, IPOPT's interior-point method at
-# its tolerance, which is tightened from 1e-8. Of 180 random loops (hard state bounds, soft ones,
-# soft ones at a cost weight of a million) these three find every input. Not offered: qrqp, which
-# had no answer in 2 of 30 loops with hard rows and in most with soft ones; OSQP, in 7 of 90;
-# fatrop, which wants the stages apart and prints.
+#: CasADi plugin and options of each available solver.
+# Active-set methods end at round-off, IPOPT at its tolerance, which is tightened from 1e-8. These
+# three find every input in 180 random loops (hard state bounds, soft ones, soft ones with a penalty
+# of 1e6). Not offered: qrqp failed in 2 of 30 loops with hard rows and in most with soft ones, OSQP
+# in 7 of 90; fatrop needs separate stages and prints.
 PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
     "daqp": ("daqp", {"error_on_fail": False}),
     "qpoases": (
@@ -66,32 +63,31 @@ PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
             "printLevel": "none",
             "error_on_fail": False,
             "sparse": False,
-            # By default it starts at lower bounds, which are infinite here: of 180 random loops one
+            # The default starts at lower bounds, which are infinite here: 1 of 180 random loops
             # ended in a division by zero.
             "initialStatusBounds": "inactive",
         },
     ),
     "ipopt": ("nlpsol", {"error_on_fail": False, "nlpsol": "ipopt", "nlpsol_options": _IPOPT}),
 }
-#: Names of CasADi's solvers that may be asked for.
+#: Names of the available CasADi solvers.
 SOLVERS = tuple(PLUGINS)
 
-# Slacks enter the cost linearly, so the Hessian is singular, which DAQP does not take. They get a
-# quadratic cost about a centre, of this share of their cost weight, and the problem is solved again
-# about what was found until that no longer moves: then the quadratic cost has no effect (proximal
-# point).
+# Slacks are linear in the cost, so the Hessian is singular, which DAQP does not accept. They get a
+# quadratic cost about a centre, with this share of their penalty, and the problem is solved again
+# about the solution until it no longer moves (proximal point method).
 _PROXIMAL, _ROUNDS = 1e-3, 10
-# Relative to 1 and to the largest slack.
+# Convergence tolerance relative to 1 and to the largest slack.
 _SETTLED = 1e-7
-# What the conditions of optimality may be broken by in a solver's own answer, and what its z may
-# differ from that of the equations by, relative to the larger of 1 and z. DAQP keeps rows to 1e-5
-# where a cost weight of a million is paid. The answer of the equations is checked to 1e-9.
+# Tolerance for the optimality conditions of a solver's own solution, and for its difference from
+# that of the active-set equations, relative to max(1, |z|). DAQP satisfies rows to 1e-5 for a
+# penalty of 1e6. The solution of the equations is checked to 1e-9.
 _AGREES = 1e-4
 
-# Share of their bounds by which rows that no plan keeps are exceeded at least: HiGHS ends at 1e-7.
+# Smallest relative excess that proves infeasibility: HiGHS ends at 1e-7.
 _EXCEEDED = 1e-6
 
-_own = threading.local()  # a CasADi function is not to be evaluated in two threads at a time
+_own = threading.local()  # CasADi functions must not be evaluated by two threads at a time
 _printing = threading.Lock()
 
 _Answer = tuple[Array, Array, Array, float]
@@ -99,32 +95,32 @@ _Answer = tuple[Array, Array, Array, float]
 
 @dataclass(frozen=True)
 class Program:
-    """The problem of the module's text for one controller; made by `build_program`."""
+    """The scaled problem of one controller; made by `build_program`."""
 
-    solver: str  # One of `SOLVERS`
-    A: Array  # Rows in the problem's numbers (r, N m)
-    squares: Array  # Squared length of each row of A (r,)
-    unit: float  # What z is multiplied by to become L'v, S = LL'
-    b: Array  # Bounds (r,)
-    soft: BoolArray  # Which rows may be exceeded (r,)
-    cost_weight: float  # Of the excess, in the problem's numbers
-    # H, rows and least y of  min y'H y / 2 + g'y,  with all rows hard and with slacks
+    solver: str  # one of `SOLVERS`
+    A: Array  # (r, N m), scaled rows
+    squares: Array  # (r,), squared length of each row of A
+    unit: float  # factor from z to L'v, S = LL'
+    b: Array  # (r,), bounds
+    soft: BoolArray  # (r,), which rows may be exceeded
+    cost_weight: float  # of the scaled excess
+    # H, rows and lower bounds of y in  min y'H y / 2 + g'y,  with all rows hard and with slacks
     hard: tuple[ca.DM, ...]
     softened: tuple[ca.DM, ...]
 
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """What a solver found at one sample."""
+    """Active set that a solver found at one sample."""
 
-    tight: IntArray  # Rows that hold with equality, linearly independent (a,)
-    given_up: BoolArray  # Soft rows that are exceeded (r,)
-    w: Array  # The solver's own answer L'v with S = LL' (N m,)
-    agrees: float  # What w may differ from that of the equations by, in its unit
+    tight: IntArray  # (a,), rows that hold with equality, linearly independent
+    given_up: BoolArray  # (r,), soft rows that are exceeded
+    w: Array  # (N m,), the solver's own solution L'v with S = LL'
+    agrees: float  # tolerance for the difference of w from the active-set equations, in its unit
 
 
 def require_solver(name: str) -> str:
-    """Return the name of a solver that there is."""
+    """Return the name of an available solver in lower case."""
     given, name = name, name.lower()
     if name not in (COMPILED, *SOLVERS):
         known = ", ".join((COMPILED, *SOLVERS))
@@ -132,19 +128,19 @@ def require_solver(name: str) -> str:
     if name != COMPILED and not (ca.has_nlpsol if name == "ipopt" else ca.has_conic)(name):
         raise InputError(
             "solver",
-            f"{name!r} is not part of the CasADi that is installed",
+            f"{name!r} is not part of the installed CasADi",
             "choose another, or install CasADi from its wheel",
         )
     return name
 
 
 def described(name: str) -> str:
-    """A solver by its `name` as a page says it."""
+    """Name of a solver for reports."""
     return "the package's own" if name == COMPILED else f"{name}, of CasADi"
 
 
 class _Silence:
-    """Standard output but for what one thread writes."""
+    """Standard output without the text of one thread."""
 
     def __init__(self, beneath: Any) -> None:
         self._beneath = beneath
@@ -161,13 +157,13 @@ class _Silence:
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Keep off standard output what a solver prints; qpOASES always prints its licence."""
+    """Suppress the output of a solver; qpOASES always prints its licence."""
     with _printing, contextlib.redirect_stdout(_Silence(sys.stdout)):
         yield
 
 
 def build_program(solver: str, rows: Rows) -> Program:
-    """Write the problem of rows for a solver."""
+    """Build the scaled problem for a solver."""
     squares = np.diag(rows.gram)
     reaching = squares > 0
     distances = rows.b[reaching] / np.sqrt(squares[reaching])
@@ -188,7 +184,7 @@ def build_program(solver: str, rows: Rows) -> Program:
 
 
 def active_set(program: Program, d: Array) -> ActiveSet | None:
-    """Ask a solver which rows hold; None when its answer breaks the conditions of optimality."""
+    """Active set by the solver; None if its solution violates the optimality conditions."""
     if not (np.all(np.isfinite(program.A)) and np.all(np.isfinite(d))):
         return None
     A, right, soft = program.A, d / program.b, program.soft
@@ -198,8 +194,8 @@ def active_set(program: Program, d: Array) -> ActiveSet | None:
     if found is None:
         return None
     z, multipliers, excess, size = found
-    # The rule of the primal-dual active-set method: a multiplier, as the share of the bound that it
-    # stands for, against the slack; and what the cost weight leaves of it against the excess.
+    # Rule of the primal-dual active-set method: compare each multiplier, as a share of the bound,
+    # with the slack, and the rest of the penalty with the excess.
     given_up = soft & (
         excess > np.maximum(program.cost_weight - multipliers, 0.0) * program.squares
     )
@@ -210,16 +206,16 @@ def active_set(program: Program, d: Array) -> ActiveSet | None:
 
 
 def excluded_row(rows: Rows, slack: Array) -> int:
-    """A hard row that no input sequence keeps beside the others, by linear programming; -1 if none.
+    """Index of a hard row that is incompatible with the others, by linear programming, or -1.
 
-    The least share t of their bounds by which all rows are exceeded, M v <= slack + t b, is
-    positive; the row is the one that weighs most in the dual. `slack` (r,).
+    The smallest share t of their bounds by which all rows are exceeded, M v <= slack + t b, is
+    positive; the row is the one with the largest multiplier. `slack` (r,).
     """
     hard = np.isinf(rows.limit)
     width, b = rows.M.shape[1], rows.b[hard]
     if not (
         np.all(np.isfinite(rows.M)) and np.all(np.isfinite(slack))
-    ):  # of a plant that runs away
+    ):  # unstable prediction overflowed
         return -1
     answer: Any = scipy.optimize.linprog(
         np.r_[np.zeros(width), 1.0],
@@ -249,7 +245,7 @@ def _solve_softened(program: Program, right: Array) -> _Answer | None:
 def _solve(
     program: Program, given: tuple[ca.DM, ...], right: Array, centre: Array
 ) -> _Answer | None:
-    """The solver's answer, when it keeps the rows and its multipliers belong to it."""
+    """Solution of the solver, if it satisfies rows and optimality conditions."""
     A, soft = program.A, program.soft
     H, rows, least = given
     (count, width) = A.shape
@@ -266,7 +262,7 @@ def _solve(
         excess[soft] = found[width:]
     size = max(1.0, float(np.abs(z).max()))
     most = max(1.0, float(np.abs(multipliers).max()))
-    with np.errstate(over="ignore", invalid="ignore"):  # of a plant that runs away: then it is none
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow on unstable plants: rejected
         kept = (A @ z - right - excess).max() <= _AGREES * size
         stationary = np.abs(z + A.T @ multipliers).max() <= _AGREES * max(size, most)
     signed = multipliers.min() >= -_AGREES * most
@@ -274,7 +270,7 @@ def _solve(
 
 
 def _independent(A: Array, held: IntArray, multipliers: Array, pull: Array) -> IntArray:
-    """Rows among those held that carry the pull, independent; where some depend, by `nnls`."""
+    """Linearly independent rows among `held` that carry the pull; by `nnls` if dependent."""
     if len(held) == 0:
         return held
     diagonal = np.abs(np.diagonal(np.linalg.qr(A[held].T, mode="r")))
@@ -287,7 +283,7 @@ def _independent(A: Array, held: IntArray, multipliers: Array, pull: Array) -> I
 
 
 def _function(solver: str, width: int, count: int) -> Callable[..., Any]:
-    """The solver for problems of this size, one for each thread."""
+    """Solver for problems of this size, one for each thread."""
     kept: dict[tuple[str, int, int], Any] = _own.__dict__.setdefault("functions", {})
     key = solver, width, count
     if key not in kept:

@@ -1,8 +1,8 @@
-"""What drives a simulation and what comes of it, sample by sample.
+"""Scenarios, simulations and their status, sample by sample.
 
-A simulation never raises for what happens on the way: it has a `Status` for each sample, and
-`require_complete` turns a failure into an error that names bound and sample. The loop itself is in
-docs/theory.md, section 4.
+A simulation never raises because of its course: it has a `Status` for each sample, and
+`require_complete` turns a failure into an error that names bound and sample. For the loop see
+docs/why/theory.md, section 4.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 
 class Status(IntEnum):
-    """What happened at a sample.
+    """Result at a sample.
 
-    FREE: the gain keeps every bound. ACTIVE: a bound is active. SOFTENED: a soft bound was
-    exceeded. INFEASIBLE: no input sequence keeps the bounds. UNSOLVED: the input, or whether there
-    is one, cannot be determined in double precision. DIVERGED: the state left every reasonable
-    range. NOT_REACHED: the simulation ended before.
+    FREE: the gain satisfies all bounds. ACTIVE: a bound is active. SOFTENED: a soft bound is
+    exceeded. INFEASIBLE: no input sequence satisfies the bounds. UNSOLVED: the input, or its
+    existence, cannot be determined in double precision. DIVERGED: the state diverged. NOT_REACHED:
+    the simulation ended before.
 
     Examples
     --------
@@ -56,7 +56,7 @@ class Status(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """The status in words."""
+        """Description of the status."""
         return _SENTENCES[self]
 
 
@@ -66,25 +66,25 @@ _SENTENCES = {
     Status.SOFTENED: "a soft bound was exceeded",
     Status.INFEASIBLE: "no input sequence keeps the bounds",
     Status.UNSOLVED: "the input cannot be determined in double precision",
-    Status.DIVERGED: "the state left every reasonable range",
+    Status.DIVERGED: "the state diverged",
     Status.NOT_REACHED: "the simulation ended before this sample",
 }
 
 
 @dataclass(frozen=True)
 class Scenario(Value):
-    """What drives a simulation, in the units of the plant.
+    """Initial state, disturbance and targets of a simulation, in the units of the plant.
 
     Attributes
     ----------
-    x0 : Array
-        Initial state (n,).
-    disturbance : Array
-        One row for each sample (steps, d).
-    target : Array
-        Targets of some signals, one row for each sample (steps + 1, q) or fewer: the last stays.
+    x0 : ndarray of shape (n,)
+        Initial state.
+    disturbance : ndarray of shape (steps, d)
+        One row per sample.
+    target : ndarray of shape (steps + 1, q)
+        Targets of `signals`, one row per sample; if shorter, the last row continues.
     signals : tuple of str
-        Outputs or states that have one (q,).
+        Outputs or states with a target, length q.
     """
 
     _rules: ClassVar[Mapping[str, Any]] = {
@@ -106,22 +106,22 @@ class Scenario(Value):
 
 @dataclass(frozen=True)
 class Simulation(Frozen):
-    """A closed loop from its first state to its last.
+    """Trajectory of a closed loop.
 
     Attributes
     ----------
     plant : Plant
-    x : Array
-        States (steps + 1, n). Of samples that were not reached NaN; in a search, which goes on
-        with them, the last state.
-    u : Array
-        Inputs (steps, m); NaN, or zero, at samples that were not reached.
-    status : Array of Status
-        (steps,).
+        Simulated plant.
+    x : ndarray of shape (steps + 1, n)
+        States. At samples that are not reached NaN (inside a search the last state).
+    u : ndarray of shape (steps, m)
+        Inputs; NaN, or zero, at samples that are not reached.
+    status : ndarray of shape (steps,)
+        `Status` of each sample.
     weakly_active : int
         Number of samples at which the active set is about to change, to 1e-8 of the bound.
     failed_row : int
-        Row of `Rows` that proved the last problem inconsistent, -1 when none did.
+        Row of `Rows` that proved the last problem infeasible, or -1.
 
     Examples
     --------
@@ -146,35 +146,35 @@ class Simulation(Frozen):
 
     @property
     def time(self) -> Array:
-        """Of every state, s (steps + 1,)."""
+        """Time of every state in s (steps + 1,)."""
         return np.asarray(self.plant.dt * np.arange(len(self.x)), dtype=np.float64)
 
     @property
     def states(self) -> Array:
-        """x (steps + 1, n)."""
+        """States x (steps + 1, n)."""
         return self.x
 
     @property
     def outputs(self) -> Array:
-        """y = C x (steps + 1, p)."""
+        """Outputs y = C x (steps + 1, p)."""
         return np.asarray(self.x @ self.plant.C.T)
 
     @property
     def inputs(self) -> Array:
-        """u (steps, m)."""
+        """Inputs u (steps, m)."""
         return self.u
 
     @property
     def statuses(self) -> tuple[Status, ...]:
-        """What happened at every sample."""
+        """Status of every sample."""
         return tuple(Status(int(code)) for code in self.status)
 
     def frame(self) -> pd.DataFrame:
-        """Time, states, outputs and inputs as columns with their names; the last input is NaN.
+        """Return time, states, outputs and inputs as named columns; the last input is NaN.
 
-        `frame().attrs["units"]` has the unit of each column.
+        `frame().attrs["units"]` contains the unit of each column.
         """
-        import pandas as pd  # noqa: PLC0415  # a third of a second
+        import pandas as pd  # noqa: PLC0415  # takes a third of a second
 
         plant, last = self.plant, np.full((1, self.u.shape[1]), np.nan)
         columns = [self.time[:, None], self.x, self.outputs, np.vstack([self.u, last])]
@@ -198,7 +198,7 @@ class Simulation(Frozen):
 
     @property
     def applied(self) -> Array:
-        """The inputs of the samples that were reached (reached, m), in their units."""
+        """Inputs of the samples that were reached (reached, m), in their units."""
         return self.u[: self.reached]
 
 
@@ -206,8 +206,8 @@ class Simulation(Frozen):
 class Sensitivity(Frozen):
     """Derivatives of a `Simulation` along p directions."""
 
-    x: Array  # Of the states (steps + 1, n, p)
-    u: Array  # Of the inputs (steps, m, p)
+    x: Array  # (steps + 1, n, p), of the states
+    u: Array  # (steps, m, p), of the inputs
 
 
 @checked(steps=(1, 10_000_000))
@@ -218,23 +218,29 @@ def scenario(
     disturbance: ArrayLike | None = None,
     target: Mapping[str, Any] | None = None,
 ) -> Scenario:
-    """Check and freeze an initial state with a number of steps or a disturbance.
+    """Return a checked scenario for a simulation.
 
     Parameters
     ----------
+    plant : Plant
+        Plant that is simulated.
     x0 : array_like
-        (n,).
+        Initial state (n,).
     steps : int, optional
-        Needed when there is no disturbance; otherwise its length is taken.
+        Number of samples; required without a disturbance, whose length is used otherwise.
     disturbance : array_like, optional
-        (steps, d), or (steps,) for a single disturbance.
+        Disturbance (steps, d), or (steps,) for a single one.
     target : mapping, optional
         Set points of outputs or states by name, in their units: a number, or (steps + 1,).
+
+    Returns
+    -------
+    Scenario
 
     Raises
     ------
     DataError
-        When something is not finite or of the wrong shape, or neither length is given.
+        If a value is not finite or of the wrong shape, or `steps` is missing.
 
     Examples
     --------
@@ -246,7 +252,7 @@ def scenario(
     count = physical_disturbances(plant)
     if disturbance is None:
         if steps is None:
-            raise DataError("steps", "got None without a disturbance", "give at least 1")
+            raise DataError("steps", "is missing, without a disturbance", "give at least 1")
         pushes: Array = np.zeros((steps, count))
     else:
         columns = as_numbers("disturbance", disturbance)
@@ -259,7 +265,7 @@ def scenario(
 
 
 def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str, str]:
-    """The bound that an infeasible simulation could not keep, and what to do, in words."""
+    """Bound that made a simulation infeasible, and the remedy, as text."""
     remedy = "start nearer to the origin, lengthen the horizon, or soften the state bounds"
     row = simulation.failed_row
     if row < 0:
@@ -271,20 +277,32 @@ def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str,
         return f"the bound {name} {stage} samples ahead", remedy
     return (
         f"the bound {name} in the terminal set, {stage} samples ahead",
-        f"{remedy}, or leave the set out: terminal_set=False",
+        f"{remedy}, or set terminal_set=False",
     )
 
 
 @checked
 def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
-    """Return the simulation when every sample was reached.
+    """Return the simulation if every sample was reached, else raise an error.
+
+    Parameters
+    ----------
+    controller : Controller
+        Controller that was simulated.
+    simulation : Simulation
+        Result of `Controller.simulate`.
+
+    Returns
+    -------
+    Simulation
+        The given simulation.
 
     Raises
     ------
     InfeasibleError
-        When a sample has no input that keeps the bounds: names the bound and the sample.
+        If no input satisfies the bounds at a sample; names the bound and the sample.
     SolverError
-        When the loop diverged or the active-set method found no answer.
+        If the loop diverged or the active-set method found no solution.
 
     Examples
     --------

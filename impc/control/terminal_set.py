@@ -1,18 +1,18 @@
-"""The terminal set: the largest set in which the gain alone keeps every bound for ever.
+"""The terminal set: the largest set in which the gain alone satisfies all bounds for ever.
 
 Under u = -Kx the closed loop is x+ = F x, F = A - BK, and the bounds E x + F_u u <= b of one stage
 become G x <= b with G = E - F_u K. The maximal positively invariant set is
 
     O = {x : G_c F^k x <= b_c  for every bound c and every step k >= 0},    O_k: the steps up to k.
 
-Gilbert and Tan (1991): when every row of step k + 1 already follows from O_k, then O = O_k; the
-first such k, k*, is finite for a stable F and an origin strictly inside the bounds. Each row that
-is kept carries its pair (family c, step k), so that H[i] = G_c F^k can be differentiated through K.
+If every row of step k + 1 follows from O_k, then O = O_k (Gilbert and Tan 1991); the first such k,
+k*, is finite for a stable F and an origin strictly inside the bounds. Each row that is kept carries
+its pair (family c, step k), so that H[i] = G_c F^k can be differentiated with respect to K.
 
 Whether a row follows from others is one linear program. Two facts save most of them: if G_c F^k
-follows from O_{k-1}, then G_c F^(k+1) follows from O_k (put Fx for x), so a bound that has dropped
-out stays out; and a point of the set beyond a row shows that the row is needed. All tolerances are
-relative to the bound: rows are divided by b, the right sides are then 1.
+follows from O_{k-1}, then G_c F^(k+1) follows from O_k (substitute Fx for x), so a bound that drops
+out stays out; and a point of the set beyond a row shows that the row is needed. Tolerances are
+relative to the bound: rows are divided by b.
 
 E. G. Gilbert, K. T. Tan, Linear systems with state and control constraints, IEEE TAC 36 (9), 1991.
 """
@@ -47,38 +47,40 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 
-# States of a set whose corners are listed: with more they are thousands.
+# Largest number of states for which corners are listed; with more there are thousands.
 _MOST_STATES = 6
 
 
 @dataclass(frozen=True)
 class TerminalSet(Value):
-    """The set {x : H x <= h}, without redundant rows, and where each row comes from.
+    """The set {x : H x <= h} without redundant rows, and the origin of each row.
 
     Attributes
     ----------
-    H, h : Array
-        Shapes (r, n) and (r,), in the units of the bounds; r = 0 when nothing is bounded.
-    family : IntArray
-        Bound c of each row (r,), an index into ``rows``.
-    step : IntArray
-        Step k of each row (r,): H[i] = ((E - F_u K) F^k)[c] and h[i] = b[c].
+    H : ndarray of shape (r, n)
+        Rows, in the units of the bounds; r = 0 if nothing is bounded.
+    h : ndarray of shape (r,)
+        Right sides.
+    family : ndarray of shape (r,)
+        Bound c of each row, an index into `rows`.
+    step : ndarray of shape (r,)
+        Step k of each row: H[i] = ((E - F_u K) F^k)[c] and h[i] = b[c].
     determinedness : int
-        k*, the last step that adds a row to those before; 0 when there are no rows.
+        k*, the last step that adds a row; 0 without rows.
     tolerance : float
-        Support of a removed row above its bound, relative to the bound, that was accepted.
-    gain : Array
-        K (m, n) of u = -Kx.
-    F : Array
-        Closed loop A - BK, (n, n).
+        Accepted excess of a removed row, relative to its bound.
+    gain : ndarray of shape (m, n)
+        K of u = -Kx.
+    F : ndarray of shape (n, n)
+        Closed loop A - BK.
     rows : BoundRows
-        The bounds of one stage, E x + F_u u <= b.
-    bases : mapping of int to IntArray
-        How the linear programs ended, for ``near=``: bases (c, q) by step, and at 0 those of the
-        last pruning.
+        Bounds of one stage, E x + F_u u <= b.
+    bases : mapping of int to ndarray
+        Final bases (c, q) of the linear programs by step, for ``near=``; at 0 those of the last
+        pruning.
     own : bool
-        Whether it is a set that a user gave: ``rows`` are then its own and ``gain`` is zero, for
-        nothing says that it is invariant.
+        Whether the user supplied the set: `rows` are then its own, `gain` is zero, and invariance
+        is not known.
 
     Examples
     --------
@@ -109,12 +111,12 @@ class TerminalSet(Value):
         return bool(np.all(self.H @ state <= self.h * (1 + self.tolerance)))
 
     def vertices(self) -> Array:
-        """Corners (v, n) in the units of the states; of two states counter-clockwise.
+        """Return the corners (v, n) in the units of the states; for two counter-clockwise.
 
         Raises
         ------
         InputError
-            When the set is unbounded, or has more than 6 states.
+            If the set is unbounded or has more than 6 states.
         """
         n = self.H.shape[1]
         if n > _MOST_STATES:
@@ -122,26 +124,26 @@ class TerminalSet(Value):
         return corners(self.H / self.h[:, None])
 
     def project(self, first: int, second: int) -> Array:
-        """Corners (v, 2) of its shadow on two states; counter-clockwise.
+        """Return the corners (v, 2) of the projection on two states, counter-clockwise.
 
         Parameters
         ----------
         first, second : int
-            Places of the states, counted from 0.
+            Indices of the states, from 0.
 
         Raises
         ------
         InputError
-            As `vertices`.
+            As in `vertices`.
         """
         return hull(self.vertices()[:, [first, second]])
 
     def to_pytope(self) -> Any:
-        """The set as a `pytope.Polytope` in half-space form, which finds corners when asked."""
+        """Return the set as a `pytope.Polytope` in half-space form."""
         pytope = optional("pytope", "terminal set")
         if not len(self.h):
             raise InputError("terminal set", "is the whole space", "give at least one bound")
-        # pytope 0.0.4 squeezes the right side to a scalar when there is one row: state it twice.
+        # pytope 0.0.4 squeezes a single right side to a scalar: repeat the row.
         twice = slice(None) if len(self.h) > 1 else [0, 0]
         return pytope.Polytope(np.array(self.H[twice]), np.array(self.h[twice]))
 
@@ -173,28 +175,32 @@ def maximal_invariant_set(
     Parameters
     ----------
     plant : Plant
-        Discrete.
+        Discrete-time plant.
     gain : array_like
-        K, shape (m, n), such that A - BK is stable.
+        Gain K (m, n) such that A - BK is stable.
     bounds : Bounds
-        Of the plant's size.
+        Bounds of states and inputs.
     tolerance : float
-        A row is redundant when it exceeds its bound by no more than this fraction of the bound.
+        A row is redundant if it exceeds its bound by at most this fraction of the bound.
     max_steps : int
         Largest k* to try.
     near : TerminalSet, optional
-        The set of a similar gain: the bases of its linear programs are tried, and checked,
-        before a program is solved. It changes the time, not the answer.
+        Set of a similar gain: the bases of its linear programs are tried first. It changes the run
+        time, not the result.
+
+    Returns
+    -------
+    TerminalSet
 
     Raises
     ------
     PlantError
-        When the plant is continuous.
+        If the plant is continuous.
     DataError, InputError, BoundsError
-        When the gain has the wrong shape or does not stabilise, the bounds are not the plant's,
-        or a setting is out of range.
+        If the gain has the wrong shape or does not stabilise, the bounds do not fit the plant, or a
+        setting is out of range.
     SolverError
-        When k* exceeds max_steps, or a linear program fails.
+        If k* exceeds max_steps, or a linear program fails.
 
     Examples
     --------
@@ -231,12 +237,12 @@ def maximal_invariant_set(
 
 
 def own_terminal_set(plant: Plant, given: TerminalSet | tuple[ArrayLike, ArrayLike]) -> TerminalSet:
-    """The set {x : H x <= h} that a user gives as a pair (H, h); of another set its rows."""
+    """The set {x : H x <= h} that a user supplies as a pair (H, h), or as another set."""
     pair = (given.H, given.h) if isinstance(given, TerminalSet) else given
     H = finite_array("terminal_set: H", pair[0], (None, plant.n))
     h = finite_array("terminal_set: h", pair[1], (len(H),))
     if np.any(h <= 0):
-        problem = f"leaves no room about the origin: its least entry is {h.min():g}"
+        problem = f"excludes a neighbourhood of the origin: its smallest entry is {h.min():g}"
         raise InputError("terminal_set: h", problem, "give H x <= h with h > 0")
     names = tuple(f"H[{row}] x <= {bound:g}" for row, bound in enumerate(h))
     rows = BoundRows(H, np.zeros((len(h), plant.m)), h, np.ones(len(h), dtype=bool), names)
@@ -248,10 +254,10 @@ def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: 
     radius = float(np.max(np.abs(np.linalg.eigvals(F))))
     if not radius < 1:
         problem = f"does not stabilise the plant: the spectral radius of A - BK is {radius:.6g}"
-        raise InputError("gain", problem, "give the gain of a regulator, such as solve_lqr(...).K")
+        raise InputError("gain", problem, "give a stabilising gain, such as solve_lqr(...).K")
     if (bounds.x_min.size, bounds.u_min.size) != (plant.n, plant.m):
         problem = f"are for {bounds.x_min.size} states and {bounds.u_min.size} inputs"
-        raise BoundsError("bounds", problem, f"the plant has {plant.n} and {plant.m}: Bounds")
+        raise BoundsError("bounds", problem, f"make Bounds for {plant.n} and {plant.m}")
     if not 0 <= tolerance <= 1e-2 or max_steps < 1:
         problem = f"are {tolerance!r} and {max_steps!r}"
         raise InputError("tolerance, max_steps", problem, "give 0 to 0.01, and at least 1")
@@ -260,14 +266,14 @@ def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: 
 def _loop(
     normal: Array, F: Array, tolerance: float, max_steps: int
 ) -> tuple[_Loop, IntArray, IntArray | None]:
-    """The construction, the bounds that it follows, and their mirror images, as in `_half`."""
+    """State of the construction, the bounds that it follows, and their mirror images."""
     basis = seen_directions(_steps(normal, F, len(F)))
     families, mirror = _half(normal, np.flatnonzero(np.any(normal @ basis, axis=1)))
     return _Loop(normal, F, basis, mirror is not None, tolerance, max_steps), families, mirror
 
 
 def _in_order(family: IntArray, step: IntArray, mirror: IntArray | None) -> tuple[IntArray, ...]:
-    """Rows and their mirror images, by step and then by bound."""
+    """Rows and their mirror images, sorted by step and bound."""
     if mirror is not None:
         family, step = np.concatenate([family, mirror[family]]), np.tile(step, 2)
     order = np.lexsort((family, step))
@@ -275,7 +281,7 @@ def _in_order(family: IntArray, step: IntArray, mirror: IntArray | None) -> tupl
 
 
 def _steps(normal: Array, F: Array, count: int) -> Array:
-    """Rows (count, c, n) of the steps 0 .. count - 1."""
+    """Rows (count, c, n) of the steps 0 to count - 1."""
     steps = [normal]
     for _ in range(count - 1):
         steps.append(steps[-1] @ F)
@@ -283,11 +289,11 @@ def _steps(normal: Array, F: Array, count: int) -> Array:
 
 
 def _half(normal: Array, families: IntArray) -> tuple[IntArray, IntArray | None]:
-    """Half of the bounds and the mirror image of each, when all have one; else all, and None."""
+    """Half of the bounds with their mirror images, if all have one; else all, and None."""
     opposite = np.all(normal[families, None] == -normal[None, families], axis=2)
     partner = np.argmax(opposite, axis=1) if len(families) else families
     ahead = np.arange(len(families))
-    # Duplicated bounds share a mirror image: pairing is then not one to one.
+    # Duplicated bounds share a mirror image, so that pairing is not one to one.
     if not np.all(np.any(opposite, axis=1)) or np.any(partner[partner] != ahead):
         return families, None
     mirror = np.arange(len(normal))

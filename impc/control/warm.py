@@ -1,7 +1,7 @@
-"""Compile what simulations and fits run, so that nobody waits for it later.
+"""Compile the numba code of simulations and fits in advance (docs/howto/speed.md).
 
-A cart is simulated in each way that has compiled code of its own: with and without derivatives, by
-a named solver, and with a body that is not linear (docs/speed.md).
+A cart is simulated in each way that has its own compiled code: with and without derivatives, with
+a named solver, and with a nonlinear body.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _system() -> control.StateSpace:
 
 
 def cart() -> tuple[Controller, Scenario]:
-    """The law that holds a cart, and what moves it."""
+    """A controlled cart and a scenario."""
     plant = Plant(_system(), ["u"])
     bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
     law = Controller.from_gain(plant, [[8.0, 4.0]], bounds, 5, terminal_set=False)
@@ -50,7 +50,7 @@ def cart() -> tuple[Controller, Scenario]:
 
 
 def compiled_parts() -> Iterator[str]:
-    """Compile one part after the other; yield what each is for when it is done."""
+    """Compile one part after the other and yield its description."""
     law, drive = cart()
     simulate_and_differentiate(law, drive, directions(law, 2, x0=np.eye(2)))
     simulate(replace(law, solver="daqp"), drive)
@@ -61,4 +61,4 @@ def compiled_parts() -> Iterator[str]:
     bent = Plant(_system(), ["u"], body=ca.Function("body", [x, w], [moved]))
     bent_law = replace(law, plant=bent, bounds=Bounds(bent, u_min=-_LIMIT, u_max=_LIMIT))
     simulate_and_differentiate(bent_law, drive, directions(bent_law, 2, x0=np.eye(2)))
-    yield "bodies that are not linear"
+    yield "nonlinear bodies"

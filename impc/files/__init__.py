@@ -1,1 +1,1 @@
-"""Recordings in files: tables of any format, what their columns mean, checks, resampling."""
+"""Recordings in files: reading of all formats, configuration, checks, resampling."""

@@ -1,10 +1,8 @@
-"""Files read in a process of their own, with a limit on memory and time.
+"""Read files in a separate process with limits on memory and computing time.
 
-HDF5 and scipy's reader of MATLAB 5 are compiled, and nptdms and c3d take what a header says: a
-damaged file can end their process, fill the memory, or never end. One process serves a whole run:
-it starts with the first file, by the one interpreter and none of the user's modules, and is
-replaced when a file ends it. Requests and answers are pickles in its pipes, and it ends when they
-close.
+The format libraries are compiled or trust file headers: a damaged file can crash the process, fill
+the memory or never end. One process serves a whole run. It imports none of the user's modules, is
+replaced when a file ends it, and exchanges pickles through its pipes.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from impc.errors import DataError, ImpcError, InputError, brief
 from impc.files.disk import damaged
 from impc.files.table import Table
 
-#: Module, function and library of each format that is read here.
+#: Module, function and library of each format that is read in the separate process.
 READERS = {
     "matlab": ("impc.files.matlab", "read_matlab", "scipy.io"),
     "matrices": ("impc.files.matlab", "read_matrices", "scipy.io"),
@@ -38,15 +36,14 @@ READERS = {
     "spreadsheet": ("impc.files.spreadsheet", "read_spreadsheet", "python_calamine"),
     "cells": ("impc.files.spreadsheet", "read_cells", "python_calamine"),
 }
-# Seconds of computing that a file may take: measured, 1.5 s for 100 MB of HDF5 and 6 s for a C3D
-# of 10 MB (60 000 frames), which is the slowest.
+# CPU seconds allowed for a file. Measured: 1.5 s for 100 MB of HDF5, 6 s for 10 MB of C3D.
 _SECONDS, _SECONDS_A_MEGABYTE = 10, 2
-# Bytes that reading may take: a reader holds the file's arrays up to three times.
+# Bytes of memory allowed for a file: a reader holds its arrays up to three times.
 _ROOM, _ROOM_A_BYTE = 800_000_000, 3
-# Where the system bounds no address space, the size is looked at this often, in seconds.
+# Interval in s at which the process size is checked where the system cannot limit it.
 _LOOK = 0.02
 _BOUNDED = sys.platform == "linux"
-# -P: never from the folder in which the command was typed. The package is the one that is running.
+# -P: do not import from the current folder; argv[1] is the folder of the running package.
 _START = """
 import sys
 try:
@@ -62,30 +59,24 @@ _ENVIRONMENT = {
 }
 _KILLED = getattr(signal, "SIGKILL", 9)
 _lock = threading.Lock()
-# By the process that started it: a fork has one of its own.
+# By process id of the parent: a forked process starts its own reader.
 _children: dict[int, subprocess.Popen[bytes]] = {}
 
 
 def read_apart(kind: str, path: Path, largest: int, sheet: str = "") -> Table:
-    """Read the file at `path` in a process of its own: `kind` is a key of `READERS`.
-
-    Its arrays take `largest` bytes at most; `sheet` is that of a workbook, where one is asked for.
-    """
+    """Read `path` with reader `kind` (a key of `READERS`); arrays take at most `largest` bytes."""
     given = (path.absolute(), largest, sheet) if sheet else (path.absolute(), largest)
     found = _read(path, kind, *given)
     if found.rate is not None and not 0 < found.rate < math.inf:
-        problem = f"says {found.rate:g} samples per second"
-        raise DataError(str(path), problem, "export it again with its rate")
+        problem = f"states a rate of {found.rate:g} samples per second"
+        raise DataError(str(path), problem, "export it again with its sampling rate")
     for values in found.columns.values():
         values.flags.writeable = False
     return Table(str(path), found.columns, found.units, found.rate, found.skipped, found.notes)
 
 
 def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
-    """What a .mat file of version 5 to 7 at `path` holds of a saved plant, by name.
-
-    Real arrays, (rows, columns) or more, of `largest` bytes at most, and lists of text.
-    """
+    """Numeric arrays and lists of text in a .mat file (version 5 to 7) with a saved plant."""
     try:
         found: dict[str, Any] = _read(path, "matrices", path.absolute(), largest)
     except DataError as error:
@@ -94,30 +85,26 @@ def matrices_apart(path: Path, largest: int) -> dict[str, Any]:
 
 
 def cells_apart(path: Path, largest: int) -> list[list[str]]:
-    """The rows of the first sheet of the workbook at `path`, cells as texts.
-
-    It may unpack to `largest` bytes.
-    """
+    """Rows of the first sheet of a workbook as text; it may unpack to `largest` bytes."""
     found: dict[str, list[list[str]]] = _read(path, "cells", path.absolute(), largest)
     return found["cells"]
 
 
 def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] | None:
-    """The named groups of a `pattern` that matches a whole `text`; None when it does not.
+    """Named groups of a `pattern` that matches the whole `text`; None without a match.
 
-    Some patterns of users, such as ``(a+)+x``, take longer than anybody lives; `subject` is for the
-    message.
+    Runs apart because patterns such as ``(a+)+x`` need exponential time; `subject` is for messages.
     """
     try:
         found: dict[str, str | None] | None = _asked(subject, "match", (pattern, text), 0)
     except DataError:
         problem = f"cannot be matched with {text[:80]!r} in {_SECONDS} s"
-        raise InputError(subject, problem, "write no repetition within a repetition") from None
+        raise InputError(subject, problem, "remove nested repetitions such as (a+)+") from None
     return found
 
 
 def _read(path: Path, kind: str, *given: Any) -> Any:
-    """What the reader of a `kind` returns; messages name the file as it was given."""
+    """Result of reader `kind`; error messages name the file as the user gave it."""
     try:
         return _asked(str(path), kind, given, path.stat().st_size)
     except ImpcError as error:
@@ -126,7 +113,7 @@ def _read(path: Path, kind: str, *given: Any) -> Any:
 
 
 def _asked(source: str, kind: str, given: tuple[Any, ...], size: int) -> Any:
-    """The answer of the process that is there, or of a new one."""
+    """Send a request to the reader process (started if needed) and return its answer."""
     room, seconds = _ROOM + _ROOM_A_BYTE * size, _SECONDS + _SECONDS_A_MEGABYTE * size // 1_000_000
     done = threading.Event()
     with _lock:
@@ -141,7 +128,7 @@ def _asked(source: str, kind: str, given: tuple[Any, ...], size: int) -> Any:
             found = pickle.load(child.stdout)
         except (EOFError, OSError):
             found = _why(source, kind, _ended(), room, seconds)
-        except BaseException:  # interrupted: its answer would be taken for the next one's
+        except BaseException:  # interrupted: its late answer would be taken for the next one's
             _ended()
             raise
         finally:
@@ -155,7 +142,7 @@ def _asked(source: str, kind: str, given: tuple[Any, ...], size: int) -> Any:
 
 
 def _watch(pid: int, room: int, done: threading.Event) -> None:
-    """End a process that grows too large, where the system does not see to it."""
+    """Kill a process that outgrows `room` bytes, on systems without a memory limit."""
     import psutil  # noqa: PLC0415  # not on Linux
 
     with contextlib.suppress(psutil.Error):
@@ -167,7 +154,7 @@ def _watch(pid: int, room: int, done: threading.Event) -> None:
 
 
 def _running(source: str) -> subprocess.Popen[bytes]:
-    """The process that is there, or a new one."""
+    """Return the reader process; start one if there is none."""
     child = _children.get(os.getpid())
     if child is not None and child.poll() is None:
         return child
@@ -189,7 +176,7 @@ def _running(source: str) -> subprocess.Popen[bytes]:
 
 @atexit.register
 def _ended() -> int:
-    """End the process that is there; what it ended with."""
+    """End the reader process and return its exit status."""
     child = _children.pop(os.getpid(), None)
     if child is None:
         return 0
@@ -200,11 +187,11 @@ def _ended() -> int:
 
 
 def _why(source: str, kind: str, status: int, room: int, seconds: int) -> DataError:
-    """Why a process ended, and what to do."""
+    """Error that explains why the reader process ended, with a remedy."""
     again = "copy or export it again"
     if status in (-getattr(signal, "SIGXCPU", 0), 1):  # 1: `faulthandler` ended it
-        return DataError(source, f"takes longer than {seconds} s to read: it is damaged", again)
-    # Libraries in Rust abort where they are given no more memory.
+        return DataError(source, f"takes longer than {seconds} s to read; probably damaged", again)
+    # Rust libraries abort if an allocation fails.
     rust = READERS.get(kind, ("",))[-1] == "python_calamine"
     if status == -_KILLED or (rust and status == -signal.SIGABRT):
         problem = f"takes more than {room / 1e9:.1f} GB to read"
@@ -214,9 +201,9 @@ def _why(source: str, kind: str, status: int, room: int, seconds: int) -> DataEr
 
 
 def serve() -> None:
-    """Answer requests until the input ends; in the process that reads."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asks is interrupted, and ends this
-    # What libraries print must not stand among the answers.
+    """Answer requests until the input ends (runs in the reader process)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
+    # Keep what libraries print out of the pipe with the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     while True:
@@ -224,8 +211,8 @@ def serve() -> None:
             kind, given, room, seconds = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
-        for module in READERS.get(kind, ())[::2]:  # so that its limits are for the file alone
-            with contextlib.suppress(ImportError):  # the reader says so
+        for module in READERS.get(kind, ())[::2]:  # imports must not count towards the limits
+            with contextlib.suppress(ImportError):  # reported by the reader
                 import_module(module)
         _limit(room, seconds)
         found = _found(kind, given)
@@ -235,10 +222,9 @@ def serve() -> None:
 
 
 def _limit(room: int, seconds: int) -> None:
-    """No more than so much memory and so many seconds, whatever a library does.
+    """Limit memory, and computing time in s; wall-clock time to ten times as long.
 
-    Seconds are of computing, so that a busy machine changes no verdict; a file that makes its
-    library wait is ended by the clock after ten times as long.
+    CPU seconds keep the result independent of the machine's load.
     """
     faulthandler.dump_traceback_later(10 * seconds, exit=True)
     if sys.platform == "win32":
@@ -256,7 +242,7 @@ def _limit(room: int, seconds: int) -> None:
 
 
 def _found(kind: str, given: tuple[Any, ...]) -> Any:
-    """What a reader returns, or the error that it raises."""
+    """Return the result of a reader, or the error that it raised."""
     try:
         if kind == "match":
             match = re.fullmatch(*given)
@@ -265,6 +251,6 @@ def _found(kind: str, given: tuple[Any, ...]) -> Any:
         return getattr(import_module(module), function)(*given)
     except (ImpcError, MemoryError) as error:
         return error.with_traceback(None)
-    # The libraries meet damaged files with any exception: struct.error, KeyError, AssertionError.
+    # With damaged files the libraries raise anything: struct.error, KeyError, AssertionError.
     except Exception as error:
         return damaged(str(given[0]), error)

@@ -1,23 +1,22 @@
-"""What offset, drift and order of a trial's signals say about its sensors and columns.
+"""Check a trial for sensor offset, drift and misaligned columns by linear regression.
 
-One step ahead, by least squares, with L lags and k/N from -1/2 to 1/2,
+One-step prediction by least squares, with L lags and k/N from -1/2 to 1/2,
 
     y_k = c_0 + c_1 k/N + sum_i a_i y_(k-i) + sum_j b_j d_(k-j) + e_k.
 
-Where the sensor's zero is the equilibrium, c = 0, wherever the perturbation moves the loop. The
-first effects of a perturbation, C E, C A E and C A^2 E, are those of the plant alone; with later
-ones free, the residual is least at the lag at which it acts.
+If the sensor's zero is the equilibrium, c = 0 for any perturbation. The first effects of a
+perturbation, C E, C A E and C A^2 E, depend on the plant alone; with later effects free, the
+residual is smallest at the lag at which the perturbation acts.
 
-No effect comes before its cause. Perturbation and response are averaged to 20 samples per second.
-An autoregression turns the one into white noise and is applied to the other as well (Box and
-Jenkins, Time Series Analysis, section 11.2); their cross-correlation
+Order of cause and effect: perturbation and response are averaged to 20 samples per second. An
+autoregression that whitens the perturbation is applied to both (Box and Jenkins, Time Series
+Analysis, section 11.2). Their cross-correlation
 
     c(l) = sum_t d(t) y(t + l) / sqrt(sum d^2 sum y^2)
 
-is then proportional to the impulse response between them, and of standard deviation 1/sqrt(n) where
-there is none. Of 100 simulated pairs without a connection, at 30 s and at 120 s, none exceeded 4
-deviations. A lead is seen once it reaches half the rise time of the response: 0.2 s for a natural
-frequency of 0.5 Hz.
+is then proportional to the impulse response, with standard deviation 1/sqrt(n) if the two are
+independent. A lead is detected once it reaches half the rise time of the response (0.2 s for a
+natural frequency of 0.5 Hz).
 """
 
 from __future__ import annotations
@@ -32,20 +31,17 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array, IntArray
 
-_PAST, _PAST_ROWS = 6, 8  # for offset and drift, and for rows
-_KNOWN = 3  # effects that the plant alone decides: no controller reacts before
-_REACH = 4  # rows by which lags are tried; the outermost are no answer
-_SAMPLES = 5  # for each unknown, below which nothing is said
+_PAST, _PAST_ROWS = 6, 8  # lags in the tests of offset and drift, and of shifted rows
+_KNOWN = 3  # effects that the plant alone determines: no controller reacts earlier
+_REACH = 4  # largest lag tried, in rows; a best lag at either end is not accepted
+_SAMPLES = 5  # samples needed for each unknown
 _CERTAIN = 2.5  # standard errors
-_MARGIN = 25.0  # of 2 log likelihood, by which one lag beats all others
-_SHARE = 0.04  # of the variance of the residual, which one lag saves compared with all others
+_MARGIN = 25.0  # by which 2 log-likelihood of one lag must exceed all others
+_SHARE = 0.04  # share of residual variance that one lag must save over all others
 
 
 def departures(response: Array, disturbances: Sequence[Array]) -> tuple[float, float]:
-    """Offset and drift over the trial of a `response` (samples,), in its unit; 0 if not certain.
-
-    The `disturbances` are (samples,) each.
-    """
+    """Offset of `response` (samples,), and its drift over the trial; 0 if not significant."""
     count = len(response)
     now = np.arange(_PAST, count)
     size = float(np.std(response))
@@ -68,9 +64,9 @@ def departures(response: Array, disturbances: Sequence[Array]) -> tuple[float, f
 
 
 def rows_later(outputs: Array, disturbance: Array, effects: Array) -> int:
-    """By how many rows a `disturbance` (samples,) acts later than recorded; 0 where none is better.
+    """Rows by which a `disturbance` (samples,) acts later than recorded; 0 if undecided.
 
-    `outputs` is (samples, p); `effects` (3, p) those of one unit of it one to three samples later.
+    `outputs` (samples, p); `effects` (3, p): response to a unit disturbance 1 to 3 samples later.
     """
     lags = range(-_REACH, _REACH + 1)
     now = np.arange(_PAST_ROWS + _REACH, len(outputs) - _REACH)
@@ -87,13 +83,13 @@ def rows_later(outputs: Array, disturbance: Array, effects: Array) -> int:
             free[place] += _likelihood(past[0], [*past[1:], *shifted[1:]])
     best, second = np.argsort(likely)[[-1, -2]]
     margin = likely[best] - likely[second]
-    # The plant's own effects must explain more than effects unlike them would add.
+    # The plant's known effects must explain more than unrestricted effects gain.
     clear = margin > max(_MARGIN, _SHARE * len(now), free[best] - likely[best])
     return lags[best] if clear and abs(lags[best]) < _REACH else 0
 
 
 def _likelihood(values: Array, terms: Sequence[Array]) -> float:
-    """Twice the logarithm of the likelihood of `values` as a combination of terms."""
+    """Twice the log-likelihood of `values` regressed on `terms`."""
     system = np.column_stack(terms)
     left = values - system @ np.linalg.lstsq(system, values, rcond=None)[0]
     return float(-len(values) * np.log(left @ left + 1e-12 * (values @ values)))
@@ -104,60 +100,62 @@ def _past(values: Array, now: IntArray, first: int, last: int) -> list[Array]:
 
 
 def _known(shifted: Sequence[Array], first: Array, ago: int) -> Array:
-    """What of a sample `ago` samples ago is the effect of the disturbance by the plant alone."""
+    """Part of a sample, `ago` samples back, that the plant's known effects explain."""
     parts = [first[i - ago - 1] * shifted[i] for i in range(ago + 1, _KNOWN + 1)]
     return np.sum(parts, axis=0) if parts else np.zeros(len(shifted[0]))
 
 
-_RATE = 20.0  # samples per second: sway has little above 5 Hz, and differences raise noise
+_RATE = 20.0  # samples per second: sway has little power above 5 Hz
 _ORDER = 1.0  # s, of the autoregression
-_LONGEST = 3.0  # s, of the lags that are looked at
-_DEVIATIONS = 4.0  # of chance that a correlation must exceed
-_BEFORE = 0.5  # largest before the cause over largest behind it, from which it is a finding
-_REPEATS = 0.5  # autocorrelation from which the perturbation repeats itself within the lags
-_SHORTEST = 400  # samples below which a missing connection says nothing
+_LONGEST = 3.0  # s, largest lag
+# Correlations must exceed this many standard deviations: of 100 simulated pairs without a
+# connection, at 30 s and at 120 s, none exceeded 4.
+_DEVIATIONS = 4.0
+_BEFORE = 0.5  # ratio of the largest correlation at leads to that at lags, from which to report
+_REPEATS = 0.5  # autocorrelation from which a perturbation counts as periodic within the lags
+_SHORTEST = 400  # samples below which a missing correlation is not reported
 
 
 def misaligned(disturbance: Array, response: Array, dt: float) -> str:
-    """What is wrong with the order of cause and effect, as the end of a sentence; or nothing.
+    """Problem in the order of `disturbance` and `response` (end of a sentence), or "".
 
-    The `disturbance` (samples,) and the `response` (samples,) are on the plant's clock of `dt` s.
+    Both are (samples,), sampled with the plant's step `dt` in s.
     """
     width = max(1, round(1 / (_RATE * dt)))
     step = width * dt
     cause, effect = (_averaged(values, width) for values in (disturbance, response))
     order = min(round(_ORDER / step), len(cause) // 10)
     if order < 2 or np.ptp(cause) == 0 or np.ptp(effect) == 0:
-        return ""  # too short to say
+        return ""  # too short
     cause, effect = _whitened(cause, effect, order)
     lags = min(round(_LONGEST / step), len(cause) // 4)
     if np.abs(_correlation(cause, cause, 2 * lags)[2 * lags + 1 :]).max() > _REPEATS:
-        return ""  # a sinusoid: a lead cannot be said from a lag
+        return ""  # periodic: leads and lags cannot be distinguished
     strength = np.abs(_correlation(cause, effect, lags)) * np.sqrt(len(cause))
     before, behind = strength[:lags], strength[lags:]
     if strength.max() < _DEVIATIONS:
         if len(cause) < _SHORTEST:
             return ""
-        return "has nothing in common with it beyond chance: a wrong column or trial?"
+        return "is not correlated with the disturbance beyond chance; check column and trial"
     if before.max() < max(_DEVIATIONS, _BEFORE * behind.max()):
         return ""
     lead = (lags - int(np.argmax(before))) * step
     return (
-        f"comes before it: their correlation is {before.max():.1f} deviations from chance at a "
-        f"lead of {lead:.2g} s and at most {behind.max():.1f} behind it; shift one of the two, or "
-        "name the right column"
+        f"precedes the disturbance: their correlation is {before.max():.1f} standard "
+        f"deviations at a lead of {lead:.2g} s and at most {behind.max():.1f} at any lag; shift "
+        "one of the two, or name the right column"
     )
 
 
 def _averaged(values: Array, width: int) -> Array:
-    """Means over `width` samples, without their mean."""
+    """Block means over `width` samples, centred."""
     count = len(values) // width
     means = values[: count * width].reshape(count, width).mean(axis=1)
     return np.asarray(means - means.mean())
 
 
 def _whitened(cause: Array, effect: Array, order: int) -> tuple[Array, Array]:
-    """Both through the filter that makes the cause white: Yule and Walker's equations."""
+    """Filter both with the autoregression that whitens the cause (Yule-Walker equations)."""
     size = len(cause)
     covariance = np.array([cause[: size - lag] @ cause[lag:] for lag in range(order + 1)])
     covariance[0] *= 1 + 1e-6  # a perturbation of few frequencies is predicted exactly

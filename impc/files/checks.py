@@ -1,8 +1,7 @@
-"""What can be wrong with a recorded channel, one small function a check.
+"""Checks of a recorded channel, one function each.
 
-A check raises `DataError` when the channel cannot be used, and returns a finding, one sentence for
-the report, when it can. An empty string: nothing to say. Every message names file, signal and
-column, how many samples, and where the first is.
+A check raises `DataError` if the channel cannot be used; otherwise it returns a sentence for the
+report, or "". Messages name file, signal and column, the number of samples, and the first of them.
 """
 
 from __future__ import annotations
@@ -19,27 +18,26 @@ if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray
     from impc.files.units import Unit
 
-#: How the message of a fall begins.
+#: First words of the message about a fall.
 FELL = "the subject fell"
-# Share of samples that rest on an extreme value: above the first a finding, above the second no
-# use. A sinusoid in coarse steps rests on its extremes too, but at most 2.4 times as long as on the
-# next step (square roots of 2 and 4 steps); so three times is asked for.
+# Share of samples at an extreme value: above the first a finding, above the second an error. A
+# coarsely quantised sinusoid stays at its extremes at most 2.4 times as long as at the next step
+# (for 2 and 4 steps), so a factor of 3 is required.
 _CLIPPED, _TOO_CLIPPED = 0.01, 0.05
 _NEXT = 3.0
-# A response stands still where it keeps a value so many times longer than anywhere else, for so
-# many samples at least, and in so many places at most.
+# A sensor failed where it keeps a value this many times longer than elsewhere, for at least this
+# many samples, in at most this many stretches.
 _LONGER, _STILL, _EPISODES = 4, 10, 20
-# A jump is so many times the usual step, and is no accident when it leads to one value so often.
+# A jump is this many times the usual step; reported if it leads to one value this often.
 _JUMP, _AGAIN = 6, 3
 _BALANCED = 0.05  # share of a trial before a fall
 _MISSING = 0.5  # share of an output or a command that may be missing
-# Largest deviations of an angle, rad: more than half a turn is no posture; 0.2 deg is the size of
-# 11.5 deg that were recorded in rad and called deg.
+# Plausible range of an angle, rad: a posture spans at most half a turn; 0.2 deg is the span left of
+# 11.5 deg that were recorded in rad and labelled deg.
 _TURN, _WIDE, _TINY = np.pi, 1.0, np.deg2rad(0.2)
-
-# In SI units. Fourth powers of both are still numbers, and nothing measured comes near.
+# Plausible sizes in SI units; their fourth powers are still finite floating-point numbers.
 _LARGEST, _SMALLEST = 1e50, 1e-50
-# The plant's samples for one of the recording: milliseconds taken for seconds are 1000.
+# Largest ratio of recording period to plant step; milliseconds read as seconds give 1000.
 _SLOWER = 50
 
 
@@ -47,9 +45,9 @@ _SLOWER = 50
 class Channel:
     """One recorded signal, before it is resampled."""
 
-    source: str  # File, name in the plant, name in the file
-    signal: str
-    column: str
+    source: str  # file
+    signal: str  # name in the plant
+    column: str  # name in the file
     unit: Unit
     time: Array  # (samples,), s, on the file's clock
     values: Array  # (samples,), in `unit`, after offset and sign
@@ -60,15 +58,12 @@ class Channel:
         return f"{self.source}: {self.signal} (column {self.column!r})"
 
     def at(self, index: int) -> str:
-        """Where the sample `index` is, for messages."""
+        """Number and time of a sample, for messages."""
         return f"sample {index + 1} ({self.time[index]:.6g} s)"
 
 
 def unit_of_the_file(channel: Channel, stated: Unit | None, overruled: bool) -> str:
-    """The unit that the file gives must be that of the configuration, unless it is overruled.
-
-    A file that says "1" gives none.
-    """
+    """Require that the file's unit (if not "1") agrees with the configuration or is overruled."""
     if stated is None or (
         stated.base == channel.unit.base and np.isclose(stated.factor, channel.unit.factor)
     ):
@@ -76,19 +71,19 @@ def unit_of_the_file(channel: Channel, stated: Unit | None, overruled: bool) -> 
     key = f"signals.{channel.signal}"
     if overruled or (stated.base == "dimensionless" and stated.factor == 1):
         return (
-            f"{channel.name}: taken in {channel.unit.written!r} by {key}, where the file says "
+            f"{channel.name}: read in {channel.unit.written!r} as {key} says; the file states "
             f"{stated.written!r}"
         )
     raise DataError(
         channel.name,
-        f"is in {channel.unit.written!r} by the configuration and in {stated.written!r} by the "
-        "file",
-        f"correct {key}.unit, or write {key}.overrule_unit = true if the file is wrong",
+        f"has the unit {channel.unit.written!r} in the configuration and {stated.written!r} in "
+        "the file",
+        f"correct {key}.unit, or set {key}.overrule_unit = true if the file is wrong",
     )
 
 
 def measurable(channel: Channel) -> str:
-    """Values that no measurement has: infinite almost, or all but nothing."""
+    """Reject values that are implausibly large or small."""
     sizes = np.where(np.isfinite(channel.values), np.abs(channel.values), 0)
     first = int(np.argmax(sizes))
     factor = channel.unit.factor
@@ -96,24 +91,24 @@ def measurable(channel: Channel) -> str:
         raise DataError(
             channel.name,
             f"is {channel.values[first]:.3g} {channel.unit.written} in {channel.at(first)}, which "
-            "is no measurement",
-            f"correct the column, or offset and unit in signals.{channel.signal}",
+            "is implausible",
+            f"check the column, and offset and unit in signals.{channel.signal}",
         )
     return ""
 
 
 def comparable_rates(subject: str, period: float, dt: float) -> None:
-    """Require that a recording is not much slower than the plant: its `period`, and `dt`, in s."""
+    """Require that a recording is not much slower than the plant; `period` and `dt` in s."""
     if period > _SLOWER * dt:
         raise DataError(
             subject,
-            f"has a sample every {period:.4g} s, and the plant one every {dt:.4g} s",
-            "correct recording.time_unit or rate, or give the plant a longer dt",
+            f"has a sample every {period:.4g} s, far slower than the plant (dt = {dt:.4g} s)",
+            "correct recording.time_unit or rate, or use a plant with a longer dt",
         )
 
 
 def gaps(channel: Channel, fill_gaps: float) -> BoolArray:
-    """Missing samples in stretches longer than `fill_gaps`, in s, or at an end (samples,)."""
+    """Mask (samples,) of missing samples at an end, or in gaps longer than `fill_gaps` s."""
     lost = ~np.isfinite(channel.values)
     kept = np.flatnonzero(~lost)
     after = np.searchsorted(kept, np.arange(len(lost)))
@@ -124,9 +119,9 @@ def gaps(channel: Channel, fill_gaps: float) -> BoolArray:
 
 
 def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str:
-    """Samples of a `channel` that are missing or not finite; `fill_gaps`, in s, may be bridged.
+    """Report samples that are missing or not finite; gaps up to `fill_gaps` s may be filled.
 
-    `keep` says whether longer gaps count as not measured; None where they cannot.
+    `keep`: whether longer gaps count as not measured; None if they never can.
     """
     finite = np.isfinite(channel.values)
     lost = np.flatnonzero(~finite)
@@ -141,11 +136,11 @@ def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str
         share = float(np.mean(left))
         if share > _MISSING:
             remedy = "leave the trial out: at most half of a signal may be missing"
-            raise DataError(channel.name, f"{found}: {share:.0%} of them", remedy)
+            raise DataError(channel.name, f"{found}; {share:.0%} lie in long gaps", remedy)
         filled = "; the others filled by interpolation" if left.sum() < len(lost) else ""
         return f"{channel.name}: {found}; {100 * share:.2g} % count as not measured{filled}"
     remedy = "cut with recording.start and stop, or repair the file"
-    remedy += ", or write recording.keep_gaps = true" if keep is False else ""
+    remedy += ", or set recording.keep_gaps = true" if keep is False else ""
     if len(kept) == 0 or not finite[0] or not finite[-1]:
         raise DataError(channel.name, f"{found}, at an end of the recording", remedy)
     times = channel.time[kept]
@@ -154,25 +149,25 @@ def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str
         raise DataError(
             channel.name,
             f"{found}, the longest stretch {bridged.max():.4g} s",
-            f"{remedy}, or allow recording.fill_gaps (now {fill_gaps:g} s)",
+            f"{remedy}, or raise recording.fill_gaps (now {fill_gaps:g} s)",
         )
     return f"{channel.name}: {found}; filled by interpolation"
 
 
 def constant(channel: Channel) -> str:
-    """A channel that never changes: an unplugged sensor, a perturbation that never acted."""
+    """Reject a constant channel: unplugged sensor, or perturbation that never acted."""
     values = channel.values[np.isfinite(channel.values)]
     if np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
         raise DataError(
             channel.name,
             f"is constant at {values[0]:.6g} {channel.unit.written} in all {len(values)} samples",
-            "name the right column; a disturbance may be left out",
+            "name the right column, or leave out a disturbance that does not act",
         )
     return ""
 
 
 def clipped(channel: Channel) -> str:
-    """A response that rests on its extreme values: an amplifier or converter at its end."""
+    """Report a response that stays at its extreme values: amplifier or converter saturated."""
     finite = channel.values[np.isfinite(channel.values)]
     span = np.ptp(finite)
     levels = np.unique(finite)
@@ -195,23 +190,23 @@ def clipped(channel: Channel) -> str:
 
 
 def stretches(channel: Channel) -> str:
-    """A response that stands still within its range, or jumps to one value and back."""
+    """Report a response that freezes within its range, or repeatedly jumps to one value."""
     values, finite = channel.values, np.isfinite(channel.values)
     steps = np.abs(np.diff(values))
     ends = np.flatnonzero(~(steps == 0)) + 1
     starts, ends = np.append(0, ends), np.append(ends, len(values))
-    ends_of_range = (np.nanmin(values), np.nanmax(values))  # where it is clipped
+    ends_of_range = (np.nanmin(values), np.nanmax(values))  # reported by `clipped`
     extreme = np.isin(values[starts], ends_of_range)
     lengths = np.where(extreme, 1, ends - starts)
     sizes = np.sort(lengths)[::-1]
     gaps = np.flatnonzero(sizes[:-1] >= _LONGER * sizes[1:])[:1]
     if len(gaps) and gaps[0] < _EPISODES and sizes[gaps[0]] >= _STILL:
         still = lengths >= sizes[gaps[0]]
-        first, often = int(starts[np.argmax(still)]), "time" if still.sum() == 1 else "times"
+        first, often = int(starts[np.argmax(still)]), "stretch" if still.sum() == 1 else "stretches"
         return (
-            f"{channel.name} stands still {still.sum()} {often}, {lengths[still].sum()} samples "
-            f"in all, the first at {values[first]:.6g} {channel.unit.written} from "
-            f"{channel.at(first)}: did the sensor fail? cut it with recording.start and stop"
+            f"{channel.name} is constant in {still.sum()} {often}, {lengths[still].sum()} samples "
+            f"in total, the first at {values[first]:.6g} {channel.unit.written} from "
+            f"{channel.at(first)}: the sensor may have failed; cut it with recording.start and stop"
         )
     moves = steps[np.isfinite(steps) & (steps > 0)]
     inside = (starts > 0) & (ends < len(values)) & finite[starts]
@@ -224,13 +219,13 @@ def stretches(channel: Channel) -> str:
     lost = values == value
     return (
         f"{channel.name} jumps to {value:.6g} {channel.unit.written} and back {times.max()} times, "
-        f"in {lost.sum()} samples, the first {channel.at(int(np.argmax(lost)))}: samples that were "
-        "lost? leave them empty in the file, and allow recording.fill_gaps"
+        f"in {lost.sum()} samples, the first {channel.at(int(np.argmax(lost)))}: if it marks lost "
+        "samples, leave them empty in the file and set recording.fill_gaps"
     )
 
 
 def beyond_the_stop(channel: Channel, limit: float) -> str:
-    """A value that the mechanical stop does not let happen; limit in the channel's unit."""
+    """Reject values beyond the mechanical stop; `limit` in the channel's unit."""
     beyond = np.abs(channel.values) > limit * (1 + 1e-9)
     if not beyond.any():
         return ""
@@ -238,7 +233,7 @@ def beyond_the_stop(channel: Channel, limit: float) -> str:
     raise _fault(
         channel,
         limit,
-        f"is beyond its stop of {limit:g} {channel.unit.written} in {beyond.sum()} of "
+        f"exceeds its mechanical stop of {limit:g} {channel.unit.written} in {beyond.sum()} of "
         f"{len(beyond)} samples, the first {channel.at(int(np.argmax(beyond)))}, "
         f"at most {largest:.4g}",
         f"correct unit, offset or limit in signals.{channel.signal}",
@@ -246,7 +241,7 @@ def beyond_the_stop(channel: Channel, limit: float) -> str:
 
 
 def degrees_for_radians(channel: Channel) -> str:
-    """An angle that is too large for a posture, or too small for a movement."""
+    """Check that an angle is neither too large for a posture nor too small for a movement."""
     if not channel.unit.angle:
         return ""
     finite = channel.values[np.isfinite(channel.values)] * channel.unit.factor
@@ -259,13 +254,13 @@ def degrees_for_radians(channel: Channel) -> str:
             _TURN / 2 / channel.unit.factor,
             f"spans {span / channel.unit.factor:.4g} {written}, more than half a turn, largest in "
             f"{where}",
-            "the column is in smaller units: degrees taken for radians?",
+            "correct its unit; the column may hold degrees instead of radians",
         )
     if channel.unit.factor < 1 and span < 2 * _TINY:
         raise DataError(
             channel.name,
-            f"spans {span / channel.unit.factor:.4g} {written} only",
-            'radians taken for degrees? write unit = "rad"',
+            f"spans only {span / channel.unit.factor:.4g} {written}",
+            'if the column holds radians, write unit = "rad"',
         )
     if span > _WIDE:
         return (
@@ -276,7 +271,7 @@ def degrees_for_radians(channel: Channel) -> str:
 
 
 def _fault(channel: Channel, beyond: float, problem: str, remedy: str) -> DataError:
-    """A fall, where the response goes `beyond` a value once and stays there; else the problem."""
+    """`FallError` if the response passes `beyond` once and stays there; else the problem."""
     size = np.abs(channel.values)
     first = int(np.argmax(size >= beyond))
     if first < _BALANCED * len(size) or np.any(size[first:] < beyond / 2):
@@ -291,7 +286,7 @@ def _fault(channel: Channel, beyond: float, problem: str, remedy: str) -> DataEr
 
 
 def too_few(source: str, samples: int, needed: int) -> str:
-    """Fewer samples of a `source` at the analysis rate than the `needed` ones."""
+    """Require the `needed` number of samples at the plant's rate."""
     if samples < needed:
         raise DataError(
             source,
@@ -302,6 +297,6 @@ def too_few(source: str, samples: int, needed: int) -> str:
 
 
 def _rests(resting: BoolArray) -> bool:
-    """Whether the value is held over at least three samples in a row."""
+    """Whether the value is held for at least three consecutive samples."""
     held = resting[:-2] & resting[1:-1] & resting[2:]
     return bool(held.any())

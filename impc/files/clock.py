@@ -1,4 +1,4 @@
-"""The clock of a recording: its period, its gaps, its jitter, and values on even instants."""
+"""The clock of a recording: period, gaps and jitter; resampling to uniform instants."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ if TYPE_CHECKING:
     from impc.files.configuration import RecordingTable
     from impc.files.table import Table
 
-# An interval this many periods long has lost a sample.
+# An interval of at least this many periods contains a lost sample.
 _GAP = 1.5
-# Deviation from an even clock, in periods, from which it is a finding and values are interpolated.
+# Deviation from a uniform clock, in periods, that is reported and makes values be interpolated.
 _JITTER = 0.01
-# Two statements of the rate that differ by more than this contradict each other.
+# Relative difference above which two statements of the rate contradict each other.
 _RATE = 1e-3
-# What no recorder has: a clock beyond 30 000 years (1.7e9 s is a count from 1970), a period outside
-# of these, in s, and more even instants for each sample, where gaps may be filled.
+# Plausible: clocks below 30 000 years (1.7e9 s counts from 1970), periods in this range in s, and
+# at most this many uniform instants for each sample, where gaps may be filled.
 _LONGEST, _PERIODS, _GAPS = 1e12, (1e-9, 1e6), 10
 
 
 @dataclass(frozen=True)
 class Clock:
-    """When the samples were taken."""
+    """Sampling instants of a recording."""
 
     time: Array  # (samples,), s, on the file's clock
-    rows: slice  # The rows of the file that are used, after the cut
-    steps: IntArray  # (samples,): even instant at which each sample was taken; 0 for the first
-    start: float  # s; the even instants are start + k period
-    period: float
-    findings: tuple[str, ...] = ()  # Gaps and jitter that were let pass
-    note: str = ""  # How its numbers were read, where nothing says it; empty otherwise
+    rows: slice  # rows of the file that are used, after the cut
+    steps: IntArray  # (samples,): index of the uniform instant of each sample; 0 for the first
+    start: float  # s; the uniform instants are start + k period
+    period: float  # s
+    findings: tuple[str, ...] = ()  # accepted gaps and jitter, for the report
+    note: str = ""  # how the numbers were read if the file does not say it
 
     @property
     def even(self) -> bool:
-        """Whether the samples stand on the even instants, so that they need no interpolation."""
+        """Whether the samples lie on uniform instants and need no interpolation."""
         return not self.findings
 
 
 def read_clock(table: Table, recording: RecordingTable) -> Clock:
-    """Read the clock, cut the recording, and check that its instants are even."""
+    """Read the clock, cut the recording, and require uniform sampling."""
     if recording.time is None:
         rate = _stated_rate(table, recording)
         _require_period(table.source, 1 / rate)
@@ -77,18 +77,18 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
 
 
 def counts_days(values: Array) -> bool:
-    """Whether a clock without a unit, `values` (samples,), has day numbers of Excel or MATLAB.
+    """Whether a clock without unit, `values` (samples,), holds day numbers of Excel or MATLAB.
 
-    Days since 1900 or the year 0; as seconds the recording would last less than a tenth of one.
+    These are days since 1900 or year 0; read as seconds, the recording would last under 0.1 s.
     """
     first, last = float(values[0]), float(values[-1])
     return (2e4 < first < 1e5 or 6e5 < first < 9e5) and 0 < last - first < 0.1
 
 
 def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
-    """A column by its `name`, with or without the unit behind it: its name in the file, its values.
+    """Name in the file and values (samples,) of column `name`, with or without its unit.
 
-    The values are (samples,); `place` is the key of the configuration that gives the name.
+    `place` is the configuration key that names the column, for messages.
     """
     short = name.rpartition(" (")[0] or name.rpartition(" [")[0]
     for known in (name, short):
@@ -112,16 +112,15 @@ def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
 
 
 def on_even_instants(clock: Clock, values: Array) -> Array:
-    """The `values` (samples,) at start + k period (instants,), of which there are steps[-1] + 1.
+    """Interpolate `values` (samples,) at the steps[-1] + 1 uniform instants (Akima).
 
-    Akima's interpolation where samples are missing, NaN, or late; the values themselves where the
-    clock is even and all are finite. The first and the last are.
+    Used if samples are missing, NaN or late; `values` must begin and end with finite numbers.
     """
     finite = np.isfinite(values)
     if clock.even and finite.all():
         return values
     instants = clock.start + clock.period * np.arange(clock.steps[-1] + 1)
-    # A late first sample is taken as it is; nothing is extrapolated.
+    # A late first sample is used as it is; nothing is extrapolated.
     inside = np.clip(instants, clock.time[0], clock.time[-1])
     spline = scipy.interpolate.Akima1DInterpolator(
         clock.time[finite], values[finite], method="makima"
@@ -134,13 +133,13 @@ def _stated_rate(table: Table, recording: RecordingTable) -> float:
     if given is None and stated is None:
         raise DataError(
             table.source,
-            "gives no clock and no rate",
-            "name the column with recording.time, or give recording.rate",
+            "has neither a time column nor a sampling rate",
+            "set recording.time or recording.rate",
         )
     if given is not None and stated is not None and abs(given - stated) > _RATE * stated:
         raise DataError(
             table.source,
-            f"says {stated:g} samples per second and recording.rate {given:g}",
+            f"states {stated:g} samples per second, but recording.rate is {given:g}",
             "correct recording.rate or leave it out",
         )
     rate = given if given is not None else stated
@@ -156,7 +155,7 @@ def _require_rising(subject: str, values: Array) -> None:
             f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}",
             "repair the clock, or give recording.rate instead",
         )
-    with np.errstate(over="ignore"):  # a step of more than the largest number is a step
+    with np.errstate(over="ignore"):  # steps beyond the largest float
         backward = np.diff(values) <= 0
     if backward.any():
         first = int(np.argmax(backward))
@@ -179,7 +178,7 @@ def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
         raise DataError(
             source,
             f"has {len(kept)} samples between recording.start and stop",
-            f"its clock runs from {time[0]:g} to {time[-1]:g} s",
+            f"choose them within the recording ({time[0]:g} to {time[-1]:g} s)",
         )
     for key, wanted, reached in (
         ("start", recording.start, float(time[0])),
@@ -192,29 +191,29 @@ def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
         if beyond:
             raise DataError(
                 source,
-                f"does not reach recording.{key} = {wanted:g} s",
-                f"its clock runs from {time[0]:g} to {time[-1]:g} s",
+                f"recording.{key} = {wanted:g} s lies outside the recording",
+                f"choose a value between {time[0]:g} and {time[-1]:g} s",
             )
     return slice(int(kept[0]), int(kept[-1]) + 1)
 
 
 def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock:
-    """Period by least squares over the samples, with gaps counted as whole periods."""
+    """Period by least squares over the samples; gaps count as whole periods."""
     intervals = np.diff(time)
     usual = intervals[intervals < _GAP * np.median(intervals)]
     rough = float(np.mean(usual))
     _require_period(subject, rough)
     if (instants := (time[-1] - time[0]) / rough) > _GAPS * len(time):
-        problem = f"has {len(time)} samples on {instants:.3g} even instants: the rest are gaps"
+        problem = f"has {len(time)} samples at {instants:.3g} uniform instants: the rest are gaps"
         raise DataError(subject, problem, "cut with recording.start and stop")
     counts = np.rint(intervals / rough).astype(np.int64)
     if (counts == 0).any():
         first = int(np.argmax(counts == 0))
         raise DataError(
             subject,
-            f"is uneven: an interval of {intervals[first]:.4g} s at {time[first]:.6g} s where "
+            f"is not uniform: an interval of {intervals[first]:.4g} s at {time[first]:.6g} s where "
             f"{rough:.4g} s are usual",
-            "export with an even clock",
+            "export with a constant sampling rate",
         )
     gaps = intervals > _GAP * rough
     findings = _gaps(subject, time, intervals, gaps, fill_gaps)
@@ -224,9 +223,9 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock
     if late.max() > _JITTER * period:
         worst = int(np.argmax(late))
         findings.append(
-            f"{subject}: jitter, {np.sum(late > _JITTER * period)} of {len(time)} samples are off "
-            f"an even clock by more than 1 % of its period, at most by {late.max() / period:.0%} "
-            f"(at {time[worst]:.6g} s); values were interpolated"
+            f"{subject}: jitter: {np.sum(late > _JITTER * period)} of {len(time)} samples deviate "
+            f"from a uniform clock by more than 1 % of its period, at most by "
+            f"{late.max() / period:.0%} (at {time[worst]:.6g} s); values were interpolated"
         )
     return Clock(time, rows, steps, float(time[0]) + start, period, tuple(findings))
 
@@ -245,17 +244,17 @@ def _gaps(
         raise DataError(
             subject,
             f"has {found}",
-            f"cut with recording.start and stop, or allow recording.fill_gaps "
+            f"cut with recording.start and stop, or raise recording.fill_gaps "
             f"(now {fill_gaps:g} s)",
         )
     return [f"{subject}: {found}; filled by interpolation"]
 
 
 def _require_period(subject: str, period: float) -> None:
-    """Require that a recorder can have the `period`, in s."""
+    """Require a plausible sampling period in s."""
     if not _PERIODS[0] <= period <= _PERIODS[1]:
         raise DataError(
             subject,
             f"has a sample every {period:.3g} s",
-            f"correct the rate or the clock's unit: {_PERIODS[0]:g} to {_PERIODS[1]:g} s can be",
+            f"correct the rate or the clock's unit ({_PERIODS[0]:g} to {_PERIODS[1]:g} s)",
         )

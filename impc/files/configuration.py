@@ -1,8 +1,8 @@
-"""What the columns of a recording mean: a short TOML file, checked at the door.
+"""Read and validate the TOML file that describes the columns of a recording.
 
-[recording] says time or rate, label and cut; [signals.NAME], one table a signal of the plant, says
-column, unit, stop, offset and sign; [plant], [fit] and [plan] are arguments of the plant and
-settings of the fit and of a plan, and not interpreted here.
+[recording] has clock or rate, label and cut; [signals.NAME], one table for each signal of the
+plant, has column, unit, mechanical stop, offset and sign. [plant], [fit] and [plan] are passed on
+and not interpreted here.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from impc.files.units import si_unit
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-#: What `impc inspect` writes where nothing says; it has to be filled in.
+#: Placeholder that `impc inspect` writes for an unknown unit; the user has to replace it.
 FILL_IN = "?"
 
 _LARGEST = 1_000_000
-_DEEPEST = 16  # tables within tables
+_DEEPEST = 16  # nested tables
 _DOTTED = re.compile(rf"""(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_DEEPEST}}}""")
 _LABELS = ("subject", "visit", "condition", "trial")
 _TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
@@ -44,87 +44,148 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The [recording] table."""
+    """The [recording] table.
 
-    time: str | None = None  # Column with the clock
-    time_unit: str | None = None  # Its unit; None takes the one that the file says, or seconds
-    # Samples per second, where there is no clock. Neither is needed for TDMS and C3D.
+    Attributes
+    ----------
+    time : str, optional
+        Column with the time of each sample.
+    time_unit : str, optional
+        Unit of the time column, such as "s" or "ms"; by default the unit stated in the file, or s.
+    rate : float, optional
+        Samples per second, if there is no time column. TDMS and C3D files need neither.
+    subject : str, optional
+        Code of the subject.
+    visit : str, optional
+        Visit (session).
+    condition : str, optional
+        Experimental condition.
+    trial : str, optional
+        Name of the trial; by default the name of the file.
+    pattern : str, optional
+        Regular expression that must match the whole file name without its ending. Its named
+        groups `subject`, `visit`, `condition` and `trial` give the label.
+    fill_gaps : float, optional
+        Longest gap in s that is filled by interpolation; 0 fills none.
+    keep_gaps : bool, optional
+        Whether longer gaps of outputs and commands count as not measured instead of an error.
+    start : float, optional
+        First time that is used, in s on the file's clock (from 0 if only a rate is given).
+    stop : float, optional
+        Last time that is used, in s on the file's clock.
+    sheet : str, optional
+        Sheet of a workbook; by default the first one with rows of numbers.
+    """
+
+    time: str | None = None
+    time_unit: str | None = None
     rate: Positive | None = None
-    subject: str = ""  # The label of the trial; empty where it is not said
+    subject: str = ""
     visit: str = ""
     condition: str = ""
     trial: str = ""
-    # Regular expression that the file's name without its ending must match as a whole; its named
-    # groups subject, visit, condition and trial give the label
     pattern: str | None = None
-    # Seconds; the longest gap that may be filled by interpolation. 0 fills none.
     fill_gaps: Annotated[float, msgspec.Meta(ge=0, le=_MOST)] = 0.0
-    # Whether longer gaps of outputs and commands count as not measured
     keep_gaps: bool = False
-    # Seconds on the file's clock, which begins at 0 where there is only a rate
     start: Finite | None = None
     stop: Finite | None = None
-    sheet: str = ""  # Of a workbook; empty for the first one with rows of numbers
+    sheet: str = ""
 
 
 class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A [signals.NAME] table: si value = sign * (column - offset) in SI base units."""
+    """A [signals.NAME] table: value in SI units = sign * (column - offset), converted.
 
-    column: str  # Column of the file
-    unit: str  # Its unit, as pint knows it
-    # Mechanical stop in this unit: the largest magnitude after offset and sign
+    Attributes
+    ----------
+    column : str
+        Column of the file.
+    unit : str
+        Unit of the column, as the library pint spells it, such as "deg", "rad/s" or "N*m".
+    limit : float, optional
+        Mechanical stop in `unit`: largest possible magnitude after offset and sign.
+    offset : float, optional
+        Reading of the sensor at zero, in `unit`; it is subtracted first.
+    sign : 1 or -1, optional
+        -1 reverses the direction of the signal.
+    overrule_unit : bool, optional
+        Whether `unit` counts although the file states another one.
+    shift : int or float, optional
+        Delay that is added to the signal: a whole number of samples, or s if written with a point.
+    command : bool, optional
+        Whether the signal is a recorded command of the subject and not a disturbance.
+    target : str or float, optional
+        Value that the subject regulates an output to: a column, or a constant; with unit, offset
+        and sign of the signal.
+    """
+
+    column: str
+    unit: str
     limit: Positive | None = None
-    offset: Finite = 0.0  # In this unit
-    sign: Literal[1, -1] = 1  # 1 or -1
-    overrule_unit: bool = False  # Whether `unit` counts where the file gives another one
-    # By how much the signal is moved later: a whole number of samples, or seconds with a point
+    offset: Finite = 0.0
+    sign: Literal[1, -1] = 1
+    overrule_unit: bool = False
     shift: int | Finite = 0
-    # Whether it is a command of the subject that was recorded, and not a disturbance
     command: bool = False
-    # What an output is regulated to: a column, or one value; unit, offset and sign are the signal's
     target: str | Finite | None = None
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The [report] table."""
+    """The [report] table.
 
-    # "degrees" or "radians": in which all pages and figures of a run show angles
+    Attributes
+    ----------
+    angles : "degrees" or "radians", optional
+        Unit of angles in all pages and figures of a run.
+    """
+
     angles: Literal["degrees", "radians"] = "degrees"
 
 
 class Configuration(msgspec.Struct, frozen=True):
-    """What a configuration file says."""
+    """Content of a configuration file."""
 
     recording: RecordingTable
-    signals: dict[str, SignalTable]  # By the name of an output or disturbance of the plant
-    plant: dict[str, Any] = {}  # Arguments of the plant's function; not interpreted here
-    fit: dict[str, Any] = {}  # Settings of the fit; not interpreted here
-    plan: dict[str, Any] = {}  # Of an experiment that is planned; not interpreted here
-    study: dict[str, Any] = {}  # Tables of a study; not interpreted here
+    signals: dict[str, SignalTable]  # by name of the plant's output, disturbance or command
+    plant: dict[str, Any] = {}  # arguments of the plant's function; not interpreted here
+    fit: dict[str, Any] = {}  # settings of the fit; not interpreted here
+    plan: dict[str, Any] = {}  # settings of a planned experiment; not interpreted here
+    study: dict[str, Any] = {}  # tables of a study; not interpreted here
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
     report: ReportTable = ReportTable()
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """The signals that are no commands: what is recorded of the plant."""
+        """Names of the recorded signals that are not commands."""
         return tuple(name for name, entry in self.signals.items() if not entry.command)
 
     @property
     def aimed(self) -> tuple[str, ...]:
-        """The signals with a target."""
+        """Names of the signals with a target."""
         return tuple(name for name, entry in self.signals.items() if entry.target is not None)
 
 
 @checked
 def read_configuration(path: Path | str, *more: str) -> Configuration:
-    r"""Read the configuration at `path`; `more` names tables that it may have besides.
+    r"""Read the TOML file that describes the columns of a recording.
+
+    Parameters
+    ----------
+    path : Path or str
+        Configuration file.
+    *more : str
+        Names of further tables that the file may contain.
+
+    Returns
+    -------
+    Configuration
+        Validated content of the file.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no TOML, or has a key or value that cannot be: the message
-        names it by its TOML path.
+        If the file cannot be read, is not TOML, or has an unknown key or invalid value; the
+        message names the key by its TOML path.
 
     Examples
     --------
@@ -157,10 +218,10 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
         signals[name] = _convert(source, f"signals.{brief(name, 80)}", table, SignalTable)
         if signals[name].unit != FILL_IN:
             _unit(source, f"signals.{brief(name, 80)}.unit", signals[name].unit)
-    # A plan needs none: nothing is recorded yet.
+    # A plan needs no signals: nothing is recorded yet.
     if not signals and not tables["plan"]:
         raise InputError(
-            f"{source}: signals", "names no signal", "write a table [signals.NAME] for each"
+            f"{source}: signals", "contains no signal", "write a table [signals.NAME] for each"
         )
     plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", "plan", *_STUDY)}
     report = _convert(source, "report", tables["report"], ReportTable)
@@ -169,11 +230,11 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
 
 def _parsed(source: str, path: Path) -> dict[str, Any]:
     if not os.path.lexists(path):
-        raise InputError(source, "does not exist", "`impc inspect FILE --out` writes one")
+        raise InputError(source, "does not exist", "create it with `impc inspect FILE --out`")
     require_readable(path, _LARGEST, InputError)
     try:
         text = path.read_text(encoding="utf-8-sig")
-        # tomllib keeps every prefix of a dotted key: one of 32 kB takes 1 GB.
+        # tomllib stores every prefix of a dotted key: one of 32 kB takes 1 GB.
         content = {} if (dotted := _DOTTED.search(text)) else tomllib.loads(text)
         if dotted or _deeper(content, _DEEPEST):
             raise RecursionError
@@ -183,7 +244,7 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
         raise InputError(source, f"cannot be opened ({reason})", "check the path") from None
     except UnicodeDecodeError:
         raise InputError(source, "is not UTF-8 text", "save it as UTF-8") from None
-    except ValueError as error:  # an integer of 5000 digits is no TOMLDecodeError
+    except ValueError as error:  # an integer of 5000 digits raises no TOMLDecodeError
         raise InputError(
             source, f"is not TOML ({brief(str(error), 160)})", "correct that line"
         ) from None
@@ -192,7 +253,7 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
 
 
 def _deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists are nested more than so many `levels` deep."""
+    """Whether tables and lists are nested more than `levels` deep."""
     items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return levels < 0 or any(_deeper(item, levels - 1) for item in items)
 
@@ -200,7 +261,7 @@ def _deeper(value: Any, levels: int) -> bool:
 def require_known(
     where: Callable[[str], str], table: Mapping[str, Any], known: Iterable[str], problem: str
 ) -> None:
-    """Refuse a key that is not `known`; `where` makes the subject of a message from a path."""
+    """Reject keys that are not `known`; `where` makes a message's subject from a key."""
     names = list(known)
     for key in table:
         if key not in names:
@@ -212,9 +273,9 @@ def require_known(
 def converted(
     where: Callable[[str], str], table: Mapping[str, Any], kind: type[T], see: str = "correct it"
 ) -> T:
-    """The `table` as a `kind` of value, by msgspec; its messages in ours.
+    """Convert `table` to type `kind` with msgspec, with error messages in this package's form.
 
-    `where` makes the subject of a message from a path, and `see` is what to do about most faults.
+    `where` makes the subject of a message from a path; `see` is the remedy for most faults.
     """
     try:
         return msgspec.convert(table, kind)
@@ -257,14 +318,16 @@ def _check_recording(source: str, table: RecordingTable) -> None:
         return InputError(f"{source}: recording.{key}", problem, remedy)
 
     if table.time is not None and table.rate is not None:
-        raise refuse("rate", "is given beside recording.time", "keep one of the two")
+        raise refuse("rate", "is given in addition to recording.time", "keep one of the two")
     if table.start is not None and table.stop is not None and table.stop <= table.start:
-        raise refuse("stop", f"is {table.stop:g} s, start {table.start:g} s", "give a later one")
+        raise refuse("stop", f"is {table.stop:g} s, start {table.start:g} s", "make it later")
     if table.time_unit is not None and _unit(source, "recording.time_unit", table.time_unit) != (
         "second"
     ):
         raise refuse(
-            "time_unit", f"{brief(table.time_unit, 80)!r} is no time", 'write "s", "ms" or "us"'
+            "time_unit",
+            f"{brief(table.time_unit, 80)!r} is not a unit of time",
+            'write "s", "ms" or "us"',
         )
     if table.pattern is not None:
         _check_pattern(refuse, table, table.pattern)
@@ -277,16 +340,18 @@ def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
             groups = re.compile(pattern).groupindex
     except (re.error, OverflowError, RecursionError) as error:
         raise refuse(
-            "pattern", f"is no regular expression ({brief(str(error), 80)})", "correct it"
+            "pattern", f"is not a regular expression ({brief(str(error), 80)})", "correct it"
         ) from None
     if not groups or not set(groups) <= set(_LABELS):
         named = ", ".join(f"(?P<{name}>...)" for name in _LABELS)
         raise refuse(
-            "pattern", f"has the groups {brief(str(list(groups)), 80)}", f"name some of {named}"
+            "pattern",
+            f"has the named groups {brief(str(list(groups)), 80)}",
+            f"use at least one of {named}, and no others",
         )
     for name in groups:
         if getattr(table, name):
-            raise refuse(name, "is given, and in recording.pattern too", "keep one of the two")
+            raise refuse(name, "is given here and in recording.pattern", "keep one of the two")
 
 
 def _unit(source: str, place: str, written: str) -> str:

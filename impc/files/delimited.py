@@ -1,8 +1,8 @@
-"""Delimited text: CSV with comma or semicolon, TSV, columns of blanks; decimal point or comma.
+"""Read delimited text: CSV, TSV or blank-separated columns, with decimal point or comma.
 
-Lines above the first row of numbers are titles and settings (ignored), the header, and a row of
-units below it. What stands below the last row of the block is named and not read. The numbers are
-parsed piece by piece: a file takes no more memory than its content and its numbers.
+Above the first row of numbers stand titles and settings (ignored), the header, and a row of units
+below it. Lines below the last row of the block are reported and not read. Numbers are parsed in
+pieces, so that a file needs no more memory than its content and its numbers.
 """
 
 from __future__ import annotations
@@ -40,29 +40,29 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 _DELIMITERS = {".csv": ",;\t", ".lvm": "\t,;", ".txt": "\t;, "}
-_TABS = "\t", "\t "  # .tsv; files of OpenSim, which blanks may divide too
+_TABS = "\t", "\t "  # .tsv; OpenSim files, whose columns may also be separated by blanks
 _NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
-# What stands for no number, errors of spreadsheets and of C among it.
+# Texts for a missing number, including errors of spreadsheets and of C.
 _MISSING = [
     *("", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "null", "-nan", "-nan(ind)", "nan(ind)"),
     *("#N/A", "#NV", "#NA", "#DIV/0!", "#VALUE!", "#WERT!", "#NUM!", "#ZAHL!", "#REF!", "#BEZUG!"),
     *("#NAME?", "#NULL!", "1.#QNAN", "-1.#IND"),
 ]
-# Digits are taken once (++): a field of 50 000 of them and a letter is no matter of a minute.
+# Possessive quantifiers (++): without them, 50 000 digits and a letter take minutes.
 _NUMBER = re.compile(
     r"[+-]?(\d++[.,]?\d*+|[.,]\d++)(e[+-]?\d++)?|[+-]?inf(inity)?|nan", re.IGNORECASE
 )
 _LONGEST = 50_000  # characters of a line: 2000 columns of 24
-# Where a spreadsheet would begin a formula: at the start, or behind what it may take for the end of
-# a cell. A list separator is a semicolon in half of Europe, whether the text is quoted or not.
+# Where a spreadsheet would begin a formula: at the start, or behind a possible end of a cell (in
+# many European locales a semicolon, quoted or not).
 _FORMULA = re.compile(r"(^|[;\t\r\n])(?=\s*[=+@\-])")
-_SAMPLE = 3 * HEAD  # lines by which the layout is known
-_PIECE = 100_000  # rows that are parsed at once
+_SAMPLE = 3 * HEAD  # lines from which the layout is determined
+_PIECE = 100_000  # rows parsed at once
 
 
 @dataclass(frozen=True)
 class _Text:
-    """The content of a file, lines ended by newlines, and the signs that divide its rows."""
+    """Content of a file with newlines normalised, its delimiter and its decimal sign."""
 
     source: str
     content: bytes
@@ -71,7 +71,7 @@ class _Text:
     decimal: str = ""
 
     def lines(self) -> Iterator[tuple[int, str]]:
-        """The lines that are not empty, with their numbers in the file."""
+        """Lines that are not empty, with their numbers in the file."""
         blank = " " if self.delimiter == "\t" else " \t"
         for number, line in enumerate(io.BytesIO(self.content), 1):
             text = line.decode(self.encoding, "replace").rstrip("\n")
@@ -79,7 +79,7 @@ class _Text:
                 yield number, text
 
     def fields(self, line: str) -> list[str]:
-        """The fields of a line."""
+        """Fields of a line."""
         if self.delimiter == "\n":
             return [line.strip()]
         if self.delimiter == " ":
@@ -88,13 +88,13 @@ class _Text:
         return [item.strip() for item in next(csv.reader([line], delimiter=self.delimiter))]
 
     def width(self, line: str) -> int:
-        """Number of its fields."""
+        """Number of fields of a line."""
         if '"' in line or self.delimiter == " ":
             return len(self.fields(line))
-        return line.count(self.delimiter) + 1  # of "\n" none
+        return line.count(self.delimiter) + 1  # the delimiter "\n" occurs in no line
 
     def kinds(self, line: str) -> list[int]:
-        """What stands in each of its fields."""
+        """Kind of each field: `EMPTY`, `NUMBER` or `WORD`."""
         return [
             EMPTY if not item else NUMBER if is_number(item, self.decimal) else WORD
             for item in self.fields(line)
@@ -103,7 +103,7 @@ class _Text:
 
 @dataclass(frozen=True)
 class _Body:
-    """The rows of numbers: how many lines are above, rows, places of the longest, what is below."""
+    """Block of numbers: lines above it, its rows, fields of the longest row, note on the rest."""
 
     start: int
     rows: int
@@ -113,7 +113,7 @@ class _Body:
 
 @dataclass
 class _Column:
-    """What is found in a column: its numbers, and how often a word, the first with its row."""
+    """Numbers of a column; count of its words, and the first word with its row."""
 
     values: Array
     signs: bool = False  # whether some of its numbers may have a decimal sign
@@ -124,16 +124,13 @@ class _Column:
 
 
 def read_delimited(path: Path, largest: int = LARGEST) -> Table:
-    """Read the text file at `path`, whose ending says which delimiters it may have.
-
-    Its numbers may take `largest` bytes.
-    """
+    """Read the text file at `path`; its ending determines the possible delimiters."""
     source = str(path)
     content, encoding = _decoded(source, path.read_bytes())
     text, block = _divided(_Text(source, content, encoding), path.suffix.lower())
     body = _body(text, block)
     if 8 * body.rows * body.width > largest:
-        problem = f"has {body.rows} rows of {body.width} values, more than are read"
+        problem = f"has {body.rows} rows of {body.width} values, too many to read"
         raise DataError(source, problem, "export only the signals that are needed")
     columns = _columns(text, body)
     end = _statistics(text, block, body, columns)
@@ -145,7 +142,7 @@ def read_delimited(path: Path, largest: int = LARGEST) -> Table:
 
 
 def encode_delimited(table: Table, suffix: str) -> bytes:
-    """The bytes of a file with every digit kept; `suffix` .csv has commas, others have tabs."""
+    """Encode a table with all digits; .csv is comma-separated, all else tab-separated."""
     delimiter = "," if suffix == ".csv" else "\t"
     text = io.StringIO()
     writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")
@@ -157,18 +154,18 @@ def encode_delimited(table: Table, suffix: str) -> bytes:
 
 
 def text_cell(text: str) -> str:
-    """A text of which no spreadsheet makes a formula: an apostrophe stands before its sign."""
+    """Put an apostrophe before text that a spreadsheet would take for a formula."""
     return _FORMULA.sub(r"\1'", text)
 
 
 def is_number(text: str, decimal: str) -> bool:
-    """Whether the `text` of a field is a number with this `decimal` sign, or stands for none."""
+    """Whether `text` is a number with this `decimal` sign, or marks a missing number."""
     other = "," if decimal == "." else "."
     return text in _MISSING[1:] or (_NUMBER.fullmatch(text) is not None and other not in text)
 
 
 def _decoded(source: str, content: bytes) -> tuple[bytes, str]:
-    """The content with plain newlines, and its encoding."""
+    """Content with normalised newlines, and its encoding."""
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         content = content.decode("utf-16", errors="replace").encode()
     content = content.removeprefix(b"\xef\xbb\xbf")
@@ -184,8 +181,8 @@ def _decoded(source: str, content: bytes) -> tuple[bytes, str]:
     long = re.search(rb"[^\n]{%d,}" % (_LONGEST + 1), content)
     if long is not None:
         line, size = content[: long.start()].count(b"\n") + 1, len(long[0])
-        problem = f"line {line} has {size} characters, and {_LONGEST} is the most"
-        raise DataError(source, problem, "export it again, one sample a row")
+        problem = f"line {line} has {size} characters; at most {_LONGEST} are read"
+        raise DataError(source, problem, "export it again, one sample per row")
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -194,7 +191,7 @@ def _decoded(source: str, content: bytes) -> tuple[bytes, str]:
 
 
 def _divided(text: _Text, suffix: str) -> tuple[_Text, Block]:
-    """The text with the delimiter and decimal sign that make most numbers, and where they begin."""
+    """Choose the delimiter and decimal sign with most numbers; locate the block of numbers."""
     allowed = _DELIMITERS.get(suffix, _TABS[suffix != ".tsv"])
     best, most = None, 0.5
     for delimiter in (*allowed, "\n"):
@@ -211,14 +208,14 @@ def _divided(text: _Text, suffix: str) -> tuple[_Text, Block]:
     )
     expected = " or ".join(_NAMES[mark] for mark in allowed)
     if between is None:
-        problem = f"has no rows of numbers divided by {expected} in the first {HEAD} of its lines"
+        problem = f"has no rows of numbers separated by {expected} in the first {HEAD} of its lines"
     else:
-        problem = f"is divided by {_NAMES[between]}, and a {suffix} file is by {expected}"
-    raise DataError(text.source, problem, "export it again, one signal a column")
+        problem = f"is separated by {_NAMES[between]}; a {suffix} file needs {expected}"
+    raise DataError(text.source, problem, "export it again, one signal per column")
 
 
 def _block(text: _Text) -> tuple[Block | None, float]:
-    """The block of numbers, and their share in what is not empty from its first row on."""
+    """Block of numbers, and the share of numbers among its fields that are not empty."""
     if text.decimal == text.delimiter:
         return None, 0.0
     sample = zip(range(_SAMPLE), text.lines(), strict=False)
@@ -229,7 +226,7 @@ def _block(text: _Text) -> tuple[Block | None, float]:
 
 
 def _body(text: _Text, block: Block) -> _Body:
-    """The rows from the first of the block to the last one that has as many fields."""
+    """Rows from the first of the block to the last one with as many fields."""
     width, rows, kept, before = len(block.kinds), 0, 0, 0
     lines = text.lines()
     for _ in range(block.first):
@@ -251,23 +248,23 @@ def _body(text: _Text, block: Block) -> _Body:
             return _Body(block.first, kept, width, _rest(number, line))
         rows, width = rows + 1, max(width, found)
         if line.strip(f" {text.delimiter}"):
-            kept, before = rows, number  # rows of delimiters alone at the end are none
+            kept, before = rows, number  # trailing rows of delimiters alone do not count
     return _Body(block.first, kept, width, "")
 
 
 def _is_word(line: str, text: _Text) -> bool:
-    """Whether a line begins with a word, which no number that was cut does."""
+    """Whether a line begins with a word (which a truncated number does not)."""
     return re.match(r"[^\W\d_]{3}", text.fields(line)[0]) is not None or text.content.endswith(
         b"\n"
     )
 
 
 def _rest(number: int, line: str) -> str:
-    return f"line {number} and those below are not read: they begin with {line.strip()[:40]!r}"
+    return f"line {number} and the lines below are not read; they begin with {line.strip()[:40]!r}"
 
 
 def _statistics(text: _Text, block: Block, body: _Body, columns: Sequence[_Column]) -> _Body | None:
-    """The body without what stands below it in rows as long as its own; None where nothing does."""
+    """Body without trailing rows of summary statistics; None if there are none."""
     mixed = [column.row for column in columns if column.words and np.isfinite(column.values).any()]
     if not mixed:
         return None
@@ -283,8 +280,8 @@ def _statistics(text: _Text, block: Block, body: _Body, columns: Sequence[_Colum
 
 
 def _columns(text: _Text, body: _Body) -> list[_Column]:
-    """The columns of the body, parsed piece by piece."""
-    import pandas as pd  # noqa: PLC0415  # half a second, for who reads text only
+    """Columns of the body, parsed piece by piece."""
+    import pandas as pd  # noqa: PLC0415  # takes 0.5 s; not needed for text files
 
     found = [_Column(np.full(body.rows, np.nan)) for _ in range(body.width)]
     separator: Any = {"\n": "\x1f", " ": r"\s+"}.get(text.delimiter, text.delimiter)
@@ -316,13 +313,13 @@ def _columns(text: _Text, body: _Body) -> list[_Column]:
                 start += len(piece)
     except (ValueError, OverflowError) as error:
         reason = str(error).strip().splitlines()[0]
-        problem = f"cannot be divided into columns ({reason})"
+        problem = f"cannot be split into columns ({reason})"
         raise DataError(text.source, problem, "export it again") from None
     return found
 
 
 def _take(column: _Column, piece: pd.Series[Any], start: int, decimal: str) -> None:
-    """Take in the values of some rows, and count the words among them."""
+    """Store the values of some rows and count the words among them."""
     values = column.values[start : start + len(piece)]
     column.signs |= piece.dtype.kind not in "iu"
     if piece.dtype.kind in "fiu":
@@ -356,7 +353,7 @@ def _table(text: _Text, body: _Body, columns: Sequence[_Column], above: Sequence
         elif column.words:
             skipped[known] = _words(text, body, known, column)
         else:
-            column.values.flags.writeable = False  # taken as they are
+            column.values.flags.writeable = False  # used without a copy
             kept[known] = column.values
             floats |= {place: name} if column.signs else {}
     _require_no_thousands(text, body, floats)
@@ -365,14 +362,14 @@ def _table(text: _Text, body: _Body, columns: Sequence[_Column], above: Sequence
 
 
 def _first(text: _Text, body: _Body) -> Iterator[str]:
-    """The first rows of the body."""
+    """First three rows of the body."""
     for index, (_, line) in zip(range(body.start + 3), text.lines(), strict=False):
         if index >= body.start:
             yield line
 
 
 def _words(text: _Text, body: _Body, name: str, column: _Column) -> str:
-    """Why a column with words is none of numbers."""
+    """Reason why a column with words is skipped; an error if it also has numbers."""
     row = body.start + column.row
     line = next(number for index, (number, _) in enumerate(text.lines()) if index == row)
     if column.truths:
@@ -388,7 +385,7 @@ def _words(text: _Text, body: _Body, name: str, column: _Column) -> str:
 
 
 def _require_no_thousands(text: _Text, body: _Body, floats: dict[int, str]) -> None:
-    """Look for thousands where some of the numbers that are not whole have no decimal sign."""
+    """Search for thousands separators if some non-integer columns lack a decimal sign."""
     sign = text.decimal.encode()
     if text.content.count(sign) >= body.rows * len(floats):
         return

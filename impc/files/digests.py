@@ -1,10 +1,8 @@
-"""What a result depends on, as one number: recordings, plant, settings and versions, all of them.
+"""SHA-256 digests of everything a result depends on: recordings, plant, settings, versions.
 
-A result that is kept carries the digest of everything that went into it, and result.json says it
-(`Inputs`). `digest` takes values, `content_digest` a file from its first byte to its last,
-`source_digest` the code or the file of a plant or model, and `versions` what computes. A file that
-a plant's own code opens is known when its name is an argument of the plant, and not otherwise
-(docs/security.md).
+Stored results carry the digest of all their inputs, and result.json lists it (`Inputs`). A file
+that a plant's own code opens is included only if its name is an argument of the plant
+(docs/ref/security.md).
 """
 
 from __future__ import annotations
@@ -32,27 +30,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from types import ModuleType
 
-# This package's own modules; they are known by their version.
+# This package's own modules; `versions` covers them.
 _OURS = ("impc", "plants")
-# What computes: another version of any of them may give other digits.
+# Packages that compute: another version of any of them may give other digits.
 _PACKAGES = ("casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 _PLANT_FILES = (".mat", ".npz", ".json")
-# Two threads that parse at the same time fail now and then in Python 3.11.
+# In Python 3.11 two threads that parse at the same time occasionally fail.
 _PARSING = threading.Lock()
 
 
 def digest(*parts: object) -> str:
-    """SHA-256 of the contents of the `parts`, hexadecimal.
-
-    None, numbers, text, bytes, paths, dates, arrays of numbers, and mappings with names, sequences,
-    sets, dataclasses and msgspec structs of such.
-    """
+    """SHA-256, hexadecimal, of plain values, arrays, paths, and containers or structs of them."""
     text = msgspec.msgpack.encode(parts, enc_hook=_written, order="deterministic")
     return hashlib.sha256(text).hexdigest()
 
 
 def _written(value: Any) -> Any:
-    """What msgspec writes for a `value` that it does not know."""
+    """Encode a `value` of a type that msgspec does not know."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
         return value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, np.generic):
@@ -65,10 +59,10 @@ def _written(value: Any) -> Any:
 
 
 def content_digest(path: Path) -> str:
-    """SHA-256 of the whole file at `path`, hexadecimal; 0.4 to 2 GB a second."""
+    """SHA-256 of the file at `path`, hexadecimal."""
     try:
         if path.exists() and not path.is_file():
-            raise DataError(f"file {path.name}", "is no ordinary file", "name a file")
+            raise DataError(f"file {path.name}", "is not a regular file", "name a file")
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except (OSError, ValueError) as error:
@@ -80,7 +74,7 @@ def content_digest(path: Path) -> str:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Of Python, of the packages that compute, and the digest of this package's own source."""
+    """Versions of Python and of the packages that compute; digest of this package's source."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -96,11 +90,10 @@ def versions() -> dict[str, str]:
 
 
 def source_digest(name: str, arguments: Mapping[str, Any] | None = None) -> str:
-    """Of the plant or model `name`: a file's content, or the user's code that it is made of.
+    """Digest of plant or model `name`: a file's content, or the user's code that defines it.
 
-    The code is the module that is named, imported already, and the modules in its folder and below
-    that it imports: this package and what is installed are said by `versions`. Of `arguments` that
-    name a file its content counts.
+    The code is the named module (already imported) and the modules in its folder and below that it
+    imports. Of `arguments` that name a file, the content counts.
     """
     given = {
         key: (value, content_digest(Path(value)) if _names_a_file(value) else None)
@@ -115,11 +108,11 @@ def source_digest(name: str, arguments: Mapping[str, Any] | None = None) -> str:
 def _names_a_file(value: object) -> bool:
     try:
         return isinstance(value, str) and Path(value).is_file()
-    except (OSError, ValueError):  # too long, or with a NUL: the name of no file
+    except (OSError, ValueError):  # too long, or contains NUL
         return False
 
 
-@functools.cache  # once a process: Python does not read a module again either
+@functools.cache  # once a process: Python does not reload modules either
 def _source(module: ModuleType) -> str:
     file = Path(getattr(module, "__file__", None) or "")
     found: dict[str, bytes] = {}
@@ -139,14 +132,14 @@ def _is_installed(file: Path) -> bool:
 
 
 def _gather(file: Path, root: Path, found: dict[str, bytes]) -> None:
-    """Add a `file` of the user's and those in the folder `root` that it imports, anywhere in it."""
+    """Add a user's `file`, and recursively the files in folder `root` that it imports."""
     key = os.path.relpath(file, root)
     if key in found or Path(key).parts[0] in _OURS:
         return
     found[key] = file.read_bytes()
     for base, name in _imports(file, root) if file.suffix == ".py" else ():
         parts = name.split(".")
-        for count in range(1, len(parts) + 1):  # a package's own __init__ runs too
+        for count in range(1, len(parts) + 1):  # a package's __init__ runs too
             place = base.joinpath(*parts[:count])
             for other in (place.with_suffix(".py"), place / "__init__.py"):
                 if other.is_file():
@@ -154,11 +147,11 @@ def _gather(file: Path, root: Path, found: dict[str, bytes]) -> None:
 
 
 def _imports(file: Path, root: Path) -> Iterator[tuple[Path, str]]:
-    """Folder and name of all modules that a `file` may import."""
+    """Folder and name of every module that a `file` may import."""
     try:
         with _PARSING:
             tree = ast.parse(file.read_bytes())
-    except (SyntaxError, ValueError):  # of a file that cannot be imported
+    except (SyntaxError, ValueError):  # the file cannot be imported
         return
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -173,22 +166,22 @@ def _imports(file: Path, root: Path) -> Iterator[tuple[Path, str]]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """SHA-256 of what went into a result."""
+    """SHA-256 of the inputs of a result."""
 
-    # Of each file, in the order given; of a study, by the name of the unit
+    # of each file, in the order given; of a study, by analysis unit
     recordings: tuple[str, ...] | Mapping[str, tuple[str, ...]]
-    configuration: str  # Of the configuration or the study file
-    code: str  # Of the plant's or model's code or file, and its arguments
-    versions: str  # Of Python, of the packages that compute, and of this package's source
-    kind: str = "plant"  # What the code is: "plant" or "model"
+    configuration: str  # of the configuration or study file
+    code: str  # of code or file of the plant or model, and its arguments
+    versions: str  # of Python, of the packages that compute, and of this package's source
+    kind: str = "plant"  # what `code` describes: "plant" or "model"
 
     @property
     def digest(self) -> str:
-        """All of them as one."""
+        """Digest of all of them."""
         return digest(self)
 
     def plain(self) -> Mapping[str, Any]:
-        """As result.json has them."""
+        """Mapping as written to result.json."""
         return {
             "recordings": self.recordings,
             "configuration": self.configuration,
@@ -205,10 +198,10 @@ def gather_inputs(
     arguments: Mapping[str, Any],
     kind: str = "plant",
 ) -> Inputs:
-    """Digests of the `recordings`, of the `configuration` and of a plant or model as they are now.
+    """Compute the digests of `recordings`, `configuration` and plant or model.
 
-    The recordings are files, or those of each unit of a study. The plant is a file or an import
-    path, the `name`, imported already, with its `arguments`; `kind` is "plant" or "model".
+    `recordings` are files, or files by analysis unit. `name` is the plant's file or import path
+    (already imported), with its `arguments`; `kind` is "plant" or "model".
     """
     contents: tuple[str, ...] | Mapping[str, tuple[str, ...]]
     if isinstance(recordings, Mapping):

@@ -1,4 +1,4 @@
-"""Files on the disk: ordinary and small enough to read, written whole or not at all."""
+"""Files on disk: checked before reading, written atomically."""
 
 from __future__ import annotations
 
@@ -13,42 +13,39 @@ from impc.errors import DataError, ImpcError, OutputError, brief
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: Bytes of a file, and of its arrays in memory: an hour of 16 channels at 2 kHz.
+#: Largest file in bytes, and largest arrays in memory: an hour of 16 channels at 2 kHz.
 LARGEST = 1_000_000_000
 
 
 def require_readable(path: Path, largest: int, error: type[ImpcError] = DataError) -> int:
-    """Look at the file at `path` before it is opened: a pipe would never end. Its size in bytes.
-
-    More than `largest` bytes are refused. Links are followed; `error` is the kind that is raised.
-    """
+    """Size in bytes of the file at `path`, after checks: regular, not empty, not too large."""
     source = str(path)
     try:
         found = path.stat()
     except FileNotFoundError:
         raise error(source, "does not exist", "check the path") from None
-    except (OSError, ValueError) as fault:  # ValueError: a zero byte in the name
+    except (OSError, ValueError) as fault:  # ValueError: NUL in the name
         reason = getattr(fault, "strerror", None) or str(fault)
         raise error(source, f"cannot be opened ({reason})", "check the path") from None
     if stat.S_ISDIR(found.st_mode):
         raise error(source, "is a folder", "name the file in it")
     if not stat.S_ISREG(found.st_mode):
-        raise error(source, "is no ordinary file", "copy it to one")
+        raise error(source, "is not a regular file", "copy its content to a regular file")
     if found.st_size == 0:
         raise error(source, "is empty (0 bytes)", "copy or export it again")
     if found.st_size > largest:
         raise error(
             source,
-            f"has {_size(found.st_size)}, and {_size(largest)} is the most that is read",
+            f"has {_size(found.st_size)}; at most {_size(largest)} are read",
             "export only the signals and seconds that are needed"
             if error is DataError
-            else "give a smaller one",
+            else "use a smaller file",
         )
     return found.st_size
 
 
 def damaged(source: str, fault: Exception) -> DataError:
-    """What a library says of a file, the `source`, that it cannot read: a `fault` of any kind."""
+    """Error for a file that a library cannot read, with the library's message."""
     reason = brief(" ".join(str(fault).split()), 120) or type(fault).__name__
     return DataError(source, f"is damaged and cannot be read ({reason})", "copy or export it again")
 
@@ -57,41 +54,38 @@ def _size(size: int) -> str:
     return f"{size / 1e9:.1f} GB" if size >= 50_000_000 else f"{size / 1e6:.3g} MB"
 
 
-#: What to do about a file that cannot be written, where room would not help.
-IN_ITS_PLACE = "move what is in its place, or give another folder"
-#: Numbers of errors that room on the disk, or a larger quota or limit, would mend.
+#: Remedy for a file that cannot be written for a reason other than disk space.
+IN_ITS_PLACE = "move the existing file or folder of that name, or choose another folder"
+#: Numbers of errors caused by a lack of disk space, by a quota or by a size limit.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def unwritable(subject: str, error: OSError | ValueError, remedy: str) -> OutputError:
-    """What to say of the `error` of a `subject` that cannot be written.
-
-    The `remedy`, or to make room if there is none.
-    """
+    """Error for a file that cannot be written; advises to free space if that is the cause."""
     number = getattr(error, "errno", None)
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    stated = "make room and start again" if number in NO_ROOM else remedy
+    stated = "free disk space and start again" if number in NO_ROOM else remedy
     return OutputError(subject, f"cannot be written ({reason})", stated)
 
 
 def require_ordinary(path: Path) -> None:
-    """Refuse a pipe or a device at `path`, in the place of a file: to open it may wait for ever."""
+    """Reject a pipe or device at `path`: opening it could block forever."""
     if not path.is_file() and path.exists():
-        raise OSError(errno.EINVAL, "no ordinary file")
+        raise OSError(errno.EINVAL, "not a regular file")
 
 
 def write_whole(path: Path, content: bytes, *, flush: bool = True) -> None:
-    """Write `content` beside `path`, flush to the disk, rename: the whole file, or the one before.
+    """Write `content` atomically: temporary file in the same folder, flush, rename.
 
-    Its folder is made when it is missing. What says itself whether it is whole needs no `flush`.
+    Creates a missing folder. Content that carries its own checksum needs no `flush`.
     """
     staging = path.with_name(f".{path.name}.part")
     try:
         if not path.parent.is_dir():
             path.parent.mkdir(parents=True, exist_ok=True)
-        staging.unlink(missing_ok=True)  # of a run that was killed
+        staging.unlink(missing_ok=True)  # left by a killed run
         try:
-            # "x": never through a link that somebody put there.
+            # "x": never write through an existing link.
             with staging.open("xb") as stream:
                 stream.write(content)
                 if flush:
@@ -108,14 +102,14 @@ def write_whole(path: Path, content: bytes, *, flush: bool = True) -> None:
 
 
 def remove_empty(folder: Path) -> None:
-    """Remove a `folder` and those in it, as far as there are no files in them."""
+    """Remove a `folder` and its subfolders that contain no files."""
     for path in (*sorted(folder.rglob("*"), reverse=True), folder):
         if path.is_dir() and not path.is_symlink() and not os.listdir(path):
             path.rmdir()
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the names in a `folder` to the disk, where the system lets folders be opened."""
+    """Flush the directory entries of a `folder` to disk (POSIX only)."""
     if os.name != "posix":
         return
     number = os.open(folder, os.O_RDONLY)
@@ -126,7 +120,7 @@ def flush_folder(folder: Path) -> None:
 
 
 def truth_beside(folder: Path) -> Any:
-    """The truth.json of a `folder`, that of simulated recordings; {} where none can be read."""
+    """Content of `truth.json` in a `folder` of simulated recordings; {} if unreadable."""
     path = folder / "truth.json"
     try:
         return json.loads(path.read_text("utf-8")) if path.stat().st_size <= LARGEST else {}

@@ -1,4 +1,4 @@
-"""The door: which format a file is in, by its ending and its first bytes, and who reads it."""
+"""File formats: recognised by ending and first bytes, and passed to their readers."""
 
 from __future__ import annotations
 
@@ -29,17 +29,15 @@ if TYPE_CHECKING:
 class Format:
     """How files of one ending are recognised, read and written."""
 
-    # (path, most bytes that its arrays may take) -> table; of a workbook also the name of a sheet,
-    # where one is asked for. Whatever it raises becomes one line.
+    # (path, largest size of its arrays in bytes[, sheet of a workbook]) -> table
     read: Callable[..., Table]
-    encode: Callable[[Table], bytes]  # Table -> the bytes of a file
-    # Whether the first kilobyte of a file is that of this format; by default, of any text: of what
-    # does not begin as something else
+    encode: Callable[[Table], bytes]  # table -> content of a file
+    # Whether the first kilobyte is that of this format; default: not that of a known other one
     begins: Callable[[bytes], bool] = lambda head: not _what_it_is(head)
 
 
 _WORKBOOKS = (".xlsx", ".ods")
-# First bytes of what else may carry one of the endings, and what it is.
+# First bytes of other kinds of files that occur with these endings.
 _SIGNATURES = {
     b"PK\x03\x04": "a zip archive or an Excel workbook",
     b"\xd0\xcf\x11\xe0": "an Excel workbook that is old or locked by a password",
@@ -61,17 +59,23 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
     Parameters
     ----------
     path : Path or str
-        With one of the endings in `FORMATS`.
+        File with one of the supported endings: .csv, .tsv, .txt, .lvm, .sto, .mot, .trc, .xlsx,
+        .ods, .mat, .tdms or .c3d.
     largest : int
-        Bytes above which a file is refused before it is read.
+        Largest size in bytes of the file, and of its arrays.
     sheet : str
-        Of a workbook; by default the first one with rows of numbers.
+        Sheet of a workbook; by default the first one with rows of numbers.
+
+    Returns
+    -------
+    Table
+        Numeric columns by name, with the units and the sampling rate that the file states.
 
     Raises
     ------
     DataError
-        When the file is missing, empty, too large, damaged, not what its ending says, or holds no
-        column of numbers.
+        If the file is missing, empty, too large or damaged, is not what its ending says, or has
+        no column of numbers.
 
     Examples
     --------
@@ -99,19 +103,25 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
         raise DataError(
             source, "does not fit in memory", "save only the signals that are needed"
         ) from None
-    except Exception as error:  # of our own readers ValueError, of pandas any
+    except Exception as error:  # ValueError of our readers, anything of pandas
         raise damaged(source, error) from None
 
 
 @checked
 def write_table(path: Path | str, table: Table) -> None:
-    """Write a table in the format of the `path`, whole or not at all; .mat is written as v5.
+    """Write a table atomically in the format that the ending of `path` names; .mat is v5.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to write.
+    table : Table
+        Columns, with units if the format can store them.
 
     Raises
     ------
     OutputError
-        When the ending is not known, the format cannot hold the table, or the file cannot be
-        written.
+        If the ending is unknown, the format cannot hold the table, or writing fails.
 
     Examples
     --------
@@ -129,7 +139,7 @@ def write_table(path: Path | str, table: Table) -> None:
 
 
 def encode_table(ending: str, table: Table) -> bytes:
-    """The bytes of a table in the format of an ending, a key of `FORMATS`; .mat is v5."""
+    """Content of a file of that ending (a key of `FORMATS`) with the table; .mat is v5."""
     return FORMATS[_suffix(Path(f"table{ending}"), OutputError)].encode(table)
 
 
@@ -137,13 +147,13 @@ def _suffix(path: Path, error: type[InputError | OutputError]) -> str:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         known = ", ".join(FORMATS)
-        remedy = "export it as one of these"
-        raise error(str(path), f"has the ending {suffix!r}, and not {known}", remedy)
+        remedy = "export it in one of these formats"
+        raise error(str(path), f"has the ending {suffix!r}, not one of {known}", remedy)
     return suffix
 
 
 def _head(path: Path, largest: int) -> bytes:
-    """The first bytes of a file that can be read and is neither empty nor too large."""
+    """First kilobyte of a file, after checking that it is readable, not empty, not too large."""
     require_readable(path, largest)
     try:
         with path.open("rb") as file:
@@ -154,7 +164,7 @@ def _head(path: Path, largest: int) -> bytes:
 
 
 def _what_it_is(head: bytes) -> str:
-    """What a file that begins like this is, as far as its first bytes say; empty if they do not."""
+    """Kind of file that begins with `head`; empty if it is not recognised."""
     return next((what for mark, what in _SIGNATURES.items() if head.startswith(mark)), "")
 
 
@@ -166,7 +176,7 @@ def _require(source: str, agrees: bool, suffix: str, head: bytes) -> None:
 
 
 def _read_matlab(path: Path, largest: int) -> Table:
-    """v5 or v7.3: the version in the header and the HDF5 signature behind it must agree."""
+    """Read v5 or v7.3; the version in the header must agree with the HDF5 signature."""
     source, head = str(path), _head(path, largest)
     hdf5 = HDF5_SIGNATURE in (head[:8], head[512:520])
     version = int.from_bytes(head[124:126], "big" if head[126:128] == b"MI" else "little") >> 8
@@ -177,9 +187,9 @@ def _read_matlab(path: Path, largest: int) -> Table:
         return read_apart("matlab", path, largest)
     inside, said = ("7.3", "5") if hdf5 else ("5", "7.3")
     if hdf5 or version == 2:
-        problem = f"says that it is version {said} and holds version {inside} or damaged data"
+        problem = f"states version {said}, but contains version {inside} or damaged data"
         raise DataError(source, problem, "save it again in MATLAB: save(..., '-v7')")
-    raise DataError(source, "is of no version that MATLAB writes", "save it again with '-v7'")
+    raise DataError(source, "has an unknown MATLAB version", "save it again with '-v7'")
 
 
 def _delimited(ending: str) -> Format:
@@ -210,7 +220,7 @@ def _write(path: Path, content: bytes) -> None:
         raise unwritable(str(path), error, "give another path") from None
 
 
-#: By ending: the formats that are read and written. A new one is a line here.
+#: Supported formats by ending.
 FORMATS: dict[str, Format] = {
     ".csv": _delimited(".csv"),
     ".tsv": _delimited(".tsv"),

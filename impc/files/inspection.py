@@ -1,4 +1,4 @@
-"""What a file holds, and a first configuration for it."""
+"""Summary of a file's columns, and a draft of a configuration for it."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
-# Units of a clock that has none, and how many make a second: the first in which the steps are
-# shorter than those of any recording of movement, s.
+# Units tried for a clock without unit, with steps per second: the first in which steps are shorter
+# than `_SLOWEST` s, the longest of any movement recording.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
 _HORIZON = 20
 _INPUT = "an input: without this table, or with command = true, a command"
 # Units at the end of names, as in alpha_deg.
 _IN_NAMES = ("deg", "rad", "mm", "cm", "m", "N", "Nm", "V", "mV", "s", "ms")
-_ALIKE = 0.6  # theta1 and theta_2 are, push and perturbation are not
+_ALIKE = 0.6  # theta1 and theta_2 are alike; push and perturbation are not
 
 
-@np.errstate(all="ignore")  # of values of 1e308, the mean is inf
+@np.errstate(all="ignore")  # the mean of values of 1e308 overflows
 def summary(table: Table) -> str:
-    """A table of the columns: unit, samples, range, mean, missing, and a rate where it rises."""
+    """Table of the columns: unit, samples, range, mean, missing, and rate of a rising column."""
     heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
     lines = [in_columns([heads, *(_row(table, name) for name in table.columns)], left=2)]
     if table.rate is not None:
-        lines.append(f"The file says {table.rate:g} samples per second.")
+        lines.append(f"The file states a rate of {table.rate:g} samples per second.")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
     lines += [f"Note: {note}" for note in table.notes]
     return "\n".join(lines)
@@ -50,7 +50,7 @@ def summary(table: Table) -> str:
 
 @np.errstate(all="ignore")
 def clock_column(table: Table) -> str | None:
-    """The column that is a clock: rising throughout, by its name or else with even steps."""
+    """Column with the clock: rising, recognised by its name or by even steps."""
     rising = [name for name, values in table.columns.items() if _rate(values) is not None]
     named = [name for name in rising if _base(name) in _CLOCKS]
     return next(iter(named or rising), None)
@@ -58,37 +58,37 @@ def clock_column(table: Table) -> str | None:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a plant needs a configuration for."""
+    """Signals and arguments of a plant that a configuration must cover."""
 
-    outputs: Sequence[str]  # Names of its signals
+    outputs: Sequence[str]
     disturbances: Sequence[str]
     controls: Sequence[str]
-    units: Mapping[str, str]  # Of those whose unit the plant says
-    # Of its function, with their defaults; `FILL_IN` for one that has none
+    units: Mapping[str, str]  # by signal, where the plant states them
+    # of the plant's function, with their defaults; `FILL_IN` if there is none
     arguments: Mapping[str, object]
-    dt: float  # Sample time, s
+    dt: float  # sample time, s
 
 
 @np.errstate(all="ignore")
 def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
-    """A commented TOML file that `read_configuration` reads (docs/recordings.md).
+    """Draft a commented TOML configuration (docs/howto/recordings.md).
 
-    Without the plant, what is `wanted`, every column becomes a signal by its own name.
+    Without `wanted` (the plant), every column becomes a signal named after itself.
     """
     lines = [
-        f"# What the columns of {Path(table.source).name!r} mean. Check every line; what neither",
-        f'# file nor plant says is "{FILL_IN}" and must be filled in.',
+        f"# Meaning of the columns of {Path(table.source).name!r}. Check every line; replace each",
+        f'# "{FILL_IN}", which neither the file nor the plant determines.',
         "",
         "[recording]",
         *_clock_lines(table),
-        _line('subject = ""', "whose recording it is"),
+        _line('subject = ""', "code of the subject"),
         *_OPTIONS,
     ]
     clock = clock_column(table)
     rest = [name for name in table.columns if name != clock] or list(table.columns)
     if wanted is None:
-        lines += ["", "# Name each table [signals.NAME] by an output or disturbance of the plant;"]
-        lines += ["# remove the columns that are none."]
+        lines += ["", "# Rename each table [signals.NAME] to an output or disturbance of the"]
+        lines += ["# plant; remove columns that are neither."]
         for column in rest:
             lines += ["", *_signal_lines(table, column, column, _span(table, column), "")]
         lines += ["", "[plant]", "# arguments of the plant's function", ""]
@@ -96,7 +96,7 @@ def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
     signals = (*wanted.outputs, *wanted.disturbances)
     chosen = _guessed(table, signals, rest, wanted)
     for signal in signals:
-        column, why = chosen.get(signal, (FILL_IN, "no column is left that fits: name it"))
+        column, why = chosen.get(signal, (FILL_IN, "no remaining column fits: enter its name"))
         acts = signal in wanted.disturbances
         kind = _INPUT if acts else _span(table, column)
         lines += ["", *_signal_lines(table, signal, column, kind, why)]
@@ -108,12 +108,12 @@ def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
 
 
 def _plant_lines(wanted: Wanted) -> list[str]:
-    lines = ["[plant]", "# Arguments of the plant's function. They are the subject's own: correct"]
-    lines += ["# what is known of them and take away the #."] if wanted.arguments else []
+    lines = ["[plant]", "# Arguments of the plant's function. They describe the subject: correct"]
+    lines += ["# those that you know and remove the #."] if wanted.arguments else []
     for name, value in wanted.arguments.items():
         if isinstance(value, bool | int | float | str):
             text = json.dumps(value, ensure_ascii=False)
-            own = f"the subject's own; without this line it is {text}, the plant's"
+            own = f"the subject's own; without this line the plant's {text} is used"
             if name in OWN and value != FILL_IN:
                 lines.append(_line(f'{name} = "{FILL_IN}"', own))
             else:
@@ -126,9 +126,9 @@ def _fit_lines(wanted: Wanted) -> list[str]:
     units = ", ".join(f"{name} in {wanted.units.get(name, 'SI')}" for name in wanted.controls)
     return [
         "[fit]",
-        _line(f"horizon = {_HORIZON}", f"samples that the controller looks ahead{seconds}"),
-        _line(f'u_max = "{FILL_IN}"', f"the most that the subject can do: {units}; without"),
-        _line("", "this line there is no limit, and all is inverse LQR"),
+        _line(f"horizon = {_HORIZON}", f"prediction horizon of the controller in samples{seconds}"),
+        _line(f'u_max = "{FILL_IN}"', f"largest command of the subject: {units}; without"),
+        _line("", "this line there is no limit (inverse LQR)"),
     ]
 
 
@@ -144,27 +144,27 @@ def _span(table: Table, column: str) -> str:
 
 
 def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> int:
-    """Whether the unit of a column may be one of the signal: 0 it may not, 2 it is of its kind."""
+    """Fit of a column's unit to a signal: 0 contradicts, 1 unknown, 2 same kind."""
     try:
         stated = si_unit(_column_unit(table, column)[0])
         needed = si_unit(wanted.units[signal])
-    except (KeyError, InputError):  # one of the two says nothing that is known
+    except (KeyError, InputError):  # one of the two units is missing or unknown
         return 1
     return 2 if stated.base == needed.base else int(stated.base == "dimensionless")
 
 
 def _column_unit(table: Table, column: str) -> tuple[str, str]:
-    """The unit of a column and how it is known: by the file, or by the end of its name."""
+    """Unit of a column, and its origin: the file, or the end of the column's name."""
     stated = table.units.get(column)
     if stated:
         try:
             si_unit(stated)
         except InputError:
-            return FILL_IN, f"the file says {stated!r}, which is not known"
-        return stated, "as the file says"
+            return FILL_IN, f"the file states {stated!r}, which is not known"
+        return stated, "stated in the file"
     last = re.split(r"[_ .]", column)[-1]
     if last != column and last in _IN_NAMES:
-        return last, "a guess: by its name"
+        return last, "a guess from its name"
     return FILL_IN, ""
 
 
@@ -188,7 +188,7 @@ def _row(table: Table, name: str) -> tuple[str, ...]:
 
 
 def _rate(values: Array) -> float | None:
-    """Steps per unit of a column that rises evenly; None for the others."""
+    """Samples per unit of a column that rises evenly; None for the others."""
     steps = np.diff(values)
     if not np.isfinite(values).all() or (steps <= 0).any():
         return None
@@ -202,7 +202,7 @@ def _base(name: str) -> str:
 
 
 def open_places(text: str) -> tuple[int, int]:
-    """How many guesses the `text` of a draft holds, and how many places to be filled in."""
+    """Numbers of guesses and of places to be filled in, in the `text` of a draft."""
     return len(re.findall("# a guess|# A GUESS", text)), text.count(f'= "{FILL_IN}"')
 
 
@@ -225,10 +225,10 @@ _OPTIONS = (
 def _clock_lines(table: Table) -> list[str]:
     clock = clock_column(table)
     if clock is None and table.rate is not None:
-        return [_line(f"# rate = {table.rate!r}", "samples per second; the file says it itself")]
+        return [_line(f"# rate = {table.rate!r}", "samples per second, stated in the file")]
     if clock is None:
         return [
-            _line('# time = "..."', "no column rises evenly: name the one with the clock,"),
+            _line('# time = "..."', "no column rises evenly: name the clock column,"),
             _line("# rate = 1000.0", "or give the samples per second"),
         ]
     values = table.columns[clock]
@@ -250,7 +250,7 @@ def _time_unit(written: str, how: str, step: float) -> tuple[str, str]:
 def _guessed(
     table: Table, signals: Sequence[str], columns: Sequence[str], wanted: Wanted
 ) -> dict[str, tuple[str, str]]:
-    """A column for each signal, and why: the most alike first, then by unit and order."""
+    """Column for each signal, and why: most similar names first, then by unit and order."""
     fits = {
         (signal, column): _fits(table, column, signal, wanted)
         for signal in signals
@@ -267,21 +267,21 @@ def _guessed(
         alike = likeness[signal, column] >= _ALIKE
         if alike and signal not in chosen and column in free:
             same = signal.lower() == column.lower()
-            chosen[signal] = column, "" if same else "a guess, by its name"
+            chosen[signal] = column, "" if same else "a guess from its name"
             free.remove(column)
     for signal in signals:
         left = [column for column in free if fits[signal, column] and not _idle(table, column)]
         if signal not in chosen and left:
-            # Of those that fit equally well the first in the file.
+            # The first of those that fit equally well.
             best = max(left, key=lambda column: fits[signal, column])
             how = "unit" if fits[signal, best] == 2 else "place"
-            chosen[signal] = best, f"A GUESS, by its {how}: check it"
+            chosen[signal] = best, f"A GUESS from its {how}: check it"
             free.remove(best)
     return chosen
 
 
 def _idle(table: Table, column: str) -> str:
-    """Why a column is hardly a signal; empty where it may be."""
+    """Reason why a column is hardly a signal; empty if it may be one."""
     values = table.columns[column]
     values = values[np.isfinite(values)]
     if len(values) == 0 or np.ptp(values) == 0:
@@ -298,7 +298,7 @@ def _signal_lines(table: Table, signal: str, column: str, kind: str, why: str) -
         _line(f"unit = {_quoted(unit)}", how or "fill in: deg, rad, N*m, ..."),
         _line("# limit = 12.0", "mechanical stop, in this unit"),
         _line("# offset = 0.0", "subtracted, in this unit"),
-        _line("# sign = -1", "where the sensor counts the other way"),
+        _line("# sign = -1", "if the sensor counts in the opposite direction"),
     ]
 
 

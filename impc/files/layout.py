@@ -1,8 +1,7 @@
-"""Rows of text or cells: where the recording begins and ends, what its columns are called.
+"""Find the block of numbers in rows of text or cells, and the names and units of its columns.
 
-A row is known by its kinds: a number, a word or nothing in each place. The recording begins at the
-first row whose width and kinds go on below it. Names and units of its columns stand above it:
-``angle (deg)``, or a row of units.
+Each cell is a number, a word or empty. The recording begins at the first row whose width and kinds
+continue below it. Names and units stand above: ``angle (deg)``, or a row of units.
 """
 
 from __future__ import annotations
@@ -22,41 +21,41 @@ if TYPE_CHECKING:
 EMPTY, NUMBER, WORD = 0, 1, 2
 #: Rows among which the first row of numbers must be.
 HEAD = 100
-# Rows of one shape that are a recording, and where they begin with a word, as settings do.
+# Rows of one shape that make a recording; more if they begin with a word, as settings do.
 _SEVERAL, _NAMED = 3, 20
 
 
 @dataclass
 class Block:
-    """Rows of one shape: the index of the first, kinds of each place of all, and counts."""
+    """Consecutive rows of one shape: index of the first, kind of each column, and counts."""
 
-    first: int  # Index of the first row, and how many rows, numbers and words it has
-    kinds: list[int] = field(default_factory=list)  # Of each place, of all rows together
+    first: int
+    kinds: list[int] = field(default_factory=list)  # of each column, over all rows
     rows: int = 0
     numbers: int = 0
     words: int = 0
 
     @property
     def width(self) -> int:
-        """Places up to the last one that has numbers."""
+        """Number of columns up to the last one with numbers."""
         return max(
             (place + 1 for place, kind in enumerate(self.kinds) if kind == NUMBER), default=0
         )
 
     @property
     def share(self) -> float:
-        """Share of numbers among all that is not empty."""
+        """Share of numbers among the cells that are not empty."""
         return self.numbers / max(self.numbers + self.words, 1)
 
     @property
     def several(self) -> bool:
-        """Whether it has several rows, which are mostly numbers."""
+        """Whether it has enough rows and mostly numbers."""
         return self.share > 0.5 and self.rows >= (_NAMED if self.kinds[0] == WORD else _SEVERAL)
 
     def fits(self, row: Sequence[int], after_blank: bool = False) -> bool:
-        """Whether a row has the same shape: as many places, or fewer or more without numbers.
+        """Whether a row has the same shape; further or missing cells must not be numbers.
 
-        One `after_blank`, an empty row, must have the first number of the rows above: the clock.
+        `after_blank`: behind an empty row, the first number (the clock) must be present.
         """
         if after_blank and row[self.kinds.index(NUMBER) :][:1] != [NUMBER]:
             return False
@@ -67,7 +66,7 @@ class Block:
         )
 
     def add(self, row: Sequence[int]) -> None:
-        """Take in a row that fits."""
+        """Include a row that fits."""
         self.kinds += [EMPTY] * (len(row) - len(self.kinds))
         self.kinds[: len(row)] = [kind or own for kind, own in zip(row, self.kinds, strict=False)]
         self.rows += 1
@@ -75,10 +74,10 @@ class Block:
         self.words += row.count(WORD)
 
     def ends_at(self, row: Sequence[int], following: Sequence[int], after_blank: bool) -> bool:
-        """Whether a row that does not fit is where the block ends, and not a row that is damaged.
+        """Whether a row that does not fit ends the block (otherwise it is damaged).
 
-        It is `after_blank`, behind an empty row; or a head of words; or it begins with a word, as
-        statistics do, and the `following` row does not fit either.
+        It ends behind an empty row, at a heading of words, or at a label (as of statistics) if
+        the `following` row does not fit either.
         """
         words = NUMBER not in row
         if after_blank or (words and row.count(WORD) > 1):
@@ -88,11 +87,11 @@ class Block:
 
 
 def first_block(rows: Sequence[Sequence[int]], alone: bool) -> Block | None:
-    """The first block of several `rows` that are mostly numbers, else that with most numbers.
+    """First block with enough rows and mostly numbers, else the one with most numbers.
 
-    The rows are kinds, from the top of a file; `alone` says whether one may be a number alone. Rows
-    as long as its own right above it that begin with a number too belong to it: they have a word in
-    the place of a number.
+    `rows` are kinds from the top of a file; `alone`: a row may be a single number. Rows of the
+    same width directly above that begin with a number belong to it: they have a word instead of a
+    number.
     """
     blocks: list[Block] = []
     for index, row in enumerate(rows):
@@ -114,16 +113,16 @@ def first_block(rows: Sequence[Sequence[int]], alone: bool) -> Block | None:
     return best
 
 
-# What may end the settings of a file without heads: LabVIEW's, OpenSim's.
+# Lines that may end the settings of a file without headings (LabVIEW, OpenSim).
 _NO_HEAD = ("endofheader", "endheader")
-# Columns that rows may leave away where they are empty.
+# Columns that rows may omit where they are empty.
 _REMARKS = ("comment", "comments", "kommentar", "event", "events", "note", "notes", "remarks")
 
 _HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
 
 
 def split_heading(heading: str) -> tuple[str, str]:
-    """Name and unit of a heading such as ``angle (deg)``; the unit is empty when it has none."""
+    """Name and unit of a heading such as ``angle (deg)``; the unit may be empty."""
     found = _HEADING.fullmatch(heading.strip())
     if found and is_unit(found[2]):
         return found[1], found[2].strip()
@@ -131,23 +130,23 @@ def split_heading(heading: str) -> tuple[str, str]:
 
 
 def written_heading(name: str, unit: str | None) -> str:
-    """The heading of a `name` and its `unit` that `split_heading` takes apart."""
+    """Heading of `name` and `unit`, the inverse of `split_heading`."""
     return f"{name} ({unit})" if unit else name
 
 
 def are_units(row: Sequence[str]) -> bool:
-    """Whether a row of headings names units and nothing else."""
+    """Whether a row of headings contains units only."""
     plain = [_bare(item) for item in row]
     return any(plain) and all(not item or is_unit(item) for item in plain)
 
 
 @dataclass(frozen=True)
 class Headings:
-    """What stands above the numbers."""
+    """Headings above the numbers."""
 
-    names: tuple[str, ...]  # Of all columns; empty for one without a name
-    units: dict[str, str]  # Of the columns that have one
-    notes: tuple[str, ...] = ()  # Which names are not those of the file
+    names: tuple[str, ...]  # of all columns; empty for a column without a name
+    units: dict[str, str]  # of the columns that have one
+    notes: tuple[str, ...] = ()  # names that differ from those of the file
 
 
 def find_headings(
@@ -155,8 +154,8 @@ def find_headings(
 ) -> Headings:
     """Names and units from the rows `above` the numbers, the last of which are the header.
 
-    `empty` says which columns below have no value, `named_rows` whether the first may be names of
-    rows, above which nothing stands; `source` is the file.
+    `empty`: columns without values; `named_rows`: the first column may hold row names without a
+    heading; `source`: file, for messages.
     """
     width = len(empty)
     rows = [row for row in map(_trimmed, above) if row]
@@ -175,7 +174,7 @@ def find_headings(
     if len(heads) > width or not all(empty[len(heads) :]):
         raise DataError(
             source,
-            f"the header names {len(heads)} columns, and the rows below have {width} values",
+            f"the header names {len(heads)} columns, but the rows below have {width} values",
             "export with a point as decimal sign, or with semicolons between columns",
         )
     level = rows[-2] if len(rows) > 1 and len(rows[-2]) <= width else ()
@@ -183,18 +182,18 @@ def find_headings(
 
 
 def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> Headings:
-    """Names from the `heads` of all columns, made distinct, and units of those that have one.
+    """Distinct names from the `heads` of all columns, and units of those that have one.
 
-    `units` is a row of their own, empty where there is none; `level` the row above the heads, which
-    names what has no name, and distinguishes what has the same.
+    `units` is a separate row of units (or empty); `level` the row above the heads, which names
+    columns without a name and distinguishes equal names.
     """
     split = [split_heading(item) for item in heads]
     names = [name or above for (name, _), above in zip(split, level, strict=True)]
     if _repeated([name for name, _ in split]) and not _repeated(heads):
-        names = [head or above for head, above in zip(heads, level, strict=True)]  # angle (rad) too
+        names = [head or above for head, above in zip(heads, level, strict=True)]  # keep the unit
     found = _distinct(names, level)
     changed = [f"{new!r}" for old, new in zip(names, found, strict=True) if old != new]
-    note = f"columns of one name are distinguished: {', '.join(changed[:12])}"
+    note = f"columns with the same name were renamed: {', '.join(changed[:12])}"
     stated = {
         name: _bare(below) or own
         for name, (_, own), below in zip(found, split, units, strict=True)
@@ -204,7 +203,7 @@ def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[st
 
 
 def _distinct(names: Sequence[str], level: Sequence[str]) -> list[str]:
-    """Names that differ: by what stands above them, else by a number."""
+    """Make names distinct with the row above them, else with a number."""
     groups, group = [], ""
     for above in level:
         group = above or group
@@ -228,12 +227,12 @@ def _distinct(names: Sequence[str], level: Sequence[str]) -> list[str]:
 
 
 def _repeated(names: Sequence[str]) -> set[str]:
-    """The names that come again; columns without a name do not count."""
+    """Names that occur more than once; empty ones do not count."""
     return {name for name, times in Counter(names).items() if name and times > 1}
 
 
 def _trimmed(row: Sequence[str]) -> list[str]:
-    """Without empty fields at the end."""
+    """Row without empty fields at the end."""
     filled = [place for place, item in enumerate(row) if item]
     return list(row[: filled[-1] + 1]) if filled else []
 
@@ -249,12 +248,11 @@ def _bare(item: str) -> str:
 def require_no_thousands(
     source: str, names: Mapping[int, str], rows: Iterable[tuple[int, Sequence[str]]], sign: str
 ) -> None:
-    """Refuse a column whose decimal `sign` may divide thousands.
+    """Reject a column whose decimal `sign` may be a thousands separator.
 
-    It may where the sign always stands before three digits and behind one to three that do not
-    begin with 0, and other values are whole numbers without a sign. A program that writes decimals
-    writes 999.000 there, or 1. `names` are those of the columns by their place in `rows`, which are
-    numbers of lines with their fields; `source` is the file.
+    That is possible if the sign always stands before three digits and behind one to three that do
+    not begin with 0, while other values are whole numbers without it. Programs that write decimals
+    write 999.000 or 1. there. `names` by index in `rows`, which are (line number, fields).
     """
     grouped = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:{re.escape(sign)}\d{{3}})+")
     left = dict(names)
@@ -269,7 +267,7 @@ def require_no_thousands(
             elif grouped.fullmatch(item):
                 first.setdefault(index, (number, item))
             else:
-                del left[index]  # decimals, without a doubt
+                del left[index]  # certainly decimals
         if not left:
             return
     for index, name in left.items():
@@ -277,7 +275,7 @@ def require_no_thousands(
             line, item = first[index]
             raise DataError(
                 source,
-                f"column {name!r} has whole numbers and {item!r} in line {line}, which may "
-                "be a thousand",
-                "export it without thousands separators, or with as many decimals in every row",
+                f"column {name!r} has whole numbers, and {item!r} in line {line} can be a decimal "
+                "or thousands",
+                "export it without thousands separators, or with equal decimals in every row",
             )

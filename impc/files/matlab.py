@@ -1,10 +1,8 @@
-"""MATLAB .mat files up to version 7 (called v5 after their header), by scipy.
+"""Read and write MATLAB .mat files up to version 7 (v5 in their header) with scipy.
 
-A flipped bit can end the process in scipy's reader: files are read in a process of their own
-(`impc.files.apart`).
-
-Vectors are columns by their name, the columns of a matrix are `name_1`, `name_2` and so on, numeric
-fields of a struct are `s.field`. The longer side of a matrix is taken as time.
+A flipped bit can crash scipy's reader: files are read in a separate process (`impc.files.apart`).
+Vectors become columns of their name, columns of a matrix `name_1`, `name_2`, ..., numeric fields of
+a struct `s.field`. The longer side of a matrix is time.
 """
 
 from __future__ import annotations
@@ -28,13 +26,13 @@ if TYPE_CHECKING:
 
 _DEPTH = 8
 _LONGEST = 1_000_000  # characters of the names in a saved plant
-#: What a cell, table or object has to become; each sentence ends a reason.
+#: How to save a cell, table or object instead; ends a reason.
 AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
 def read_matlab(path: Path, _largest: int) -> Table:
-    """Read the .mat file of version 5 to 7 at `path`; the process bounds what it unpacks to."""
+    """Read a .mat file of version 5 to 7 (the process limits the memory)."""
     columns: dict[str, Array] = {}
     skipped: dict[str, str] = {}
     for name, value in _variables(path).items():
@@ -43,11 +41,7 @@ def read_matlab(path: Path, _largest: int) -> Table:
 
 
 def read_matrices(path: Path, _largest: int) -> dict[str, Array | list[str | None]]:
-    """Read the matrices and names of a saved plant from the .mat file of version 5 to 7 at `path`.
-
-    Real numbers in MATLAB's sizes, (rows, columns) or more; of a text
-    its rows, of a cell array its texts, None for what is no text.
-    """
+    """Read the real matrices, texts and cell arrays of text of a saved plant (.mat v5 to v7)."""
     found: dict[str, Array | list[str | None]] = {}
     for name, value in _variables(path).items():
         if type(value) is np.ndarray and value.dtype.kind in "USO":
@@ -64,7 +58,7 @@ def read_matrices(path: Path, _largest: int) -> dict[str, Array | list[str | Non
 
 
 def array_columns(name: str, array: Any) -> dict[str, Array] | str:
-    """The columns (samples,) of a real numeric array called `name`, or why it has none."""
+    """Columns (samples,) of a real numeric array called `name`, or why it has none."""
     if array.dtype.kind not in "fiub":
         return "is complex" if array.dtype.kind == "c" else "is not numeric"
     if array.size < 2:
@@ -80,8 +74,8 @@ def array_columns(name: str, array: Any) -> dict[str, Array] | str:
 
 
 def encode_matlab(table: Table) -> bytes:
-    """The bytes of a v5 .mat file with one column vector for each column; units are not kept."""
-    import scipy.io  # noqa: PLC0415  # a third of a second, for who writes only
+    """Content of a v5 .mat file with one column vector per column; units are not stored."""
+    import scipy.io  # noqa: PLC0415  # takes a third of a second
 
     content = io.BytesIO()
     vectors = {name: values[:, None] for name, values in table.columns.items()}
@@ -91,16 +85,13 @@ def encode_matlab(table: Table) -> bytes:
 
 
 def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
-    """The `columns`, (samples,) each, as MATLAB variables; `s.field` as the field of a struct.
-
-    `source` is the file, for the message.
-    """
+    """Nest `columns` (samples,) as MATLAB variables: `s.field` becomes a field of a struct."""
     nested: dict[str, Any] = {}
     for name, values in columns.items():
         *parents, last = name.split(".")
         if not all(_NAME.fullmatch(part) for part in (*parents, last)):
             raise OutputError(
-                f"column {name!r} of {source}", "cannot be the name of a variable in MATLAB",
+                f"column {name!r} of {source}", "is not a valid MATLAB variable name",
                 "rename it with letters, digits and _",
             )  # fmt: skip
         place = nested
@@ -111,19 +102,19 @@ def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
 
 
 def _variables(path: Path) -> dict[str, Any]:
-    """The variables of a file by name, as scipy has them."""
-    import scipy.io  # noqa: PLC0415  # in the process that reads only
+    """Variables of a file by name, as scipy returns them."""
+    import scipy.io  # noqa: PLC0415  # only in the reader process
     from scipy.io.matlab import MatlabOpaque, MatReadWarning  # noqa: PLC0415
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # Two variables of one name, or a variable cut off: never a part of a file.
+        # Duplicate names or a truncated variable are errors: never read part of a file.
         warnings.simplefilter("error", MatReadWarning)
-        # scipy calls every object None, strings among them: two are no fault.
+        # Except for "None", which scipy calls every object, strings included.
         warnings.filterwarnings("ignore", 'Duplicate variable name "None"', MatReadWarning)
         found = scipy.io.loadmat(path, appendmat=False, struct_as_record=True)
     return {
-        # scipy calls opaque objects None; the name is inside.
+        # scipy calls opaque objects None; their name is inside.
         (_text(value, "s0") or name) if isinstance(value, MatlabOpaque) else name: value
         for name, value in found.items()
         if not name.startswith("__")
@@ -133,13 +124,13 @@ def _variables(path: Path) -> dict[str, Any]:
 def _collect(
     name: str, value: Any, columns: dict[str, Array], skipped: dict[str, str], depth: int
 ) -> None:
-    """Put a variable's columns, or the reason why it has none, in their place."""
+    """Add the columns of a variable, or the reason why it has none."""
     reason = _unreadable(value)
     if reason:
         skipped[name] = reason
     elif value.dtype.names:
         if value.size != 1 or depth >= _DEPTH:
-            skipped[name] = f"is an array of {value.size} structs; save each as a file of its own"
+            skipped[name] = f"is an array of {value.size} structs; save each as a separate file"
             return
         for part in value.dtype.names:
             _collect(f"{name}.{part}", value.flat[0][part], columns, skipped, depth + 1)
@@ -152,7 +143,7 @@ def _collect(
 
 
 def _unreadable(value: Any) -> str:
-    """Why a MATLAB value is no array of numbers or struct; empty when it is one."""
+    """Reason why a MATLAB value is neither a numeric array nor a struct; empty if it is."""
     import scipy.sparse  # noqa: PLC0415
     from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque  # noqa: PLC0415
 
@@ -173,7 +164,7 @@ def _text(value: Any, part: str) -> str:
 
 
 def _names(value: Any) -> list[str | None]:
-    """The rows of a text, or the texts of a cell array; None for a cell of something else."""
+    """Rows of a text, or texts of a cell array; None for a cell without text."""
     if value.dtype.kind == "O":
         rows = [_names(cell) if _is_text(cell) else None for cell in value.ravel(order="F")]
         return [None if row is None else " ".join(map(str, row)) for row in rows]

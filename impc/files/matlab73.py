@@ -1,4 +1,4 @@
-"""MATLAB .mat files of version 7.3: HDF5 behind a block of 512 bytes, by h5py."""
+"""Read MATLAB .mat files of version 7.3 (HDF5 behind a block of 512 bytes) with h5py."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _DEPTH = 8
 _MOST = 10_000  # names in a file
-_MOST_IDENTIFIED = 256  # bytes of an attribute of MATLAB's: it has one word
+_MOST_IDENTIFIED = 256  # bytes of a MATLAB attribute, which holds one word
 _NUMERIC = {"double", "single", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
@@ -30,19 +30,19 @@ _NUMERIC = {"double", "single", "logical"} | {
 
 @dataclass
 class _Found:
-    """What a file holds, while it is read."""
+    """State of reading a file."""
 
     source: str
     left: int  # bytes that may still be read
     names: int = 0
-    seen: set[tuple[int, int]] = field(default_factory=set)  # places of objects in the file
+    seen: set[tuple[int, int]] = field(default_factory=set)  # addresses of objects in the file
     columns: dict[str, Array] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
 
 
 def read_matlab73(path: Path, largest: int) -> Table:
-    """Read the .mat file of version 7.3 at `path`; unpacked it takes `largest` bytes at most."""
-    import h5py  # noqa: PLC0415  # a fifth of a second, for who reads text only
+    """Read a .mat file of version 7.3; unpacked it may take `largest` bytes."""
+    import h5py  # noqa: PLC0415  # takes 0.2 s; not needed for text files
 
     found = _Found(str(path), largest)
     with h5py.File(path, "r") as file:
@@ -61,10 +61,10 @@ def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:
         if found.names > _MOST:
             raise DataError(found.source, f"holds more than {_MOST} names", "save fewer of them")
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise DataError(found.source, f"{full} points elsewhere", "save the signals themselves")
+            raise DataError(found.source, f"{full} is a link", "save the signals themselves")
         item = group[name]
-        if _seen(found, item):  # a link to what was read: a file may hold any number, and cycles
-            found.skipped[full] = "is another name of what stands before it"
+        if _seen(found, item):  # hard links can form cycles
+            found.skipped[full] = "is a link to an earlier variable"
             continue
         kind = _class_of(item)
         if isinstance(item, h5py.Group):
@@ -79,14 +79,14 @@ def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:
 
 
 def _add(found: _Found, name: str, dataset: Any, kind: str) -> None:
-    """Read one dataset, when it is numeric."""
+    """Read a dataset if it is numeric."""
     if dataset.external or dataset.is_virtual:
         raise DataError(found.source, f"{name} lies in another file", "save the signals themselves")
     reason = _unreadable(dataset, kind)
     if reason:
         found.skipped[name] = reason
         return
-    # HDF5 takes the memory of a whole chunk, however little of it is filled.
+    # HDF5 allocates whole chunks, however little of them is filled.
     chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
     found.left -= max(8, dataset.dtype.itemsize) * dataset.size
     if found.left < chunk:
@@ -103,7 +103,7 @@ def _add(found: _Found, name: str, dataset: Any, kind: str) -> None:
 
 
 def _unreadable(dataset: Any, kind: str) -> str:
-    """Why a dataset has no column, from what the file says of it; empty when it may have one."""
+    """Reason why a dataset has no column, from its metadata; empty if it may have one."""
     if "MATLAB_object_decode" in dataset.attrs or kind not in (*_NUMERIC, ""):
         reasons = {"char": "is text", "cell": f"is a cell array; {AS_STRUCT}, or cell2mat"}
         return reasons.get(kind, f"is a MATLAB {kind}; {AS_STRUCT}, or writetable")
@@ -115,11 +115,11 @@ def _unreadable(dataset: Any, kind: str) -> str:
         return "is not numeric"
     if dataset.ndim > 2:
         return f"has {dataset.ndim} dimensions"
-    return "" if dataset.id.get_storage_size() else "has no values, only one to fill it with"
+    return "" if dataset.id.get_storage_size() else "has no stored values, only a fill value"
 
 
 def _seen(found: _Found, item: Any) -> bool:
-    """Whether the object was met before; it is from now on."""
+    """Whether the object occurred before; records it."""
     import h5py  # noqa: PLC0415
 
     place = h5py.h5o.get_info(item.id)
@@ -136,7 +136,7 @@ def _class_of(item: Any) -> str:
 
 
 def _attribute(item: Any, name: str) -> Any:
-    """An attribute of one word or number; None where there is none."""
+    """Attribute that is one word or number; None if there is none."""
     if name not in item.attrs:
         return None
     attribute = item.attrs.get_id(name)

@@ -1,14 +1,12 @@
-"""A plant from where a user keeps it: an import path with arguments, or a saved state space.
+"""Plants from an import path with arguments, or from saved state-space matrices.
 
-A module that comes with the package, or with what is installed, is never looked for in the working
-folder: a file there called plants.py or numpy.py replaces nothing. Only a module of another name is
-looked for there, last, as long as it is being imported. What a user's function does wrong, whatever
-it raises, is one line that names it.
+A module of this package or of an installed one is never searched in the working folder: a file
+there called plants.py or numpy.py replaces nothing. Other modules are searched there last, and only
+during the import. Any exception of a user's function becomes one line that names it.
 
-A study file that names a plant `module:function` asks for that module to be imported and that
-function to be called. Somebody else may have written the file: such a name needs the consent of
-whoever types the command. The plants of this package, and saved matrices, need none
-(docs/security.md).
+A study file that names a plant `module:function` makes impc run that code. Because someone else may
+have written the file, such a name needs the consent of the user on the command line; plants of
+this package and saved matrices need none (docs/ref/security.md).
 """
 
 from __future__ import annotations
@@ -37,22 +35,22 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-#: Arguments of a plant that are measured of every subject.
+#: Arguments of a plant that are measured for every subject.
 OWN = ("mass", "height")
-#: The table in [plant] that says how well its parameters are known, and a word in it for all.
+#: Table in [plant] with the uncertainty of its parameters, and its key for all of them.
 UNCERTAINTY, _ALL = "uncertainty", "all"
 
 
 @dataclass(frozen=True)
 class PlantSource:
-    """How to make a plant."""
+    """Function that makes a plant, with its arguments."""
 
-    name: str  # Import path ``module:function`` or file
-    make: Callable[..., Any]  # Keyword arguments -> `control.StateSpace`
-    arguments: Mapping[str, Any]  # Arguments as the configuration's [plant] table gives them
+    name: str  # import path ``module:function`` or file
+    make: Callable[..., Any]  # keyword arguments -> `control.StateSpace`
+    arguments: Mapping[str, Any]  # from the [plant] table
 
     def defaults(self) -> dict[str, object]:
-        """Arguments of the function with their defaults, `FILL_IN` for one that has none."""
+        """Arguments of the function with their defaults; `FILL_IN` if there is none."""
         found = {}
         for name, item in inspect.signature(self.make).parameters.items():
             if item.kind not in (item.VAR_POSITIONAL, item.VAR_KEYWORD):
@@ -60,7 +58,7 @@ class PlantSource:
         return found
 
     def assumed(self) -> dict[str, object]:
-        """What is measured of every subject, and stands here at the plant's typical value."""
+        """Arguments of the subject (`OWN`) that keep the plant's typical value."""
         defaults = {} if Path(self.name).suffix in SAVED else self.defaults()
         left = (name for name in OWN if name in defaults and name not in self.arguments)
         return {name: defaults[name] for name in left if defaults[name] != FILL_IN}
@@ -69,22 +67,22 @@ class PlantSource:
 def consented_name(
     where: str, named: str, given: str | None, allowed: bool, option: str, known: tuple[str, ...]
 ) -> str:
-    """The plant or model that may be run, when the place `where` in a file has `named` one.
+    """Name of the plant or model to run: that of the command line, else `named` in a file.
 
-    What the command line has `given` replaces it; `allowed` says whether it allows what the file
-    names. `option` is "plant" or "model", and `known` are short names of this package's own.
+    Code that a file names needs `given` on the command line, or `allowed`. `where` is the place in
+    the file; `option` is "plant" or "model"; `known` are short names of this package.
     """
     name = given or named
     if not name:
         raise InputError(where, "is missing", f'write {option} = "module:function"')
     module = name.partition(":")[0]
-    data = option == "plant" and Path(name).suffix in SAVED  # a model is never a file
+    data = option == "plant" and Path(name).suffix in SAVED  # a model is never data
     if name in known or data or module == "plants" or ":" not in name:
-        return name  # the last: no name of code at all, and said so by who looks for it
+        return name  # without ":" it is no import path; rejected where it is used
     if given is None and not allowed:
         raise InputError(
             where, f"names code that would be run, {name!a}",
-            f"look at it, then say --{option} {name}, or --allow-{option}",
+            f"inspect it, then pass --{option} {name} or --allow-{option}",
         )  # fmt: skip
     return name
 
@@ -93,8 +91,8 @@ def consented_name(
 def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """Find a plant by import path, or by the name of a .mat, .npz or .json file.
 
-    A file holds A, B, C and dt, and may hold D, and the names `states`, `inputs`, `outputs`, which
-    the arguments may give as well. A .npz file is read without pickles.
+    A file holds A, B, C, dt and optionally D and the names `states`, `inputs`, `outputs`, which
+    `arguments` may also give. A .npz file is read without pickles.
     """
     if Path(name).suffix in SAVED:
         matrices = read_matrices(Path(name))
@@ -106,12 +104,14 @@ def plant_source(name: str, arguments: Mapping[str, Any]) -> PlantSource:
 
 @checked
 def import_function(path: str) -> Callable[..., Any]:
-    """The function of an import path ``module:function``; see the module's text for where."""
+    """Import ``module:function`` (search order: see the module docstring)."""
     module, _, function = path.partition(":")
     first = module.partition(".")[0]
     if not (first and function):
         raise InputError(
-            f"plant {path}", "is neither a known name, a file, nor module:function", "see docs"
+            f"plant {path}",
+            "is neither a known name, a file, nor module:function",
+            "see docs/tutorials/own_plant.md",
         )
     installed = first in sys.modules or importlib.util.find_spec(first) is not None
     try:
@@ -132,10 +132,9 @@ def import_function(path: str) -> Callable[..., Any]:
 
 @contextmanager
 def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
-    """Run code of a user's, of that `name`: whatever it raises is one line that says so.
+    """Turn any exception of user code `name` into one line of this package's form.
 
-    Errors of the package, those of the kinds in `passing` and an interruption from the keyboard
-    stay what they are.
+    Errors of this package, those in `passing` and KeyboardInterrupt pass unchanged.
     """
     foreseen: tuple[type[Exception], ...] = (ImpcError, *passing)
     try:
@@ -146,19 +145,19 @@ def users_code(name: str, *passing: type[Exception]) -> Iterator[None]:
         if type(error) is KeyboardInterrupt:
             raise
         said = one_line(error)
-        problem = f"ends in {type(error).__name__}{f' ({said})' if said else ''}"
-        raise InputError(name, problem, "correct the function, or what it is given") from None
+        problem = f"raised {type(error).__name__}{f' ({said})' if said else ''}"
+        raise InputError(name, problem, "correct the function, or its arguments") from None
 
 
 @contextmanager
 def _beside_the_recordings() -> Iterator[None]:
-    """The working folder on the import path, behind all that is installed."""
+    """Put the working folder last on the import path."""
     folder = os.getcwd()
     sys.path.append(folder)
     try:
         yield
     finally:
-        sys.path.reverse()  # the last one, should it have been there before
+        sys.path.reverse()  # remove the last entry, not an equal earlier one
         sys.path.remove(folder)
         sys.path.reverse()
 
@@ -169,8 +168,8 @@ def make_plant(
 ) -> Plant:
     """Make the plant; inputs that are `recorded` are disturbances, the others are controls.
 
-    Names that are no inputs are ignored; what is `changed` replaces arguments of the source. Of a
-    `linear` plant the body is not made.
+    Names that are not inputs are ignored; `changed` replaces arguments of the source; with
+    `linear` the nonlinear body is not made.
     """
     name, system = f"plant {source.name}", made_by(source, **changed)
     if linear and hasattr(system, "body"):
@@ -180,17 +179,14 @@ def make_plant(
     inputs = tuple(getattr(system, "input_labels", ()))
     controls = [item for item in inputs if item not in recorded]
     if inputs and not controls:
-        remedy = "write command = true in [signals.NAME] of the command"
+        remedy = "set command = true in [signals.NAME] of the command"
         raise PlantError(name, "all its inputs are recorded", remedy)
     with _refused_arguments(name), users_code(name, *_REFUSED):
         return Plant(system, controls or None)
 
 
 def made_by(source: PlantSource, **changed: float) -> Any:
-    """What the function of a source returns: a plant as a rule, or an optimal control problem.
-
-    What is `changed` replaces arguments of the source.
-    """
+    """Result of the source's function (plant or optimal control problem), some args `changed`."""
     arguments = {**source.arguments, **changed}
     arguments.pop(UNCERTAINTY, None)
     for key, value in arguments.items():
@@ -207,13 +203,13 @@ _REFUSED = (TypeError, ValueError, np.exceptions.ComplexWarning)
 
 @contextmanager
 def _refused_arguments(name: str) -> Iterator[None]:
-    """What a function says of its arguments, as one line on the plant `name`."""
+    """Turn errors about the arguments of plant `name` into one line."""
     try:
         yield
     except ImpcError:
         raise
     except np.exceptions.ComplexWarning:  # control.ss would drop the imaginary parts
-        raise PlantError(name, "has complex matrices", "give it real ones") from None
+        raise PlantError(name, "has complex matrices", "make them real") from None
     except (TypeError, ValueError) as error:
         raise InputError(
             name, f"refuses its arguments ({one_line(error)})", "correct the [plant] table"
@@ -223,10 +219,10 @@ def _refused_arguments(name: str) -> Iterator[None]:
 def plant_family_of(
     source: PlantSource, recorded: Sequence[str], free: Sequence[str]
 ) -> PlantFamily | None:
-    """The plants that differ in the `free` arguments and in uncertain ones; None without any.
+    """Family of plants that differ in `free` and uncertain arguments; None without any.
 
-    The names of `recorded` signals are as in `make_plant`. A body that is not linear keeps, beside
-    a linear part that follows the parameters, what is not linear of it.
+    `recorded` as in `make_plant`. A nonlinear body keeps its nonlinear part; its linear part
+    follows the parameters.
     """
     offered = made_by(source)
     nominal = dict(getattr(offered, "parameters", {}))
@@ -252,11 +248,11 @@ def plant_family_of(
 
 
 def _stated_uncertainty(source: PlantSource, offered: Any) -> dict[str, Any]:
-    """Standard deviations by name: those of the plant, and what [plant.uncertainty] says."""
+    """Standard deviations by name: the plant's own, overridden by [plant.uncertainty]."""
     given = source.arguments.get(UNCERTAINTY, {})
     if not isinstance(given, dict):
-        remedy = 'write a table [plant.uncertainty], as in mass = "3 %"'
-        raise InputError(f"[plant] {UNCERTAINTY}", "is no table", remedy)
+        remedy = 'write a table [plant.uncertainty], for example mass = "3 %"'
+        raise InputError(f"[plant] {UNCERTAINTY}", "is not a table", remedy)
     for name, value in given.items():
         if isinstance(value, bool) or not isinstance(value, (int, float, str)):
             raise InputError(f"[plant.{UNCERTAINTY}] {name}", f"got {value!r}", 'give "5 %"')
@@ -273,5 +269,5 @@ def _nominal(source: PlantSource, name: str) -> float:
         parameter = inspect.signature(source.make).parameters.get(name)
         value = None if parameter is None else parameter.default
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"parameter {name}", "has no nominal value", "give it in [plant]")
+        raise InputError(f"parameter {name}", "has no nominal value", "set it in [plant]")
     return float(value)

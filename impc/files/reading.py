@@ -1,4 +1,4 @@
-"""Recordings from files: columns by the configuration, checked, on the plant's clock."""
+"""Read recordings: columns by configuration, checked, resampled to the plant's rate."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from impc.files.units import Unit
     from impc.model.plant import Plant
 
-# Shares of half the range above which an offset and a drift are findings.
+# Ratios to half the range above which offset and drift are reported.
 _OFFSET, _DRIFT = 0.12, 0.25
-# Samples for each state of the plant below which nothing can be fitted.
+# Samples needed for each state of the plant.
 _SAMPLES_A_STATE = 5
-# Share of a resampled value that missing samples may be, beyond which it is missing itself.
+# Largest share of missing samples in a resampled value that still counts as measured.
 _LOST = 0.05
 
 
@@ -59,24 +59,24 @@ def read_recordings(
     Parameters
     ----------
     paths : sequence of Path
-        One file a trial.
+        One file for each trial.
     configuration : Configuration
-        Names a column for each output of the plant, for its target, and for the disturbances and
-        commands that were recorded; other disturbances are zero.
+        Names a column for each output of the plant, for its target, and for the recorded
+        disturbances and commands; other disturbances are zero.
     plant : Plant
-        Discrete; gives the names and the rate.
+        Discrete-time plant; determines names and rate.
 
     Returns
     -------
     tuple of Recording
-        In SI base units; initial states zero; findings of the checks beside each.
+        Trials in SI base units, with initial states zero and the findings of the checks.
 
     Raises
     ------
     InputError
-        When the configuration does not name the plant's signals, or a file is given twice.
+        If the configuration does not name the plant's signals, or a file is given twice.
     DataError
-        When a file cannot be read or a check fails. Nothing is returned then.
+        If a file cannot be read or a check fails; nothing is returned then.
 
     Examples
     --------
@@ -104,12 +104,12 @@ def read_recordings(
 def read_unit(
     paths: Sequence[Path], configuration: Configuration, plant: Plant
 ) -> tuple[tuple[Recording, ...], tuple[FallError, ...]]:
-    """The trials of the `paths` in which the subject did not fall, and the falls by file."""
+    """Trials in which the subject did not fall, and the falls by file."""
     plant.require_discrete()
-    _require_names(configuration, plant)  # before files are read, which may take long
+    _require_names(configuration, plant)  # before the slow reading of files
     require_distinct(paths)
     if not paths:
-        raise InputError("recordings", "no file is given", "name at least one")
+        raise InputError("recordings", "no file is given", "name at least one file")
     sheet = configuration.recording.sheet
     tables = (read_table(path, sheet=sheet) for path in paths)
     read: list[tuple[Path, Recording]] = []
@@ -132,7 +132,7 @@ def read_unit(
 
 
 def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Recording:
-    """Make the trial of one table: checks, even clock, plant's rate."""
+    """Make the trial of one table: checks, uniform clock, plant's rate."""
     _require_names(configuration, plant)
     entry = configuration.recording
     label = label_of(table.source, entry)
@@ -159,7 +159,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
         series[name] = np.where(np.abs(share) > _LOST, np.nan, series[name])
     controls, nothing = plant.commands or plant.controls, np.full(samples, np.nan)
     commands = np.column_stack([series.get(name, nothing) for name in controls])
-    if plant.commands:  # its controls are their changes
+    if plant.commands:  # the controls are changes of the commands
         commands = np.diff(commands, axis=0, prepend=np.nan)
     return Recording(
         plant,
@@ -176,18 +176,18 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 def _clocked(
     table: Table, clock: Clock, configuration: Configuration, plant: Plant
 ) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], list[str]]:
-    """Every signal, where it is missing, and every target, on the plant's clock; and findings."""
+    """Signals, their missing share and targets, at the plant's rate; and findings."""
     recorded, signals, findings = configuration.recording, configuration.signals, list[str]()
     acting = [name for name in plant.disturbances if name in signals]
     commands = [name for name in plant.commands or plant.controls if name in signals]
-    even: dict[tuple[str, str], Array] = {}  # by signal and what it is: "", "lost" or "target"
+    even: dict[tuple[str, str], Array] = {}  # by signal and kind: "", "lost" or "target"
     for name in (*plant.outputs, *acting, *commands):
         channel = channel_of(table, clock, name, signals[name])
         response, keep = name in plant.outputs, None if name in acting else recorded.keep_gaps
         findings += _checked(table, channel, signals[name], recorded, response, keep)
         values = on_even_instants(clock, channel.values * channel.unit.factor)
         if keep and (gaps := checks.gaps(channel, recorded.fill_gaps)).any():
-            known = np.isfinite(values)  # the ends are held already
+            known = np.isfinite(values)
             values = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
             even[name, "lost"] = np.zeros(len(values))
             even[name, "lost"][clock.steps] = gaps
@@ -215,7 +215,7 @@ def _clocked(
 def _target(
     table: Table, clock: Clock, name: str, configuration: Configuration
 ) -> tuple[Array, list[str]]:
-    """The target of a signal at even instants, the last that was recorded, and what was found."""
+    """Target of a signal at uniform instants (last recorded value), and findings."""
     entry = configuration.signals[name]
     channel = channel_of(table, clock, name, entry, "target")
     found = [
@@ -231,14 +231,14 @@ def _target(
 
 
 def require_whole(recordings: Sequence[Recording], command: str) -> None:
-    """Refuse missing samples where a `command` cannot do without them."""
+    """Refuse missing samples for a `command` that needs every sample."""
     if any(trial.has_gaps for trial in recordings):
-        problem = f"leaves gaps, and impc {command} needs every sample"
-        raise InputError("recording.keep_gaps", problem, "take it out, or allow fill_gaps")
+        problem = f"leaves gaps, but impc {command} needs every sample"
+        raise InputError("recording.keep_gaps", problem, "remove it, or set fill_gaps")
 
 
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
-    """Perturbations of one table on the plant's clock (samples, d), in SI base units."""
+    """Perturbations of a table at the plant's rate (samples, d), in SI base units."""
     entry, columns = configuration.recording, []
     clock = read_clock(table, entry)
     checks.comparable_rates(table.source, clock.period, plant.dt)
@@ -259,7 +259,7 @@ def disturbances_of(table: Table, configuration: Configuration, plant: Plant) ->
 def _shifts(
     source: str, clock: Clock, configuration: Configuration, names: Iterable[str]
 ) -> dict[str, float]:
-    """By how many samples of the recording each signal is moved: whole numbers count those."""
+    """Shift of each signal in samples of the recording; integers count samples, floats s."""
     given = {name: configuration.signals[name].shift for name in names}
     rows = {
         name: float(shift) if isinstance(shift, int) else shift / clock.period
@@ -267,8 +267,8 @@ def _shifts(
     }
     for name, shift in rows.items():
         if abs(shift) > (len(clock.time) - 1) / 2:
-            problem = f"moves it by {shift:.4g} of {len(clock.time)} samples"
-            raise DataError(f"{source}: signals.{name}.shift", problem, "give a smaller one")
+            problem = f"moves the signal by {shift:.4g} of {len(clock.time)} samples"
+            raise DataError(f"{source}: signals.{name}.shift", problem, "use a smaller shift")
     return rows
 
 
@@ -279,10 +279,10 @@ def _departing(
     configuration: Configuration,
     plant: Plant,
 ) -> list[str]:
-    """Offsets and drifts that are large compared with the motion."""
+    """Report offsets and drifts that are large compared with the motion."""
     found: list[str] = []
     if any(np.ptp(values) == 0 for values in targets.values()):
-        return found  # what stays away from zero does so by intent
+        return found  # a constant target moves the equilibrium away from zero
     acting = [series[name] for name in plant.disturbances if name in series]
     acting += targets.values()
     for name in plant.outputs:
@@ -294,16 +294,16 @@ def _departing(
         digits = 2 - math.floor(math.log10(motion)) if motion > 0 else 0
         key = f"signals.{name}.offset = {round(entry.offset + offset, digits):g}"
         if abs(drift) > _DRIFT * motion:
-            remedy = "take a drift of the sensor out of the file"
+            remedy = "remove the drift of the sensor from the file"
             found.append(f"{source}: {name} drifts by about {drift:.2g} {moves}: {remedy}")
         elif abs(offset) > _OFFSET * motion:
-            remedy = f"if the sensor's zero is off, write {key}"
+            remedy = f"if the sensor's zero is off, set {key}"
             found.append(f"{source}: {name} is off by about {offset:.2g} {moves}: {remedy}")
     return found
 
 
 def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) -> list[str]:
-    """Rows of a disturbance that act earlier or later than the plant's."""
+    """Report a disturbance that acts earlier or later than in the plant."""
     found = []
     for index, name in enumerate(plant.disturbances):
         if name not in series:
@@ -314,7 +314,7 @@ def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) 
         if rows:
             how = f"{abs(rows)} sample{'s' * (abs(rows) > 1)} {'later' if rows > 0 else 'earlier'}"
             found.append(
-                f"{source}: {name} acts {how} than its rows say: try signals.{name}.shift = {rows}"
+                f"{source}: {name} acts {how} than recorded: try signals.{name}.shift = {rows}"
             )
     return found
 
@@ -324,8 +324,8 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
         controls = plant.commands or plant.controls
         known = controls if entry.command else (*plant.outputs, *plant.disturbances)
         if entry.target is not None and name not in plant.outputs:
-            remedy = f"give it to one of {', '.join(plant.outputs)}"
-            raise InputError(f"signals.{name}.target", "is for outputs alone", remedy)
+            remedy = f"set it for one of {', '.join(plant.outputs)}"
+            raise InputError(f"signals.{name}.target", "is allowed for outputs only", remedy)
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean {near[0]}?" if near else f"the plant has {', '.join(known)}"
@@ -344,42 +344,39 @@ def _require_names(configuration: Configuration, plant: Plant) -> None:
 
 
 def require_filled_in(name: str, entry: SignalTable) -> None:
-    """Require that column and unit of the signal `name` are no longer `FILL_IN`."""
+    """Require that column and unit of signal `name` are filled in."""
     for key, meant in (("column", "its name in the file"), ("unit", "the column's unit")):
         if getattr(entry, key) == FILL_IN:
             raise InputError(f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}")
 
 
 def require_kind(name: str, written: str, expected: str) -> None:
-    """Require that a `written` unit may stand for the `expected` one of the signal `name`.
-
-    What has no unit may stand for anything.
-    """
+    """Require that unit `written` is of the kind `expected` for signal `name`, or has none."""
     if expected == UNKNOWN:
         return
     unit = si_unit(expected)
     if unit.factor != 1:
         raise InputError(
             f"plant.units {name}",
-            f"is {expected!r}",
+            f"is {expected!r}, not an SI base unit",
             "make the plant in SI units",
         )
     if si_unit(written).base not in (unit.base, "dimensionless"):
         raise InputError(
             f"signals.{name}.unit",
-            f"is {written!r}, and the plant has {name} in {expected}",
+            f"is {written!r}, but the plant has {name} in {expected}",
             "correct the unit or the column",
         )
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
-    """None of the `paths` is given twice, by whatever name, nor a copy of another to the byte."""
+    """Require that no file is given twice, under any name or as an identical copy."""
     places: dict[str, Path] = {}
     sizes: dict[int, list[Path]] = {}
     for path in paths:
-        place = os.path.realpath(path)  # Path.resolve raises on a circle of links
+        place = os.path.realpath(path)  # Path.resolve raises for circular links
         if place in places:
-            same = "" if str(places[place]) == str(path) else f", as {places[place]} too"
+            same = "" if str(places[place]) == str(path) else f", also as {places[place]}"
             raise InputError(str(path), f"is given twice{same}", "name each trial once")
         places[place] = Path(path)
         if os.path.isfile(place):
@@ -395,8 +392,8 @@ def require_distinct(paths: Sequence[Path]) -> None:
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:
-    """Whose trial the file `source` is, by its name and the [recording] table."""
-    # A name that is no text is shown as the bytes that it is not.
+    """Label of the trial in file `source`, from its name and the [recording] table."""
+    # Bytes of a name that are not UTF-8 are shown escaped.
     stem = os.fsencode(Path(source).stem).decode("utf-8", "backslashreplace")
     groups: dict[str, str | None] = {}
     if entry.pattern is not None:
@@ -419,9 +416,9 @@ def label_of(source: str, entry: RecordingTable) -> Label:
 def channel_of(
     table: Table, clock: Clock, name: str, entry: SignalTable, key: str = "column"
 ) -> checks.Channel:
-    """The column of the signal `name`, or of its target, in its own unit, after offset and sign."""
+    """Column of signal `name`, or of its target, in its own unit, after offset and sign."""
     column, values = column_of(table, getattr(entry, key), f"signals.{name}.{key}")
-    # Beyond the largest number, or a NaN that signals: not finite, and said below.
+    # Overflow and signalling NaN become values that are not finite, reported below.
     with np.errstate(over="ignore", invalid="ignore"):
         used = entry.sign * (values[clock.rows] - entry.offset)
     return checks.Channel(table.source, name, column, si_unit(entry.unit), clock.time, used)
@@ -435,7 +432,7 @@ def _checked(
     response: bool,
     keep: bool | None,
 ) -> list[str]:
-    """Every check of one channel, those first whose fault would explain the others."""
+    """All checks of a channel; faults that explain others come first."""
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
@@ -443,7 +440,7 @@ def _checked(
         checks.constant(channel),
         checks.degrees_for_radians(channel) if response else "",
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
-        # A perturbation of two or three levels rests on its extremes by design.
+        # A perturbation of two or three levels stays at its extremes by design.
         checks.clipped(channel) if response else "",
         checks.stretches(channel) if response else "",
     ]
@@ -451,11 +448,11 @@ def _checked(
 
 
 def stated_unit(table: Table, column: str) -> Unit | None:
-    """The unit that a file says of a `column`, if it says one that is known."""
+    """Unit that the file states for a `column`; None if missing or unknown."""
     try:
         return si_unit(table.units[column])
     except (KeyError, InputError):
-        return None  # the file says none, or one that only its maker knows
+        return None
 
 
 def _slower(source: str, clock: Clock, plant: Plant) -> list[str]:
@@ -464,12 +461,12 @@ def _slower(source: str, clock: Clock, plant: Plant) -> list[str]:
         return []
     return [
         f"{source}: recorded at {1 / clock.period:.4g} samples per second and analysed at "
-        f"{1 / plant.dt:.4g}: nothing above {0.5 / clock.period:.4g} Hz is known"
+        f"{1 / plant.dt:.4g}: it contains nothing above {0.5 / clock.period:.4g} Hz"
     ]
 
 
 def _order(source: str, series: dict[str, Array], name: str, plant: Plant) -> list[str]:
-    """The response that follows a disturbance most must not come before it."""
+    """Report outputs that precede, or are unrelated to, a disturbance."""
     found = [misaligned(series[name], series[output], plant.dt) for output in plant.outputs]
     return [
         f"{source}: {output} {reason} ({name})"
@@ -479,4 +476,4 @@ def _order(source: str, series: dict[str, Array], name: str, plant: Plant) -> li
 
 
 def _shorter(path: Path, samples: int, longest: int) -> str:
-    return f"{path}: trials of unequal length, {samples} samples where the longest has {longest}"
+    return f"{path}: trials of unequal length: {samples} samples, the longest has {longest}"

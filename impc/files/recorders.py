@@ -1,4 +1,4 @@
-"""National Instruments TDMS, by nptdms (LGPL), and the analog channels of C3D, by c3d (MIT).
+"""National Instruments TDMS with nptdms (LGPL), and analog channels of C3D with c3d (MIT).
 
 Both are extras, `tdms` and `c3d`. Marker positions of C3D are not read.
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
-# Kinds of scales that nptdms applies.
+# Kinds of scaling that nptdms applies.
 _SCALES = (
     *("Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"),
     *("RTD", "Strain", "Thermistor", "Thermocouple"),
@@ -33,14 +33,14 @@ _SCALES = (
 
 
 def read_tdms(path: Path, largest: int) -> Table:
-    """Read the channels of all groups at `path`; `group/channel` where two groups name one alike.
+    """Read the channels of all groups; `group/channel` if two groups use the same name.
 
-    Time stamps become seconds after the first. The rate is 1 / wf_increment, where it is given.
-    Arrays take `largest` bytes at most.
+    Time stamps become seconds after the first; the rate is 1 / wf_increment. The arrays may take
+    `largest` bytes.
     """
     source = str(path)
     nptdms = optional("nptdms", source)
-    # Opened here, because nptdms leaves a file open when its head is damaged.
+    # Opened here because nptdms leaves a file with a damaged head open.
     with _silent(nptdms), _Bounded(io.FileIO(path)) as handle, nptdms.TdmsFile.open(handle) as file:
         if file.file_status.incomplete_final_segment:
             raise DataError(
@@ -55,13 +55,13 @@ def read_tdms(path: Path, largest: int) -> Table:
         }
         claimed = sum(len(channel) for channel in channels)
         if 8 * claimed > largest or claimed > path.stat().st_size:
-            problem = f"is too large or damaged: it says that it has {claimed} values"
+            problem = f"is too large or damaged: it claims to have {claimed} values"
             raise DataError(source, problem, "export only the channels that are needed")
         return _table(source, channels, unknown)
 
 
 def encode_tdms(table: Table) -> bytes:
-    """The bytes of a TDMS file with one group."""
+    """Content of a TDMS file with one group."""
     nptdms = optional("nptdms", "TDMS")
     channels = []
     for name, values in table.columns.items():
@@ -78,10 +78,10 @@ def encode_tdms(table: Table) -> bytes:
 
 
 class _Bounded(io.BufferedReader):
-    """A file that is asked for no more than it has: Python takes the memory before it looks."""
+    """Reader that never requests more than the file has: Python allocates before it reads."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As of any file; `size` in bytes."""
+        """Read up to `size` bytes."""
         if size is None or size < 0:
             return super().read()
         here = self.tell()
@@ -91,7 +91,7 @@ class _Bounded(io.BufferedReader):
 
 
 def _unknown_scale(channel: Any, *owners: Any) -> str:
-    """The kind of a scale that nptdms does not apply, so that its samples are raw counts."""
+    """Kind of a scaling that nptdms does not apply (its samples are raw counts), or ""."""
     for owner in (channel, *owners):
         for key, kind in owner.properties.items():
             counts = kind == "AdvancedAPI" and channel.dtype.kind in "iu"
@@ -110,7 +110,7 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
         twice = names[channel.name] > 1
         name = f"{channel.group_name}/{channel.name}" if twice else channel.name
         if channel.path in unknown:
-            skipped[name] = f"has a scale of the unknown kind {unknown[channel.path]!r}: raw counts"
+            skipped[name] = f"has unscaled counts (unknown scaling {unknown[channel.path]!r})"
             continue
         if channel.dtype.kind not in "fiubM":
             skipped[name] = "is complex" if channel.dtype.kind == "c" else "is text"
@@ -131,13 +131,13 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
         raise DataError(
             source,
             f"has channels of {min(stated):g} and {max(stated):g} samples per second",
-            "export those of one rate into a file of their own",
+            "export those of one rate into a separate file",
         )
     return make_table(source, table.columns, table.units, next(iter(stated), None), table.skipped)
 
 
 def _require_together(source: str, timed: dict[str, Any]) -> None:
-    """Refuse channels with a clock that begin at different times."""
+    """Reject channels whose clocks begin at different times."""
     moments = {name: item.get("wf_start_time") for name, item in timed.items()}
     earliest = min((moment for moment in moments.values() if moment is not None), default=None)
     begins = {name: float(item.get("wf_start_offset", 0) or 0) for name, item in timed.items()}
@@ -148,13 +148,13 @@ def _require_together(source: str, timed: dict[str, Any]) -> None:
     for name, begin in begins.items():
         if begin != begins[first]:
             problem = f"channel {first} begins at {begins[first]:g} s and {name} at {begin:g} s"
-            remedy = "export channels that are recorded together into a file of their own"
+            remedy = "export channels that were recorded together into a separate file"
             raise DataError(source, problem, remedy)
 
 
 @contextlib.contextmanager
 def _silent(nptdms: Any) -> Iterator[None]:
-    """Keep nptdms from printing warnings of its own: what matters becomes an error here."""
+    """Silence the warnings that nptdms prints; relevant ones are errors here."""
     handler = nptdms.log.log_manager.console_handler
     before = handler.level
     handler.setLevel(logging.CRITICAL + 1)
@@ -165,13 +165,10 @@ def _silent(nptdms: Any) -> Iterator[None]:
 
 
 def read_c3d(path: Path, largest: int) -> Table:
-    """Read the analog channels of the file at `path`, with their units and rate.
-
-    Its arrays take `largest` bytes at most.
-    """
+    """Read the analog channels, units and rate; the arrays may take `largest` bytes."""
     source = str(path)
     c3d = optional("c3d", source)
-    # c3d warns of headers that contradict themselves in small things; what matters is checked here.
+    # c3d warns of minor contradictions in headers; relevant ones are checked here.
     with warnings.catch_warnings(), path.open("rb") as handle:
         warnings.simplefilter("ignore")
         reader = c3d.Reader(handle)
@@ -199,13 +196,13 @@ def read_c3d(path: Path, largest: int) -> Table:
 
 
 def encode_c3d(table: Table) -> bytes:
-    """The bytes of a C3D file with the columns as analog channels, in single precision."""
+    """Content of a C3D file with the columns as analog channels, in single precision."""
     c3d = optional("c3d", "C3D")
     if table.rate is None:
-        raise OutputError("C3D", "needs the rate of the samples", "give the table a rate")
+        raise OutputError("C3D", "needs a sampling rate", "give the table a rate")
     writer = c3d.Writer(point_rate=table.rate, analog_rate=table.rate, point_scale=-1.0)
     names = list(table.columns)
-    writer.set_point_labels(["none"])  # the format has no file without a marker
+    writer.set_point_labels(["none"])  # the format requires a marker
     writer.set_analog_labels(names)
     writer.set_analog_scales(np.ones(len(names)))
     writer.set_analog_offsets(np.zeros(len(names)))

@@ -1,14 +1,14 @@
-"""From the recorded clock to the plant's: outputs at instants, disturbances as means.
+"""Resample from the recorded clock to the plant's: outputs at instants, disturbances as means.
 
-The plant holds its inputs over a sample. An output is wanted as its value at the instant k dt,
-after what the new rate cannot show has been removed; a disturbance as its mean over
-[k dt, (k + 1) dt), so that the plant receives the same impulse. With x_j recorded at t_j = j T,
+The plant holds its inputs over a sample. An output is its anti-aliased value at the instant k dt; a
+disturbance is its mean over [k dt, (k + 1) dt), so that the plant receives the same impulse. With
+x_j recorded at t_j = j T,
 
     y_k = sum_j h(k dt - t_j) x_j / sum_j h(k dt - t_j)
     d_k = (1 / dt) integral of x from k dt to (k + 1) dt, x linear between its samples
 
-h is a sinc under a Kaiser window, even, so that no phase is added; see docs/recordings.md. Before
-the first and behind the last sample x is continued by its point reflection 2 x_0 - x_j.
+where h is a sinc with a Kaiser window, which is even and adds no phase (docs/howto/recordings.md).
+Beyond its ends x is continued by point reflection, 2 x_0 - x_j.
 """
 
 from __future__ import annotations
@@ -24,26 +24,25 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-# Attenuation in dB of what would alias, and the largest ripple below: 10^(-70/20) = 3e-4.
+# Stopband attenuation in dB; the largest passband ripple is 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0
-# What is kept ends here, as a part of the lower of the two Nyquist frequencies; what is removed
-# begins at that frequency itself.
+# End of the passband as a fraction of the lower Nyquist frequency, where the stopband begins.
 _PASS = 0.8
-# Rates are the same when the clocks differ by less than this part of a sample at the end.
+# Rates are equal if the clocks differ by less than this part of a sample at the end.
 _SAME = 0.05
-_CHUNK = 2_000_000  # numbers in memory at a time: 16 MB
+_CHUNK = 2_000_000  # numbers in memory at a time (16 MB)
 Key = TypeVar("Key")
 
 
 def same_rate(samples: int, period: float, dt: float) -> bool:
-    """Whether clocks of `period` and `dt`, in s, stay together over so many `samples`."""
+    """Whether clocks with steps `period` and `dt` in s agree over so many `samples`."""
     return samples * abs(period - dt) <= _SAME * dt
 
 
 def shifted(series: Mapping[Key, Array], samples: Mapping[Key, float]) -> dict[Key, Array]:
-    """The `series` (samples,), each moved later by so many `samples`, where all have values (any,).
+    """Delay `series` (samples,) by so many `samples` each, and cut to their common range.
 
-    A part of a sample is interpolated linearly.
+    Fractions of a sample are interpolated linearly.
     """
     first = max(0, *map(math.ceil, samples.values()))
     size = min(map(len, series.values()))
@@ -58,22 +57,19 @@ def shifted(series: Mapping[Key, Array], samples: Mapping[Key, float]) -> dict[K
 
 
 def resampled_samples(samples: int, period: float, dt: float) -> int:
-    """Number of instants k dt within a recording of that many samples; `period` and dt in s."""
+    """Number of instants k dt within a recording; `period` and `dt` in s."""
     return int(np.floor((samples - 1) * period / dt + 1e-6)) + 1
 
 
 def instants(values: Array, period: float, dt: float) -> Array:
-    """The `values` (samples,), every `period` s, at the instants k dt (resampled,).
-
-    Without what the lower of the two rates cannot show; themselves when `dt`, in s, is the period.
-    """
+    """Anti-aliased `values` (samples,), recorded every `period` s, at the instants k dt."""
     if same_rate(len(values), period, dt):
         return values
     half = int(np.ceil(_half_width(period, dt) / period))
     padded = _continued(values, half + 1)
     positions = np.arange(resampled_samples(len(values), period, dt)) * dt / period
     whole = np.floor(positions + 1e-9).astype(np.int64)
-    # Equal phases share their weights: for a rational ratio there are few.
+    # Equal phases share their weights; a rational ratio has few phases.
     phases, which = np.unique(np.round(positions - whole, 9), return_inverse=True)
     offsets = np.arange(-half, half + 2)
     result = np.empty(len(positions))
@@ -82,17 +78,17 @@ def instants(values: Array, period: float, dt: float) -> Array:
     ):
         used, local = np.unique(which[part], return_inverse=True)
         weights = _kernel(np.asarray((phases[used, None] - offsets) * period), period, dt)
-        weights /= weights.sum(axis=1, keepdims=True)  # a constant stays what it is
+        weights /= weights.sum(axis=1, keepdims=True)  # keeps constants exactly
         taken = padded[whole[part, None] + offsets + half + 1]
         result[part] = np.einsum("ij,ij->i", weights[local], taken)
     return result
 
 
 def held_means(values: Array, period: float, dt: float) -> Array:
-    """Means of the `values` (samples,), every `period` s, over [k dt, (k + 1) dt) (resampled,).
+    """Means of `values` (samples,), recorded every `period` s, over [k dt, (k + 1) dt).
 
-    The signal is linear between its samples. The last interval reaches beyond the recording; there
-    the last value is held. The values themselves when `dt`, in s, is the period.
+    The signal is linear between its samples. The last interval extends beyond the recording, where
+    the last value is held.
     """
     if same_rate(len(values), period, dt):
         return values
@@ -108,7 +104,7 @@ def held_means(values: Array, period: float, dt: float) -> Array:
 
 
 def held_values(values: Array, period: float, dt: float) -> Array:
-    """The last of the `values` (samples,), every `period` s, before or at k dt (resampled,)."""
+    """Last of the `values` (samples,), recorded every `period` s, at or before k dt."""
     if same_rate(len(values), period, dt):
         return values
     instant = np.arange(resampled_samples(len(values), period, dt)) * dt / period
@@ -116,14 +112,14 @@ def held_values(values: Array, period: float, dt: float) -> Array:
 
 
 def _half_width(period: float, dt: float) -> float:
-    """Half the length of the filter, s: Kaiser's formula for its attenuation and transition."""
+    """Half the filter length in s (Kaiser's formula for attenuation and transition)."""
     nyquist = 0.5 / max(period, dt)
     transition = 2 * np.pi * (1 - _PASS) * nyquist  # rad/s
     return float((_ATTENUATION - 7.95) / (2.285 * transition) / 2)
 
 
 def _kernel(time: Array, period: float, dt: float) -> Array:
-    """h at these times: a sinc under a Kaiser window."""
+    """h at these times: sinc with Kaiser window."""
     cut = (1 + _PASS) / 2 * 0.5 / max(period, dt)  # Hz, the middle of the transition
     inside = 1 - (time / _half_width(period, dt)) ** 2
     beta = scipy.signal.kaiser_beta(_ATTENUATION)

@@ -1,7 +1,6 @@
-"""result.json of every command: what is in each, checked when it is read (docs/results.md).
+"""Read and validate result.json (docs/ref/results.md); `impc.reporting.document` writes it.
 
-Written by `impc.reporting.document`. `schema` counts changes of a key's meaning: a program that
-reads results sees from it whether it knows them.
+`schema` increases when a key changes its meaning, so that programs can detect it.
 """
 
 from __future__ import annotations
@@ -20,46 +19,82 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-#: Of the files that are written now. Before the first one that has a number there were others.
+#: Version of the files that are written now.
 SCHEMA = 7
 
 Matrix = list[list[float]]
 
 
 class MethodRecord(msgspec.Struct, frozen=True):
-    """What a method found, as result.json has it."""
+    """Result of one method in result.json.
 
-    seconds: float  # Of the method, s
-    K: Matrix | None = None  # Gain (m, n) and metric (m, m), in SI units; None without a gain
+    Attributes
+    ----------
+    seconds : float
+        Run time of the method in s.
+    K : list of list of float
+        Feedback gain (m, n) in SI units; null without a gain.
+    S : list of list of float
+        Metric (m, m) of the input in SI units; null without a gain.
+    Q : list of list of float
+        State weight (n, n), scaled to R[0][0] = 1; null without weights.
+    R : list of list of float
+        Input weight (m, m), scaled to R[0][0] = 1; null without weights.
+    status : str
+        How the method ended: "explained", "settled", "stopped", "gain only" or "none"; empty for
+        the methods of the example.
+    reason : str
+        Explanation if there is no result, or if weights fit worse than the gain; else empty.
+    """
+
+    seconds: float
+    K: Matrix | None = None
     S: Matrix | None = None
-    Q: Matrix | None = None  # Weights (n, n) and (m, m), at R[0][0] = 1; None without weights
+    Q: Matrix | None = None
     R: Matrix | None = None
-    # How the method ended (`impc.inverse.estimates.Status`), and why without an answer; empty for
-    # the methods of the example, which end in an answer
     status: str = ""
     reason: str = ""
 
 
 class ResultFile(msgspec.Struct, frozen=True):
-    """result.json of any command."""
+    """Content of result.json of any command.
 
-    schema: int  # Which version of docs/results.md it follows
-    command: str  # The command line, without folders
-    made: str  # Date and time, UTC, ISO 8601
-    versions: dict[str, str]  # Of Python and of the packages that compute
-    files: list[str]  # Names of the recordings
-    sha256: dict[str, Any] | None  # Digests of all files that went in
-    # Of `impc fit`, `impc compare` and `impc.report`; empty for the other commands
+    Attributes
+    ----------
+    schema : int
+        Version of the meaning of the keys.
+    command : str
+        Command line, without folders.
+    made : str
+        Date and time (UTC, ISO 8601).
+    versions : dict
+        Versions of Python and of the packages that compute.
+    files : list of str
+        Names of the recordings.
+    sha256 : dict
+        SHA-256 of all inputs; null if there are none.
+    methods : dict
+        `MethodRecord` by method (`impc fit`, `impc compare`, `impc.report`; else empty).
+    content : dict
+        Whole file as parsed JSON (only in Python).
+    """
+
+    schema: int
+    command: str
+    made: str
+    versions: dict[str, str]
+    files: list[str]
+    sha256: dict[str, Any] | None
     methods: dict[str, MethodRecord] = {}
-    content: dict[str, Any] = {}  # All of the file, as JSON has it
+    content: dict[str, Any] = {}
 
     def table(self, name: str) -> pd.DataFrame:
-        """The table of a finding of the page, by its `name`, which is also that of its CSV file.
+        """Return a table of the report by its `name`, which is also that of its CSV file.
 
         Parameters
         ----------
         name : str
-            Such as "gain", of `impc fit`.
+            For example "gain" of `impc fit`.
 
         Returns
         -------
@@ -69,9 +104,9 @@ class ResultFile(msgspec.Struct, frozen=True):
         Raises
         ------
         DataError
-            When the result has no such table.
+            If the result has no such table.
         """
-        import pandas as pd  # noqa: PLC0415  # a third of a second
+        import pandas as pd  # noqa: PLC0415  # takes a third of a second
 
         found = self.content.get("findings", {})
         known = [key for key, item in found.items() if "table" in item]
@@ -83,31 +118,33 @@ class ResultFile(msgspec.Struct, frozen=True):
 
 
 def read_content(file: Path) -> dict[str, Any]:
-    """What stands in a file of JSON that this version of impc wrote."""
+    """Parsed content of a JSON file that this version of impc wrote."""
     try:
         require_ordinary(file)
         content = json.loads(file.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise _refused(
-            file, f"is no result ({getattr(error, 'strerror', None) or error})"
+            file, f"is not a result file ({getattr(error, 'strerror', None) or error})"
         ) from None
     if not isinstance(content, dict):
-        raise _refused(file, "is no result (no names at its top)")
+        raise _refused(file, "is not a result file (no JSON object)")
     schema = content.get("schema", 1)
     if schema != SCHEMA:
-        raise _refused(file, f"is of another version of impc (schema {schema}, not {SCHEMA})")
+        raise _refused(
+            file, f"was written by another version of impc (schema {schema}, not {SCHEMA})"
+        )
     return content
 
 
 def read_result(place: Path) -> ResultFile:
-    """The result of a command, from its folder or its result.json."""
+    """Result of a command from its folder or its result.json."""
     file = place / "result.json" if os.path.isdir(place) else place
     content = read_content(file)
     try:
         return msgspec.convert({**content, "content": content}, ResultFile)
     except msgspec.ValidationError as error:
-        raise _refused(file, f"is no result ({error})") from None
+        raise _refused(file, f"is not a result file ({error})") from None
 
 
 def _refused(file: Path, problem: str) -> DataError:
-    return DataError(f"file {file}", problem, "run the command that wrote it again")
+    return DataError(f"file {file}", problem, "repeat the command that wrote it")

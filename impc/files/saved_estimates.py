@@ -1,8 +1,7 @@
-"""An estimate in a file: JSON, exact to the last digit, with its problem; no code, no pickle.
+"""Save and load an estimate with its problem as JSON, exact to the last digit, without code.
 
-What is a function of Python is not in the file: a body that is not linear, and a family of plants.
-Whoever loads such an estimate gives the plant or the family again, and it is compared with what
-was saved.
+Python functions are not saved: a nonlinear body and a family of plants must be passed to `load`
+again, which compares them with the saved values.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily
 
 _SIGNALS = ("states", "controls", "disturbances", "outputs", "commands")
-# How a plain field is read.
+# Conversion of plain fields by annotation.
 _PLAIN: dict[Any, Any] = {"bool": bool, "int": int, "str": str}
-# A plant that is given again is the one that was saved up to this, of its entries.
+# Relative tolerance for entries of a plant that is passed again.
 _SAME = 1e-9
 
 
 def save_estimate(estimate: Estimate, path: Path) -> Path:
-    """Write an estimate and its problem into one file, whole or not at all."""
+    """Write an estimate and its problem into one file, atomically."""
     content = {
         "schema": SCHEMA,
         "problem": _encode(estimate.problem),
@@ -53,7 +52,7 @@ def save_estimate(estimate: Estimate, path: Path) -> Path:
     try:
         write_whole(path, json.dumps(content).encode())
     except (OSError, ValueError) as error:
-        raise unwritable(f"file {path}", error, "give another file") from None
+        raise unwritable(f"file {path}", error, "choose another file") from None
     return path
 
 
@@ -66,12 +65,12 @@ def load(
     Parameters
     ----------
     path : str or Path
-        A file of `Estimate.save`; a folder that a command or `impc.report` wrote, or its
+        File written by `Estimate.save`, folder written by a command or `impc.report`, or its
         result.json.
     plant : Plant, optional
-        Of an estimate, where the plant has a body that is not linear: no file holds it.
+        Plant of the estimate; needed if it has a nonlinear body, which is not saved.
     family : PlantFamily, optional
-        Of an estimate, where physical parameters were fitted: likewise.
+        Family of the estimate; needed if physical parameters were fitted.
 
     Returns
     -------
@@ -80,9 +79,9 @@ def load(
     Raises
     ------
     DataError
-        When the file is missing or damaged, or another version of impc wrote it.
+        If the file is missing or damaged, or another version of impc wrote it.
     InputError
-        When the plant or the family is needed, or is another than was saved.
+        If the plant or the family is needed, or differs from the saved one.
 
     Examples
     --------
@@ -118,7 +117,7 @@ def load(
 
 
 def encode_estimate(estimate: Estimate) -> dict[str, Any]:
-    """Values that Python's JSON keeps to the last digit; the problem itself is not among them."""
+    """Values of an estimate for JSON, exact to the last digit, without the problem itself."""
     kept: dict[str, Any] = _encode(replace(estimate, problem=None))
     problem = estimate.problem
     return kept | {
@@ -130,16 +129,16 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
 
 
 def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
-    """Make an estimate again of the problem as its method saw it."""
+    """Rebuild an estimate from `kept` values and the problem as its method saw it."""
     m, n, weights = seen.plant.m, seen.plant.n, kept["weights"]
     sizes = {"K": (m, n), "S": (m, m)}
     posed = replace(seen, terminal_set=kept["terminal_set"])
     own = (np.array(kept[name], dtype=float) for name in ("starts", "logarithms", "shifts"))
     numbers = {name: float(kept[name]) for name in ("misfit", "noise", "seconds")}
     if kept["method"] not in METHODS or not isinstance(kept["reason"], str):
-        raise ValueError("no such method, or a reason that is no text")
+        raise ValueError("unknown method, or a reason that is not text")
     if not set(seen.offsets) <= set(seen.plant.outputs):
-        raise ValueError("an offset of no output")
+        raise ValueError("an offset of an unknown output")
     values = dict(kept) | {
         **numbers,
         "evaluations": int(kept["evaluations"]),
@@ -160,7 +159,7 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
 
 
 def _encode(value: Any) -> Any:
-    """Fields by name, arrays as lists, an enumeration by its value; no functions."""
+    """JSON value: fields by name, arrays as lists, enumerations by value; no functions."""
     if isinstance(value, Plant):
         return _fields(value) | {"body": value.body is not None}
     if isinstance(value, Problem):
@@ -184,11 +183,11 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
     if family is not None and family.limit_deviation:
         family = _with_limits(family, kept)
     if names and (family is None or list(family.names) != names):
-        raise InputError("family", f"of {', '.join(names)} is needed", "give load(..., family=...)")
+        raise InputError("family", f"must have {', '.join(names)}", "pass load(..., family=...)")
     if family is not None and names:
         plant = plant_at(family, np.array(kept["logarithms"], dtype=float))
     if saved["body"] and plant is None:
-        raise InputError("plant", "has a body that is in no file", "give load(..., plant=...)")
+        raise InputError("plant", "has an unsaved nonlinear body", "pass load(..., plant=...)")
     if plant is None:
         fixed = {name: tuple(saved[name]) for name in _SIGNALS}
         pairs = {name: tuple(map(tuple, saved[name])) for name in ("units", "words")}
@@ -214,7 +213,7 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
 
 
 def _with_limits(family: PlantFamily, kept: dict[str, Any]) -> PlantFamily:
-    """The family with the limits of the controls among its parameters, at what was given."""
+    """Family extended by the control limits as parameters, at their nominal values."""
     plant, count = family.make(family.nominal), len(family.names)
     wider = family.with_limits(plant, Bounds(plant, **kept["bounds"]))
     nominal = np.array(wider.nominal)
@@ -223,7 +222,7 @@ def _with_limits(family: PlantFamily, kept: dict[str, Any]) -> PlantFamily:
 
 
 def _require_names(plant: Plant) -> None:
-    """Refuse signals without a name, or names that are no text."""
+    """Require a text name for every signal."""
     sizes = (plant.n, plant.m, plant.E.shape[1], len(plant.C), len(plant.commands))
     for signals, size in zip(_SIGNALS, sizes, strict=True):
         names = getattr(plant, signals)
@@ -231,11 +230,11 @@ def _require_names(plant: Plant) -> None:
             raise ValueError(f"{signals} without names")
     for pairs in (plant.units, plant.words):
         if not all(isinstance(text, str) for pair in pairs for text in pair):
-            raise ValueError("a unit that is no text")
+            raise ValueError("a unit that is not text")
 
 
 def _require_same(plant: Plant, saved: Mapping[str, Any]) -> None:
-    """Refuse a plant that is given again and is another one."""
+    """Require that a plant that is passed again equals the saved one."""
     other = [name for name in _SIGNALS if list(getattr(plant, name)) != saved[name]]
     for name in ("A", "B", "E", "C", "dt", "observer", "ahead"):
         own, kept = np.asarray(getattr(plant, name)), np.asarray(saved[name], dtype=float)
@@ -244,7 +243,7 @@ def _require_same(plant: Plant, saved: Mapping[str, Any]) -> None:
     if (plant.body is not None) != saved["body"]:
         other.append("body")
     if other:
-        raise InputError("plant", f"has another {other[0]} than was saved", "give the same plant")
+        raise InputError("plant", f"has a different {other[0]} than saved", "pass the same plant")
 
 
 def _recording(kept: Mapping[str, Any], plant: Plant) -> Recording:
@@ -264,7 +263,7 @@ def _tuples(kept: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _filled(kind: Any, values: Mapping[str, Any]) -> Any:
-    """A value of that kind from its fields, each checked."""
+    """Make a `kind` from its checked fields, bypassing `__init__`."""
     made = object.__new__(kind)
     made._fill(**{
         item.name: frozen(values[item.name])

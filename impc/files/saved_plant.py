@@ -1,4 +1,4 @@
-"""Saved state spaces: matrices and names from a .mat, .npz or .json file, checked before use."""
+"""Read a state space, matrices and names, from a .mat, .npz or .json file."""
 
 from __future__ import annotations
 
@@ -25,17 +25,14 @@ _MATRICES = ("A", "B", "C", "D")
 _NAMES = ("states", "inputs", "outputs")
 _NEEDED = ("A", "B", "C", "dt")
 _REMEDY = "save A, B, C and dt in it, MATLAB: -v7"
-# Bytes of a file and of what it unpacks to: a plant of a thousand states has 8 MB.
+# Bytes of a file and of its unpacked content: a plant of 1000 states has 8 MB.
 _LARGEST = 50_000_000
-# An entry whose fourth power is still a number: balancing and Riccati's equation take it.
+# Largest entry: its fourth power must be finite for balancing and the Riccati equation.
 _MOST = 1e70
 
 
 def read_matrices(path: Path) -> dict[str, Any]:
-    """What the file at `path` holds, by name, not checked; A, B, C and dt are among it.
-
-    It is .mat up to version 7, .npz or .json. No pickles are opened.
-    """
+    """Unchecked content by name of a .mat (up to v7), .npz or .json file; no pickles."""
     require_readable(path, _LARGEST, InputError)
     subject = f"plant {path}"
     read = {".json": _from_json, ".npz": _from_npz, ".mat": _from_mat}[path.suffix]
@@ -51,7 +48,7 @@ def read_matrices(path: Path) -> dict[str, Any]:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(subject, f"cannot be read ({reason})", _REMEDY) from None
     if not isinstance(found, dict):
-        raise InputError(subject, "holds no names", "save A, B, C and dt in it")
+        raise InputError(subject, "has no named entries", "save A, B, C and dt in it")
     missing = [name for name in _NEEDED if name not in found]
     if missing:
         raise InputError(subject, f"lacks {', '.join(missing)}", "save A, B, C and dt in it")
@@ -59,17 +56,19 @@ def read_matrices(path: Path) -> dict[str, Any]:
 
 
 def state_space(name: str, given: Mapping[str, Any]) -> Any:
-    """The `control.StateSpace` of the matrices that are given; `name` of the file, for messages."""
+    """`control.StateSpace` of the given matrices; `name` of the file, for messages."""
     subject = f"plant {name}"
     unknown = [key for key in given if key not in (*_MATRICES, "dt", *_NAMES, "units")]
     if unknown:
         raise InputError(
-            subject, f"does not know {brief(unknown[0], 80)}", f"names: {list(_NAMES)}"
+            subject,
+            f"has an unknown entry {brief(unknown[0], 80)}",
+            f"use A, B, C, D, dt, units and {list(_NAMES)}",
         )
     matrices = {key: _matrix(subject, key, given[key]) for key in _MATRICES if key in given}
     dt = _matrix(subject, "dt", given["dt"])
     if dt.size != 1 or not math.isfinite(dt.item()):
-        raise InputError(subject, "has a dt that is not one number", "give seconds, or 0")
+        raise InputError(subject, "has a dt that is not one number", "give dt in s, or 0")
     A, B, C = (matrices[key] for key in "ABC")
     sizes = {"states": len(A), "inputs": B.shape[1], "outputs": len(C)}
     D = matrices.get("D", np.zeros((sizes["outputs"], sizes["inputs"])))
@@ -78,7 +77,7 @@ def state_space(name: str, given: Mapping[str, Any]) -> Any:
         if len(names) != sizes[key]:
             raise InputError(
                 subject,
-                f"names {len(names)} {key} and has {sizes[key]}",
+                f"names {len(names)} {key}, but has {sizes[key]}",
                 f"give a name for each of the {key}, or none",
             )
     system = control.ss(A, B, C, D, dt.item(), **labels)
@@ -108,7 +107,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
 
 
 def _matrix(subject: str, name: str, value: Any) -> Any:
-    """Two dimensions of real numbers."""
+    """Real matrix `value` called `name`."""
     try:
         array = np.atleast_2d(np.asarray(value))
     except ValueError:  # rows of unequal length
@@ -116,8 +115,8 @@ def _matrix(subject: str, name: str, value: Any) -> Any:
     if array.dtype.kind == "c":
         raise InputError(subject, f"has a complex matrix {name}", "save real numbers")
     if array.dtype.kind not in "fiu" or array.ndim != 2:
-        problem = f"has {name} that is not made of numbers in rows"
-        raise InputError(subject, problem, "save matrices")
+        problem = f"has a {name} that is not a matrix of numbers"
+        raise InputError(subject, problem, "save real matrices")
     if array.size and np.abs(array.astype(np.float64)).max() > _MOST:
         problem = f"has entries beyond {_MOST:g} in {name}"
         raise InputError(subject, problem, "give the plant in other units")
@@ -125,12 +124,12 @@ def _matrix(subject: str, name: str, value: Any) -> Any:
 
 
 def _labels(subject: str, name: str, value: Any) -> list[str]:
-    """Names from a text, a list or an array of them."""
+    """Names from a text, a list or an array."""
     if isinstance(value, str):
         value = [value]
     found = [item.item() if isinstance(item, np.ndarray) else item for item in _flat(value)]
     if not found or not all(isinstance(item, str | int) and str(item).strip() for item in found):
-        raise InputError(subject, f"has {name} that are not names", "save a list of text")
+        raise InputError(subject, f"has {name} that are not names", "save a list of texts")
     found = [str(item).strip() for item in found]
     repeated = next((item for item in found if found.count(item) > 1), None)
     if repeated is not None:

@@ -1,8 +1,8 @@
-"""Workbooks of Excel (.xlsx) and LibreOffice (.ods), by python-calamine (the extra `excel`).
+"""Workbooks of Excel (.xlsx) and LibreOffice (.ods), read with python-calamine (extra `excel`).
 
-The recording is the sheet that is asked for, else the first that is not hidden and has a block of
-rows of numbers; the others are named. What stands above and below the block is as in delimited
-text. Of a formula the value counts that was saved with it. Workbooks are written by openpyxl.
+The recording is the requested sheet, else the first visible one with a block of numbers; the other
+sheets are listed as skipped. Rows above and below the block are treated as in delimited text. For a
+formula the saved value counts. Workbooks are written with openpyxl.
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ if TYPE_CHECKING:
     from impc.files.table import Table
 
 _DAY = 86_400.0
-_LONGEST_NAME = 31  # characters of a sheet's
+_LONGEST_NAME = 31  # characters of a sheet name
 _ANY_LENGTH = 32_767  # characters of a cell
-_WIDEST, _LOOKED_AT = 100, 200  # characters of a column, and the rows that say how wide it is
+_WIDEST, _LOOKED_AT = 100, 200  # column width in characters; rows that determine it
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 _TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
 
 
 def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
-    """Read the columns of the first sheet that has a block of rows of numbers, or of `sheet`.
+    """Read `sheet`, or the first sheet that has a block of numbers.
 
-    Dates and times become seconds after the first. Numbers that were saved as text, with decimal
-    commas too, are numbers. The file at `path` may unpack to `largest` bytes.
+    Dates and times become seconds after the first. Numbers saved as text count, with decimal
+    commas too. The file may unpack to `largest` bytes.
     """
     source = str(path)
     sheets = list(_sheets(path, largest))
     if sheet and sheet not in [item.name for item in sheets]:
         named = ", ".join(item.name for item in sheets[:12])
-        raise DataError(source, f"has no sheet {sheet!r}", f"recording.sheet may be {named}")
+        raise DataError(source, f"has no sheet {sheet!r}", f"set recording.sheet to {named}")
     found = [
         (item, block)
         for item in sheets
@@ -67,11 +67,11 @@ def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
     ]
     if not found:
         problem = f"has no rows of numbers in the first {HEAD} rows of a sheet"
-        raise DataError(source, problem, "save one signal a column, its name above it")
+        raise DataError(source, problem, "save one signal per column, its name above it")
     full = [item for item in found if item[1].several]
     chosen, block = (full or found)[0]
     skipped = {f"sheet {item.name}": "is another sheet" for item in sheets if item is not chosen}
-    notes = (f"sheet {chosen.name!r} is read, and others have rows of numbers too",)
+    notes = (f"sheet {chosen.name!r} is read; other sheets have rows of numbers too",)
     return _table(source, chosen, block, skipped, notes if len(full) > 1 else ())
 
 
@@ -91,21 +91,21 @@ def _kind_of(cell: Any) -> int:
 
 
 def read_cells(path: Path, largest: int) -> dict[str, Any]:
-    """The cells of the first sheet at `path` as texts, a row in each list; `largest` as above."""
+    """Cells of the first sheet as texts, row by row; it may unpack to `largest` bytes."""
     sheet = next(_sheets(path, largest), None)
     return {"cells": [[_text(cell) for cell in row] for row in sheet.rows] if sheet else []}
 
 
 @dataclass(frozen=True)
 class _Sheet:
-    """The cells of a sheet from its first one that is not empty, `corner` (row, column)."""
+    """Cells of a sheet from `corner` (row, column), the first that is not empty."""
 
     name: str
     rows: list[list[Any]]
     corner: tuple[int, int]
 
     def cell(self, row: int, column: int) -> str:
-        """How a spreadsheet calls a cell: B7."""
+        """Spreadsheet name of a cell, such as B7."""
         letters, number = "", column + self.corner[1] + 1
         while number:
             number, letter = divmod(number - 1, 26)
@@ -114,7 +114,7 @@ class _Sheet:
 
 
 def _sheets(path: Path, largest: int) -> Iterator[_Sheet]:
-    """The sheets that are not hidden, one after the other."""
+    """Visible sheets, one after the other."""
     source = str(path)
     calamine = optional("python_calamine", source)
     with zipfile.ZipFile(path) as archive:
@@ -133,7 +133,7 @@ def _sheets(path: Path, largest: int) -> Iterator[_Sheet]:
 
 
 def _body(sheet: _Sheet, block: Block) -> tuple[list[list[Any]], str]:
-    """The rows of a block, and a note on what stands below it."""
+    """Rows of a block, and a note on what stands below it."""
     last, blank = block.first, False
     for index, row in enumerate(sheet.rows[block.first :], start=block.first):
         kinds = _kinds(row)
@@ -143,14 +143,14 @@ def _body(sheet: _Sheet, block: Block) -> tuple[list[list[Any]], str]:
         if not block.fits(kinds, blank) and block.ends_at(kinds, _following(sheet, index), blank):
             place = next(cell for cell, kind in enumerate(kinds) if kind)
             where, what = sheet.cell(index, place), str(row[place])[:40]
-            note = f"row {where} and those below are not read: they begin with {what!r}"
+            note = f"row {where} and the rows below are not read; they begin with {what!r}"
             return sheet.rows[block.first : last + 1], note
         last, blank = index, False
     return sheet.rows[block.first : last + 1], ""
 
 
 def _following(sheet: _Sheet, index: int) -> list[int]:
-    """The kinds of the next row that is not empty."""
+    """Kinds of the next row that is not empty."""
     below = (_kinds(sheet.rows[place]) for place in range(index + 1, len(sheet.rows)))
     return next((kinds for kinds in below if any(kinds)), [])
 
@@ -183,7 +183,7 @@ def _table(
 def _column(
     source: str, sheet: _Sheet, corner: tuple[int, int], name: str, cells: Sequence[Any]
 ) -> Array | str:
-    """The numbers below a cell, or why there are none."""
+    """Numbers of a column, or the reason why there are none."""
     given = [cell for cell in cells if cell != ""]
     if all(isinstance(cell, bool) for cell in given):
         return "holds true and false"
@@ -207,7 +207,7 @@ def _column(
     kinds = {_kind(cell) for cell in given}
     if len(kinds) > 1:
         problem = f"column {name!r} has {' and '.join(sorted(kinds))}"
-        raise DataError(source, problem, "save it as numbers, all of one kind")
+        raise DataError(source, problem, "save the column as numbers, all of one kind")
     numbers = np.array(values, dtype=np.float64)
     return numbers if kinds == {"numbers"} else numbers - numbers[0]
 
@@ -219,7 +219,7 @@ def _kind(cell: Any) -> str:
 
 
 def _value(cell: Any, mark: str) -> float | None:
-    """The number of a cell, NaN where it is empty, times in s; None of a word."""
+    """Number of a cell: NaN if empty, times in s; None for a word."""
     if isinstance(cell, str):
         return _typed(cell.strip(), mark)
     if isinstance(cell, bool):
@@ -238,7 +238,7 @@ def _typed(text: str, mark: str) -> float | None:
 def _seconds(
     time: datetime.datetime | datetime.date | datetime.time | datetime.timedelta,
 ) -> float:
-    """Since a moment that is the same for all of a kind."""
+    """Seconds since a moment that is the same for all values of a kind."""
     if isinstance(time, datetime.timedelta):
         return time.total_seconds()
     if isinstance(time, datetime.time):
@@ -249,15 +249,15 @@ def _seconds(
 
 
 def _text(cell: Any) -> str:
-    """A cell as it would be typed: a whole number without a point."""
+    """Cell as text; whole numbers without a decimal point."""
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < 1e15:
         return str(int(cell))
     return str(cell).strip()
 
 
 def workbook_bytes(tables: Mapping[str, pd.DataFrame], readme: pd.DataFrame | None = None) -> bytes:
-    """Tables as sheets of one workbook (.xlsx), what they are first; not finite: an empty cell."""
-    import openpyxl  # noqa: PLC0415  # for who writes workbooks only
+    """Workbook (.xlsx) with a sheet for each table, `readme` first; not finite: empty cell."""
+    import openpyxl  # noqa: PLC0415  # only needed to write workbooks
 
     book = openpyxl.Workbook(write_only=True)
     first = {} if readme is None else {"README": readme}
@@ -281,8 +281,8 @@ def workbook_bytes(tables: Mapping[str, pd.DataFrame], readme: pd.DataFrame | No
 
 
 def encode_workbook(table: Table) -> bytes:
-    """The bytes of a workbook with one sheet, its headings with their units, to 16 digits."""
-    import pandas as pd  # noqa: PLC0415  # half a second, for who reads text only
+    """Workbook with one sheet, units in its headings, to 16 digits."""
+    import pandas as pd  # noqa: PLC0415  # takes 0.5 s; not needed for text files
 
     heads = [written_heading(name, table.units.get(name)) for name in table.columns]
     columns = pd.DataFrame(dict(enumerate(table.columns.values())))
@@ -290,10 +290,9 @@ def encode_workbook(table: Table) -> bytes:
 
 
 def as_data(table: pd.DataFrame) -> pd.DataFrame:
-    """A table whose texts no spreadsheet takes for formulas; truth values are yes and no.
+    """Table with formula-like texts escaped by an apostrophe, and truth values as yes and no.
 
-    A spreadsheet runs what begins with = + - or @, and names come from files of others: such a text
-    gets an apostrophe, which spreadsheets know as the mark of text.
+    Spreadsheets run texts that begin with = + - or @, and names come from other people's files.
     """
     safe = table.copy(deep=False)
     for place, kind in enumerate(table.dtypes):

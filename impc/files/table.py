@@ -1,4 +1,4 @@
-"""A file as it stands: named columns of equal length, before anything is made of them."""
+"""Content of a file: named numeric columns of equal length."""
 
 from __future__ import annotations
 
@@ -17,24 +17,20 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
-_LONGEST = 160  # characters of a name, a unit or a reason: they stand in messages and in TOML
+_LONGEST = 160  # characters of a name, a unit or a reason, as used in messages and TOML
 
 
 @dataclass(frozen=True)
 class Table(Frozen):
-    """The numeric columns of one file."""
+    """Numeric columns of one file."""
 
-    source: str  # Where they come from, for messages
-    # By name, in the order of the file, each (samples,). NaN where the file has no value.
+    source: str  # file, for messages
+    # by name, in the order of the file, each (samples,); NaN where the file has no value
     columns: Mapping[str, Array]
-    # Units of the columns for which the file says them, as it writes them
-    units: Mapping[str, str]
-    rate: float | None  # Samples per second, where the file says it itself (TDMS, C3D)
-    # What else the file holds, and why it is no column
-    skipped: Mapping[str, str] = field(default_factory=dict)
-    # What a user of the columns has to know of the file: names that were changed, rows that were
-    # not read
-    notes: tuple[str, ...] = ()
+    units: Mapping[str, str]  # as the file writes them, for the columns that have one
+    rate: float | None  # samples per second, if the file states it (TDMS, C3D)
+    skipped: Mapping[str, str] = field(default_factory=dict)  # other content, and why it is skipped
+    notes: tuple[str, ...] = ()  # renamed columns, rows that were not read
 
     @property
     def samples(self) -> int:
@@ -51,27 +47,32 @@ def make_table(
     skipped: Mapping[str, str] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Table:
-    """Keep the columns of the length that most have; the others are named among the skipped.
+    """Make a table from columns of equal length; those of another length are skipped.
 
     Parameters
     ----------
     source : str
         File, for messages.
     columns : mapping of str to array_like
-        (samples,) each, by name. What a masked array masks is missing: NaN.
+        Columns by name, (samples,) each. Masked entries become NaN.
     units : mapping of str to str, optional
-        As the file writes them, of the columns that have one.
+        Units by column, as the file writes them.
     rate : float, optional
-        Samples per second, where the file says it.
+        Samples per second, if the file states it.
     skipped : mapping of str to str, optional
-        What was not read, and why.
+        Content that was not read, and why.
     notes : tuple of str, optional
-        What a user of the columns has to know.
+        Remarks for the user, such as renamed columns.
+
+    Returns
+    -------
+    Table
+        The columns of the most frequent length; the others are listed in `skipped`.
 
     Raises
     ------
     DataError
-        When no column of numbers is left.
+        If no column of numbers is left.
 
     Examples
     --------
@@ -82,17 +83,17 @@ def make_table(
     """
     vectors: dict[str, Any] = {_line(name): value for name, value in columns.items()}
     if len(vectors) < len(columns):
-        raise DataError(source, "has two columns of one name", "give each its own")
+        raise DataError(source, "has two columns of one name", "give each its own name")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
     left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
     lengths = Counter(len(values) for values in vectors.values() if len(values) > 1)
     if not lengths:
         left_out |= {name: f"has {len(values)} values" for name, values in vectors.items()}
-        found = next((f"{name} {reason}" for name, reason in left_out.items()), "nothing in it")
+        found = next((f"{name} {reason}" for name, reason in left_out.items()), "it is empty")
         raise DataError(
-            source, f"holds no column of numbers ({found})", "save each signal as a column"
+            source, f"has no column of numbers ({found})", "save each signal as a column"
         )
-    # The longer one where two are equally frequent.
+    # If two are equally frequent, the longer one.
     usual = max(lengths, key=lambda length: (lengths[length], length))
     kept = {}
     for name, values in vectors.items():
@@ -105,16 +106,13 @@ def make_table(
 
 
 def _line(text: str) -> str:
-    """A name or a unit of a file's, of printable signs."""
+    """Text of a file reduced to printable characters and a limited length."""
     line = "".join(mark if mark.isprintable() else " " for mark in text[: 10 * _LONGEST]).strip()
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."
 
 
 def in_columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:
-    """The `rows`, a line each: the first `left` columns flush left, the others flush right.
-
-    pandas would set all of them flush right, names of methods too, or want a formatter a column.
-    """
+    """Format `rows` as lines: the first `left` columns flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(

@@ -1,4 +1,4 @@
-"""Units as people write them, in SI base units."""
+"""Convert units, in the spellings that people use, to SI base units."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Any
 from impc.checking import checked
 from impc.errors import InputError, brief
 
-# pint would take Nm for "number metre" and a.u. for "year times atomic mass unit".
+# pint reads Nm as "number metre" and a.u. as "year times atomic mass unit".
 _TORQUE = re.compile(r"(?<![A-Za-z])([kmM]?)N[ ·.\-⋅]?([cm]?)m(?![A-Za-z0-9])")
-_DEGREES = str.maketrans("º˚", "°°")  # the marks of ordinals and of rings, typed for degrees
-_PRESSURE = "kilogram / meter / second ** 2"  # of which a million is usual
+_DEGREES = str.maketrans("º˚", "°°")  # ordinal mark and ring, typed instead of the degree sign
+_PRESSURE = "kilogram / meter / second ** 2"  # a million of it is usual (MPa)
 _NO_UNIT = ("", "1", "-", "none", "unitless", "dimensionless", "n.d.")
-# Words that pint knows and that mean something else in half of the files that have them.
+# Units that pint knows, but that often mean something else in recordings.
 _UNCLEAR = {
     "g": "write g_0 for the acceleration of gravity, gram for a mass",
     "a.u.": 'write unit = "1" for arbitrary units',
@@ -25,7 +25,7 @@ _UNCLEAR = {
     "nm": "write N*m for a torque, nanometer for a length",
     "px": 'write unit = "1" for pixels',
 }
-# The same within products and quotients: Grad/s.
+# The same within products and quotients, such as Grad/s.
 _UNCLEAR_WORDS = {
     **dict.fromkeys(("grad", "grads", "grade", "grades"), "write deg for degrees, gon otherwise"),
     "rads": "write rad",
@@ -33,11 +33,11 @@ _UNCLEAR_WORDS = {
     "u": "write rpm for revolutions a minute",
 }
 _WORD = re.compile(r"[^\W\d_]+")
-# Letters, products, quotients and one-digit exponents. Longer numbers would be computed by pint,
-# and 9**9**9 takes as long as it likes.
+# Letters, products, quotients and one-digit exponents. pint would compute longer numbers, and
+# 9**9**9 takes practically for ever.
 _WRITTEN = re.compile(r"[A-Za-zµμ°Ω%_·⋅.*/^ ()0-9²³-]{1,40}")
 _HOSTILE = re.compile(r"[0-9)²³] *(\*\*|\^)|[0-9²³]{2}")
-#: What pint says of the units that most recordings have (`_base`). To ask it takes half a second.
+#: Results of pint for the most frequent units (see `_base`); the first use of pint takes 0.5 s.
 USUAL = {
     "s": (1.0, 0.0, "second"),
     "rad": (1.0, 0.0, "radian"),
@@ -48,28 +48,28 @@ USUAL = {
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit and what it is in SI base units."""
+    """A unit and its conversion to SI base units."""
 
-    written: str  # As the user or the file writes it
-    factor: float  # Value in SI base units = factor times value in this unit
-    base: str  # Its SI base units as pint prints them; "radian" for an angle, "second" for a time
+    written: str  # as the user or the file writes it
+    factor: float  # value in SI base units = factor * value in this unit
+    base: str  # SI base units as pint prints them; "radian" for an angle, "second" for a time
 
     @property
     def angle(self) -> bool:
-        """Whether it measures an angle."""
+        """Whether it is a unit of angle."""
         return self.base == "radian"
 
 
 @checked
 @functools.cache
 def si_unit(written: str) -> Unit:
-    """What a `written` unit is in SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m."""
+    """Convert a unit to SI base units: deg -> 0.01745 rad, "N*m" and "Nm" -> 1 N m."""
     text = written.strip().translate(_DEGREES)
     if text.lower() in _NO_UNIT:
         return Unit(written, 1.0, "dimensionless")
     unclear = _unclear(text)
     if unclear:
-        raise InputError(f"unit {written!r}", "can be read in two ways", unclear)
+        raise InputError(f"unit {written!r}", "is ambiguous", unclear)
     if not _WRITTEN.fullmatch(text) or _HOSTILE.search(text):
         raise _unknown(written)
     text = text.replace("⋅", "*").replace("²", "^2").replace("³", "^3")
@@ -82,7 +82,7 @@ def si_unit(written: str) -> Unit:
             factor, zero, base = found
             if zero != 0:
                 raise InputError(
-                    f"unit {written!r}", "has an offset", "record in a unit with its zero at zero"
+                    f"unit {written!r}", "has an offset", "use a unit that is zero at zero"
                 )
             if factor >= (1e4 if base.startswith("radian") else 1e6) and base != _PRESSURE:
                 problem = f"is {factor:g} {base}: a capital M is mega, G giga"
@@ -92,7 +92,7 @@ def si_unit(written: str) -> Unit:
 
 
 def is_unit(text: str) -> bool:
-    """Whether the `text` behind a column's name is a unit, or may be one of two."""
+    """Whether the `text` behind a column's name is a unit, possibly an ambiguous one."""
     try:
         si_unit(text)
     except InputError:
@@ -101,32 +101,32 @@ def is_unit(text: str) -> bool:
 
 
 def _unclear(text: str) -> str:
-    """What to do about a unit that can be read in two ways; empty for the others."""
+    """Remedy for an ambiguous unit; empty for the others."""
     whole = "" if text == "Nm" else _UNCLEAR.get(text.lower(), "")
     parts = (_UNCLEAR_WORDS.get(word, "") for word in _WORD.findall(text.lower()))
     return whole or next(filter(None, parts), "")
 
 
 def _base(text: str) -> tuple[float, float, str] | None:
-    """Factor, value of its zero, and base units; None for what pint cannot read."""
+    """Factor, offset and base units; None if pint cannot read it."""
     return USUAL[text] if text in USUAL else as_pint_says(text)
 
 
 def as_pint_says(text: str) -> tuple[float, float, str] | None:
-    """Ask pint for factor, value of its zero, and base units of the unit in a `text`."""
+    """Factor, offset and base units according to pint."""
     registry = _registry()
     try:
         unit = registry.parse_units(text)
         zero = registry.Quantity(0.0, unit).to_base_units()
         one = registry.Quantity(1.0, unit).to_base_units()
-    except Exception:  # pint raises a dozen kinds, AttributeError, TokenError and TypeError among
+    except Exception:  # pint raises many kinds, among them AttributeError, TokenError, TypeError
         return None
     return float(one.magnitude - zero.magnitude), float(zero.magnitude), str(one.units)
 
 
 @functools.cache
 def _registry() -> Any:
-    import pint  # noqa: PLC0415  # a third of a second, for who needs units only
+    import pint  # noqa: PLC0415  # takes a third of a second
 
     return pint.UnitRegistry()
 

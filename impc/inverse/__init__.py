@@ -1,1 +1,1 @@
-"""From recordings to gains and weights: the inverse problem and every method that solves it."""
+"""Inverse problem and estimation methods: from recordings to gains and weights."""

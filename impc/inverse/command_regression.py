@@ -1,12 +1,11 @@
-"""The gain by regression on recorded commands, where the controller meets no bound.
+"""Gain by regression on recorded commands, at samples with inactive bounds.
 
     u_t - u_s = -K (x_t - x_s) + noise
 
-x_t are the recorded states, where the outputs have them all, or those of the plant driven by the
-recorded commands, which are then taken for exact; its start is fitted to the outputs. Nothing is
-simulated in a loop, so that white noise of the person, which the loop answers, is no error of this
-gain; coloured noise is, which the states follow, and an error of x_t. At which samples no bound
-within the horizon is met, the controller that was fitted says.
+x_t are the recorded states, or those of the plant driven by the recorded commands (assumed exact,
+initial state fitted to the outputs). Nothing is simulated in closed loop, so white noise of the
+subject does not bias the gain; coloured noise, which is correlated with the states, and errors of
+x_t do. The fitted controller decides at which samples no bound is active over the horizon.
 """
 
 from __future__ import annotations
@@ -27,24 +26,26 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.recordings import Recording
 
-# A driven plant that misses more of the outputs than this share of their 2-norm does not follow.
+# Largest error of the driven plant relative to the 2-norm of the outputs.
 _FOLLOWS = 0.5
 
 
 @dataclass(frozen=True)
 class CommandRegression:
-    """A gain by regression, and what it was made from."""
+    """Gain and the data of its regression."""
 
     K: Array  # (m, n)
-    deviations: list[Array]  # x - x_s of each trial (samples - 1, n), zero where it is left out
-    residuals: list[Array]  # u + K (x - x_s) - u_s of each trial (samples - 1, m), likewise
-    used: int  # How many samples count
+    deviations: list[Array]  # x - x_s of each trial (samples - 1, n); zero where excluded
+    residuals: list[Array]  # u + K (x - x_s) - u_s of each trial (samples - 1, m); likewise
+    used: int  # Number of samples used
 
 
 def regress_commands(problem: Problem, gain: Array, metric: Array) -> CommandRegression:
-    """Regress the recorded commands; bounds are those of a `gain` (m, n) and a `metric` (m, m)."""
+    """Regress the recorded commands; a `gain` (m, n) and `metric` (m, m) define active bounds."""
     if not all(len(trial.commands) for trial in problem.recordings):
-        raise DataError("commands", "were not recorded", "give Recording(..., commands=...)")
+        raise DataError(
+            "commands", "expected recorded commands, got none", "pass Recording(..., commands=...)"
+        )
     controller = controller_for(problem, gain, metric)
     x, u, used = [], [], 0
     for trial, states in zip(problem.recordings, _states(problem), strict=True):
@@ -60,7 +61,9 @@ def regress_commands(problem: Problem, gain: Array, metric: Array) -> CommandReg
     together = np.concatenate(x)
     if used < problem.plant.n or np.linalg.matrix_rank(together) < problem.plant.n:
         raise SolverError(
-            "commands", f"{used} samples without a bound do not determine a gain", "record more"
+            "commands",
+            f"{used} samples with inactive bounds do not determine a gain",
+            "record more samples below the limits",
         )
     K = -np.linalg.lstsq(together, np.concatenate(u))[0].T
     return CommandRegression(
@@ -78,10 +81,12 @@ def _states(problem: Problem) -> list[Array]:
 
 
 def _driven(problem: Problem, trial: Recording) -> Array:
-    """States of the linear plant under recorded commands, its start fitted where it is unknown."""
+    """States of the linear plant driven by recorded commands; fits unknown initial states."""
     plant, commands = problem.plant, trial.commands[:-1]
     if np.isnan(commands).any():
-        raise DataError("commands", "have gaps, and not all states are recorded", "fill the gaps")
+        raise DataError(
+            "commands", "have gaps although not all states are recorded", "fill the gaps"
+        )
     pushes = commands @ plant.B.T + trial.disturbance[:-1] @ plant.E.T
     free = np.empty((trial.samples, plant.n, plant.n))
     x = np.empty((trial.samples, plant.n))
@@ -100,14 +105,14 @@ def _driven(problem: Problem, trial: Recording) -> Array:
     if not np.linalg.norm(missed) <= _FOLLOWS * np.linalg.norm(trial.outputs[known]):
         raise SolverError(
             "commands",
-            "do not move the plant as it was recorded",
-            "check their sign and unit, or leave them out",
+            "the plant driven by them does not reproduce the recorded outputs",
+            "check their sign and unit, or remove them",
         )
     return x
 
 
 def _free(controller: Controller, away: Array, taken: Array, held: Array) -> BoolArray:
-    """At which deviations (samples, n) the gain keeps every bound within the horizon."""
+    """Mask of the deviations (samples, n) at which no bound is active over the horizon."""
     rows = build_rows(controller)
     right = np.tile(rows.b, (len(away), 1))
     if len(taken):

@@ -1,18 +1,16 @@
-"""The unknowns of a search for a gain, in coordinates in which a step of one is a large step.
+"""Scaled coordinates of a gain search, in which a unit step is a large step.
 
-    z = (G^-1 K T | factor of S but its first entry | x0 of each trial | parameters)
+    z = (G^-1 K T | factor of S without its first entry | x0 of each trial | parameters)
 
-T T' is the covariance of the states that the first gain gives when white noise enters at the
-inputs, and G gives the inputs the size of that noise (`natural_coordinates`; with one input it is
-1), so that a step of length one moves the command by one unit of that noise, whatever the units of
-states and inputs. S = L F F'L' with the first S = LL' and F lower triangular, for the same reason.
-Gain and metric are independent: where no bound is active S has no effect, and does not hold K.
-No optimal regulator has a K T of norm above (tr(B'PB)/R)^(1/2), because white noise costs it
-tr(B'PB) a sample, of which R u^2 is a part.
+T T' is the state covariance under the first gain with white noise at the inputs, and G scales the
+inputs to that noise (`natural_coordinates`; 1 with one input), so that a unit step moves the
+command by one SD of that noise. S = L F F'L' with the first S = LL' and F lower triangular. Gain
+and metric are independent: without active bounds S has no effect. For every optimal regulator ||K
+T|| <= (tr(B'PB)/R)^(1/2), because white noise costs tr(B'PB) per sample, which includes R u^2.
 
-Initial states are measured in those of the trials themselves (`start_unit`), offsets in the size of
-their outputs, a parameter that is free in thirds of itself, and one with a stated uncertainty in
-that. Of such a one the prior is about its nominal value and is never weaker (docs/fitting.md).
+Initial states are scaled by the states of the trials (`start_unit`), offsets by their outputs, free
+parameters by a third of themselves, and parameters with a stated uncertainty by that. The latter
+have a prior at their nominal value that is never weakened (docs/why/theory.md).
 """
 
 from __future__ import annotations
@@ -38,35 +36,35 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
 
 _START_FLOOR = 1e-8
-# Columns below that, of the largest, are rounding.
+# Relative size below which columns are rounding.
 _EXPLAINED = 1e-12
 
 
 @dataclass(frozen=True)
 class Point:
-    """What a point of a search stands for."""
+    """Values at a point of a search."""
 
     K: Array  # Gain (m, n)
     S: Array  # Metric (m, m)
-    problem: Problem  # At the initial states and the parameters
+    problem: Problem  # At the initial states and parameters of the point
 
 
 @dataclass(frozen=True)
 class Compressed:
-    """Residual and derivative in bases of the derivative's QR factorisations, trial by trial."""
+    """Residual and derivative, compressed trial by trial by QR factorisations."""
 
-    rows: Rows  # Gain, metric and parameters are shared, initial states the trial's own
-    # How many of the shared columns stand before those of initial states; the rest after
+    rows: Rows  # Shared: gain, metric, parameters; own: initial states and offsets
+    # Number of shared columns before those of the initial states
     split: int
 
     @property
     def residual(self) -> Array:
-        """(r,)."""
+        """Compressed residual (r,)."""
         return np.ravel(self.rows.residual)
 
     @cached_property
     def jacobian(self) -> Array:
-        """With respect to the q coordinates (r, q)."""
+        """Compressed derivative by the q coordinates (r, q)."""
         shared, own = self.rows.shared, self.rows.own
         trials, height, n = own.shape
         starts = np.zeros((trials, height, trials, n))
@@ -77,7 +75,7 @@ class Compressed:
 
 
 class Coordinates:
-    """The coordinates of one search, and the residual in them."""
+    """Coordinates of one search, and the residual in them."""
 
     def __init__(
         self,
@@ -88,7 +86,7 @@ class Coordinates:
         correction: Correction | None = None,
     ) -> None:
         self.problem, self.correction = problem, correction
-        #: Gain and metric of the origin, as they were given.
+        #: Gain and metric of the origin.
         self.given = gain, metric
         plant = problem.plant
         self.m, self.n, self.trials = plant.m, plant.n, len(problem.recordings)
@@ -114,7 +112,7 @@ class Coordinates:
         self.start = self.at_gain(gain)
 
     def at_gain(self, gain: Array) -> Array:
-        """z (q,) of the origin with another gain (m, n), or the one of the basis next to it."""
+        """z (q,) of the origin with another gain (m, n), or its projection on the basis."""
         shapes = np.diff(np.concatenate([[0], self.ends]))
         nuisance = np.zeros(int(shapes[2] + shapes[3]))
         along = np.tensordot(self.natural(self.gains), self.natural(gain), 2)
@@ -122,30 +120,30 @@ class Coordinates:
 
     @property
     def centre(self) -> Array:
-        """z (q,) of the prior: the origin, and nominal values where an uncertainty is stated."""
+        """Prior mean of z (q,): the origin; nominal values of stated uncertainties."""
         found = self.start.copy()
         nominal = -self.problem.logarithms / self.units
         found[int(self.ends[2]) :] = np.where(self.stated, nominal, 0.0)
         return found
 
     def unpack(self, z: Array) -> Point:
-        """The values at z (q,)."""
+        """Gain, metric and problem at z (q,)."""
         along, factor, starts, parameters = np.split(z, self.ends[:-1])
         gain = np.asarray(np.tensordot(along, self.gains, 1))
         return Point(gain, self._metric(factor), self.problem_at(starts, parameters))
 
     def problem_at(self, starts: Array, parameters: Array) -> Problem:
-        """The problem at coordinates of its other unknowns; `parameters` (k,)."""
+        """Problem at other coordinates of initial states and offsets, and of `parameters` (k,)."""
         problem = self.problem
         moved = starts.reshape(self.trials, self.own) @ self.own_unit.T
         return with_own(problem, moved, problem.logarithms + self.units * parameters)
 
     def at(self, z: Array) -> Compressed:
-        """Residual and derivative at z (q,)."""
+        """Residual and derivative at z (q,), compressed."""
         return self.evaluated(z)[1]
 
     def residual(self, z: Array) -> Array | None:
-        """Residual (r,) at z (q,) without derivatives; None where there is none."""
+        """Residual (r,) at z (q,) without derivatives; None if infeasible."""
         here = self.unpack(z)
         residual, reason = residual_or_reason(
             here.problem, here.K, here.S, correction=self.correction
@@ -155,7 +153,7 @@ class Coordinates:
         return None if reason else residual
 
     def pulled(self, z: Array, change: Array) -> Array:
-        """J' (q,) of a change (r,) of the residual, J the derivative at z (q,)."""
+        """J'c (q,) of a change c (r,) of the residual, J the derivative at z (q,)."""
         found, _ = self.evaluated(z)
         dK, dS = self.changes(self.unpack(z), z)
         on_gain, on_metric = np.tensordot(change, found.dK, 1), np.tensordot(change, found.dS, 1)
@@ -170,10 +168,10 @@ class Coordinates:
         return pulled
 
     def evaluated(self, z: Array, known: Evaluation | None = None) -> tuple[Evaluation, Compressed]:
-        """The same at z (q,), as it was computed and compressed; `known` from another search."""
+        """Residual and derivative at z (q,), full and compressed; reuses `known` if given."""
         key = z.tobytes()
         if self.last is None or self.last[0] != key:
-            self.last = None  # of hundreds of trials there is no room for two
+            self.last = None  # free memory first: with hundreds of trials two would not fit
             here = self.unpack(z)
             found = known or evaluate(here.problem, here.K, here.S, self.near, self.correction)
             self.near = found.terminal or self.near
@@ -183,7 +181,7 @@ class Coordinates:
         return self.last[1:]
 
     def without_nuisance(self, z: Array) -> Array:
-        """Derivative at z (q,) with respect to gain and metric that the rest leaves."""
+        """Derivative at z (q,) by gain and metric, after projection on the other unknowns."""
         rows = self.at(z).rows
         left, values, _ = np.linalg.svd(rows.own, full_matrices=False)
         largest = np.max(values, initial=0.0)
@@ -202,7 +200,7 @@ class Coordinates:
         return np.asarray(kept - rest @ (rest.T @ kept))
 
     def natural(self, gains: Array) -> Array:
-        """G^-1 K T, (..., m, n), of gains (..., m, n)."""
+        """G^-1 K T (..., m, n) of gains K (..., m, n)."""
         return np.asarray(np.linalg.solve(self.G, gains @ self.T))
 
     def _factor(self, entries: Array) -> Array:
@@ -215,7 +213,7 @@ class Coordinates:
         return np.asarray(factor @ factor.T)
 
     def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
-        """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
+        """Derivatives of K (q, m, n), and of S scaled to trace m (q, m, m), by z (q,)."""
         lower = self._factor(z[self.ends[0] : self.ends[1]])
         dK, dS = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
         dK[: self.ends[0]] = self.gains
@@ -223,8 +221,8 @@ class Coordinates:
         return dK, scaled_changes(here.S, dS)
 
     def _compress(self, found: Evaluation, dK: Array, dS: Array) -> Compressed:
-        """Factor derivative and residual together, trial by trial, then apply the chain rule."""
-        # Initial states move neither K nor S: with hundreds of trials they are most of the columns.
+        """Factorise derivative and residual together, trial by trial, then apply the chain rule."""
+        # Initial states move neither K nor S, but are most of the columns.
         first, last = int(self.ends[1]), int(self.ends[2])
         shared = np.delete(np.arange(len(dK)), slice(first, last))
         along = found.dK.reshape(-1, self.m * self.n) @ dK[shared].reshape(len(shared), -1).T
@@ -232,7 +230,7 @@ class Coordinates:
             along += found.dS.reshape(-1, self.m**2) @ dS[shared].reshape(len(shared), -1).T
         rows, row = [], 0
         sizes = self.problem.trial_sizes
-        if not self.own:  # no column belongs to one trial: all are one block
+        if not self.own:  # one block: no trial-specific columns
             sizes = [sum(sizes)]
         for size in sizes:
             mine = slice(row, row + size)
@@ -272,7 +270,7 @@ def descend(
 
 
 class _Along:
-    """The residual of some coordinates from a point, along given columns of the shared ones."""
+    """Residual along given combinations of the shared coordinates, from a point."""
 
     def __init__(self, space: Coordinates, z: Array, along: Array | None) -> None:
         self.space, self.z = space, z
@@ -298,9 +296,9 @@ class _Along:
         whole = compressed.rows
         if found.reason:
             return None
-        # At an active bound the derivative has kinks, and its derivative says little; with several
-        # inputs bent steps reached exact recordings of 20 random problems where straight ones
-        # reached 14 (of 30, half of the outputs).
+        # With active bounds the second derivative is unreliable. With several inputs geodesic
+        # acceleration solved 20 of 30 random exact problems (half of the outputs), straight steps
+        # 14.
         curved = self.space.m > 1 or found.active == 0
         return Rows(whole.residual, whole.shared @ self.columns, whole.own, curved)
 
@@ -320,13 +318,13 @@ class _Along:
 
 
 def metric_directions(metric: Array) -> Array:
-    """Directions (k, m, m) of a metric (m, m) but for its scale, in its own units."""
+    """Directions (k, m, m) of a metric (m, m) without its scale, in its own units."""
     first: Array = np.asarray(np.linalg.cholesky(metric), dtype=np.float64)
     return _factor_changes(first, first)
 
 
 def _factor_changes(first: Array, lower: Array) -> Array:
-    """Change (k, m, m) of L F F'L' with each entry of F but the first, of L and of L F (m, m)."""
+    """Change (k, m, m) of L F F'L' by entries of F but the first, of L and of L F (m, m)."""
     found = []
     for row, column in list(zip(*np.tril_indices(len(first)), strict=True))[1:]:
         change = np.outer(first[:, row], lower[:, column])
@@ -335,10 +333,7 @@ def _factor_changes(first: Array, lower: Array) -> Array:
 
 
 def with_own(problem: Problem, moved: Array, logarithms: Array | None = None) -> Problem:
-    """The problem at initial states and offsets that differ by `moved` (trials, own).
-
-    And at other `logarithms` (k,) of its parameters, where they are given.
-    """
+    """Problem with initial states and offsets shifted by `moved` (trials, own)."""
     starts, shifts = np.array(problem.starts), np.array(problem.shifts)
     size = problem.searched_states
     starts[:, :size] += moved[:, :size]
@@ -347,18 +342,18 @@ def with_own(problem: Problem, moved: Array, logarithms: Array | None = None) ->
 
 
 def own_values(problem: Problem) -> Array:
-    """Initial states and offsets that are searched (trials, own)."""
+    """Searched initial states and offsets (trials, own)."""
     shifts = problem.shifts[:, _offset_places(problem)]
     return np.hstack([problem.starts[:, : problem.searched_states], shifts])
 
 
 def _offset_places(problem: Problem) -> list[int]:
-    """Which outputs have an offset that is searched."""
+    """Indices of the outputs with a searched offset."""
     return [problem.plant.outputs.index(name) for name in problem.offsets]
 
 
 def own_unit(problem: Problem, gain: Array) -> Array:
-    """Unit of what is a trial's own (own, own): that of `start_unit`, and of the outputs."""
+    """Unit of the unknowns of one trial (own, own): `start_unit` and output scales."""
     size, shifts = problem.searched_states, np.diag(problem.output_scale[_offset_places(problem)])
     whole = start_unit(problem, gain) if size else np.zeros((0, 0))
     if size < len(whole):  # the other states are known
@@ -367,11 +362,10 @@ def own_unit(problem: Problem, gain: Array) -> Array:
 
 
 def start_unit(problem: Problem, gain: Array) -> Array:
-    """Unit of initial states (n, n) at a stabilising `gain` (m, n): that of any state of a trial.
+    """Unit of initial states (n, n): factor of the second moments of the states under `gain`.
 
-    A factor of the second moments that the states have when the gain's controller is driven as the
-    recordings were. Where nothing drives it, or it diverges, white noise at the inputs of the size
-    of the outputs.
+    Without excitation, or if the loop diverges: white noise at the inputs of the size of the
+    outputs.
     """
     plant = problem.plant
     runs = simulated(problem, gain, np.eye(plant.m))

@@ -1,11 +1,11 @@
-"""No method's answer may be worse, in its own model, than the answer of another method there.
+"""Cross-check: no solution may fit worse in its own model than that of another method.
 
-    inverse_mpc, inverse_lqr_output    over all weights: those of any other method are candidates
-    feedback_gain                      over all gains, without bounds: so is any gain
+    inverse_mpc, inverse_lqr_output    search all weights: candidates are weights of other methods
+    feedback_gain                      searches all gains without bounds: any gain is a candidate
 
-Each candidate is simulated once, in the model and at the initial states of the answer that it might
-replace. One that leaves less is where that search begins again; what still leaves more afterwards
-says so (`Estimate.doubts`; docs/fitting.md).
+Each candidate is simulated in the model and at the initial states of the solution that it might
+replace. If one fits better, the search restarts from it; `Estimate.doubts` names one that still
+fits better afterwards.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-# Misfits that differ by less, of themselves, are the same.
+# Relative difference below which two misfits count as equal.
 _SAME = 1e-3
 # Methods that search all weights.
 _WEIGHTS = ("inverse_mpc", "inverse_lqr_output")
 
 
 def cross_checked(problem: Problem, found: dict[str, Estimate]) -> dict[str, Estimate]:
-    """The estimates of some methods, inverse MPC among them, none beaten in its own model."""
+    """Estimates of several methods, inverse MPC among them, after the cross-check."""
     own = found["inverse_mpc"]
     winner = _winner(own, found)
     if winner is not None:
@@ -55,7 +55,7 @@ def cross_checked(problem: Problem, found: dict[str, Estimate]) -> dict[str, Est
 
 
 def _winner(own: Estimate, found: dict[str, Estimate]) -> Estimate | None:
-    """The answer of another method that leaves least in this one's model, if it leaves less."""
+    """Solution of another method with the least misfit in this model, if better than `own`."""
     if own.K is None or own.method not in (*_WEIGHTS, "feedback_gain"):
         return None
     best, least = None, (1 - _SAME) * own.misfit
@@ -76,12 +76,12 @@ def _pair(estimate: Estimate) -> tuple[Array, Array]:
 def _begun_again(own: Estimate, winner: Estimate) -> Estimate:
     try:
         return fit_controller(own.problem, winner.stage_weights)
-    except ImpcError:  # its own answer stands
+    except ImpcError:  # keep the own solution
         return own
 
 
 def _searched_again(problem: Problem, start: Estimate, own: Estimate, winner: Estimate) -> Estimate:
-    """The method's own search from another method's answer; the better of both."""
+    """Restart the method from the solution of another one; return the better of both."""
     try:
         if own.method == "feedback_gain":
             posed = replace(own.problem, unknown_start=problem.unknown_start)

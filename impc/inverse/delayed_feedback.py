@@ -1,10 +1,10 @@
-"""The dissertation's preliminary estimate: gains on a few states, and physical parameters.
+"""Preliminary estimate of the dissertation: gains on a few states, and parameters.
 
     u = -K_4 x_4,   K = [K_4, 0]                                                         (3.20)
     fitted to the outputs together with the free physical parameters                     (3.19)
 
-without bounds. On the seat x_4 are angles and rates; delay and muscle get no gain, so a person who
-predicts over the delay is not in this family, and the parameters make up for it as far as they can.
+without bounds. On the seat x_4 are angles and rates. Delay and muscle states have no gain, so the
+model excludes prediction over the delay; the parameters compensate for it as far as they can.
 """
 
 from __future__ import annotations
@@ -33,16 +33,15 @@ _FINE, _EVALUATIONS = 0.01, 60
 
 
 def preliminary_gain(problem: Problem, states: Sequence[str]) -> tuple[Array, Problem]:
-    """Fit gains on some states, with initial states and physical parameters, without bounds.
-
-    The gain (m, n), zero on the other states, and the problem at what was found with it.
-    """
+    """Fit gains on `states`, initial states and parameters: gain (m, n) and problem."""
     loose = problem.without_bounds()
     names = problem.plant.states
     unknown = [name for name in states if name not in names]
     if unknown or not states:
         raise InputError(
-            "[fit] feedback_states", f"{unknown or 'is empty'}", f"known: {list(names)}"
+            "[fit] feedback_states",
+            f"expected states of the plant, got {unknown or 'none'}",
+            f"choose from {list(names)}",
         )
     kept: BoolArray = np.isin(names, states)
     gain, centre = _start(loose, kept)
@@ -53,7 +52,7 @@ def preliminary_gain(problem: Problem, states: Sequence[str]) -> tuple[Array, Pr
 
 
 def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:
-    """Gains on the kept states (k, m, n), orthonormal in natural coordinates of a gain (m, n)."""
+    """Gains on the kept states (k, m, n), orthonormal in whitened coordinates of `gain`."""
     T, G = natural_coordinates(plant, gain)
     entries = np.eye(gain.size).reshape(-1, *gain.shape)[np.tile(kept, plant.m)]
     natural, _ = np.linalg.qr(np.linalg.solve(G, entries @ T).reshape(len(entries), -1).T)
@@ -61,7 +60,7 @@ def _basis(plant: Plant, gain: Array, kept: BoolArray) -> Array:
 
 
 def _start(problem: Problem, kept: BoolArray) -> tuple[Array, Array]:
-    """The best multiple of a balanced regulator's gains on the kept states, and all its gains."""
+    """Best multiple of a balanced gain restricted to the kept states, and the full gain."""
     metric = np.eye(problem.plant.m)
     best: tuple[Array, Array] | None = None
     least = np.inf
@@ -75,6 +74,6 @@ def _start(problem: Problem, kept: BoolArray) -> tuple[Array, Array]:
         raise SolverError(
             "preliminary gain",
             "no gain on these states alone stabilises the plant",
-            "choose others in [fit] feedback_states",
+            "choose other states in [fit] feedback_states",
         )
     return best

@@ -1,9 +1,8 @@
-"""The choice of one pair of weights among all that have a given gain.
+"""Choose one pair of weights among all that have a given gain.
 
-The fibre of a gain (`gain_fibre`) is a linear space; its positive definite members are the weights
-with that gain. Three of them have a name here: the one that shows best that any exist, the one of
-least condition number, and the analytic centre. The first and the last do not depend on the units
-of states and inputs, the second does (docs/equivalent-weights.md, section 2).
+The positive definite members of the linear space `gain_fibre` are the weights with that gain. Three
+choices: the largest definiteness margin, the least condition number, and the analytic centre. Only
+the second depends on the units of states and inputs (docs/why/equivalent_weights.md).
 """
 
 from __future__ import annotations
@@ -27,50 +26,50 @@ from impc.inverse.solution_set import GainFibre, pair_blocks, split_blocks
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
-# Least eigenvalue, of a mean of 1, from which weights are said to exist: Clarabel errs by 1e-10.
+# Least eigenvalue, at mean 1, from which weights count as existing: Clarabel errs by 1e-10.
 _MARGIN = 1e-9
-#: By how much, relatively, the condition number of a convention may exceed the least: with less
-#: the members differ by less than the programs can determine.
+#: Relative slack of the least condition number in the tie-break; below it the solutions differ by
+#: less than the solver's accuracy.
 SLACK = 1e-5
-# Relative distance to the dual bound at which a program is not solved again, and counts as failed.
+# Relative gap to the dual bound at which a program is not repeated, and at which it fails.
 _GAP, _LARGEST_GAP = 1e-9, 1e-4
 
 
 @dataclass(frozen=True)
 class WeightsMargin:
-    """Whether a fibre has positive definite members, and by how much."""
+    """Whether a space of weights has positive definite members, and its margin."""
 
-    # Largest t with blkdiag(Q, R) >= t I in natural coordinates, at a mean eigenvalue of 1: at most
-    # 1, independent of units, negative when no member is even semidefinite
+    # Largest t with blkdiag(Q, R) >= t I in whitened coordinates, at a mean eigenvalue of 1: at
+    # most 1, independent of units, negative if no member is positive semidefinite
     margin: float
     exist: bool  # Whether the margin is above 1e-9
-    weights: Weights | None  # The member of that margin, when they exist
+    weights: Weights | None  # Member with that margin, if any exist
 
 
 @dataclass(frozen=True)
 class EquivalentWeights(Frozen):
-    """Weights that have the gain of a fibre."""
+    """Weights that have a given gain."""
 
     weights: Weights  # Scaled to R[0, 0] = 1
-    P: Array  # Their Riccati solution (n, n), solved anew
+    P: Array  # Riccati solution (n, n), recomputed from the weights
     condition: float  # Condition number of blkdiag(Q, R)
-    gain_error: float  # ||K(Q, R) - K||_F / ||K||_F, with K(Q, R) from that solution
-    status: str  # How they were found, and the solver's own word
-    # Of `least_condition_weights`: the least condition number, which these weights exceed by up to
-    # 2e-5 of it. None for weights that were not chosen by it.
+    gain_error: float  # ||K(Q, R) - K||_F / ||K||_F for that solution
+    status: str  # How they were computed, and the status of the solver
+    # `least_condition_weights` only: least condition number, which the weights exceed by up to 2e-5
+    # of it; otherwise None
     least: float | None
-    gap: float | None  # How much lower, relatively, that could be by the dual bound
+    gap: float | None  # Relative gap of `least` to its dual bound
 
 
 @checked
-@functools.lru_cache(maxsize=1)  # whoever looks for one member of a fibre looks for others next
+@functools.lru_cache(maxsize=1)  # the same space is often queried several times
 def weights_margin(fibre: GainFibre) -> WeightsMargin:
-    """Whether any weights have the gain: max t such that X >= t I, X of mean eigenvalue 1."""
+    """Largest t with X >= t I at mean eigenvalue 1; positive if any weights have the gain."""
     basis, n, size = fibre.natural_basis(), fibre.plant.n, fibre.plant.n + fibre.plant.m
     traces = np.trace(basis, axis1=1, axis2=2)
-    if np.linalg.norm(traces) < 1e-12:  # no member has a positive trace, or there is none but 0
+    if np.linalg.norm(traces) < 1e-12:  # no member has a positive trace
         return WeightsMargin(-np.inf, exist=False, weights=None)
-    # The trace is eliminated: as an equality, it stops Clarabel at once on one plant in twenty.
+    # Eliminate the trace: as an equality it stopped Clarabel on 1 plant in 20.
     first = np.tensordot(traces * size / (traces @ traces), basis, 1)
     level = np.tensordot(scipy.linalg.null_space(traces[None]).T, basis, 1)
     lowered = np.concatenate([level, -np.eye(size)[None]])
@@ -78,12 +77,16 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
     cones = [matrix_inequality(first[part, part], lowered[:, part, part]) for part in parts]
     found = solve_semidefinite(-np.eye(len(lowered))[-1], cones)
     member = first + np.tensordot(found.y[:-1], level, 1)
-    # From the member itself, not from the solver's word.
+    # Recomputed from the member, not taken from the solver.
     margin = float(np.linalg.eigvalsh(member)[0])
     if margin > _MARGIN:
         return WeightsMargin(margin, exist=True, weights=fibre.from_natural(member))
     if not abs(margin + found.bound) <= _LARGEST_GAP * max(1.0, -margin):
-        raise SolverError("margin", f"Clarabel: {found.status}, undecided", "scale the states")
+        raise SolverError(
+            "margin",
+            f"undecided whether weights exist (Clarabel: {found.status})",
+            "rescale the states (use other units)",
+        )
     return WeightsMargin(margin, exist=False, weights=None)
 
 
@@ -91,38 +94,39 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
 def least_condition_weights(
     fibre: GainFibre, member: Weights | None = None, *, rough: bool = False
 ) -> EquivalentWeights:
-    """Return the weights of least condition number that have the gain.
+    """Return the weights of least condition number that have a given gain.
 
-    minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the fibre.
+    Solves: minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the space of weights
+    with this gain. Several weights may have the least condition number. By convention the result
+    is, among those within a relative 1e-5 of it, the one of least Frobenius norm in whitened
+    coordinates (`gain_fibre`) at least eigenvalue 1. It is unique.
 
-    Many weights may have the least condition number. By convention the answer is, of those whose
-    condition number is at most 1e-5 larger, that of least Frobenius norm in natural coordinates
-    (`gain_fibre`) when their least eigenvalue is 1: it is unique, and the same on every processor.
-
-    A member X0 = LL' of least eigenvalue 1 and largest a sets the scale: the first inequality is
-    written for L^-1 X L^-T, the second divided by a, so that all entries are of order one. One
-    such program reaches 2e-4 on the seat plant (a condition number of 2e7); from its own answer
-    the next reaches 1e-11. As written above it returns twice the least condition number there.
+    The program is scaled by a member X0 = LL' of least eigenvalue 1 and largest eigenvalue a: the
+    first inequality is written for L^-1 X L^-T, the second divided by a. It is repeated from its
+    own solution, because one program is not accurate enough on ill-conditioned plants.
 
     Parameters
     ----------
     fibre : GainFibre
+        Space of the weights with the gain, from `gain_fibre`.
     member : Weights, optional
-        Weights known to have the gain: where to begin when no program finds any. Weights at the
-        edge of what a program can determine from none (a margin below 1e-9) are found again like
-        this.
-    rough : bool
-        Whether a least condition number that is proved to 1e-4 is enough, and programs are left as
-        they stand and not scaled once more: half of the time or less. Over 150 random plants they
-        agree to 2e-6; a search that begins at these weights ends elsewhere within its tolerance.
+        Weights known to have the gain; the starting point if the program finds no definite member.
+    rough : bool, default False
+        If True, accept a least condition number proved to 1e-4 and skip the second scaling and the
+        tie-break; at least twice as fast.
+
+    Returns
+    -------
+    EquivalentWeights
+        Weights, condition number, gain error, and the gap to the dual bound.
 
     Raises
     ------
     WeightsError
-        When no weights have the gain.
+        If no weights have the gain.
     SolverError
-        When the dual bound stays more than 1e-4 below, or no member is definite to working
-        precision in the units of the plant.
+        If the dual bound stays more than 1e-4 below, or no member is definite to working precision
+        in the units of the plant.
 
     Examples
     --------
@@ -148,8 +152,8 @@ def least_condition_weights(
     if not gap < _LARGEST_GAP:
         raise SolverError(
             "least condition number",
-            f"Clarabel: {status}, condition {least:.6g}, proven only to {gap:.2g}",
-            "use `analytic_centre`, or scale the states",
+            f"condition number {least:.6g} proved only to {gap:.2g} (Clarabel: {status})",
+            "use `analytic_centre`, or rescale the states (use other units)",
         )
     if not rough:
         chosen = _least_norm(fibre, best, (1 + SLACK) * least)
@@ -160,10 +164,10 @@ def least_condition_weights(
 
 @checked
 def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
-    """Return the member of largest det Q det R among those with trace(N^-1 R) = m.
+    """Return the member of largest det Q det R with trace(N^-1 R) = m, by damped Newton steps.
 
-    N is the metric of the natural coordinates, so the choice does not depend on the coordinates
-    of states and inputs. With a single input it is the largest det Q with R fixed. Damped Newton.
+    N is the metric of the whitened coordinates, so the choice does not depend on the units of
+    states and inputs. With a single input it is the largest det Q with R fixed.
     """
     n, basis = fibre.plant.n, fibre.natural_basis()
     X = fibre.to_natural(_interior(fibre))
@@ -173,7 +177,7 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
     for iteration in range(1, 201):
         inverse = np.linalg.inv(np.linalg.cholesky(X))
         seen = (inverse @ level @ inverse.T).reshape(len(level), X.size)
-        # The Newton step of log det: the least-squares solution of sum d_i seen_i = I.
+        # Newton step of log det: least-squares solution of sum d_i seen_i = I.
         step = np.linalg.lstsq(seen.T, np.eye(len(X)).ravel())[0]
         decrement = float(np.linalg.norm(step @ seen))
         X = X + np.tensordot(step, level, 1) / (1 + decrement if decrement > 0.25 else 1)
@@ -184,8 +188,8 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
             break
     raise WeightsError(
         "gain",
-        "leaves the cost on some combination of states free, so there is no analytic centre",
-        "use `least_condition_weights`, or remove states that are out of reach or gone in one step",
+        "leaves the cost of some combination of states free, so there is no analytic centre",
+        "use `least_condition_weights`, or remove uncontrollable and deadbeat states",
     )
 
 
@@ -193,19 +197,26 @@ def analytic_centre(fibre: GainFibre) -> EquivalentWeights:
 def other_weights(
     fibre: GainFibre, count: int = 2, *, condition_ratio: float = 10.0
 ) -> tuple[EquivalentWeights, ...]:
-    """Return weights clearly unlike those of least condition number, with the same gain.
+    """Return weights far from those of least condition number, with the same gain.
 
-    From the weights of least condition number, straight along each basis direction of the fibre
-    and its opposite, as far as the condition number stays below the ratio; of these ends the one
-    farthest from all chosen so far, again and again. Distances are spreads of the logarithms of
-    relative eigenvalues, in which neither scale nor units count.
+    Starts at the weights of least condition number and follows each basis direction of the space,
+    both ways, until the condition number reaches its limit. The end points farthest from all
+    previous choices are returned. The distance is the SD of the logarithms of the relative
+    eigenvalues, which depends on neither scale nor units.
 
     Parameters
     ----------
-    count : int
-        How many; fewer come back when the fibre has fewer ends, none when it has one member.
-    condition_ratio : float
+    fibre : GainFibre
+        Space of the weights with the gain, from `gain_fibre`.
+    count : int, default 2
+        Number of weights; fewer are returned if the space has fewer end points, none if it has only
+        one member.
+    condition_ratio : float, default 10
         Largest condition number, as a multiple of the least.
+
+    Returns
+    -------
+    tuple of EquivalentWeights
 
     Raises
     ------
@@ -247,20 +258,20 @@ def _interior(fibre: GainFibre, member: Weights | None = None) -> Weights:
         raise WeightsError(
             "gain",
             f"no positive definite weights have it (margin {found.margin:.3g})",
-            "look for the nearest gain that has, by the gradient of inverse LQR",
+            "use inverse_lqr_gradient for the nearest gain that has weights",
         )
     return found.weights
 
 
 @dataclass(frozen=True)
 class _Centred:
-    """A fibre as seen from a member, whose least eigenvalue is 1 and whose largest is `largest`."""
+    """Space in coordinates of a member of least eigenvalue 1 and largest eigenvalue `largest`."""
 
     raw: Array
-    seen: Array  # L^-1 raw L^-T, orthonormal: the programs' variables are well scaled
+    seen: Array  # L^-1 raw L^-T, orthonormal, so that programs are well scaled
     lower: Array  # L^-1 L^-T
     largest: float
-    natural: Array  # raw in the fibre's own basis, orthonormal in natural coordinates
+    natural: Array  # raw in the basis of the space, orthonormal in whitened coordinates
     blocks: tuple[slice, slice]
 
     @classmethod
@@ -270,7 +281,7 @@ class _Centred:
             raise SolverError(
                 "least condition number",
                 "the weights are singular to working precision in the units of the plant",
-                "scale the states",
+                "rescale the states (use other units)",
             )
         inverse = inverse_factor(fibre, centre) * np.sqrt(eigenvalues[0])
         lower = inverse @ inverse.T
@@ -287,7 +298,7 @@ class _Centred:
         )
 
     def cones(self, limit: float | None) -> list[Cone]:
-        """I <= X <= limit I; without a limit X <= s largest I, s one variable more."""
+        """I <= X <= limit I; without a limit X <= s largest I with a further variable s."""
         size, cones = len(self.lower), []
         more = np.zeros((1, size, size)), np.eye(size)[None] * (limit is None)
         seen = np.concatenate([self.seen, more[0]])
@@ -303,7 +314,7 @@ class _Centred:
 
 
 def _centred_program(fibre: GainFibre, centre: Weights, scaled: bool) -> tuple[Weights, float, str]:
-    """One program of `least_condition_weights`, scaled by a member: (found, bound, status)."""
+    """One program of `least_condition_weights` scaled by a member: (found, bound, status)."""
     at = _Centred.about(fibre, centre)
     last = np.eye(len(at.raw) + 1)[-1]
     found = solve_semidefinite(last, at.cones(None), scaled=scaled)
@@ -311,7 +322,7 @@ def _centred_program(fibre: GainFibre, centre: Weights, scaled: bool) -> tuple[W
 
 
 def _least_norm(fibre: GainFibre, centre: Weights, limit: float) -> Weights:
-    """Of the members with I <= X <= limit I that of least Frobenius norm in natural coordinates."""
+    """Member with I <= X <= limit I of least Frobenius norm in whitened coordinates."""
     at = _Centred.about(fibre, centre)
     last = np.eye(len(at.raw) + 1)[-1]
     size = np.linalg.norm(fibre.to_natural(centre)) / np.linalg.eigvalsh(centre.block)[0]
@@ -321,15 +332,14 @@ def _least_norm(fibre: GainFibre, centre: Weights, limit: float) -> Weights:
 
 
 def _ends(fibre: GainFibre, centre: Weights, limit: float) -> tuple[list[Array], Array]:
-    """Ends X of the rays as seen from the centre, and the frame L: L X L' in natural coordinates.
+    """End points X of the rays from the centre, and L with L X L' in whitened coordinates.
 
-    By bisection, for the condition is quasiconvex. Seen from the centre, which is I there, they are
-    definite to the last digit; in other coordinates the condition numbers multiply.
+    Bisection (the condition number is quasiconvex) in coordinates in which the centre is I.
     """
     inverse = inverse_factor(fibre, centre)
     back = np.linalg.inv(inverse)
     seen = (inverse @ pair_blocks(fibre.Q, fibre.R) @ inverse.T).reshape(fibre.dimension, -1)
-    # Across the centre itself, seen as I, so that every ray leaves the cone.
+    # Orthogonal to the centre, so that every ray leaves the cone.
     flat = np.eye(len(back)).ravel() / np.sqrt(len(back))
     across = seen - np.outer(seen @ flat, flat)
     directions = np.linalg.svd(across, full_matrices=False)[2][: fibre.dimension - 1]
@@ -346,12 +356,16 @@ def _ends(fibre: GainFibre, centre: Weights, limit: float) -> tuple[list[Array],
 
 def _distance(X: Array, Y: Array) -> float:
     ratios = scipy.linalg.eigvalsh(X, Y)
-    return float(np.std(np.log(np.maximum(ratios, 1e-12 * ratios[-1]))))  # rounding ends there
+    return float(np.std(np.log(np.maximum(ratios, 1e-12 * ratios[-1]))))  # rounding level
 
 
 def inverse_factor(fibre: GainFibre, weights: Weights) -> Array:
-    """L^-1 (n + m, n + m) of blkdiag(Q, R) = LL', by way of the natural coordinates."""
-    factor = np.linalg.cholesky(fibre.to_natural(weights))
+    """L^-1 (n + m, n + m) of blkdiag(Q, R) = LL', computed through whitened coordinates."""
+    try:
+        factor = np.linalg.cholesky(fibre.to_natural(weights))
+    except np.linalg.LinAlgError:
+        problem = "are singular to working precision in whitened coordinates"
+        raise SolverError("weights", problem, "scale the states") from None
     return np.linalg.inv(factor) @ scipy.linalg.block_diag(fibre.T, fibre.G).T
 
 

@@ -1,8 +1,4 @@
-"""What a method found: the one type for every method, from a feedback gain to inverse MPC.
-
-The unknowns are those of docs/theory.md, section 6; what one more function says of an estimate
-(intervals, intent, agreement with trials left out) is in `impc.assess`.
-"""
+"""Result type of all estimation methods, from a plain feedback gain to inverse MPC."""
 
 from __future__ import annotations
 
@@ -44,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Status(Enum):
-    """How a method ended; each has a sentence."""
+    """How a method ended."""
 
     EXPLAINED = "explained"
     SETTLED = "settled"
@@ -54,81 +50,82 @@ class Status(Enum):
 
     @property
     def sentence(self) -> str:
-        """The same as a sentence (docs/fitting.md)."""
+        """Sentence for reports and the terminal."""
         return _SENTENCES[self]
 
 
-# What is left is much when half of the recordings' 2-norm is (a VAF of 75 %). Of the noisy carts of
-# the tests inverse MPC ends within 0.3 % of the best gain's misfit, inverse LQR 170 % above it.
+# Residual of half the recorded 2-norm (VAF 75 %) that is reported as large. Inverse MPC ended
+# within 0.3 % of the misfit of the best gain on the noisy carts of the tests, inverse LQR 170 %
+# above it.
 _MUCH, _MORE = 0.5, 1.05
-# Standard deviations of the first autocorrelation of white noise beyond which a residual is not
-# white, and its least size: that of noise after a filter on the way to a lower rate is 0.15.
+# First autocorrelation from which a residual is not white: in SDs of that of white noise, and its
+# least value (noise filtered before resampling has 0.15).
 _WHITE, _LEAST = 3.0, 0.3
-#: A direction whose singular value is below this, of the largest, is not determined at all.
+#: Directions whose singular value is below this share of the largest are not identified.
 DETERMINED = 1e-6
-#: So is one along which a natural step changes the outputs by less than this share of them.
+#: Nor are directions along which a whitened step moves the outputs by less than this share.
 ROUNDING = 1e-10
 
 _SENTENCES = {
-    Status.EXPLAINED: "The weights reproduce the recordings to 1e-9 of them.",
-    Status.SETTLED: "The search ended; what it leaves of the recordings counts as noise.",
-    Status.STOPPED: "The search was stopped before it ended: the answer may be wrong.",
-    Status.GAIN_ONLY: "A gain was found, and no weights that have it.",
-    Status.NONE: "The method ended without a gain.",
+    Status.EXPLAINED: "The weights reproduce the recordings to a relative error of 1e-9.",
+    Status.SETTLED: "The search converged; the remaining residual is treated as noise.",
+    Status.STOPPED: "The search stopped before it converged: the result may be wrong.",
+    Status.GAIN_ONLY: "A gain was found, but no weights that have it.",
+    Status.NONE: "The method found no gain.",
 }
 
 
 @dataclass(frozen=True)
 class Goodness:
-    """What the simulation of the recordings says of an answer."""
+    """Diagnostics from the simulation of the recordings."""
 
-    # Whether what is left of no output is autocorrelated from one sample to the next; of an exact
-    # answer it is rounding
+    # Whether the residuals of all outputs are white (first autocorrelation)
     white: bool
-    softened: int  # How many samples exceed a soft bound or the terminal set, and of how many
+    softened: int  # Samples that exceed a soft state bound or the terminal set; all samples
     samples: int
-    # Directions of the gain (of the weights, where the terminal weight is given) identified
+    # Number of identified directions of the gain (with a fixed terminal weight: of the weights)
     rank: int
-    unconfirmed: bool = (
-        False  # Whether the best of several searches was alone: the others ended at more
-    )
-    # Method whose answer leaves less in the model of this one; empty where there is none
+    unconfirmed: bool = False  # Only one of several searches reached this misfit
+    # Method whose solution has a smaller misfit in the model of this one; empty if none
     beaten_by: str = ""
 
 
-@dataclass(frozen=True, eq=False)  # itself alone: so what is derived from one may be cached
+@dataclass(frozen=True, eq=False)  # identity comparison, so that derived results can be cached
 class Estimate(Frozen):
-    """A controller that a method found behind recordings.
+    """Controller identified from recordings by one method.
 
     Attributes
     ----------
     method : str
-        A name of `impc.inverse.methods.METHODS`.
+        Identifier in `impc.inverse.methods.METHODS`.
     problem : Problem
-        As the method saw it (a method of inverse LQR knows no bounds), at the initial states and
-        physical parameters that belong to the answer.
-    K, S : Array or None
-        Gain (m, n) and metric (m, m); None when the method ended without them.
+        Problem that the method solved (inverse LQR: without bounds), at the fitted initial states,
+        offsets and physical parameters.
+    K, S : ndarray of shape (m, n) and (m, m), or None
+        Gain of u = -Kx and input metric; None if the method found none.
     weights : Weights or None
-        Scaled to R[0, 0] = 1; None where the method seeks or finds none.
-    metrics : Array
-        Basis of the metrics that the recordings do not identify from S (k, m, m), see `GainFit`.
+        Cost weights scaled to R[0, 0] = 1; None if the method does not estimate or find any.
+    metrics : ndarray of shape (k, m, m)
+        Basis of the metrics between which the recordings cannot distinguish; S is one of them.
     misfit : float
-        2-norm of the output residual, each output over its scale; NaN without a gain.
+        2-norm of the output residual, each output divided by its scale; NaN without a gain.
     noise : float
-        The part of it that no weights are asked to explain: that of the best gain of any kind.
+        Part of the misfit that is attributed to noise: for inverse MPC, the misfit of the best
+        gain.
     status : Status
+        How the method ended.
     reason : str
-        Why there is no gain or no weights, in the words of whatever failed; empty otherwise.
+        Why there is no gain, why there are no weights, or why the weights fit worse than the gain;
+        empty otherwise.
     evaluations : int
-        Simulations with derivatives.
+        Number of simulations with derivatives.
     seconds : float
-        Time of the method, given what it starts from, s.
+        Run time of the method in s, without its starting estimate.
     fit : Goodness
-        What its simulation of the recordings says against it.
-    cost_weights : Array or None
-        Unknowns of the problem's structure (count,), for the method that searches them; minus
-        infinity is a cost weight of zero.
+        Diagnostics of the simulation: white residuals, violated soft bounds, identified directions.
+    cost_weights : ndarray of shape (count,), or None
+        Unknowns of the cost structure (logarithms of cost weights), if the method estimates them;
+        minus infinity stands for a cost weight of zero.
 
     Examples
     --------
@@ -142,7 +139,7 @@ class Estimate(Frozen):
     >>> found
     <Estimate inverse_mpc: explained, misfit ...>
     >>> found.status.sentence
-    'The weights reproduce the recordings to 1e-9 of them.'
+    'The weights reproduce the recordings to a relative error of 1e-9.'
     >>> found.intervals().round(3)
                 unit  value    low   high  identified
     name
@@ -178,23 +175,23 @@ class Estimate(Frozen):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Sentences that say why the answer may be wrong, or is not all of the answer."""
+        """Sentences that qualify the result: soft bounds, misfit, unidentified directions."""
         if self.K is None:
             return ()
         found, doubts = self.fit, []
         if self.problem.terminal_set:
-            doubts.append("The controller ends in its terminal set.")
+            doubts.append("The controller has a terminal set.")
         if found.softened:
             doubts.append(
-                f"{found.softened} of {found.samples} samples of its simulation exceed a state "
-                "bound or the terminal set, which the search had softened."
+                f"{found.softened} of {found.samples} simulated samples exceed a state bound or "
+                "the terminal set; both are soft constraints during the search."
             )
         if self.problem.terminal_weight is not None:
             count = 0 if self.cost_weights is None else len(self.cost_weights)
             doubts.append(
-                "The horizon ends in a terminal weight of your own: K is the first of its gains, "
-                "and the weights are identified otherwise than by one gain. The recordings "
-                f"identify {found.rank} of their {count} directions."
+                "The terminal weight is fixed, so that every stage of the horizon has its own "
+                f"gain; K is the first. The recordings identify {found.rank} of the {count} "
+                "directions of the weights."
             )
         elif found.rank < self.K.size:
             doubts.append(
@@ -204,89 +201,72 @@ class Estimate(Frozen):
             return tuple(doubts)
         share = self.misfit / recorded_size(self.problem)
         if share > _MUCH:
-            doubts.append(f"It leaves {100 * share:.0f} % of the recordings.")
+            doubts.append(f"The residual is {100 * share:.0f} % of the recordings (2-norm).")
             still = not any(np.any(trial.disturbance) for trial in self.problem.recordings)
             if still and self.problem.plant.disturbances:
                 names = ", ".join(self.problem.plant.disturbances)
                 doubts.append(f"No recording has a disturbance, although the plant has {names}.")
         if self.misfit > _MORE * self.noise:
             doubts.append(
-                f"But another gain leaves less, {self.noise:.3g}: not all of it is noise."
+                f"Another gain has a smaller misfit, {self.noise:.3g}: "
+                "part of the residual is not noise."
             )
         if found.beaten_by:
-            doubts.append(f"The answer of {found.beaten_by} leaves less here: the search failed.")
+            doubts.append(
+                f"The solution of {found.beaten_by} has a smaller misfit here: the search failed."
+            )
         if found.unconfirmed:
-            doubts.append("Of several searches one ended here: a better answer may exist.")
+            doubts.append(
+                "Only one of several searches reached this misfit: a better solution may exist."
+            )
         if not found.white:
             doubts.append(
-                "What it leaves is no white noise: noise in the loop, another model, or a better "
-                "answer that was not found."
+                "The residuals are autocorrelated: noise inside the loop, a wrong model, or a "
+                "better solution that the search missed."
             )
         return tuple(doubts)
 
     @property
     def gain(self) -> Array:
-        """K (m, n).
-
-        Raises
-        ------
-        SolverError
-            When the method ended without one.
-        """
+        """Gain K (m, n); raises SolverError if the method found none."""
         return self._found(self.K)
 
     @property
     def metric(self) -> Array:
-        """S (m, m).
-
-        Raises
-        ------
-        SolverError
-            When the method ended without one.
-        """
+        """Input metric S (m, m); raises SolverError if the method found none."""
         return self._found(self.S)
 
     @property
     def stage_weights(self) -> Weights:
-        """The weights.
-
-        Raises
-        ------
-        WeightsError
-            When the method has found none.
-        """
+        """Cost weights; raises WeightsError if the method found none."""
         if self.weights is None:
-            raise WeightsError(self.method, f"found no weights: {self.reason}", "see its reason")
+            raise WeightsError(
+                self.method, f"found no weights: {self.reason}", "use the gain, or another method"
+            )
         return self.weights
 
     @property
     def explained(self) -> bool:
-        """Whether the weights, simulated, reproduce the recordings to 1e-9 of them."""
+        """Whether the simulated weights reproduce the recordings to a relative error of 1e-9."""
         return self.status is Status.EXPLAINED
 
     @property
     def converged(self) -> bool:
-        """Whether the search ended by itself."""
+        """Whether the search converged."""
         return self.status in (Status.EXPLAINED, Status.SETTLED)
 
     def controller(self) -> Controller:
-        """Return the constrained controller that was found.
-
-        Raises
-        ------
-        SolverError
-            When the method ended without a gain.
-        """
+        """Return the identified controller with its bounds; SolverError without a gain."""
         return controller_for(self.problem, self.gain, self.metric, weights=self.weights)
 
     @cached_property
     def simulations(self) -> tuple[Simulation, ...]:
-        """The recorded trials under this controller, one each."""
+        """Simulations of the recorded trials under this controller, one per trial."""
         return tuple(simulated(self.problem, self.gain, self.metric, self.weights))
 
     @property
     def time(self) -> tuple[Array, ...]:
-        """Of the samples, s: a tuple with an array for each trial, as the next three are."""
+        """Time of the samples in s, one array per trial; likewise for the next three."""
         return tuple(run.time for run in self.simulations)
 
     @property
@@ -305,7 +285,7 @@ class Estimate(Frozen):
         return tuple(run.inputs for run in self.simulations)
 
     def frame(self) -> pd.DataFrame:
-        """All trials as one table with the names of the signals; the first column counts trials."""
+        """All simulated trials as one table with signal names; the first column is the trial."""
         import pandas as pd  # noqa: PLC0415  # a third of a second
 
         frames = [run.frame() for run in self.simulations]
@@ -315,36 +295,38 @@ class Estimate(Frozen):
 
     @property
     def vaf(self) -> Array:
-        """Variance accounted for (3.24), over all trials, % (p,)."""
-        from impc.assess.assessments import evaluate_method  # noqa: PLC0415  # as all below: where used
+        """Variance accounted for (3.24) of each output over all trials, in %, shape (p,)."""
+        from impc.assess.assessments import evaluate_method  # noqa: PLC0415
 
         return evaluate_method(self, self.problem.bounds).vaf
 
     def intervals(self) -> pd.DataFrame:
-        """The gain, and free parameters, with 95 % intervals, a row each.
+        """Gain entries and free parameters with 95 % intervals, one row each.
 
-        By name, such as "K.u.x1" for the entry from the state x1 to the input u: `unit`, `value`,
-        `low`, `high` and `identified`, whether the recordings determine this number by itself.
-        The value is that of least squares along what they determine (docs/fitting.md), and may
-        differ from K, which is that of weights.
+        Returns
+        -------
+        pandas.DataFrame
+            Index: name, such as "K.u.x1" for the entry from state x1 to input u. Columns: `unit`,
+            `value`, `low`, `high`, and `identified`, whether the recordings identify this number
+            individually. Values are least-squares estimates along the identified directions and can
+            differ from K, which belongs to weights (docs/why/intervals.md).
         """
         from impc.assess.printed_gain import interval_table  # noqa: PLC0415
 
         return interval_table(self)
 
     def continuous_gain(self) -> pd.DataFrame:
-        """The gain of continuous feedback of which that of `intervals()` is the held one.
+        """Continuous-time gain of which that of `intervals()` is the sampled counterpart.
 
-        To compare with gains of publications; rows and columns as of `intervals()`, and the same
-        covariance to first order, with fitted parameters as they are. What is equal in the two
-        loops: `Controller.from_continuous_gain`, the way back.
+        For comparison with published gains; columns as in `intervals()`. Intervals are first-order
+        at fixed parameters. `Controller.from_continuous_gain` defines and inverts the conversion.
         """
         from impc.assess.printed_gain import continuous_interval_table  # noqa: PLC0415
 
         return continuous_interval_table(self)
 
     def identifiability(self) -> Identifiability:
-        """How many directions of the weights the recordings determine (`impc.identifiability`)."""
+        """Count the weight directions that the recordings identify; see `impc.identifiability`."""
         from impc.assess.weights_test import identifiability  # noqa: PLC0415
 
         return identifiability(self.problem, self.stage_weights)
@@ -352,37 +334,41 @@ class Estimate(Frozen):
     def simulate(
         self, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
     ) -> Simulation:
-        """Simulate the controller found from another state, as `Controller.simulate`.
+        """Simulate the identified controller from another state, as `Controller.simulate`.
 
         Parameters
         ----------
-        x0 : array_like
-            (n,).
+        x0 : array_like of shape (n,)
+            Initial state.
         steps : int, optional
-            Needed when there is no disturbance.
-        disturbance : array_like, optional
-            (steps, d), or (steps,) for a single one.
+            Number of samples; required without a disturbance.
+        disturbance : array_like of shape (steps, d) or (steps,), optional
+            Disturbance signals.
+
+        Returns
+        -------
+        Simulation
         """
         return self.controller().simulate(x0, steps=steps, disturbance=disturbance)
 
     def summary(self) -> str:
-        """Method, problem, agreement and doubts, then gain with intervals and weights, as text."""
+        """Text summary: method, problem, fit, qualifications, gain with intervals, and weights."""
         from impc.reporting.estimate_text import summary  # noqa: PLC0415
 
         return summary(self)
 
     def plot(self, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
-        """Draw the outputs and inputs of a trial, counted from 0; returns matplotlib axes.
+        """Plot outputs and inputs of a trial (counted from 0); returns matplotlib axes.
 
-        `found.plot()[0].figure.savefig("fit.png")` keeps it. `axes` are an array of your own, one
-        for each output and input.
+        `axes` is an array of your own axes, one per output and input. To save the figure, use
+        `found.plot()[0].figure.savefig("fit.png")`.
         """
         from impc.reporting.estimate_text import plot  # noqa: PLC0415
 
         return plot(self, trial, axes)
 
     def save(self, path: str | Path) -> Path:
-        """Write the estimate and its problem into a file (JSON), which `impc.load` reads."""
+        """Save the estimate and its problem as JSON; read the file with `impc.load`."""
         from impc.files.saved_estimates import save_estimate  # noqa: PLC0415
 
         return save_estimate(self, Path(path))
@@ -414,7 +400,7 @@ def simulated_estimate(
     cost_weights: Array | None = None,
     rank: int | None = None,
 ) -> Estimate:
-    """What a method found, simulated; the last are fields of `Estimate` and its `Goodness`."""
+    """Build an estimate: simulate the recordings and set status and diagnostics."""
     known = gain_rank(problem, K, S) if rank is None else rank
     misfit, fit = goodness(problem, simulated(problem, K, S, weights), known)
     if weights is None:
@@ -442,7 +428,7 @@ def simulated_estimate(
 
 
 def no_estimate(method: str, problem: Problem, reason: str) -> Estimate:
-    """A method that ended without a gain, and why."""
+    """Estimate without a gain, with the reason."""
     m, none = problem.plant.m, float("nan")
     metrics = frozen(np.zeros((0, m, m)))
     nothing = Goodness(white=True, softened=0, samples=0, rank=0)
@@ -453,7 +439,7 @@ def no_estimate(method: str, problem: Problem, reason: str) -> Estimate:
 
 
 def goodness(problem: Problem, runs: list[Simulation], rank: int) -> tuple[float, Goodness]:
-    """Misfit of the simulated recordings, and what else they say; the rank is known."""
+    """Misfit and diagnostics of simulated recordings, for a known `rank`."""
     status = np.concatenate([run.status for run in runs])
     softened = int(np.count_nonzero(status == SampleStatus.SOFTENED))
     left = misfit(problem, runs)
@@ -461,7 +447,7 @@ def goodness(problem: Problem, runs: list[Simulation], rank: int) -> tuple[float
 
 
 def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
-    """How many directions of a `gain` (m, n) with a `metric` (m, m) the recordings identify."""
+    """Number of directions of a `gain` (m, n) with a `metric` (m, m) that the data identify."""
     found = evaluate(problem, gain, metric)
     if found.reason:
         return 0
@@ -476,7 +462,7 @@ def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
 
 
 def determined(problem: Problem, values: Array) -> BoolArray:
-    """Which falling singular values (k,) of the outputs' derivative are more than rounding (k,)."""
+    """Mask (k,) of the singular values (k,), largest first, above rounding level."""
     return np.asarray(values > max(DETERMINED * values[0], ROUNDING * recorded_size(problem)))
 
 

@@ -1,20 +1,17 @@
-"""Weights behind a fitted gain, evaluated by what they do: the second half of the reduced form.
+"""Weights with a fitted gain, checked by simulation: the second half of the reduced form.
 
-    all weights with the gain and, along what is identified of it, the metric
+    all weights with the gain and the identified part of the metric
         ->  least condition number  ->  simulated and compared
 
-With several inputs the metric is the one of those that weights can have with the gain that fits
-best (`consistent_metrics`). See docs/theory.md, section 6, and docs/fitting.md for several inputs.
-
-The metrics that weights can have with a given gain, in closed form, and the one that fits.
-
-With S = R + B'PB the gain is K = S^-1 B'P A, so S K A^-1 B = B'PB is symmetric: K A^-1 B is
-self-adjoint in S. Its eigenvalues are real and between 0 and 1, and with V its eigenvectors
+With several inputs the metric is, of those that weights can have with the gain, the one that fits
+best (docs/why/theory.md). With S = R + B'PB the gain is K = S^-1 B'P A, so S K A^-1 B = B'PB is
+symmetric: K A^-1 B is self-adjoint in S. Its eigenvalues are real and between 0 and 1, and with V
+its eigenvectors
 
     S = V^-T diag(exp d) V^-1,
 
-one number for each input; up to scale m - 1. Only at samples with an active bound does S show, and
-where the inputs outnumber the rank of B it has a block more (docs/theory.md, section 2):
+with one number per input, m - 1 up to scale. S has an effect only at samples with an active bound.
+If the inputs outnumber the rank of B, S has a further block:
 
     B = B V1 V1',   V2 = null(B),   K = (V1 + V2 Y) F,   D = V2 - V1 Y',   C lower triangular,
     S = V1 V^-T diag(exp d) V^-1 V1' + D C C'D'.
@@ -49,16 +46,16 @@ if TYPE_CHECKING:
 class WeightsBehind:
     """Result of `weights_behind`."""
 
-    gain: GainFit  # The gain that the weights have
-    metrics: Array  # The metric, then directions along which nothing identifies it (k, m, m)
-    equivalent: EquivalentWeights | None  # None when there are none
+    gain: GainFit  # Fitted gain
+    metrics: Array  # Metric, then directions in which it is not identified (k, m, m)
+    equivalent: EquivalentWeights | None  # None if there are none
     misfit: float  # 2-norm of the residual of these weights; infinite without
     explained: bool  # Whether that is at most 1e-9 of the recorded outputs
-    reason: str  # Why there are none, or why they do not explain; empty when they do
+    reason: str  # Why there are none, or why they do not explain; otherwise empty
 
 
 def weights_behind(fit: GainFit) -> WeightsBehind:
-    """Find the weights of least condition number that reproduce the recordings as a gain does."""
+    """Find the weights of least condition number with the gain and check that they explain."""
     problem = fit.problem
     metrics = np.array(fit.S)[None]
     try:
@@ -68,18 +65,22 @@ def weights_behind(fit: GainFit) -> WeightsBehind:
         return WeightsBehind(fit, metrics, None, np.inf, explained=False, reason=str(error))
     misfit, size = weights_misfit(problem, equivalent.weights), recorded_size(problem)
     explained = misfit <= EXPLAINED * size
-    reason = "" if explained else f"the weights miss the recordings by {misfit / size:.2g} of them"
+    reason = "" if explained else f"the weights have a relative misfit of {misfit / size:.2g}"
     return WeightsBehind(fit, metrics, equivalent, misfit, explained, reason)
 
 
 def _metrics(fit: GainFit) -> Array:
-    """The metric that fits best with the gain, then directions that nothing identifies."""
+    """Metric that fits best with the gain, then unidentified directions."""
     plant, K = fit.problem.plant, np.array(fit.K)
     if plant.m == 1:
         return np.array(fit.S)[None]
     family = metric_family(plant, K)
     if family is None:
-        raise WeightsError("gain", "no metric makes K A^-1 B symmetric", "no weights have it")
+        raise WeightsError(
+            "gain",
+            "no metric makes K A^-1 B self-adjoint, so no weights have this gain",
+            "use inverse_lqr_gradient for the nearest gain",
+        )
     z = fitted_metric(fit.problem, K, family, np.array(fit.S))
     return unidentified_metrics(fit.problem, K, family, z)
 
@@ -90,31 +91,31 @@ def weights_misfit(problem: Problem, weights: Weights) -> float:
     return float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
 
 
-# Condition number from which eigenvectors determine no metric, and share of an imaginary part.
+# Largest condition number of the eigenvectors, and relative imaginary part that counts as real.
 _DEFECTIVE, _REAL = 1e8, 1e-4
-# Grid of each d, in decades, and the most of it that is simulated; starts of a search among these.
+# Grid of each d in decades, most points simulated, and starts of a search among them.
 _GRID, _MOST, _STARTS = np.linspace(-3, 3, 13), 400, 3
 _EVALUATIONS, _FAR = 60, 20.0
-# Of the largest singular value: a direction of the metric with less is not identified.
+# Metric directions below this share of the largest singular value are not identified.
 _IDENTIFIED = 1e-8
 
 
 @dataclass(frozen=True)
 class MetricFamily:
-    """All consistent metrics of one gain."""
+    """All metrics that weights with one gain can have."""
 
-    rows: Array  # V^-1 V1' (r, m), of length one each
-    others: Array  # D and V2 (m, e), of the inputs beyond the rank of B
+    rows: Array  # V^-1 V1' (r, m), rows normalised
+    others: Array  # D and V2 (m, e), for inputs beyond the rank of B
     idle: Array
 
     @property
     def count(self) -> int:
-        """Unknowns, the scale of S among them."""
+        """Number of unknowns, including the scale of S."""
         extra = self.others.shape[1]
         return len(self.rows) + extra * (extra + 1) // 2
 
     def metric(self, z: Array) -> Array:
-        """S (m, m) at z (count,): d, then C with the logarithms of its diagonal."""
+        """S (m, m) at z (count,): d, then C with logarithms of its diagonal."""
         logs, C = self._split(z)
         D = self.others
         return np.asarray((self.rows.T * np.exp(logs)) @ self.rows + D @ C @ C.T @ D.T)
@@ -133,7 +134,7 @@ class MetricFamily:
         return np.array(found)
 
     def nearest(self, metric: Array) -> Array:
-        """z (count,) of a `metric` (m, m) that is a member, or of one next to it."""
+        """z (count,) of a `metric` (m, m) in the family, or of a member near it."""
         inverse, extra = np.linalg.inv(metric), self.others.shape[1]
         sizes = np.einsum("ri,ij,rj->r", self.rows, inverse, self.rows)
         square: Array = self.idle.T @ metric @ self.idle
@@ -150,7 +151,7 @@ class MetricFamily:
 
 
 def metric_family(plant: Plant, gain: Array) -> MetricFamily | None:
-    """The consistent metrics of a gain (m, n); None where it has none, to 1e-4."""
+    """Metrics of a gain (m, n); None if it has none, to 1e-4."""
     rank = int(np.linalg.matrix_rank(plant.B))
     directions = np.linalg.svd(plant.B)[2].T
     V1, V2 = directions[:, :rank], directions[:, rank:]
@@ -172,10 +173,9 @@ def metric_family(plant: Plant, gain: Array) -> MetricFamily | None:
 def fitted_metric(
     problem: Problem, gain: Array, family: MetricFamily, near: Array | None = None
 ) -> Array:
-    """Coordinates (count,) of the metric of a family that fits recordings best, for a gain (m, n).
+    """Coordinates (count,) of the metric that fits best for a gain (m, n); also tries `near`.
 
-    A grid over all metrics of the family, then least squares from the best of it; where no bound is
-    active, or one number is no choice, the first will do. `near` (m, m) is tried too.
+    Grid over the family, then least squares from its best points.
     """
     starts: list[Array] = _grid(family) if family.count > 1 else [np.zeros(family.count)]
     if near is not None:
@@ -192,16 +192,16 @@ def fitted_metric(
 
 
 def unidentified_metrics(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> Array:
-    """The metric at z (count,), then directions (k, m, m) that nothing identifies."""
+    """Metric at z (count,), then directions (k, m, m) that the recordings do not identify."""
     S, changes = family.metric(z), family.changes(z)
     found = evaluate(problem, gain, S)
     seen = found.along_metric(S, changes)
-    # Of the triangle: the left vectors of all samples would take memory in their square.
+    # SVD of the triangle: that of all samples would need quadratic memory.
     _, values, rows = np.linalg.svd(np.linalg.qr(seen, mode="r"))
     size = float(np.linalg.norm(found.dK.reshape(len(found.residual), -1) @ np.ravel(gain)))
     identified = np.count_nonzero(values > _IDENTIFIED * max(size, float(np.max(values))))
     free = np.tensordot(rows[identified:], changes, 1).reshape(-1, S.size)
-    # One of them is the scale.
+    # Remove the direction of the scale.
     unit = S.ravel() / np.linalg.norm(S)
     _, sizes, others = np.linalg.svd(free - np.outer(free @ unit, unit), full_matrices=False)
     others = others[sizes > _IDENTIFIED * np.linalg.norm(free, 2)]
@@ -209,7 +209,7 @@ def unidentified_metrics(problem: Problem, gain: Array, family: MetricFamily, z:
 
 
 def _grid(family: MetricFamily) -> list[Array]:
-    """Logarithms of the ratios to the first number, over six decades; the least ratios first."""
+    """Log ratios to the first number over six decades, least ratios first."""
     extra = family.others.shape[1]
     rows, columns = np.tril_indices(extra)
     logs = np.concatenate(

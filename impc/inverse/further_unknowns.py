@@ -1,7 +1,6 @@
-"""One unknown more in a problem: what a test of its fit says that the model lacks.
+"""Free one more unknown of a problem for a test: limit, delay, offsets, perturbation.
 
-Each is fitted about what the model says, with a standard deviation that is wide beside what the
-recordings will say of it.
+Each has a prior at the value of the model, wide compared with the precision of the recordings.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
 
-#: The size of a perturbation, relative to what was recorded, as a parameter.
+#: Name of the parameter: size of the perturbation relative to the recorded one.
 STRENGTH = "perturbation"
-# Deviations: of the limit, of that size, and of the delay in samples.
+# Prior SDs: relative for limit and perturbation size, in samples for the delay.
 _LIMIT, _STRENGTH, _DELAY = 0.3, 0.3, 1.0
 
 
 def with_limit_unknown(problem: Problem) -> Problem | None:
-    """The limits of the controls among the parameters; None where they cannot be."""
+    """Free the control limits; None if asymmetric or if commands are plant states."""
     bounds = problem.bounds
     if np.any(bounds.u_max != -bounds.u_min) or problem.plant.commands:
         return None
@@ -35,7 +34,7 @@ def with_limit_unknown(problem: Problem) -> Problem | None:
 
 
 def with_delay_unknown(problem: Problem) -> Problem | None:
-    """A delay of the commands among the parameters; None for a plant that cannot have one here."""
+    """Free a delay of the commands; None for plants that do not support it."""
     plant, m = problem.plant, problem.plant.m
     dressed = plant.ahead or plant.commands or np.any(plant.observer)
     if plant.body is not None or dressed or problem.terminal_weight is not None:
@@ -59,12 +58,12 @@ def with_delay_unknown(problem: Problem) -> Problem | None:
 
 
 def with_offsets_unknown(problem: Problem) -> Problem | None:
-    """An offset of every output in every trial."""
+    """Free a constant offset of every output in every trial."""
     return replace(problem, offsets=problem.plant.outputs)
 
 
 def with_strength_unknown(problem: Problem) -> Problem | None:
-    """The size of the disturbances, one factor for all, among the parameters."""
+    """Free one common scale factor of all disturbances; None if already free or known ahead."""
     if problem.plant.ahead or STRENGTH in problem.parameter_names:
         return None
 
@@ -81,7 +80,7 @@ def _family(problem: Problem) -> PlantFamily:
 
 
 def _posed(problem: Problem, family: PlantFamily, **parts: object) -> Problem:
-    """The problem with a wider family, its further parameters at their nominal values."""
+    """Problem with a wider family; the further parameters start at their nominal values."""
     more = np.zeros(len(family.names) - len(problem.logarithms))
     logarithms = np.append(problem.logarithms, more)
     known = {"plant": plant_at(family, logarithms), "logarithms": frozen(logarithms)}

@@ -1,18 +1,15 @@
-"""The gain behind recordings, with or without bounds: from prediction error to simulation error.
+"""Fit the gain to recordings, with or without bounds.
 
     a regulator  ->  least prediction error  ->  least simulation error     (each over K, S, x0)
 
-The misfit of a simulated trial has local minima, and gains that make it diverge; that of
-predictions one sample ahead has few, and can be computed at every gain (`prediction`). So each
-search minimises that first, and begins the search of the simulation at its end. Recordings of a
-few hundred numbers are searched from other regulators too, until three searches have the least
-misfit; longer ones where the simulation leaves much more than the prediction, until two have it.
-Searches begin at balanced regulators, those of Bryson's rule (outputs of recorded size cost as much
-as commands of full size), and at random ones about these. Every regulator stabilises.
+The simulation misfit has local minima, and some gains diverge; the one-step prediction misfit has
+few and exists at every gain (`prediction`). Each search minimises it first. Short recordings are
+searched from further starts until several searches agree on the least misfit; long ones only if the
+simulation leaves much more than the prediction. Starts are balanced regulators (Bryson's rule:
+outputs of recorded size cost as much as commands of full size) and random ones near these.
 
-Without bounds this is the first line of Table 3.1; with them it is the reduced form of inverse
-MPC: the recordings determine K, and for several inputs the metric S while bounds are active, and
-nothing else (docs/theory.md, section 2).
+Without bounds this is line 1 of Table 3.1; with bounds the reduced form of inverse MPC: the
+recordings determine K and, with several inputs and active bounds, S (docs/why/theory.md).
 """
 
 from __future__ import annotations
@@ -42,30 +39,30 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
 
 
-#: Numbers recorded up to which a search may be made many times.
+#: Largest number of recorded values for which the search is repeated many times.
 FEW = 2000
-# Few numbers are searched until three agree on the least misfit, to this share of it; longer
-# recordings are searched again, until two agree, where the simulation leaves this much more than
-# the prediction. Predictions this much worse than the best end there.
+# Searches that must agree on the least misfit of short recordings, and the tolerance; searches that
+# must agree on long ones whose simulation misfit exceeds the prediction misfit by the fourth
+# factor; factor above the best prediction at which a start is dropped.
 _AGREE, _SAME, _TWICE, _SUSPECT, _HOPELESS = 3, 1e-3, 2, 1.5, 30.0
-# Of a handful of numbers more searches have to agree: three wrong ones did in 2 of 80 problems.
+# Very short recordings need more agreement: three wrong searches agreed in 2 of 80 problems.
 _HANDFUL, _SURE = 200, 5
-# Errors of commands that the filter expects, in units of their size. At 10 all 67 sticks, and at 1
-# too, were found; a fast filter keeps the gains of delays in bounds.
+# Command errors assumed by the filter, in units of the command size: 10 and 1 both find all 67
+# sticks; a fast filter keeps the gains of delays bounded.
 _RATIOS = (10.0, 1.0)
-# One over the standard deviation of the prior, in natural coordinates, of a search from nothing.
+# 1 / SD of the prior in whitened coordinates for a search without a start.
 _WEAK = 1e-3
-# Evaluations of predictions and simulations, and nats per recorded number at which each ends: a
-# squared misfit that falls by less than that share of itself; and nats at which it ends at last.
+# Largest numbers of evaluations (prediction, simulation); relative decreases of the squared misfit
+# that end each; decrease in nats that ends the last search.
 _PREDICTED, _SIMULATED, _ROUGH, _FINE, _NATS = 25, 80, 1e-3, 1e-6, 1e-3
-# Where a stated uncertainty leaves gain and body to make up for each other: a fifth of a deviation.
+# Likewise if a stated uncertainty lets gain and plant compensate for each other.
 _RIDGE = 0.05
-# Misfit of rounding, of the recorded outputs.
+# Misfit of rounding relative to the recorded outputs.
 _ROUNDING = 1e-13
-# Factor by which each step back is shorter.
+# Factor of each step back towards a stabilising gain.
 _BACK = 0.8
-# Searches from random regulators, and rounds of more for few recorded numbers; in each, how many
-# are drawn, their initial states fitted in so many evaluations, and how many are searched from.
+# Random regulators; for short recordings also rounds of screened ones: rounds, draws per round,
+# evaluations to fit their initial states, and how many are searched from.
 _MORE, _ROUNDS, _DRAWN, _QUICK, _KEPT = 2, 2, 100, 4, 12
 
 
@@ -74,26 +71,25 @@ class GainFit(Frozen):
     """A gain fitted to recordings."""
 
     K: Array  # (m, n)
-    S: Array  # Metric (m, m); the one it started from where the recordings do not determine it
-    # The problem at the initial states and the parameters found; the given one when these are known
+    S: Array  # Metric (m, m); that of the start if not identified
+    # Problem at the fitted initial states and parameters
     problem: Problem
     misfit: float  # 2-norm of the output residual
     # Whether the gain stabilises and the misfit is at most 1e-9 of the recorded outputs
     explained: bool
-    # Whether A - BK is stable. Without a terminal set the search may end where it is not.
+    # Whether A - BK is stable; without bounds and terminal set the search may end at an unstable
+    # gain
     stabilises: bool
-    # Of the residual's derivative with respect to K and S in natural coordinates, after initial
-    # states and parameters have taken what they can (g,); largest first
+    # Of the residual derivative by K and S in whitened coordinates, nuisance eliminated (g,),
+    # largest first
     singular_values: Array
     evaluations: int  # Simulations with derivatives
-    unconfirmed: bool = (
-        False  # Whether several searches were made, and one only ended at this misfit
-    )
+    unconfirmed: bool = False  # Only one of several searches reached this misfit
 
 
 @checked
 def fit_gain(problem: Problem) -> GainFit:
-    """Fit K, and S for several inputs, with initial states and parameters that are not known."""
+    """Fit K, S (several inputs), and unknown initial states and parameters."""
     require_riccati(problem)
     count = problem.recorded_numbers
     few, wanted = count <= FEW, _SURE if count <= _HANDFUL else _AGREE
@@ -137,10 +133,14 @@ def refine_gain(
     max_evaluations: int = _SIMULATED,
     prior: float = 0.0,
 ) -> GainFit:
-    """One search of the simulation's misfit from a gain and a metric."""
+    """Minimise the simulation misfit from one gain and metric."""
     _, reason = misfit_or_reason(problem, gain, metric)
     if reason:
-        raise SolverError("gain", f"the start cannot be simulated: {reason}", "start elsewhere")
+        raise SolverError(
+            "gain",
+            f"the closed loop cannot be simulated at the start ({reason})",
+            "pass a stabilising gain, e.g. that of solve_lqr",
+        )
     space = Coordinates(problem, gain, metric)
     stop = _stop(problem, _FINE, max_evaluations)
     nats = _RIDGE if np.any(problem.stated) else min(stop.nats, _NATS)
@@ -150,13 +150,13 @@ def refine_gain(
 
 
 def _best(found: list[GainFit]) -> tuple[GainFit, int]:
-    """The fit of least misfit, and how many have it."""
+    """Fit of least misfit, and the number of fits that reach it."""
     best = min(found, key=lambda fit: fit.misfit)
     return best, sum(fit.misfit <= (1 + _SAME) * best.misfit for fit in found)
 
 
 def _starts(problem: Problem, few: bool) -> Iterator[tuple[Problem, LqrSolution]]:
-    """Regulators to search from, with initial states; the same at every call."""
+    """Starting regulators with initial states; deterministic."""
     first = balanced_regulator(problem)
     yield problem, first
     rng = np.random.default_rng(0)
@@ -168,7 +168,7 @@ def _starts(problem: Problem, few: bool) -> Iterator[tuple[Problem, LqrSolution]
 
 
 def _ranked(drawn: list[tuple[Problem, LqrSolution]]) -> list[tuple[Problem, LqrSolution]]:
-    """The least prediction error first, with initial states fitted to each."""
+    """Starts sorted by prediction misfit, initial states fitted to each."""
     ranked = []
     for place, (problem, regulator) in enumerate(drawn):
         space = _predictions(problem, regulator, _RATIOS[place % 2])
@@ -184,7 +184,7 @@ def _ranked(drawn: list[tuple[Problem, LqrSolution]]) -> list[tuple[Problem, Lqr
 
 
 def _predicted(problem: Problem, begin: LqrSolution, ratio: float) -> tuple[Point, int, float]:
-    """The least prediction error from a regulator: where, evaluations, and its 2-norm."""
+    """Minimise the prediction misfit: end point, evaluations, 2-norm."""
     space = _predictions(problem, begin, ratio)
     stop = _stop(problem, _ROUGH, _PREDICTED)
     z, spent, _ = descend(space, space.start, stop, shared=_WEAK, own=_WEAK)
@@ -192,7 +192,7 @@ def _predicted(problem: Problem, begin: LqrSolution, ratio: float) -> tuple[Poin
 
 
 def _simulated(problem: Problem, begin: LqrSolution, predicted: Point) -> GainFit:
-    """The least simulation error from the end of a search of predictions."""
+    """Minimise the simulation misfit from the end of a prediction search."""
     K = np.array(begin.K)
     starts = np.array(predicted.problem.starts)
     there = problem.at(starts, np.array(problem.logarithms))
@@ -204,11 +204,13 @@ def _simulated(problem: Problem, begin: LqrSolution, predicted: Point) -> GainFi
             if not reason:
                 return refine_gain(there, gain, predicted.S, prior=_WEAK)
         share *= _BACK
-    raise SolverError("gain", reason or "no gain stabilises the plant", "start elsewhere")
+    raise SolverError(
+        "gain", reason or "no gain stabilises the plant", "check the plant and the bounds"
+    )
 
 
 def _predictions(problem: Problem, begin: LqrSolution, ratio: float) -> Coordinates:
-    """Coordinates of predictions about a regulator: of the linear plant, without terminal set."""
+    """Coordinates of predictions about a regulator: linear plant, no terminal set."""
     known = replace(
         problem,
         plant=problem.plant.linear(),
@@ -243,16 +245,16 @@ def _gain_fit(space: Coordinates, z: Array, evaluations: int) -> GainFit:
     )
 
 
-# Cost weights of states that no output sees, of the others'.
+# Cost weight of unobserved states relative to the others.
 _UNSEEN = 1e-8
-# Costs of the command, of that of the balanced regulator.
+# Command weights relative to that of the balanced regulator.
 _EFFORTS = 10.0 ** np.arange(-4, 5)
-# Random weights: share of the identity, and decades of the cost of the command on either side.
+# Random weights: share of the identity, and decades of the command weight either way.
 _DEFINITE, _DECADES = 0.05, 2.0
 
 
 def balanced_regulator(problem: Problem, effort: float = 1.0) -> LqrSolution:
-    """The regulator with R = effort diag(1/u^2), u the size of the commands, Q = C'diag(1/y^2)C."""
+    """Regulator with R = effort diag(1/u^2), u the command sizes, and Q = C'diag(1/y^2)C."""
     plant, scale = problem.plant, np.asarray(problem.output_scale)
     Q = plant.C.T @ np.diag(1 / scale**2) @ plant.C
     Q += _UNSEEN * np.trace(Q) / plant.n * np.eye(plant.n)
@@ -261,13 +263,13 @@ def balanced_regulator(problem: Problem, effort: float = 1.0) -> LqrSolution:
 
 
 def regulators(problem: Problem) -> list[LqrSolution]:
-    """Those over eight decades of effort that double precision allows, the balanced one first."""
+    """Balanced regulators over eight decades of effort, the plain one first."""
     found: list[LqrSolution] = []
     refused: list[WeightsError] = []
     for effort in sorted(_EFFORTS, key=lambda one: abs(np.log(one))):
         try:
             found.append(balanced_regulator(problem, effort))
-        except WeightsError as error:  # so cheap a command that R is lost beside B'PB
+        except WeightsError as error:  # R is lost in rounding next to B'PB
             refused.append(error)
     if not found:
         raise refused[0]
@@ -275,7 +277,7 @@ def regulators(problem: Problem) -> list[LqrSolution]:
 
 
 def state_sizes(problem: Problem, regulator: LqrSolution) -> Array:
-    """Unit of states (n, n) in which the outputs are of their recorded size."""
+    """Unit of states (n, n) in which the outputs have their recorded size."""
     plant = problem.plant
     T, _ = natural_coordinates(plant, np.array(regulator.K))
     natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
@@ -285,12 +287,12 @@ def state_sizes(problem: Problem, regulator: LqrSolution) -> Array:
 def drawn_start(
     problem: Problem, sizes: Array, rng: np.random.Generator
 ) -> tuple[Problem, LqrSolution]:
-    """A random regulator, and initial states that are random where no output sees them."""
+    """Random regulator, with random initial states where the outputs do not observe them."""
     plant, regulator = problem.plant, None
     while regulator is None:
         try:
             regulator = solve_lqr(plant, _random_weights(sizes, command_sizes(problem), rng))
-        except WeightsError:  # too far apart for double precision
+        except WeightsError:  # ill-conditioned draw
             continue
     if not problem.unknown_start:
         return problem, regulator
@@ -301,7 +303,7 @@ def drawn_start(
 
 
 def _random_weights(sizes: Array, commands: Array, rng: np.random.Generator) -> Weights:
-    """Random weights of states and commands, each over its size."""
+    """Random weights of states and commands relative to their sizes."""
     parts = []
     for size in (len(sizes), len(commands)):
         L = np.tril(rng.standard_normal((size, size)))

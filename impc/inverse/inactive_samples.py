@@ -1,13 +1,12 @@
-"""Exact recordings of all states: the gain by regression on samples that no bound reaches.
+"""Starting gain and metric from noise-free recordings of all states (bounds inactive).
 
-From a sample at which no bound is met within the horizon the plan is the gain's, so that
+At a sample where no bound is active over the horizon, the controller is the linear gain:
 
     x_{k+1} - A x_k - E d_k  =  -B K x_k
 
-exactly. Any n of them give B K, and to how many of the others it applies shows whether they were
-such: runs of neighbours are tried, since they come in runs, and sets from anywhere. The metric is
-then one of the family that weights can have with this gain (`consistent_metrics`). With noise
-there are no such samples, and no start from here (docs/theory.md, section 2).
+Any n such samples give B K exactly. Candidate sets (runs of consecutive samples and random sets)
+are accepted by consensus: the number of other samples that satisfy the same equation.
+See docs/why/theory.md.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from impc.inverse.problem import recorded_states
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
 
-# A command this near to its bound counts as at it, and of the commands: what exact samples leave.
+# Relative to the largest command: distance to the bound that counts as at it, and residual.
 _AT_BOUND, _EXACT = 1e-6, 1e-8
-# Of the states: what the plant cannot do, and below which a sample says nothing.
+# Relative to the states: motion that the plant cannot produce, and the least usable state.
 _FOLLOWS, _NOTHING = 1e-7, 1e-9
-# Runs of neighbours and sets from anywhere that are tried, and how many others must follow.
+# Candidate sets of each kind, and how many other samples must satisfy the same gain.
 _MOST, _MORE = 500, 3
 
 
 def pair_of_inactive_samples(problem: Problem) -> tuple[Array, Array] | None:
-    """Gain (m, n) and metric (m, m) of exact recordings of all states; None of any others."""
+    """Gain (m, n) and metric (m, m) of noise-free recordings of all states, else None."""
     states = recorded_states(problem.plant, problem.recordings)
     if states is None:
         return None
@@ -48,10 +47,10 @@ def pair_of_inactive_samples(problem: Problem) -> tuple[Array, Array] | None:
 
 
 def _regressed(problem: Problem, states: list[Array]) -> Array | None:
-    """The gain (m, n) that most samples follow; redundant inputs share by their size."""
+    """Gain (m, n) that most samples follow; redundant inputs share by their sizes."""
     plant = problem.plant
     sizes = command_sizes(problem)
-    B = plant.B * sizes  # commands over their sizes
+    B = plant.B * sizes  # scaled commands
     back = np.linalg.pinv(B)
     x, v = [], []
     for values, trial in zip(states, problem.recordings, strict=True):
@@ -59,10 +58,10 @@ def _regressed(problem: Problem, states: list[Array]) -> Array | None:
         commands = moved @ back.T
         size = max(float(np.max(np.abs(values))), 1e-300)
         if np.linalg.norm(moved - commands @ B.T) > _FOLLOWS * size:
-            return None  # not what this plant can do
+            return None  # recorded motion is outside the range of B
         kept = _inside(problem, commands * sizes)
         kept &= np.linalg.norm(values[:-1], axis=1) > _NOTHING * size
-        # A decaying trial has many small samples: each counts by the root of its size.
+        # A decaying trial has many small samples: weight each by the square root of its norm.
         weight = np.sqrt(np.linalg.norm(values[:-1][kept], axis=1))[:, None]
         x.append(values[:-1][kept] / weight)
         v.append(commands[kept] / weight)
@@ -71,7 +70,7 @@ def _regressed(problem: Problem, states: list[Array]) -> Array | None:
 
 
 def _consensus(x: Array, v: Array) -> Array | None:
-    """The linear function (n, m) of x (k, n) that most of v (k, m) follow exactly, if many do."""
+    """Linear map (n, m) from x (k, n) to v (k, m) that most rows satisfy; None if few do."""
     count, n = x.shape
     if count < n + _MORE:
         return None
@@ -89,7 +88,7 @@ def _consensus(x: Array, v: Array) -> Array | None:
 
 
 def _inside(problem: Problem, commands: Array) -> BoolArray:
-    """Samples at which no command is at its bound; at some of them a later one of the plan is."""
+    """Samples whose command is inside its bounds (later planned ones may not be)."""
     low, high = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     margin = _AT_BOUND * np.max(np.abs(commands), axis=0, initial=1e-300)
     return np.asarray(np.all((commands > low + margin) & (commands < high - margin), axis=1))

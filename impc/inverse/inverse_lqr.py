@@ -1,8 +1,8 @@
-"""Inverse LQR: the weights (Q, R) whose regulator has a given gain, or the nearest one.
+"""Inverse LQR: weights (Q, R) whose optimal gain is a given gain, or the nearest one.
 
-Three ways, as in Table 3.1: the linear matrix inequality, which has an answer only when some
-weights have exactly the gain; the same with a cross term x'Su in the cost, which always has one;
-and the gradient of the distance between the gains. After Priess et al., IEEE TCST 23 (2015) 770.
+Three methods, as in Table 3.1: a linear matrix inequality, feasible only if some weights have
+exactly the gain; the same with a cross term x'Su in the cost, always feasible; and the gradient of
+the distance between the gains. After Priess et al., IEEE TCST 23 (2015) 770.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
-# Of the mean eigenvalue of a start: no nearer to singular does the gradient method come.
+# Floor of the eigenvalues in the gradient method, relative to the mean eigenvalue of the start.
 _FLOOR = 1e-9
 
 
 @dataclass(frozen=True)
 class InverseLqr(Frozen):
-    """Weights for a gain, or the finding that there are none."""
+    """Weights for a gain, or the result that none exist."""
 
-    weights: Weights | None  # Scaled to R[0, 0] = 1; None when the method found that there are none
+    weights: Weights | None  # Scaled to R[0, 0] = 1; None if no weights have the gain
     gain: Array | None  # K(Q, R) of these weights, (m, n)
     gain_error: float  # ||K(Q, R) - K||_F; infinite without weights
     condition: float  # Condition number of blkdiag(Q, R); infinite without weights
-    # Whether weights with exactly this gain were found: a relative error of 1e-8 or less
+    # Whether weights with exactly this gain were found (relative error <= 1e-8)
     feasible: bool
     method: str  # "lmi" or "gradient"
-    evaluations: int  # Riccati equations solved
+    evaluations: int  # Number of Riccati equations solved
     status: str  # Why the method ended
 
 
 @checked(gain="m n")
 def inverse_lqr_lmi(plant: Plant, gain: ArrayLike) -> InverseLqr:
-    """Weights of least condition number with exactly the gain, if there are any.
+    """Return the weights of least condition number with exactly a given gain, if any exist.
 
     Parameters
     ----------
     plant : Plant
         Discrete or continuous.
-    gain : array_like
-        K (m, n) of u = -Kx.
+    gain : array_like of shape (m, n)
+        Gain K of the control law u = -Kx.
 
     Returns
     -------
     InverseLqr
-        Not feasible, and without weights, when no weights have the gain: because A - BK is not
-        stable, or because the fibre of the gain has no definite member.
+        `feasible` is False and `weights` is None if no weights have the gain: A - BK is not stable,
+        or no definite (Q, R) exists.
 
     Raises
     ------
     SolverError
-        When the semidefinite program ends without an answer.
+        If the semidefinite program cannot be solved.
 
     Examples
     --------
@@ -99,28 +99,35 @@ def inverse_lqr_gradient(
     *,
     max_evaluations: int = 300,
 ) -> InverseLqr:
-    """Weights whose gain is nearest: minimise ||K(Q, R) - K||_F^2.
+    """Return weights whose gain is nearest to a given gain.
 
-    Levenberg-Marquardt in a trust region over the Cholesky factors of Q and R, with the exact
-    derivatives of K. The infimum need not be attained: Q then tends to a singular matrix, slowly,
-    and the condition number of the result says. Two limits keep that orderly, neither of which
-    touches a problem whose minimum is attained: evaluations are capped, and Q = LL' + f I,
-    R = GG' + f I with f 1e-9 times the mean eigenvalue of the start.
+    Minimises ||K(Q, R) - K||_F^2 by Levenberg-Marquardt over the Cholesky factors of Q and R, with
+    exact derivatives. The infimum may not be attained; Q then slowly approaches a singular matrix,
+    and the condition number of the result is large. Two limits bound the search without affecting
+    attained minima: the number of evaluations, and a floor Q = LL' + f I, R = GG' + f I with f =
+    1e-9 times the mean eigenvalue of the start.
 
     Parameters
     ----------
-    gain : array_like
-        K (m, n); A - BK need not be stable.
+    plant : Plant
+        Discrete or continuous.
+    gain : array_like of shape (m, n)
+        Gain K; A - BK may be unstable.
     start : Weights, optional
-        By default the cross-term weights without their cross term, or the identity when A - BK is
-        not stable.
-    max_evaluations : int
-        Of the gain, at most.
+        Starting weights. Default: weights with a cross term, cross term dropped; the identity if
+        A - BK is not stable.
+    max_evaluations : int, default 300
+        Largest number of evaluations of the gain.
+
+    Returns
+    -------
+    InverseLqr
+        Nearest weights found, with their gain and its error.
 
     Raises
     ------
     WeightsError
-        When the start has no stabilising Riccati solution.
+        If the Riccati equation has no stabilising solution at the start.
 
     Examples
     --------
@@ -136,13 +143,15 @@ def inverse_lqr_gradient(
     space = _FactorSpace.around(plant, begin, _FLOOR)
 
     def difference(parameters: Array) -> Array:
-        # Where the Riccati equation fails, the trust region shrinks: it does so for infinity.
+        # No Riccati solution: an infinite residual shrinks the trust region.
         solution = space.solution(parameters)
         return np.full(K.size, np.inf) if solution is None else (solution.K - K).ravel()
 
     first = space.solution(space.start)
     if first is None:
-        raise WeightsError("start", "has no stabilising Riccati solution", "give other weights")
+        raise WeightsError(
+            "start", "has no stabilising Riccati solution", "pass other starting weights"
+        )
     found = scipy.optimize.least_squares(
         difference,
         space.start,
@@ -159,7 +168,7 @@ def inverse_lqr_gradient(
 
 @dataclass(frozen=True)
 class _FactorSpace(Frozen):
-    """Q = LL' + f I and R = GG' + f I, the entries of L and G but G[0, 0] as parameters."""
+    """Q = LL' + f I, R = GG' + f I; parameters: the entries of L, and of G except G[0, 0]."""
 
     plant: Plant
     start: Array
@@ -190,7 +199,7 @@ class _FactorSpace(Frozen):
         return L, G
 
     def solution(self, parameters: Array) -> LqrSolution | None:
-        """The regulator, or None where the Riccati equation cannot be solved."""
+        """Riccati solution, or None if the equation cannot be solved."""
         L, G = self.factors(parameters)
         Q, R = L @ L.T + self.lift * np.eye(len(L)), G @ G.T + self.lift * np.eye(len(G))
         try:
@@ -201,7 +210,7 @@ class _FactorSpace(Frozen):
     def jacobian(self, parameters: Array) -> Array:
         """d vec(K) / d parameters: dQ = EL' + LE' for the unit matrix E of an entry."""
         solution = self.solution(parameters)
-        assert solution is not None  # asked for only where the difference is finite
+        assert solution is not None  # called only at finite residuals
         L, G = self.factors(parameters)
         gradients = gain_gradients(solution)
         on_q = 2 * (gradients.Q @ L)[..., *np.tril_indices(len(L))]
@@ -213,8 +222,8 @@ def _default_start(plant: Plant, K: Array) -> Weights:
     if not stabilises(plant, K):
         return Weights(np.eye(plant.n), np.eye(plant.m))
     found = inverse_lqr_cross_term(plant, K)
-    # Q is often singular there. A lift of 1e-4 would undo the start on the seat plant, where the
-    # eigenvalues span 1e8: a gain error of 7 % after 300 evaluations, from this one 6e-6.
+    # Q is often singular there. A lift of 1e-4 spoils the start on the seat plant (eigenvalues span
+    # 1e8): gain error 7 % after 300 evaluations, 6e-6 with this one.
     return Weights(lifted(found.Q, 1e-8 * float(np.linalg.norm(found.Q, 2))), found.R)
 
 
@@ -227,7 +236,7 @@ def _result(
 ) -> InverseLqr:
     error = float(np.linalg.norm(solution.K - target))
     weights = normalised(solution.weights)
-    # A gain of zero, as of a delay, is found to the round-off of the matrices that it is made of.
+    # A zero gain (of a delay state) has an error at the rounding level of A and B.
     plant = solution.plant
     usual = float(np.linalg.norm(plant.A) / np.linalg.norm(plant.B))
     size = float(np.linalg.norm(target)) + 1e-4 * usual
@@ -245,13 +254,13 @@ def _result(
 
 @dataclass(frozen=True)
 class CrossTerm(Frozen):
-    """Weights of  x'Qx + 2 x'Su + u'Ru  that have the gain exactly, with the least cross term."""
+    """Weights of x'Qx + 2 x'Su + u'Ru with exactly a given gain and the least cross term."""
 
     Q: Array  # Shapes (n, n), (m, m), (n, m); R >= I sets the scale
     R: Array
     S: Array
     norm: float  # ||S||_F
-    status: str  # The solver's word
+    status: str  # Status of the solver
 
 
 @checked(gain="m n")
@@ -264,22 +273,22 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
         discrete:    S' = RK - B'PF,    Q = P - F'PF + SK + K'S' - K'RK
         continuous:  S' = RK - B'P,     Q = -F'P - PF + SK + K'S' - K'RK
 
-    P >= 0 follows, for F is stable. Dropping S gives a start for `inverse_lqr_gradient`.
+    P >= 0 follows because F is stable. Without S the weights start `inverse_lqr_gradient`.
     """
     n, m = plant.n, plant.m
     K = finite_array("gain", gain, (m, n))
     F = plant.A - plant.B @ K
     if not is_stable(F, discrete=plant.discrete):
-        raise WeightsError("gain", "A - BK is not stable", "no quadratic cost has such a gain")
+        raise WeightsError("gain", "A - BK is not stable", "pass a stabilising gain")
     P, R = block_basis(n, m)[:, :n, :n], block_basis(n, m)[:, n:, n:]
     cost_to_go = plant.B.T @ P @ F if plant.discrete else plant.B.T @ P
     decay = P - F.T @ P @ F if plant.discrete else -(F.T @ P + P @ F)
     S = (R @ K - cost_to_go).transpose(0, 2, 1)
     Q = decay + S @ K + (S @ K).transpose(0, 2, 1) - K.T @ R @ K
     joint = np.block([[Q, S], [S.transpose(0, 2, 1), R]])
-    # The joint inequality is written in units of the natural spread of states and inputs, and the
-    # unknowns are rotated to be orthonormal in it: ||S|| to 3e-8 on the published example; in full
-    # natural coordinates, correlations too, only to 7e-4.
+    # Scale the joint inequality by the whitened sizes of states and inputs, with orthonormal
+    # unknowns: ||S|| is then accurate to 3e-8 on the published example; in full whitened
+    # coordinates only to 7e-4.
     spread = np.concatenate(
         [np.linalg.norm(part, axis=1) for part in natural_coordinates(plant, K)]
     )
@@ -296,8 +305,8 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
     found = solve_semidefinite(bound, cones)
     total = np.tensordot(found.y[:-1], joint, 1)
     cross = frozen((total[:n, n:] + total[n:, :n].T) / 2)
-    # The solver keeps Q >= 0 and R >= I to 1e-11 of the largest number in the program, which left a
-    # negative eigenvalue in 11 of 406 random exact recordings.
+    # The solver keeps Q >= 0 and R >= I only to 1e-11 of its largest number: a negative eigenvalue
+    # in 11 of 406 random exact recordings.
     total[:n, :n] = lifted(total[:n, :n], 0.0)
     total[n:, n:] = lifted(total[n:, n:], 1.0)
     weights = split_blocks(total, n)
@@ -305,12 +314,12 @@ def inverse_lqr_cross_term(plant: Plant, gain: ArrayLike) -> CrossTerm:
 
 
 def lifted(matrix: Array, least: float) -> Array:
-    """A symmetric matrix with its eigenvalues raised to a least one."""
+    """Symmetric matrix with eigenvalues raised to at least `least`."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     raised: Array = (vectors * np.maximum(values, least)) @ vectors.T
     return (raised + raised.T) / 2
 
 
 def _padded(stack: Array) -> Array:
-    """One more member, of zeros: the bound does not enter here."""
+    """Append a zero matrix for the bound variable, which does not enter here."""
     return np.concatenate([stack, np.zeros_like(stack[:1])])

@@ -1,22 +1,15 @@
-"""Nonlinear least squares with a normal prior, for shared unknowns and others of one trial each.
+"""Nonlinear least squares with a normal prior, for shared and trial-specific unknowns.
 
     minimise over (u, v)   N log |r(u, v)|^2 + |w_u (u - u_0)|^2 + |w_v (v - v_0)|^2,   r of N rows
 
-This is the mode of the posterior density for white noise of unknown variance |r|^2 / N: no noise
-level has to be guessed, and exact data outweigh any prior. The method is Levenberg's and
-Marquardt's. Columns of v_i are zero outside trial i, so each v_i is eliminated by a QR
-factorisation of its own trial: time and memory grow with the number of trials. A point that cannot
-be simulated is a rejected step.
+This is the posterior mode for white noise of unknown variance |r|^2 / N. The method is
+Levenberg-Marquardt. Columns of v_i are zero outside trial i, so each v_i is eliminated by a QR
+factorisation of its own trial: time and memory grow linearly with the number of trials.
 
-Exact data of few samples lie at the end of curved valleys, along which straight steps creep. There
-each step d_1 is bent by the second derivative of the residual along it (Transtrum and Sethna 2012,
-"geodesic acceleration"), for one more evaluation without derivatives:
+Steps can include geodesic acceleration (Transtrum and Sethna 2012), at the cost of one more
+evaluation without derivatives:
 
     d_2 = -1/2 (J'J + damping)^-1 J' r'',     r'' = 2/h ((r(z + h d_1) - r(z))/h - J d_1)
-
-`TrialSpan` is what initial states, trial by trial, and other columns can explain of a residual.
-Side by side these columns would take the square of the number of trials: 8 GB for 500 of 500
-samples (docs/speed.md).
 """
 
 from __future__ import annotations
@@ -33,25 +26,25 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _BLOCK = 4096
-# Damping at the start, its least value, and how it changes after a poor and after a good step.
+# Initial and least damping; its factors after a rejected and after a good step.
 _DAMPING, _LEAST, _UP, _DOWN = 1e-3, 1e-12, 6.0, 0.2
-# Rejected steps in a row that end a search.
+# A search ends after this many rejected steps in a row.
 _TRIES = 14
-# Marquardt's scale of a column: at least this share of the largest squared norm.
+# Least squared norm of a column in the damping, relative to the largest.
 _FLOOR = 1e-6
-# h, and how much of a step its bend may be: beyond, the step is too long for a second derivative.
+# Probe length h; acceleration above this share of the step means the step is too long.
 _PROBE, _BEND = 0.1, 0.375
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Residual and derivatives at a point; trials with fewer rows are filled up with zeros."""
+    """Residual and derivatives at a point; shorter trials are padded with zero rows."""
 
     residual: Array  # (trials, w)
-    # Its derivative with respect to u, (trials, w, a), and to the trial's v, (trials, w, n)
+    # Derivatives with respect to u, (trials, w, a), and to the v of the trial, (trials, w, n)
     shared: Array
     own: Array
-    curved: bool = False  # Whether a second derivative says something: steps from here are bent
+    curved: bool = False  # Whether steps from here use geodesic acceleration
 
     @property
     def square(self) -> float:
@@ -61,51 +54,48 @@ class Rows:
 
 @dataclass(frozen=True)
 class Prior:
-    """A normal prior."""
+    """Independent normal prior of u and v."""
 
-    u: Array  # Its centre (a,), (trials, n)
+    u: Array  # Mean of u (a,) and of v (trials, n)
     v: Array
-    shared: Array  # One over the standard deviations of u (a,)
-    own: float  # One over that of each entry of v
+    shared: Array  # 1 / SD of u (a,)
+    own: float  # 1 / SD of each entry of v
 
     def square(self, u: Array, v: Array) -> float:
-        """-2 log of its density at `u` (a,), `v` (trials, n), but for a constant."""
+        """-2 log density at `u` (a,), `v` (trials, n), up to a constant."""
         return float(np.sum((self.shared * (u - self.u)) ** 2) + self.own**2 * _square(v - self.v))
 
 
 @dataclass(frozen=True)
 class Stop:
-    """When a search ends."""
+    """Stopping rule of a search."""
 
     nats: float  # Predicted decrease of the objective
-    square: float  # Squared residual of rounding
-    evaluations: int  # Evaluations with derivatives, at most
+    square: float  # Squared residual at rounding level
+    evaluations: int  # Largest number of evaluations with derivatives
 
 
 class Model(Protocol):
-    """What is fitted, as a function of u (a,) and v (trials, n)."""
+    """Residual as a function of u (a,) and v (trials, n)."""
 
     @property
     def count(self) -> int:
-        """N."""
+        """Number of residuals N."""
 
     def rows(self, u: Array, v: Array) -> Rows | None:
-        """Residual and derivatives at `u` (a,), `v` (trials, n); None where there are none."""
+        """Residual and derivatives at `u` (a,), `v` (trials, n); None if infeasible."""
 
     def square(self, u: Array, v: Array) -> float:
-        """Squared residual at `u` (a,), `v` (trials, n); infinite where there is none."""
+        """Squared residual at `u` (a,), `v` (trials, n); infinite if infeasible."""
 
     def bend(self, du: Array, dv: Array, share: float) -> tuple[Array, Array] | None:
-        """J' (r(z + share d) - r(z)), (a,) and (trials, n), of `du` (a,), `dv` (trials, n).
-
-        At the last point z of `rows`.
-        """
+        """J' (r(z + share d) - r(z)) at the last point z of `rows`, d = (`du`, `dv`)."""
 
 
 def minimise(
     model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop
 ) -> tuple[Array, Array, int, bool]:
-    """Search for u (a,) and v (trials, n): where it ends, evaluations, and whether it converged."""
+    """Minimise over u (a,), v (trials, n): minimiser, evaluations, whether it converged."""
     u, v = begin
     here, spent, damping = model.rows(u, v), 1, _DAMPING
     scale: tuple[Array, Array] = np.zeros(len(u)), np.zeros(v.shape)
@@ -141,7 +131,7 @@ def minimise(
 def _scaled(
     here: Rows, prior: Prior, variance: float, before: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Marquardt's scale, squared norms of columns: it grows at once and shrinks by halves."""
+    """Squared column norms for the damping; a norm shrinks by at most half per step."""
     shared = np.sum(here.shared**2, axis=(0, 1)) + variance * prior.shared**2
     own = np.sum(here.own**2, axis=1) + variance * prior.own**2
     floor = _FLOOR * max(np.max(shared, initial=0.0), np.max(own, initial=0.0)) + 1e-300
@@ -152,9 +142,9 @@ def _scaled(
 
 
 class _Step:
-    """A damped step from u and v.
+    """Damped step from u and v.
 
-    Rows of prior and damping are one: of weight d, and a side c with d c that of the prior alone.
+    Prior and damping share rows of weight d with right-hand side c, where d c is that of the prior.
     """
 
     def __init__(
@@ -186,12 +176,12 @@ class _Step:
         self.du, self.dv = self._back(-whole[:a, a], -upper[:, :n, -1])
         moved = here.shared @ self.du + np.einsum("twn,tn->tw", here.own, self.dv)
         fall = (here.square - _square(here.residual + moved)) / variance
-        #: By how much the linear model says that the step lowers the objective, nats.
+        #: Predicted decrease of the objective in the linear model, nats.
         self.predicted = fall - prior.square(at[0] + self.du, at[1] + self.dv) + prior.square(*at)
         self.linear = self._products(here, moved)
 
     def bent(self, model: Model) -> tuple[Array, Array] | None:
-        """The step with its acceleration; None where that is too large."""
+        """Step with geodesic acceleration; None if the acceleration is too large."""
         change = model.bend(self.du, self.dv, _PROBE)
         if change is None:
             return None
@@ -208,20 +198,20 @@ class _Step:
         return float(np.sqrt(_square(self.weights[0] * du) + _square(self.weights[1] * dv)))
 
     def _products(self, here: Rows, moved: Array) -> tuple[Array, Array]:
-        """J' J d of the residual's rows alone."""
+        """J' J d of the residual rows only."""
         return (
             np.einsum("twa,tw->a", here.shared, moved),
             np.einsum("twn,tw->tn", here.own, moved),
         )
 
     def _back(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """R^-1 of a side (a,), (trials, n)."""
+        """Solve with the triangular factor R, for right-hand sides (a,) and (trials, n)."""
         du = np.linalg.solve(self.shared, u)
         dv = np.linalg.solve(self.own, (v - self.beside @ du)[..., None])[..., 0]
         return np.asarray(du), np.asarray(dv)
 
     def _solved(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """(R'R)^-1 of a gradient (a,), (trials, n)."""
+        """Solve with R'R, for a gradient (a,) and (trials, n)."""
         y_v = np.linalg.solve(np.swapaxes(self.own, 1, 2), v[..., None])[..., 0]
         y_u = np.linalg.solve(self.shared.T, u - np.einsum("tna,tn->a", self.beside, y_v))
         return self._back(np.asarray(y_u), np.asarray(y_v))
@@ -232,49 +222,48 @@ def _square(values: Array) -> float:
 
 
 def triangular_rows(columns: list[Array]) -> Array:
-    """R (w, w) of a QR factorisation of `columns`, arrays (r, k) side by side, block by block.
+    """Triangular factor R (w, w) of `columns`, arrays (r, k) side by side, by row blocks.
 
-    Norms and inner products of its columns are those of the given ones; of fewer rows than w where
-    there are fewer. Blocks of a few thousand rows stay in the processor's cache: a recording ten
-    times as long takes ten times the time, not fifteen.
+    R has the norms and inner products of the columns, and fewer rows if r < w. Blocks of a few
+    thousand rows fit into the cache of the processor.
     """
     width = sum(part.shape[1] for part in columns)
     triangle = np.zeros((0, width))
     for first in range(0, len(columns[0]), _BLOCK):
         block = np.hstack([part[first : first + _BLOCK] for part in columns])
-        # "raw" copies the triangle alone, "r" all rows below it too.
+        # mode "r" would also copy all rows below the triangle.
         _, upper = scipy.linalg.qr(np.vstack([triangle, block]), mode="raw", check_finite=False)
         triangle = np.asarray(upper, dtype=np.float64)
     return triangle
 
 
-# A column that the others explain to that of its length adds nothing but rounding.
+# Columns that the others explain up to this share of their norm count as dependent.
 _ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
 class TrialSpan:
-    """An orthonormal basis."""
+    """Orthonormal basis of trial-specific and shared columns."""
 
-    own: tuple[Array, ...]  # Of each trial (rows, k), k at most n; zero in the rows of the others
-    shared: Array  # Of the rest (r, c), orthogonal to those
+    own: tuple[Array, ...]  # Per trial (rows, k), k <= n; zero outside the trial
+    shared: Array  # Remaining columns (r, c), orthogonal to `own`
 
     def without(self, columns: Array) -> Array:
-        """What the basis does not explain of `columns` (r, k), of that shape."""
+        """Residual of `columns` (r, k) after projection on the basis."""
         left = _without(self.own, columns)
         return np.asarray(left - self.shared @ (self.shared.T @ left))
 
     def upper(self, trials: int, rows: int) -> TrialSpan:
-        """The first rows alone, those of so many trials."""
+        """Restriction to the first `trials` trials, `rows` rows."""
         return TrialSpan(self.own[:trials], self.shared[:rows])
 
     def plus(self, columns: Array) -> TrialSpan:
-        """With orthonormal `columns` (r, k) that are orthogonal to this basis."""
+        """Basis extended by orthonormal `columns` (r, k) orthogonal to it."""
         return TrialSpan(self.own, np.hstack([self.shared, columns]))
 
 
 def trial_span(own: Array, sizes: Sequence[int], shared: Array) -> TrialSpan:
-    """Span of columns, each in its own scale, to 1e-10; `own` (r, n); `shared` (r, c)."""
+    """Basis of the scaled columns `own` (r, n) by trial and `shared` (r, c), to 1e-10."""
     parts = np.split(own, np.cumsum(sizes)[:-1])
     bases = tuple(_basis(_of_length_one(part)) for part in parts)
     return TrialSpan(bases, _basis(_without(bases, _of_length_one(shared))))

@@ -1,13 +1,10 @@
-"""Every method for the weights behind recordings, by the name that it has everywhere.
+"""Registry of estimation methods and the functions that run them.
 
-A method is a function (problem, start) -> estimate. It starts from what inverse MPC found: initial
-states and physical parameters are its, every search begins at its weights, so that none loses by
-where it began, and each method's own gain has its initial states fitted again. All work in natural
-coordinates, and weigh squared misfits against the noise that the best gain leaves
-(docs/fitting.md). Table 3.1 as printed, in the units of the plant, is `impc.inverse.table31`.
-
-The names are those in result.json, the labels those of tables and figures; commands and tests
-choose from `METHODS`.
+A method is a function (problem, inverse MPC estimate) -> estimate. All methods use the initial
+states and physical parameters of inverse MPC and start from its weights, so that no method is
+penalised for its starting point; the initial states are then refitted for the gain of each method.
+Searches run in whitened coordinates, with misfits relative to the residual of the best gain. For
+Table 3.1 in the units of the plant see `impc.inverse.table31`.
 """
 
 from __future__ import annotations
@@ -48,24 +45,24 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _LOG = logging.getLogger("impc")
-# Share by which weights may miss the recordings by more than the gain that they were found for.
+# Relative misfit by which weights may exceed the gain for which they were found.
 _AS_GOOD = 1e-3
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way from recordings to a controller."""
+    """Estimation method: from recordings to a controller."""
 
-    name: str  # In result.json, in TOML and at the command line
-    label: str  # In tables and figures
-    sentence: str  # For readers who do not know it
-    # The problem as posed -> as the method sees it: inverse LQR knows no bounds
+    name: str  # Identifier in result.json, in TOML files and on the command line
+    label: str  # Label in tables and figures
+    sentence: str  # Explanation for readers who do not know the method
+    # Maps the posed problem to the one that this method solves (inverse LQR: bounds removed)
     restrict: Callable[[Problem], Problem]
-    # The problem as posed, the estimate of inverse MPC -> its own
+    # (posed problem, estimate of inverse MPC) -> estimate of this method
     find: Callable[[Problem, Estimate], Estimate]
 
     def estimate(self, problem: Problem, start: Estimate) -> Estimate:
-        """Run the method; one that ends without a gain says why in its estimate."""
+        """Run the method; if it fails, the estimate states the reason."""
         started = time.perf_counter()
         try:
             found = self.find(problem, start)
@@ -88,10 +85,9 @@ def of_gain(
     reason: str = "",
     evaluations: int = 0,
 ) -> Estimate:
-    """The estimate of a method from its gain (m, n), metric (m, m) and weights.
+    """Estimate from a gain (m, n), metric (m, m; default: that of inverse MPC) and weights.
 
-    Without a metric it has that of inverse MPC; `seen` is the problem at initial states and
-    parameters of its own.
+    `seen` is the problem at initial states and parameters of the method's own.
     """
     metric = start.metric if S is None else S
     settled = METHODS[name].restrict(start.problem.with_nuisance_fixed()) if seen is None else seen
@@ -112,20 +108,24 @@ def of_gain(
 def of_weights(
     name: str, problem: Problem, start: Estimate, weights: Weights | None, evaluations: int = 0
 ) -> Estimate:
-    """The estimate of a method from its weights, if it has found any."""
+    """Estimate from the weights of a method; raises WeightsError without weights."""
     if weights is None:
-        raise WeightsError("weights", "none have the feedback gain", "see the gradient method")
+        raise WeightsError(
+            "weights",
+            "no (Q, R) has exactly this gain",
+            "use inverse_lqr_gradient for the nearest gain",
+        )
     K = np.array(solve_lqr(problem.plant, weights).K)
     return of_gain(name, problem, start, K, weights=weights, evaluations=evaluations)
 
 
 def feedback_gain(problem: Problem, start: Estimate) -> Estimate:
-    """The best gain without bounds (3.12)."""
+    """Best gain without bounds (3.12)."""
     return of_fitted_gain(problem, start, _feedback(start))
 
 
 def of_fitted_gain(problem: Problem, start: Estimate, found: GainFit) -> Estimate:
-    """The estimate of a gain without bounds."""
+    """Estimate of a gain without bounds."""
     K, seen = np.array(found.K), found.problem.with_nuisance_fixed()
     evaluations = found.evaluations
     return of_gain("feedback_gain", problem, start, K, seen=seen, evaluations=evaluations)
@@ -133,10 +133,10 @@ def of_fitted_gain(problem: Problem, start: Estimate, found: GainFit) -> Estimat
 
 @functools.lru_cache(maxsize=4)
 def _feedback(start: Estimate) -> GainFit:
-    """That gain, which five methods share.
+    """Best gain without bounds, shared by five methods.
 
-    Searched again from where it ends: the prior is about the start, which may be far. Without
-    bounds the best gain may be unstable, of a person who saturates; it has no coordinates.
+    The search is repeated from its own solution, because the prior is centred at the start. Without
+    bounds the best gain may be unstable (saturated commands); it then has no whitened coordinates.
     """
     first = free_gain(start.problem.without_bounds().with_body_fixed(), start.stage_weights)
     if not stabilises(start.problem.plant, np.array(first.K)):
@@ -147,7 +147,7 @@ def _feedback(start: Estimate) -> GainFit:
 
 @functools.lru_cache(maxsize=4)
 def _coordinates(start: Estimate) -> tuple[Plant, Array, Weights, Array, Array]:
-    """Plant and feedback gain in natural coordinates, weights to start from, T and G."""
+    """Plant, feedback gain and starting weights in whitened coordinates, T and G."""
     plant, K, own = start.problem.plant, np.array(_feedback(start).K), np.array(start.gain)
     T, G = natural_coordinates(plant, K if stabilises(plant, K) else own)
     natural = change_coordinates(plant, T, G)
@@ -156,7 +156,7 @@ def _coordinates(start: Estimate) -> tuple[Plant, Array, Weights, Array, Array]:
 
 
 def _lmi(start: Estimate) -> Weights | None:
-    """Weights with exactly that gain, if there are any."""
+    """Weights with exactly the gain of `_feedback`; None if there are none."""
     natural, target, _, T, G = _coordinates(start)
     found = inverse_lqr_lmi(natural, target).weights
     return None if found is None else in_plant_units(found, T, G)
@@ -176,7 +176,7 @@ def _auxiliary(start: Estimate) -> Weights:
 
 
 def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = None) -> Estimate:
-    """(3.16), from some weights, or those of inverse MPC."""
+    """Inverse LQR on the outputs (3.16), started at `begin` or at the weights of inverse MPC."""
     loose, noise = start.problem.with_nuisance_fixed().without_bounds(), noise_of(_feedback(start))
     found = inverse_mpc_natural(loose, begin or start.stage_weights, noise)
     name = "inverse_lqr_output"
@@ -184,11 +184,11 @@ def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = No
 
 
 def _reduced(problem: Problem, start: Estimate) -> Estimate:
-    """Gain under the bounds, then weights with that gain."""
+    """Fit the gain under the bounds, then compute weights with that gain."""
     behind = weights_behind(free_gain(start.problem.with_nuisance_fixed(), start.stage_weights))
     weights = None if behind.equivalent is None else behind.equivalent.weights
     gain = behind.gain
-    # What the gain leaves too is noise, and no fault of the weights.
+    # The misfit of the gain itself is noise and does not count against the weights.
     missed = weights is None or behind.misfit > (1 + _AS_GOOD) * gain.misfit
     return of_gain(
         "inverse_mpc_reduced",
@@ -216,7 +216,7 @@ def _commands(problem: Problem, start: Estimate) -> Estimate:
 def _structured(problem: Problem, start: Estimate) -> Estimate:
     if problem.structure is None:
         raise InputError(
-            "structured", "the problem names no structure", "give Problem(..., structure=...)"
+            "structured", "the problem has no structure", "pass Problem(..., structure=...)"
         )
     return fit_structured(problem, problem.structure, start)
 
@@ -230,7 +230,7 @@ def _without_bounds(problem: Problem) -> Problem:
 
 
 def _cut_off(problem: Problem) -> Problem:
-    """A horizon of one sample without state bounds or terminal set: cut off, no foresight."""
+    """Horizon of one sample, without state bounds or terminal set: clipping without preview."""
     given, plant = problem.bounds, problem.plant
     free = ~np.isin(plant.states, plant.commands)
     limits = replace(
@@ -302,7 +302,7 @@ _TABLE = (
     Method(
         "clipped_lqr",
         "cut off at the limit",
-        "The gain of inverse MPC, its command cut off at the limit: it does not plan ahead.",
+        "The gain of inverse MPC with its command cut off at the limit: it does not plan ahead.",
         _cut_off,
         lambda problem, start: of_gain(
             "clipped_lqr", problem, start, np.array(start.gain), weights=start.weights
@@ -340,16 +340,18 @@ _TABLE = (
     ),
 )
 
-#: Every method by its name. A new one is one more entry.
+#: All methods by name.
 METHODS: dict[str, Method] = {method.name: method for method in _TABLE}
 
 
 @checked
 def method_named(name: str) -> Method:
-    """Return the method of the registry that is called `name`."""
+    """Return the registered method called `name`."""
     if name == "inverse_kkt":
         raise InputError(
-            "method", "inverse_kkt was removed", "take it out; experiments/inverse_kkt.py has it"
+            "method",
+            "inverse_kkt is not part of impc",
+            "remove it from methods; experiments/inverse_kkt.py has the code",
         )
     if name not in METHODS:
         raise InputError("method", f"got {name!r}", f"choose one of {', '.join(METHODS)}")
@@ -363,28 +365,33 @@ def fit(
     *,
     start: Estimate | Weights | None = None,
 ) -> Estimate:
-    """Find the controller behind recordings.
+    """Identify the controller behind recordings.
 
-    Each stage is named in the log "impc" when it is done; logging.basicConfig(level="INFO") shows
-    it.
+    The logger "impc" reports each completed stage; `logging.basicConfig(level="INFO")` prints it.
 
     Parameters
     ----------
     problem : Problem
-    method : str
-        A key of `METHODS`: "inverse_mpc", or one to compare it with, such as "feedback_gain",
+        Recordings and the closed loop to identify.
+    method : str, default "inverse_mpc"
+        A key of `METHODS`: "inverse_mpc", or a method to compare with it, such as "feedback_gain",
         "inverse_lqr_lmi", "inverse_lqr_gradient", "inverse_lqr_output" or "clipped_lqr".
     start : Estimate or Weights, optional
-        Where the search begins: an earlier estimate of inverse MPC, of the same recordings or
-        others, or weights. By default several starts are tried. The methods beside inverse MPC
-        begin with its estimate, which is fitted first where none is given.
+        Starting point: weights, or an earlier inverse MPC estimate of these or other recordings. By
+        default several starts are tried. Other methods start from the inverse MPC estimate, which
+        is computed first if it is not given.
+
+    Returns
+    -------
+    Estimate
+        Gain, weights and diagnostics; `status` states how the method ended.
 
     Raises
     ------
     InputError
-        When there is no such method.
+        If the method is unknown.
     WeightsError, SolverError
-        When no regulator can be simulated on the recordings.
+        If no starting controller can be simulated on the recordings.
 
     Examples
     --------
@@ -409,7 +416,7 @@ def fit(
         elif start is None:
             first = fit_weights(problem)
         else:
-            raise InputError("start", "has no use beside a terminal_weight", "leave it out")
+            raise InputError("start", "cannot be combined with terminal_weight", "remove start")
         first = replace(first, seconds=time.perf_counter() - started)
         _LOG.info("%s", first)
     if chosen.name == "inverse_mpc":
@@ -420,7 +427,7 @@ def fit(
 
 
 def _begun(problem: Problem, start: Estimate | Weights | None) -> tuple[Problem, Weights | None]:
-    """The problem and the weights from which a search begins."""
+    """Problem and weights from which a search starts."""
     if not isinstance(start, Estimate):
         return problem, start
     there, same = start.problem, start.problem.starts.shape == problem.starts.shape

@@ -1,17 +1,15 @@
-"""Weights for noisy recordings: the direct form (3.6) in coordinates in which it is well posed.
+"""Weights for noisy recordings: the direct form (3.6) in whitened coordinates.
 
-Noise moves a fitted gain off the gains that any weights have, so the reduced form has no answer.
-The direct form, misfit plus condition number, has one, but in the units of a plant such as the
-seat (radians beside the states of a delay) all weights near the answer have condition numbers of
-1e7, and a condition number that large outweighs any misfit. In natural coordinates (`gain_fibre`)
-the same weights have condition numbers of 10 to 100. There it is a mild regulariser, which is what
-(3.6) wants of it, and half a dozen prox-linear steps reach the answer.
+Noise moves a fitted gain off the gains that weights can have, so that the reduced form has no
+solution. The direct form has one, but in the units of a plant such as the seat the weights have
+condition numbers of 1e7, which outweigh any misfit. In whitened coordinates (`gain_fibre`) they are
+10 to 100, and the condition number acts as the mild regulariser that (3.6) intends.
 
     minimise  ||r||^2 / ||r_free||^2 + kappa(blkdiag(T'QT, G'RG)) / kappa_reference / samples
 
-r_free is the residual of the gain without weights (`fit_gain`), which says how much is noise; T and
-G are the natural coordinates of the start and stay. The reference is the condition number of the
-start, then that of the answer while it is larger: the penalty costs one sample's noise there.
+r_free is the residual of the unrestricted gain (`fit_gain`), which estimates the noise; T and G are
+the whitened coordinates of the start. The reference is the condition number of the start, then of
+the solution if that is larger: there the penalty equals the noise of one sample.
 """
 
 from __future__ import annotations
@@ -41,23 +39,20 @@ if TYPE_CHECKING:
     from impc.inverse.solution_set import GainFibre
     from impc.model.riccati import LqrSolution
 
-#: What the condition number of the start counts, in squared standard deviations of one sample's
-#: noise. It decides along directions that noise leaves open, and moves no other by as much as its
-#: own deviation; counted against all samples together (1e-3 of the squared misfit) it moved the
-#: gains of long, weakly excited recordings by several, and again at every restart.
+#: Penalty at the condition number of the start, in squared noise SDs of one sample: it decides
+#: along directions that noise leaves open. Scaled by all samples (1e-3 of the squared misfit) it
+#: moved the gains of long, weakly excited recordings by several standard errors.
 CONDITION_SHARE = 1.0
-# Rounds with another reference, and by how much the condition number has to grow for one more.
+# Rounds with an updated reference, and the growth of the condition number that needs another.
 _ROUNDS, _WORSE = 3, 1.05
 _ITERATIONS = 40
-# A step that promises less than this, of the objective, is below what the noise decides.
+# Relative decrease of the objective at which the search stops; less is below the noise.
 _TOLERANCE = 1e-5
-#: Condition number, in natural coordinates, of the weights that a search begins with. Cost weights
-#: of a
-#: diagonal start may lie at the edge of what any weights have (1e9 and more): the penalty, which is
-#: relative to the start, then regularises nothing and the search stays at that edge. Of 15 random
-#: plants with three inputs that ended short of the truth, 13 end at it from 1e3, 8 from 1e5.
+#: Largest condition number of the starting weights in whitened coordinates. Diagonal starts can lie
+#: at the edge of the cone (1e9 and more), where the penalty, relative to the start, has no effect.
+#: Of 15 random plants with three inputs that missed the truth, 13 reach it from 1e3, 8 from 1e5.
 WORST_START = 1e3
-# A start that leaves no more than this, of the noise, is where the search has to go.
+# Accept a start whose misfit is at most this multiple of the noise.
 _FITS = 1.005
 
 
@@ -66,7 +61,7 @@ def inverse_mpc_natural(
     start: Weights,
     noise: float,
 ) -> ConditionedFit:
-    """Direct inverse MPC in natural coordinates, at given initial states and plant."""
+    """Direct inverse MPC in whitened coordinates, initial states and plant fixed."""
     plant = problem.plant
     solution = solve_lqr(plant, start)
     T, G = natural_coordinates(plant, solution.K)
@@ -87,7 +82,7 @@ def inverse_mpc_natural(
         if found.condition <= _WORSE * reference:
             break
         begin, reference = found.weights, found.condition
-    assert found is not None  # there are rounds
+    assert found is not None  # _ROUNDS > 0
     weights = in_plant_units(found.weights, T, G)
     return replace(
         found,
@@ -113,15 +108,15 @@ def in_natural_units(weights: Weights, T: Array, G: Array) -> Weights:
 
 
 def best_conditioned(fibre: GainFibre, member: Weights) -> Weights:
-    """The member of least condition number, or the known one where no program says it."""
+    """Equivalent weights of least condition number; `member` if the program fails."""
     try:
         return least_condition_weights(fibre, member).weights
-    except (WeightsError, SolverError):  # at the edge of the cone, in double precision
+    except (WeightsError, SolverError):  # numerically at the edge of the cone
         return member
 
 
 def _away_from_the_edge(weights: Weights) -> Weights:
-    """The weights, if need be with a penalty on every direction, at most `WORST_START` apart."""
+    """Weights with a multiple of I added if their condition number exceeds `WORST_START`."""
     if condition_number(weights) <= WORST_START:
         return weights
     floor = float(np.linalg.eigvalsh(weights.block)[-1]) / WORST_START
@@ -132,7 +127,7 @@ def _away_from_the_edge(weights: Weights) -> Weights:
 def _residual(
     problem: Problem, T: Array, G: Array, noise: float
 ) -> Callable[[LqrSolution], Residual]:
-    """Residual over noise of a regulator given in natural coordinates, u = -G K T^-1 x."""
+    """Residual over noise of a regulator in whitened coordinates, u = -G K T^-1 x."""
     known = replace(problem, unknown_start=False, family=None, logarithms=frozen(np.zeros(0)))
     z, v = np.linalg.inv(T), np.linalg.inv(G)
     near: TerminalSet | None = None
@@ -142,7 +137,7 @@ def _residual(
         metric = v.T @ solution.S @ v
         found = evaluate(known, G @ solution.K @ z, metric, near)
         near = found.terminal or near
-        # As many rows as columns: a search uses norms and inner products only.
+        # Triangular factor: the search uses only norms and inner products.
         m, n = known.plant.m, known.plant.n
         table = triangular_rows(
             [found.dK.reshape(-1, m * n), found.dS.reshape(-1, m * m), found.residual[:, None]]
@@ -156,5 +151,5 @@ def _residual(
 
 
 def _scale_ratio(metric: Array, natural: Array) -> float:
-    """Both metrics are scaled to a mean diagonal of 1 before they are differentiated."""
+    """Ratio of the scales of both metrics, which are scaled to trace m for derivatives."""
     return float(np.trace(natural) / np.trace(metric))

@@ -1,13 +1,12 @@
-"""From recordings to one controller: gain, weights, initial states, physical parameters.
+"""Inverse MPC for noisy recordings: gain, weights, initial states and physical parameters.
 
     gain with initial states and parameters  ->  weights with that gain, or the direct form (3.6)
 
-A gain that explains its recordings to 1e-9 has weights to find, and the reduced form finds them:
-one semidefinite program. With noise a fitted gain usually has none. Then the direct form in natural
-coordinates (`natural_search`) takes the weights that fit best. It begins at balanced weights, and
-where these leave more than noise does at those whose gain is nearest as the recordings see it,
-|J (K(Q, R) - K)|^2 with J the derivative of the residual, which takes no simulation. Last the
-states in which trials start are fitted again, the controller being known (docs/fitting.md).
+A gain that explains the recordings to 1e-9 is converted to weights by one semidefinite program.
+With noise, a fitted gain usually has no weights: then the direct form in whitened coordinates
+(`natural_search`) fits the weights. It starts from balanced weights and, if these leave more than
+noise, from those with the nearest gain in |J (K(Q, R) - K)|^2, J the derivative of the residual.
+Finally the initial states are refitted with the controller fixed.
 """
 
 from __future__ import annotations
@@ -55,27 +54,28 @@ if TYPE_CHECKING:
     from impc.model.weights import Weights
 
 
-# Weights that leave more than the free gain by what noise does in one of a hundred recordings are
-# looked for again.
+# Continue the search if the free gain fits better at this significance level (likelihood ratio).
 _RARE = 0.01
-# Misfit, of the recordings, of weights behind an exact gain with which a search is over: where few
-# samples show S, an error of K that rounding left is answered by one of S, which no weights have.
+# Largest relative misfit at which weights of an exact gain are accepted. If few samples identify S,
+# a rounding error of K is compensated by an S that no weights have.
 _NEARLY = 1e-6
-# Misfits that differ by less, of themselves, are the same.
+# Relative difference below which two misfits count as equal.
 _SAME = 1e-3
-# Regulators from which weights are looked for, at most.
+# Largest number of regulators used as starts.
 _BEGINNINGS = 3
 
 
 @checked
 def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
-    """Fit the weights of the constrained controller behind recordings."""
+    """Fit the weights of the constrained controller to the recordings."""
 
     def fit(posed: Problem) -> Estimate:
         found = _fitted(posed, start)
         tried = posed.terminal_set and problem.terminal_set is None
         if tried and not keeps_hard(found.problem, found.stage_weights):
-            raise SolverError("terminal set", "is not kept", "leave it out")
+            raise SolverError(
+                "terminal set", "the fitted controller leaves it", "pass terminal_set=False"
+            )
         return found
 
     def settled(found: Estimate) -> bool:
@@ -85,10 +85,10 @@ def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
 
 
 def _set_may_matter(found: Estimate) -> bool:
-    """Whether the controller found would do otherwise, had it to end in its terminal set.
+    """Whether a terminal set would change the fit; decides if the search with one is run.
 
-    Where it cannot, another one might, unless what is left is noise. A search with the set takes
-    far longer: many samples have to speak for it at the controller found.
+    If the fitted controller cannot keep the set, another one might, unless the residuals are white.
+    With many samples, the misfit at the fitted controller must decrease with the set.
     """
     posed = replace(found.problem, terminal_set=True)
     if posed.recorded_numbers > FEW:
@@ -96,7 +96,7 @@ def _set_may_matter(found: Estimate) -> bool:
         return not reason and left < found.misfit
     try:
         runs = verify_hard(posed, found.stage_weights)
-    except (WeightsError, SolverError, InputError):  # it has no such set
+    except (WeightsError, SolverError, InputError):  # the plant has no such set
         return False
     if not all(run.complete for run in runs):
         return not found.fit.white
@@ -104,9 +104,9 @@ def _set_may_matter(found: Estimate) -> bool:
 
 
 def _fitted(problem: Problem, start: Weights | None) -> Estimate:
-    """The same where it is known whether the controller ends in its terminal set."""
+    """Fit for a decided terminal set."""
     free = fit_gain(problem) if start is None else free_gain(problem, start)
-    if free.explained:  # otherwise no weights can have it: the direct form says which come near
+    if free.explained:  # otherwise no weights have exactly this gain: use the direct form
         behind = weights_behind(free)
         nearly = behind.misfit <= _NEARLY * recorded_size(problem)
         if nearly and behind.equivalent is not None:
@@ -124,24 +124,24 @@ def _fitted(problem: Problem, start: Weights | None) -> Estimate:
 
 
 def free_gain(problem: Problem, begin: Weights) -> GainFit:
-    """The best gain of any kind near that of some weights, with what else the problem lacks."""
+    """Best unrestricted gain near that of `begin`, with initial states and parameters."""
     solution = solve_lqr(problem.plant, begin)
     return refine_gain(problem, np.array(solution.K), np.array(solution.S), prior=1.0)
 
 
 def noise_of(free: GainFit) -> float:
-    """Misfit of the free gain, at least that of rounding."""
+    """Misfit of the unrestricted gain, at least rounding level."""
     return max(free.misfit, EXPLAINED * recorded_size(free.problem))
 
 
 def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]:
-    """Weights of the direct form from a few beginnings."""
+    """Weights of the direct form, from several starts."""
     best, spent, reason = None, 0, ""
     enough = _unlikely(free) * free.misfit
     for begin in _beginnings(free, start):
         try:
             found = inverse_mpc_natural(free.problem, begin, noise_of(free))
-        except (WeightsError, SolverError) as error:  # the next may have a regulator to simulate
+        except (WeightsError, SolverError) as error:  # try the next start
             reason = reason or str(error)
             continue
         spent += found.evaluations
@@ -150,12 +150,14 @@ def _weights(free: GainFit, start: Weights | None) -> tuple[ConditionedFit, int]
         if best.misfit <= enough or (again and not free.explained):
             break
     if best is None:
-        raise SolverError("weights", f"none can be simulated: {reason}", "give a start of your own")
+        raise SolverError(
+            "weights", f"no start can be simulated ({reason})", "pass start=Weights(Q, R)"
+        )
     return best, spent
 
 
 def _unlikely(free: GainFit) -> float:
-    """Ratio of misfits of the truth and of the best gain that noise rarely exceeds."""
+    """Ratio of the misfits of truth and best gain that noise exceeds with probability `_RARE`."""
     plant, problem = free.problem.plant, free.problem
     unknowns = plant.m * plant.n + plant.m * (plant.m + 1) // 2 - 1 + len(problem.logarithms)
     unknowns += problem.own_unknowns * len(problem.recordings)
@@ -164,11 +166,9 @@ def _unlikely(free: GainFit) -> float:
 
 
 def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
-    """The given weights, then those of some regulators, and those nearest to the free gain.
+    """Starting weights: the given ones, balanced regulators, those nearest to the free gain.
 
-    With noise a free gain wanders off along what the recordings hardly identify, and weights near
-    it with it. Last those whose gain is nearest entry by entry: near its limit a stick falls with
-    any other.
+    The last start is nearest entry by entry: near its bound an unstable plant diverges with others.
     """
     if start is not None:
         yield start
@@ -178,14 +178,14 @@ def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
         yield _nearest(free, regulator)
         if free.explained:
             yield regulator.weights
-    with contextlib.suppress(WeightsError, SolverError):  # then there is no other
+    with contextlib.suppress(WeightsError, SolverError):  # skip this start
         nearest = inverse_lqr_gradient(free.problem.plant, free.K).weights
         if nearest is not None:
             yield nearest
 
 
 def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:
-    """The weights whose gain is nearest to the free one, as the recordings see it."""
+    """Weights whose gain is nearest to the free one in the metric of the recordings."""
     problem, plant = free.problem, free.problem.plant
     space = Coordinates(problem, np.array(free.K), np.array(free.S))
     count = int(space.ends[0])
@@ -193,7 +193,7 @@ def _nearest(free: GainFit, regulator: LqrSolution) -> Weights:
     form = triangle[:, :count]
     T, G = natural_coordinates(plant, np.array(regulator.K))
     natural = change_coordinates(plant, T, G)
-    # From coordinates about the free gain to those about the regulator.
+    # Transform from whitened coordinates of the free gain to those of the regulator.
     back = space.natural(G @ np.eye(count).reshape(-1, plant.m, plant.n) @ np.linalg.inv(T))
     form = form @ back.reshape(count, -1).T / noise_of(free)
     target = np.asarray(np.linalg.solve(G, free.K @ T))
@@ -225,16 +225,16 @@ def _finish(
 
 
 def _by_convention(plant: Plant, weights: Weights, metrics: Array) -> Weights:
-    """Of all weights with the same gain the reported ones, or the given ones if a program fails."""
+    """Reported weights of those with the same gain; `weights` themselves if the program fails."""
     solution = solve_lqr(plant, weights)
     try:
         return least_condition_weights(gain_fibre(plant, solution.K, metrics), weights).weights
-    except (WeightsError, SolverError):  # at the edge of what a program can determine
+    except (WeightsError, SolverError):  # numerically at the edge of the cone
         return normalised(weights)
 
 
 def _metrics(problem: Problem, solution: LqrSolution) -> Array:
-    """The metric, and directions along which it moves alone and unseen (k, m, m)."""
+    """Metric, then metric directions that the recordings do not identify (k, m, m)."""
     gain, metric = np.array(solution.K), np.array(solution.S)
     family = metric_family(problem.plant, gain) if problem.plant.m > 1 else None
     if family is None:
@@ -243,21 +243,18 @@ def _metrics(problem: Problem, solution: LqrSolution) -> Array:
 
 
 _EVALUATIONS = 20
-# The first round also counts as noise what saturation keeps from being linear; a second, which does
-# not, is worth its simulations where that was more than a share of it.
+# The first round counts nonlinearity by saturation as noise; run a second one if the noise estimate
+# changes by more than this share.
 _ROUNDS, _SHARE = 2, 1e-4
 
 
 def with_fitted_starts(
     problem: Problem, gain: Array, metric: Array, samples: int | None = None
 ) -> Problem:
-    """Return the problem with x0 and offsets of each trial fitted to its first samples.
+    """Fit x0 and offsets of each trial to its first samples, controller fixed.
 
-    Under a controller, from the given x0, by trust-region least squares. Where the samples leave x0
-    free it stays: it is given a normal prior of the size of the trial's other states (`own_unit`),
-    which weighs as the residual's own noise does.
-
-    `gain` (m, n); `metric` (m, m).
+    A normal prior of the size of the states of the trial (`own_unit`), weighted as the residual
+    noise, keeps unidentified components at the given x0. `gain` (m, n); `metric` (m, m).
     """
     fitted = []
     for trial in problem.recordings:
@@ -276,7 +273,7 @@ def _fit(problem: Problem, gain: Array, metric: Array) -> dict[str, Array]:
     def placed(z: Array) -> Recording:
         return with_own(problem, (unit @ z)[None]).recordings[0]
 
-    @functools.lru_cache(maxsize=1)  # the search asks for residual and derivative one by one
+    @functools.lru_cache(maxsize=1)  # scipy asks for residual and derivative separately
     def seen(z: tuple[float, ...]) -> tuple[Array, Array]:
         moved = placed(np.array(z))
         residual, slope = simulated(np.array(moved.x0), np.array(moved.offset))
@@ -297,13 +294,13 @@ def _fit(problem: Problem, gain: Array, metric: Array) -> dict[str, Array]:
 
 
 def _noise(residual: Array, derivative: Array) -> float:
-    """What no x0 explains: to first order, the residual beside the derivative's columns."""
+    """RMS of the residual after projection on the derivative: noise to first order."""
     left = residual - derivative @ np.linalg.lstsq(derivative, residual)[0]
     return float(np.linalg.norm(left) / np.sqrt(len(left)))
 
 
 def _round(at: Callable[[Array], tuple[Array, Array]], z: Array, noise: float) -> Array:
-    """One fit from z, with that noise."""
+    """One least-squares fit from z with noise SD `noise`."""
 
     def residual(z: Array) -> Array:
         return np.concatenate([at(z)[0], noise * z])

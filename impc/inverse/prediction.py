@@ -1,19 +1,18 @@
-"""Correction of a simulated state by the recorded outputs: from simulation to prediction error.
+"""One-step-ahead predictions: correct the simulated state by the recorded outputs.
 
     e   = y - C x                innovation, the residual
     x_f = x + M e                corrected state
     u   = controller(x_f)
     x+  = A x_f + B u + E d
 
-M = 0 is the simulation; with the gain M of a steady Kalman filter e is a one-step prediction error.
-Then the effect of a wrong gain on x dies within the memory of the filter, so that the loop does
-not diverge and the sum of squares is that of many short pieces: it has few local minima in K where
-that of a simulation has many (docs/fitting.md has the rates). What moves is linear in
-(x_f, u, d, y):
+M = 0 is the simulation; with the gain M of a stationary Kalman filter e is a one-step prediction
+error. The effect of a wrong gain then decays within the memory of the filter: the loop does not
+diverge, and the sum of squares has few local minima in K, where that of a simulation has many. The
+dynamics are linear in (x_f, u, d, y):
 
     x_f+ = (I - MC)(A x_f + B u + E d) + M y+,        e = (I - CM)^-1 (y - C x_f)
 
-so the same loop simulates it, with other matrices and y as a further disturbance.
+so the same loop simulates them, with other matrices and y as a further disturbance.
 """
 
 from __future__ import annotations
@@ -32,35 +31,35 @@ if TYPE_CHECKING:
     from impc.control.simulation import Scenario
     from impc.inverse.problem import Problem
 
-# Noise that reaches every mode, of that of the commands: for modes that B misses. The larger ones
-# are for plants whose Riccati equation is beyond double precision with less.
+# Process noise on every mode relative to command noise, for modes that B does not reach; the larger
+# values are tried if the Riccati equation fails in double precision.
 _EVERYWHERE = (1e-9, 1e-6, 1e-3)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """The correction of one problem."""
+    """Kalman correction for one problem."""
 
     M: Array  # Gain of the correction (n, p)
 
     def moves(self, problem: Problem) -> tuple[Array, Array, Array]:
-        """A (n, n), B (n, m) and (E, M) (n, columns) that move the corrected state."""
+        """A (n, n), B (n, m) and (E, M) (n, columns) of the corrected state."""
         plant, kept = problem.plant, self.kept(problem)
         return kept @ plant.A, kept @ plant.B, np.hstack([kept @ plant.E, self.M])
 
     def kept(self, problem: Problem) -> Array:
-        """I - MC (n, n), which takes the simulated to the corrected state."""
+        """I - MC (n, n), the map from simulated to corrected state."""
         return np.asarray(np.eye(problem.plant.n) - self.M @ problem.plant.C)
 
     def weighting(self, problem: Problem) -> Array:
-        """What turns C x_f - y into a residual (p, p): its inverse, and the outputs' scales."""
+        """Matrix (p, p) that converts C x_f - y into the residual: inverse and output scales."""
         C = problem.plant.C
         return np.asarray(
             np.linalg.inv(np.eye(len(C)) - C @ self.M) / problem.output_scale[:, None]
         )
 
     def drives(self, problem: Problem) -> list[Scenario]:
-        """What drives each recording: its disturbance and its outputs, one sample later."""
+        """Signals that drive each recording: its disturbance, and its outputs one sample later."""
         kept, drives = self.kept(problem), []
         for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
             y = without_gaps(trial.outputs) - trial.offset
@@ -70,7 +69,7 @@ class Correction:
 
 
 def without_gaps(outputs: Array) -> Array:
-    """The outputs (samples, p), missing ones between their neighbours; zero where all are."""
+    """Outputs (samples, p) with missing values interpolated; zero if all are missing."""
     filled, places = np.nan_to_num(outputs), np.arange(len(outputs))
     for column, known in enumerate(np.isfinite(outputs).T):
         if np.any(known) and not np.all(known):
@@ -79,11 +78,10 @@ def without_gaps(outputs: Array) -> Array:
 
 
 def correction(problem: Problem, ratio: float) -> Correction:
-    """The correction by a steady filter.
+    """Stationary Kalman correction; zero if no stable filter exists.
 
-    For outputs of which all could be noise, and commands that could be wrong by `ratio` times
-    their size: a slow filter, which remembers long, at small ratios. None where no filter is
-    stable: a mode that no output sees does not decay.
+    Assumes output noise as large as the outputs and command errors of `ratio` times their size: a
+    small ratio gives a slow filter with long memory.
     """
     plant, scale = problem.plant, np.asarray(problem.output_scale)
     C, outputs = plant.C / scale[:, None], np.eye(len(scale))
@@ -100,7 +98,7 @@ def correction(problem: Problem, ratio: float) -> Correction:
 
 
 def command_sizes(problem: Problem) -> Array:
-    """Size of each input (m,): its bound, or what moves the outputs by their size in n samples."""
+    """Size of each input (m,): its bound, or the size that moves the outputs by their scale."""
     plant, scale = problem.plant, np.asarray(problem.output_scale)
     bounds = np.maximum(-problem.bounds.u_min, problem.bounds.u_max)
     if np.all(np.isfinite(bounds)):

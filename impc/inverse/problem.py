@@ -1,12 +1,10 @@
-"""The inverse problem: recordings, and the closed loop that is to explain them.
+"""Inverse problem: recordings, and the closed loop that explains them.
 
-For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings in a row and every output
-divided by its scale, and its derivatives with respect to K and S are exact. The weights enter
-through K and S only, so every method of the package is one of two searches over this residual: for
-a gain, or for weights. What else is not known of a recording, the state in which each trial starts,
-offsets of outputs and physical parameters of the plant, is searched together with the gain; `at`
-gives the problem at other values of these (docs/theory.md, section 6; docs/fitting.md). Commands
-that were recorded are fitted as further outputs; of what is missing nothing is asked.
+For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings stacked and every output
+divided by its scale. Weights enter only through K and S, so each method searches either a gain or
+weights over this residual. Unknown initial states, output offsets and physical parameters are
+searched jointly (docs/why/theory.md). Recorded commands are fitted as further outputs; missing
+values have zero residuals.
 """
 
 from __future__ import annotations
@@ -41,83 +39,84 @@ if TYPE_CHECKING:
     from impc.model.structure import Structure
     from impc.model.weights import Weights
 
-#: Misfit, of the recorded outputs, up to which they are explained.
+#: Largest misfit, relative to the recorded outputs, of recordings that count as explained.
 EXPLAINED = 1e-9
-# Of the states: noise that a laboratory would call none is above, rounding in files is below.
+# Largest relative error of exact recordings: above rounding in files, below any measurement noise.
 _EXACT = 1e-9
-# Of the outputs: beside less noise a stated uncertainty counts as it does beside that.
+# Least noise relative to the outputs, for the weight of stated uncertainties.
 _NO_NOISE = 1e-4
 
 
 @dataclass(frozen=True, init=False)
 class Problem(Value):
-    """Find the controller that made the recordings.
+    """Inverse problem: find the controller that made the recordings.
 
     Parameters
     ----------
     plant : Plant
-        That of the family's nominal values, when there is one.
+        Discrete-time plant; with a family, the plant at its nominal parameters.
     bounds : Bounds
+        Bounds of inputs and states.
     horizon : int
-        N, in samples.
+        Prediction horizon N in samples.
     recordings : sequence of Recording
+        At least one trial.
     terminal_set, softening, unknown_start, family, structure, feedback_states, solver, \
     terminal_weight
-        See the attributes.
-    output_scale : array_like, optional
-        (p,), positive; by default the root-mean-square of each output over all recordings, so
-        that no answer depends on units. An output that is zero throughout counts as the largest.
-    command_scale : array_like, optional
-        (m,), the same of recorded commands. Smaller ones say that the commands are better known.
-    offsets : sequence of str
-        See the attributes.
+        See Attributes.
+    output_scale : array_like of shape (p,), optional
+        Positive scale of each output, in its unit. By default the root mean square over all
+        recordings, so that results do not depend on units; an output that is zero throughout gets
+        the largest of these values.
+    command_scale : array_like of shape (m,), optional
+        Likewise for recorded commands; a smaller scale gives the commands more weight.
+    offsets : sequence of str, optional
+        See Attributes.
 
     Attributes
     ----------
     plant : Plant
     bounds : Bounds
     horizon : int
-        N, in samples.
+        Prediction horizon N in samples.
     recordings : tuple of Recording
     terminal_set : bool or None
-        Whether the controller ends in its maximal invariant set. None, the default: `impc.fit` and
-        `impc fit` decide by which explains the recordings better, and the problem of their answer
-        says which; everything else takes None for False.
+        Whether the controller ends in its maximal invariant set. With None, `impc.fit` and
+        `impc fit` choose the variant that explains the recordings better, and the problem of the
+        estimate states the choice; other functions treat None as False.
     softening : float
-        Cost weight of exceeding a state bound or the terminal set during the search, see
-        `Controller`. An answer says how many of its samples do.
-    output_scale : Array
-        What each output is divided by in the residual (p,), in its unit.
-    command_scale : Array
-        What each recorded command is divided by there (m,), in its unit.
+        Cost weight of violating a state bound or the terminal set during the search (see
+        `Controller`); the estimate counts the samples that violate them.
+    output_scale : ndarray of shape (p,)
+        Scale of each output in the residual, in its unit.
+    command_scale : ndarray of shape (m,)
+        Scale of each recorded command in the residual, in its unit.
     offsets : tuple of str
-        Outputs of which every trial has an offset that is not known, constant over the trial.
+        Outputs with an unknown offset that is constant within each trial.
     unknown_start : bool
-        Whether the initial states are searched too, from the `x0` of the recordings. By default
-        they are, unless the recordings are exact: all states, and the plant follows them to
-        rounding.
+        Whether the initial states are estimated, starting from `x0` of the recordings. Default:
+        True, unless all states are recorded and follow the plant to rounding.
     family : PlantFamily or None
-        Plants among which the search goes on; None when the plant is known.
-    logarithms : Array
-        Logarithms of the family's parameters over their nominal values at which `plant` is (k,).
+        Plants with unknown physical parameters to estimate; None if the plant is known.
+    logarithms : ndarray of shape (k,)
+        Logarithms of the family's parameters over their nominal values, for the current `plant`.
     structure : Structure or None
-        What may be costed, for the method "structured" and the gain of a person
-        (`fit_output_feedback`); other methods do not ask.
+        Cost structure for the method "structured" and for `fit_output_feedback`; other methods
+        ignore it.
     feedback_states : tuple of str
-        States on which the preliminary gain (3.20) acts, for the method "preliminary".
+        States with feedback in the method "preliminary" (3.20).
     solver : str
-        What solves the controller's quadratic programs in every simulation of a search, see
-        `Controller`.
-    terminal_weight : Array or None
-        P (n, n) of the cost x_N'P x_N in the scale in which R[0, 0] = 1, given as 0 for no such
-        cost; None for that of the Riccati equation. With a P `impc.fit` searches the weights
-        themselves, by "inverse_mpc" alone; what assumes one gain and one metric refuses it.
+        Solver of the controller's quadratic programs in simulations, see `Controller`.
+    terminal_weight : ndarray of shape (n, n), or None
+        P of the terminal cost x_N'P x_N, in the scale in which R[0, 0] = 1; pass 0 for none. None
+        uses the Riccati solution. With a given P, `impc.fit` estimates the weights directly and
+        only with "inverse_mpc"; functions that assume one gain and one metric raise an error.
 
     Raises
     ------
     PlantError, DataError, InputError
-        When the plant is continuous, there is no recording, a scale is not positive, or there is
-        no such solver.
+        If the plant is in continuous time, there are no recordings, a scale is not positive, or the
+        solver is unknown.
 
     Examples
     --------
@@ -178,38 +177,38 @@ class Problem(Value):
     ) -> None:
         plant.require_discrete()
         if terminal_weight is not None and (terminal_set or family is not None):
-            problem = "goes neither with terminal_set=True nor with a family of plants"
-            raise InputError("terminal_weight", problem, "leave one out")
+            problem = "cannot be combined with terminal_set=True or a family"
+            raise InputError("terminal_weight", problem, "remove one of them")
         if not recordings:
-            raise DataError("recordings", "there are none", "give at least one trial")
-        outputs = [trial.outputs for trial in recordings]
+            missing = "expected at least one trial, got none"
+            raise DataError("recordings", missing, "pass [Recording(...)]")
         commands = [trial.commands for trial in recordings if len(trial.commands)]
-        scale = _scale("output_scale", output_scale, outputs, len(plant.outputs))
-        for name in offsets:
-            if name not in plant.outputs:
-                known = ", ".join(plant.outputs)
-                raise InputError("offsets", f"there is no output {name!r}", f"choose of {known}")
+        outputs = [trial.outputs for trial in recordings]
+        for name in sorted(set(offsets) - set(plant.outputs)):
+            known = ", ".join(plant.outputs)
+            raise InputError("offsets", f"no output is named {name!r}", f"choose from: {known}")
         if family is not None:
             if plant_at(family, np.zeros(len(family.names))).states != plant.states:
-                remedy = "give family.make(family.nominal) as plant"
-                raise InputError("family", "makes a plant with other states", remedy)
+                remedy = "pass plant=family.make(family.nominal)"
+                raise InputError("family", "its plant and `plant` have different states", remedy)
             family = family.with_limits(plant, bounds)
-            family = family if family.names else None  # all of it is known
-        aimed = aims(plant, recordings)
+            family = family if family.names else None  # no unknown parameter
+        if unknown_start is None:
+            unknown_start = not follows_plant(plant, recordings)
+        if terminal_set is None and aims(plant, recordings):
+            terminal_set = False
         P = None if terminal_weight is None else terminal_matrix(plant, terminal_weight)
         self._fill(
             plant=plant,
             bounds=bounds,
             horizon=horizon,
             recordings=tuple(recordings),
-            terminal_set=False if terminal_set is None and aimed else terminal_set,
+            terminal_set=terminal_set,
             softening=softening,
-            output_scale=frozen(scale),
+            output_scale=frozen(_scale("output_scale", output_scale, outputs, len(plant.outputs))),
             command_scale=frozen(_scale("command_scale", command_scale, commands, plant.m)),
             offsets=tuple(offsets),
-            unknown_start=(
-                not follows_plant(plant, recordings) if unknown_start is None else unknown_start
-            ),
+            unknown_start=unknown_start,
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
             structure=structure,
@@ -219,15 +218,15 @@ class Problem(Value):
         )
 
     def without_bounds(self) -> Problem:
-        """Return the same problem for a plain feedback gain: no bounds, no terminal set."""
+        """Copy without bounds and terminal set: a plain feedback gain."""
         return replace(self, bounds=Bounds(self.plant), terminal_set=False)
 
     def with_nuisance_fixed(self) -> Problem:
-        """Return the problem with its initial states, offsets and parameters as they stand."""
+        """Copy with initial states, offsets and parameters fixed at their current values."""
         return replace(self, unknown_start=False, offsets=(), family=None, logarithms=frozen([]))
 
     def with_body_fixed(self) -> Problem:
-        """Return the problem with what has a stated uncertainty held where it stands."""
+        """Copy with the parameters of stated uncertainty fixed at their current values."""
         if self.family is None or not np.any(self.stated):
             return self
         free = ~self.stated
@@ -235,20 +234,20 @@ class Problem(Value):
         return replace(self, family=family, logarithms=frozen(self.logarithms[free]))
 
     def leaving_out(self, trial: int) -> Problem:
-        """Return the problem without one trial, counted from 0."""
+        """Copy without one trial, counted from 0."""
         return replace(self, recordings=self.recordings[:trial] + self.recordings[trial + 1 :])
 
     def at(self, starts: Array, logarithms: Array, shifts: Array | None = None) -> Problem:
-        """Return the problem at other initial states, parameters and offsets.
+        """Return a copy at other initial states, parameters and offsets.
 
         Parameters
         ----------
-        starts : Array
-            Initial states (trials, n).
-        logarithms : Array
-            Of the family's parameters over their nominal values (k,).
-        shifts : Array, optional
-            Offsets of the outputs (trials, p); by default those that there are.
+        starts : ndarray of shape (trials, n)
+            Initial states.
+        logarithms : ndarray of shape (k,)
+            Logarithms of the family's parameters over their nominal values.
+        shifts : ndarray of shape (trials, p), optional
+            Offsets of the outputs; unchanged by default.
         """
         moved = self.shifts if shifts is None else shifts
         recordings = tuple(
@@ -279,80 +278,82 @@ class Problem(Value):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of what was recorded (q,): the outputs, and the controls where commands were."""
+        """Names of the q recorded signals: outputs, then controls if commands were recorded."""
         commands = any(len(trial.commands) for trial in self.recordings)
         return (*self.plant.outputs, *self.plant.controls) if commands else self.plant.outputs
 
     @property
     def scale(self) -> Array:
-        """What each of these is divided by in the residual (q,)."""
+        """Residual scale of each recorded signal (q,)."""
         both = np.concatenate([self.output_scale, self.command_scale])
         return both[: len(self.measured)]
 
     @property
     def searched_states(self) -> int:
-        """How many states of a trial's start are searched: the first ones, or none."""
+        """Number of initial states that are searched (the first ones); 0 if they are known."""
         return physical_states(self.plant) if self.unknown_start else 0
 
     @property
     def own_unknowns(self) -> int:
-        """How many unknowns belong to one trial: initial states, then offsets."""
+        """Number of unknowns of one trial: initial states, then offsets."""
         return self.searched_states + len(self.offsets)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Physical parameters that are fitted (k,)."""
+        """Names of the k fitted physical parameters."""
         return () if self.family is None else self.family.names
 
     @property
     def parameter_units(self) -> Array:
-        """Unit of each parameter's logarithm in a search (k,): its deviation where it is stated."""
+        """Scale of each log-parameter in a search (k,): its SD if an uncertainty is stated."""
         return np.zeros(0) if self.family is None else self.family.unit
 
     @property
     def stated(self) -> BoolArray:
-        """Which parameters have a stated uncertainty (k,)."""
+        """Mask of the parameters with a stated uncertainty (k,)."""
         return np.zeros(0, bool) if self.family is None else self.family.stated
 
     @property
     def trial_sizes(self) -> list[int]:
-        """How many numbers of the residual belong to each trial."""
+        """Number of residual entries of each trial."""
         return [trial.samples * len(self.measured) for trial in self.recordings]
 
     @property
     def row_sizes(self) -> list[int]:
-        """The same with the rows of stated uncertainties, which stand last."""
+        """`trial_sizes`, then the number of rows for stated uncertainties."""
         stated = int(np.count_nonzero(self.stated))
         return self.trial_sizes + ([stated] if stated else [])
 
     @property
     def recorded_numbers(self) -> int:
-        """How many numbers were recorded in all trials; missing ones do not count."""
+        """Number of recorded values in all trials, missing ones excluded."""
         return sum(int(np.isfinite(recorded(self, trial)).sum()) for trial in self.recordings)
 
 
 def aims(plant: Plant, recordings: Sequence[Recording]) -> bool:
-    """Whether the controller regulates to more than rest, so that it has no terminal set."""
+    """Whether the controller tracks targets or signals, so that it has no terminal set."""
     return bool(np.any(plant.observer)) or any(trial.signals for trial in recordings)
 
 
 def _scale(name: str, given: ArrayLike | None, parts: Sequence[Array], size: int) -> Array:
-    """What is given (size,), or the root-mean-square of what was recorded."""
+    """Given scale (size,), or the root mean square of the recordings."""
     if given is None:
         values = np.concatenate([*parts, np.zeros((1, size))])[:-1]
         largest = np.max(np.abs(np.nan_to_num(values)), axis=0, initial=0.0)
-        unit = np.where(largest > 0, largest, 1.0)  # squares of 1e200 are none
+        unit = np.where(largest > 0, largest, 1.0)  # avoids overflow of squares
         count = np.maximum(np.sum(np.isfinite(values), axis=0), 1)
         rms = largest * np.sqrt(np.sum(np.nan_to_num(values / unit) ** 2, axis=0) / count)
         given = np.where(rms > 0, rms, np.max(rms) or 1.0)
     scale = finite_array(name, given, (size,))
     if np.any(scale <= 0):
-        raise InputError(name, f"got {scale.tolist()}", "give positive numbers")
+        raise InputError(
+            name, f"expected positive numbers, got {scale.tolist()}", "pass positive scales"
+        )
     return scale
 
 
 def recorded(problem: Problem, trial: Recording) -> Array:
-    """Outputs and, where the problem has them, commands of a trial (samples, q); NaN: missing."""
+    """Outputs, and commands if recorded, of a trial (samples, q); NaN where missing."""
     outputs, count = trial.outputs, len(problem.measured)
     if count == outputs.shape[1]:
         return outputs
@@ -361,7 +362,7 @@ def recorded(problem: Problem, trial: Recording) -> Array:
 
 
 def modelled(problem: Problem, trial: Recording, run: Simulation) -> Array:
-    """The same of a simulation (samples, q), with the trial's offsets; no command at the end."""
+    """Simulated counterpart of `recorded` with offsets (samples, q); last command NaN."""
     outputs = run.x @ problem.plant.C.T + trial.offset
     if len(problem.measured) == outputs.shape[1]:
         return np.asarray(outputs)
@@ -369,7 +370,7 @@ def modelled(problem: Problem, trial: Recording, run: Simulation) -> Array:
 
 
 def missed(problem: Problem, trial: Recording, run: Simulation) -> Array:
-    """Simulated minus recorded over the scales (samples, q), zero where something is missing."""
+    """(Simulated - recorded) / scale, shape (samples, q); zero for missing values."""
     difference = (modelled(problem, trial, run) - recorded(problem, trial)) / problem.scale
     return np.where(np.isnan(difference), 0.0, difference)
 
@@ -381,7 +382,7 @@ def controller_for(
     near: TerminalSet | None = None,
     weights: Weights | None = None,
 ) -> Controller:
-    """Return the controller of a `gain` (m, n) and `metric` (m, m), or beside a P of `weights`."""
+    """Controller of a `gain` (m, n) and `metric` (m, m), or of `weights` with a fixed P."""
     if problem.terminal_weight is not None and weights is not None:
         return weights_controller(problem, weights)
     require_riccati(problem)
@@ -399,7 +400,7 @@ def controller_for(
 
 
 def weights_controller(problem: Problem, weights: Weights, *, hard: bool = False) -> Controller:
-    """Return the controller of the problem with these weights, its rows soft or `hard`."""
+    """Controller of these weights; state bounds and terminal set soft or `hard`."""
     return Controller(
         problem.plant,
         weights,
@@ -413,33 +414,33 @@ def weights_controller(problem: Problem, weights: Weights, *, hard: bool = False
 
 
 def require_riccati(problem: Problem) -> None:
-    """Refuse a terminal weight of the user's own where one gain and metric have to be all."""
+    """Raise InputError if the user fixed the terminal weight: the caller needs one gain."""
     if problem.terminal_weight is not None:
         raise InputError(
             "terminal_weight",
-            "of your own gives each stage a gain, and this needs one gain for all",
-            "use impc.fit(problem), or leave the terminal weight out",
+            "gives every stage its own gain, but this function needs a single gain",
+            "use impc.fit(problem), or remove terminal_weight",
         )
 
 
 def scenarios(problem: Problem) -> list[Scenario]:
-    """What drives each recording."""
+    """Initial state and external signals of every recording."""
     return [drive_of(trial, trial.x0) for trial in problem.recordings]
 
 
 def drive_of(trial: Recording, x0: Array) -> Scenario:
-    """What drives a trial from a state (n,)."""
+    """Initial state (n,) and external signals of a trial."""
     return Scenario(frozen(x0), trial.disturbance[:-1], trial.target, trial.signals)
 
 
 def recorded_size(problem: Problem) -> float:
-    """2-norm of all that was recorded, each divided by its scale."""
+    """2-norm of all recorded values over their scales."""
     parts = [(recorded(problem, trial) / problem.scale).ravel() for trial in problem.recordings]
     return float(np.linalg.norm(np.nan_to_num(np.concatenate(parts))))
 
 
 def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array] | None:
-    """States (samples, n) of each trial, where the outputs determine them."""
+    """States (samples, n) of each trial; None if the outputs do not determine them."""
     C = plant.C
     gaps = any(trial.has_gaps for trial in recordings)
     if gaps or C.shape[0] != C.shape[1] or np.linalg.matrix_rank(C) < len(C):
@@ -450,10 +451,7 @@ def recorded_states(plant: Plant, recordings: Sequence[Recording]) -> list[Array
 
 
 def follows_plant(plant: Plant, recordings: Sequence[Recording]) -> bool:
-    """Whether recordings of all states are exact: what inputs cannot do is rounding.
-
-    So is what the first of them differs by from the `x0` of its trial.
-    """
+    """Whether all states are recorded and follow the plant and `x0` to rounding."""
     rank, states = int(np.linalg.matrix_rank(plant.B)), recorded_states(plant, recordings)
     if states is None or rank == plant.n:
         return False
@@ -483,7 +481,7 @@ T = TypeVar("T", bound=_Fitted)
 def with_or_without_set(
     problem: Problem, fit: Callable[[Problem], T], settled: Callable[[T], bool]
 ) -> T:
-    """The better fit of a `problem` that leaves open whether there is a terminal set."""
+    """Better fit of the variants with and without terminal set, if the problem leaves it open."""
     if problem.terminal_set is not None:
         return fit(problem)
     without = fit(replace(problem, terminal_set=False))
@@ -491,32 +489,32 @@ def with_or_without_set(
         return without
     try:
         within = fit(replace(problem, terminal_set=True))
-    except (InputError, SolverError, WeightsError):  # no controller with the set comes near
+    except (InputError, SolverError, WeightsError):  # no controller with the terminal set fits
         return without
     return within if within.misfit < without.misfit else without
 
 
 def noise_of_residual(problem: Problem, residual: Array) -> float:
-    """Root-mean-square of a residual (r,), at least what is no noise, by which priors count."""
+    """Root mean square of a residual (r,), bounded below by `_NO_NOISE`; scales priors."""
     least = _NO_NOISE * recorded_size(problem)
     return float(max(np.linalg.norm(residual), least) / np.sqrt(problem.recorded_numbers))
 
 
 def typical_output(problem: Problem) -> float:
-    """Root-mean-square of all recorded outputs over their scales: 1 at the default scales."""
+    """Root mean square of all recorded outputs over their scales; 1 at the default scales."""
     return recorded_size(problem) / float(np.sqrt(problem.recorded_numbers)) or 1.0
 
 
 def simulated(
     problem: Problem, gain: Array, metric: Array, weights: Weights | None = None
 ) -> list[Simulation]:
-    """Every recording under the controller of a `gain` (m, n) and a `metric` (m, m)."""
+    """Simulate every recording with a `gain` (m, n) and a `metric` (m, m)."""
     controller = controller_for(problem, gain, metric, weights=weights)
     return [simulate(controller, drive) for drive in scenarios(problem)]
 
 
 def misfit(problem: Problem, simulations: list[Simulation]) -> float:
-    """2-norm of all that was simulated minus what was recorded, each divided by its scale."""
+    """2-norm of (simulated - recorded) / scale over all trials."""
     parts = [
         missed(problem, trial, run)
         for run, trial in zip(simulations, problem.recordings, strict=True)

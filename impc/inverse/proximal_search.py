@@ -1,21 +1,20 @@
-"""Weights that fit, and are as well conditioned as the fit allows: (3.5), (3.7), (3.16) and (3.6).
+"""Weights that trade fit for conditioning: problems (3.5), (3.7), (3.16) and (3.6).
 
     minimise over (Q, R)   w_fit phi(r(K, S)) + w_cond kappa(blkdiag(Q, R)),
 
-where K and S are the gain and metric of (Q, R), r is any residual of them, and phi is the 2-norm or
-its square. The four equations differ in r alone.
+where K and S are the gain and metric of (Q, R), r is a residual and phi is the 2-norm or its
+square. The four problems differ in r only.
 
-kappa has a kink wherever an extreme eigenvalue is repeated, above all at its least value, Q = I,
-and the 2-norm has one at a perfect fit: both often meet at the answer. A method for smooth
-functions stalls there (docs/conditioned-fit.md has the measurements). So each step keeps both
-kinks and linearises only what is smooth. With X = blkdiag(Q, R) scaled to a least eigenvalue of 1,
-kappa = lambda_max(X) is convex, and the step solves the semidefinite program
+kappa is nonsmooth where an extreme eigenvalue is repeated, and the 2-norm at a perfect fit; both
+often coincide with the solution. Each step therefore keeps these terms and linearises the rest.
+With X = blkdiag(Q, R) scaled to a least eigenvalue of 1, kappa = lambda_max(X) is convex, and the
+step solves the semidefinite program
 
     minimise  w_fit phi(r + J dX) + w_cond alpha
     subject to  I <= X + dX <= alpha I,   ||L^-1 dX L^-T||_F <= radius,   X = L L',
 
-a prox-linear (Gauss-Newton) step in the coordinates of the current Cholesky factor, in which the
-trust region does not depend on the units of the states.
+a prox-linear (Gauss-Newton) step in the coordinates of the current Cholesky factor, so that the
+trust region does not depend on the units of the states (docs/why/theory.md).
 """
 
 from __future__ import annotations
@@ -41,31 +40,31 @@ if TYPE_CHECKING:
 
 
 _STATIONARY = 1e-5
-# In units of the current weights: a step of 1 can double one direction or make it singular.
+# In units of the current weights: a step of 1 can double a direction or make it singular.
 _LARGEST_RADIUS = 2.0
-# Below this, relative to the weights, rounding decides whether a step is better.
+# Smaller radii are below rounding.
 _LEAST_RADIUS = 1e-10
 
 
 @dataclass(frozen=True)
 class Residual(Frozen):
-    """A residual with its derivatives with respect to K and S."""
+    """Residual with its derivatives with respect to K and S."""
 
     values: Array  # (r,)
     dK: Array  # (r, m, n)
     dS: Array  # (r, m, m)
-    usable: bool  # Whether it could be computed; otherwise the step that led there is shortened
+    usable: bool  # Whether it could be computed; if not, the step is shortened
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What is minimised."""
+    """Objective of `conditioned_fit`."""
 
-    residual: Callable[[LqrSolution], Residual]  # `LqrSolution` -> `Residual`
-    fit_weight: float  # w_fit, and w_cond with the c of (3.5) in it
+    residual: Callable[[LqrSolution], Residual]  # residual of a regulator
+    fit_weight: float  # w_fit, then w_cond including the constant c of (3.5)
     condition_weight: float
-    # Whether phi is the squared norm. The norm itself does not trade fit for conditioning when
-    # w_cond is small enough (it is an exact penalty); its square always does.
+    # Whether phi is the squared norm. The norm is an exact penalty: for small w_cond it does not
+    # trade fit for conditioning; the square always does.
     squared: bool
 
 
@@ -74,15 +73,15 @@ class ConditionedFit:
     """Result of `conditioned_fit`."""
 
     weights: Weights  # Scaled to R[0, 0] = 1
-    solution: LqrSolution  # The regulator that they make
+    solution: LqrSolution  # Riccati solution of the weights
     misfit: float  # 2-norm of the residual
     condition: float  # kappa(blkdiag(Q, R))
-    objective: float  # What was minimised, at these weights
-    iterations: int  # Steps solved, and residuals computed
+    objective: float  # Objective at these weights
+    iterations: int  # Number of steps, then of residuals
     evaluations: int
-    # Decrease that the last step promised, relative to the objective and to the step's size
+    # Predicted decrease of the last step, relative to the objective and the step size
     stationarity: float
-    converged: bool  # Whether that is at most 1e-5
+    converged: bool  # Whether `stationarity` is at most 1e-5
 
 
 def conditioned_fit(
@@ -93,7 +92,7 @@ def conditioned_fit(
     max_iterations: int = 200,
     tolerance: float = 1e-11,
 ) -> ConditionedFit:
-    """Minimise the objective from the given weights."""
+    """Minimise the objective, starting at the given weights."""
     here = _first(plant, objective, start)
     radius, evaluations, iteration, stationarity = 0.5, 1, 0, np.inf
     while iteration < max_iterations:
@@ -128,7 +127,7 @@ def conditioned_fit(
 
 
 def _step(program: StepProgram, radius: float) -> tuple[Array, float, float]:
-    """`solve_step`, within a smaller radius where that fails, and the radius."""
+    """`solve_step`, with a smaller radius if the program fails; and that radius."""
     while True:
         try:
             return *solve_step(program, radius), radius
@@ -139,7 +138,7 @@ def _step(program: StepProgram, radius: float) -> tuple[Array, float, float]:
 
 
 def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> Array:
-    """Derivative of the residual along directions of blkdiag(Q, R): (r, k)."""
+    """Derivative of the residual along directions of blkdiag(Q, R), shape (r, k)."""
     n = solution.plant.n
     dQ, dR = basis[:, :n, :n], basis[:, n:, n:]
     gain = gain_gradients(solution)
@@ -149,7 +148,7 @@ def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> 
         metric = metric_gradients(solution)
         dS = np.tensordot(metric.Q, dQ, ((2, 3), (1, 2)))
         dS += np.tensordot(metric.R, dR, ((2, 3), (1, 2)))
-        # The controller scales S to a mean diagonal of 1.
+        # The controller scales S to trace m.
         scale = solution.plant.m / np.trace(solution.S)
         traces = np.trace(dS, axis1=0, axis2=1) / np.trace(solution.S)
         total += np.tensordot(residual.dS, scale * (dS - solution.S[..., None] * traces), 2)
@@ -179,13 +178,15 @@ def _first(plant: Plant, objective: Objective, start: Weights) -> _Point:
     here = _point(plant, objective, start)
     if not here.residual.usable:
         raise SolverError(
-            "start", "the closed loop cannot be simulated with these weights", "start elsewhere"
+            "start",
+            "the closed loop cannot be simulated with these weights",
+            "pass other starting weights",
         )
     return here
 
 
 def _next_radius(radius: float, ratio: float, step: Array) -> float:
-    """Of the trust region, after a step of which so much of the promise came true."""
+    """New trust-region radius for a ratio of actual to predicted decrease."""
     if ratio > 0.75:
         return min(2 * radius, _LARGEST_RADIUS)
     if ratio < 0.25:
@@ -194,13 +195,13 @@ def _next_radius(radius: float, ratio: float, step: Array) -> float:
 
 
 def _linearise(here: _Point, objective: Objective) -> StepProgram:
-    """The step program in the coordinates D of dX = L D L'."""
+    """Program of the step in coordinates D of dX = L D L'."""
     n = here.solution.plant.n
     X = here.weights.block
     L: Array = np.asarray(np.linalg.cholesky(X), dtype=np.float64)
     basis = block_basis(n, len(X) - n)
     J = weight_jacobian(here.solution, here.residual, L @ basis @ L.T)
-    # A tall residual enters through its triangular factor: same norm, few rows.
+    # A tall residual enters as its triangular factor: same norm, few rows.
     factor, triangle = np.linalg.qr(J) if len(J) > J.shape[1] else (np.eye(len(J)), J)
     shown = factor.T @ here.residual.values
     hidden = float(np.linalg.norm(here.residual.values - factor @ shown))
@@ -219,7 +220,7 @@ def _linearise(here: _Point, objective: Objective) -> StepProgram:
 
 
 def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Point | None:
-    """The point at the end of a step, or None when there is no regulator."""
+    """Point after a step; None if it has no Riccati solution."""
     n = plant.n
     X = here.weights.block
     L = np.linalg.cholesky(X)
@@ -233,12 +234,11 @@ def _try(plant: Plant, objective: Objective, here: _Point, step: Array) -> _Poin
         return None
 
 
-#: Weight of the condition number in (3.7), against 1 for a distance as large as the gain in
-#: `infer_weights`.
+#: Weight of the condition number in (3.7); a distance as large as the gain has weight 1.
 AUXILIARY_CONDITION_WEIGHT = 1e-3
-# Starting weights are kept this definite: the search takes the Cholesky factor of them.
+# Largest condition number of starting weights, which need a Cholesky factor.
 _LARGEST_START_CONDITION = 1e6
-# Steps of a search for weights near a gain, and the decrease of the objective that is worth one.
+# Limits of `weights_near`: steps, and relative decrease of the objective.
 _STEPS, _NEAR = 60, 1e-4
 
 
@@ -251,11 +251,11 @@ def auxiliary_weights(
     metric: Array | None = None,
     condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
 ) -> ConditionedFit:
-    """Auxiliary problem (3.7): weights whose regulator is near the gain, and well conditioned.
+    """Auxiliary problem (3.7): well-conditioned weights with a gain near `gain` (m, n).
 
-    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
+        minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
 
-    `gain` (m, n); `metric` (m, m).
+    With a `metric` (m, m), the distance to it is added.
     """
     m, size = plant.m, gain.size
     target = None if metric is None else m * metric / np.trace(metric)
@@ -280,11 +280,11 @@ def auxiliary_weights(
 def weights_near(
     plant: Plant, form: Array, gain: Array, start: Weights, condition_share: float
 ) -> ConditionedFit:
-    """Weights whose gain is nearest in a quadratic form, such as that of recordings about a fit.
+    """Weights with the nearest gain in a quadratic form, e.g. that of recordings near a fit.
 
-    minimise  1 + |form vec(K(Q, R) - gain)|^2 + condition_share kappa(blkdiag(Q, R))
+        minimise  1 + |form vec(K(Q, R) - gain)|^2 + condition_share kappa(blkdiag(Q, R))
 
-    `form` (r, columns); `gain` (m, n).
+    `form` (r, mn); `gain` (m, n).
     """
     dK = np.concatenate([form, np.zeros((1, gain.size))]).reshape(-1, *gain.shape)
     dS = np.zeros((len(dK), plant.m, plant.m))
@@ -298,7 +298,7 @@ def weights_near(
 
 
 def definite(weights: Weights) -> Weights:
-    """Lift the least eigenvalues of Q and R so that the condition number is at most 1e6."""
+    """Raise the least eigenvalues of Q and R to a condition number of at most 1e6."""
     if condition_number(weights) <= _LARGEST_START_CONDITION:
         return normalised(weights)
     floor = float(np.linalg.eigvalsh(weights.block)[-1]) / _LARGEST_START_CONDITION

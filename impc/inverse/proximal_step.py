@@ -1,14 +1,13 @@
-"""The semidefinite program of one prox-linear step (docs/conditioned-fit.md).
+"""Semidefinite program of one prox-linear step (docs/why/theory.md).
 
-In the coordinates d of dX = L D L', D = sum d_i basis_i, with an epigraph f of the norm,
+In the coordinates d of dX = L D L', D = sum d_i basis_i, with an epigraph variable f of the norm,
 
     minimise    w_fit f (or w_fit f^2) + w_cond kappa a
     subject to  ||(residual + jacobian d, rest)|| <= f,   ||d|| <= radius,
-                D + I - L^-1 L^-T >= 0                  (X + dX >= I, seen through L)
+                D + I - L^-1 L^-T >= 0                  (X + dX >= I, in coordinates of L)
                 a I - (X + L D L') / kappa >= 0         (X + dX <= kappa a I).
 
-Both matrix inequalities have entries of order one whatever kappa is, because each is written in
-the coordinates in which it is well scaled.
+Each matrix inequality is scaled so that its entries are of order one for every kappa.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepProgram(Frozen):
-    """Data of the program above."""
+    """Data of the step program."""
 
     # blkdiag(Q, R) (n + m, n + m), scaled to a least eigenvalue of 1, and its Cholesky factor
     X: Array
@@ -38,10 +37,10 @@ class StepProgram(Frozen):
     basis: Array  # (k, n + m, n + m), of `block_basis`
     jacobian: Array  # (r, k)
     residual: Array  # (r,)
-    rest: float  # Norm of the part of the residual that no step changes
+    rest: float  # Norm of the residual component that no step changes
     fit_weight: float  # w_fit and w_cond
     condition_weight: float
-    squared: bool  # Whether the fit counts by its square
+    squared: bool  # Whether the fit term is squared
 
 
 @lru_cache(maxsize=16)
@@ -60,7 +59,7 @@ def block_basis(n: int, m: int) -> Array:
 
 
 def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
-    """Solve for the step d (k,), at most `radius` long, and the objective that it predicts."""
+    """Step d (k,) of norm at most `radius`, and the objective predicted by the model."""
     count, kappa = len(program.basis), float(scipy.linalg.eigvalsh(program.X)[-1])
     cost_weight, effort = program.condition_weight * kappa, program.fit_weight
     scale = max(cost_weight, effort)
@@ -73,7 +72,7 @@ def solve_step(program: StepProgram, radius: float) -> tuple[Array, float]:
 
 
 def _predict(program: StepProgram, step: Array) -> float:
-    """The model's objective at the step, from the step itself and not from the solver's word."""
+    """Objective of the model, recomputed from the step."""
     inner = np.eye(len(program.X)) + np.tensordot(step, program.basis, 1)
     moved = program.L @ inner @ program.L.T
     eigenvalues = scipy.linalg.eigvalsh((moved + moved.T) / 2)

@@ -1,13 +1,12 @@
-"""The gains that weights of a structure have, with one input: the linear space that holds them.
+"""Linear space that contains the gains of all weights of a structure (one input).
 
-A state without a cost weight is not steered for its own sake. Where the command passes a delay, its
-states have no say in the gain: the controller predicts over them, and what it does about them
-follows from what it does about the rest. On the seat the gains of all weights over angles and
-rates make five dimensions of ten (docs/structures.md has the theorem).
+With a delayed command, states without a cost weight do not enter the gain independently: on the
+seat the gains of all weights over angles and rates span five of ten dimensions
+(docs/howto/weights.md).
 
-The space is computed: regulators at three sizes of the weights, in natural coordinates, and all
-their derivatives with respect to cost weights of products of features. With several inputs there is
-no theorem, and with two the singular values fell without a gap: all gains are searched then.
+The space is computed from regulators at three weight sizes, in whitened coordinates, and their
+derivatives with respect to the cost weights of products of features. With several inputs there is
+no such result, so that all gains are searched.
 """
 
 from __future__ import annotations
@@ -26,16 +25,15 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.structure import Structure
 
-# Sizes of the weights on natural states, of natural commands' one: gains from a third of a natural
-# one to eight on the seat.
+# Weights of whitened states relative to that of the command: seat gains from 1/3 to 8 units.
 _SIZES = (1e-2, 1.0, 1e2)
-# Of the largest singular value: a gain of a thousandth moves the command by a thousandth of the
-# noise that would drive the loop. On the seat the fifth is .07 of the largest, the sixth .0002.
+# Singular values below this share are dropped: such a gain moves the command by a thousandth of one
+# whitened unit. On the seat the fifth is 0.07 of the largest, the sixth 0.0002.
 _BESIDE = 1e-3
 
 
 def kept_to(problem: Problem) -> Structure | None:
-    """The structure that the gain of a person keeps to, where the problem's own says anything."""
+    """Structure that restricts the gain of output-feedback MPC; None if unrestricted."""
     structure = problem.structure
     if structure is None or len(problem.logarithms) or problem.plant.m > 1:
         return None
@@ -43,19 +41,14 @@ def kept_to(problem: Problem) -> Structure | None:
 
 
 def regulators_alone(plant: Plant, structure: Structure, T: Array) -> Array:
-    """Basis (k, 1, n) of the gains that weights over a structure's features have.
-
-    Orthonormal in natural coordinates.
-
-    `T` (n, n).
-    """
+    """Basis (k, 1, n) of the gains of a structure, orthonormal in coordinates `T` (n, n)."""
     _, values, rows = np.linalg.svd(_regulators(plant, structure, T), full_matrices=False)
     kept = rows[values > _BESIDE * values[0]]
     return np.asarray((kept @ np.linalg.inv(T))[:, None, :])
 
 
 def _regulators(plant: Plant, structure: Structure, T: Array) -> Array:
-    """Gains of regulators and their changes with cost weights, in natural coordinates (k, n)."""
+    """Gains and their derivatives by cost weights, in whitened coordinates (k, n)."""
     _, values, rows = np.linalg.svd(structure.features @ T, full_matrices=False)
     features = rows[values > RANK * values[0]] @ np.linalg.inv(T)
     first, second = np.tril_indices(len(features))

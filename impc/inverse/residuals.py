@@ -1,8 +1,8 @@
-"""The residual of an inverse problem at a gain and a metric, with its exact derivatives.
+"""Residual of an inverse problem and its exact derivatives.
 
-One pass over each recording gives both (docs/theory.md, section 4). The columns follow what the
-problem does not know: gain, metric for several inputs, initial states, physical parameters. A
-`Correction` makes it the residual of a prediction, at which searches begin.
+One pass over each recording gives both (docs/why/theory.md). Columns: gain, metric (with several
+inputs), initial states and offsets of each trial, physical parameters. With a
+`Correction` the residual is that of one-step-ahead predictions.
 """
 
 from __future__ import annotations
@@ -52,33 +52,32 @@ if TYPE_CHECKING:
 
     OwnResidual = Callable[[Array, Array], tuple[Array, Array]]
 
-# What a sample that a trial controller does not reach counts for, in root-mean-square outputs.
+# Residual assigned to each sample after an infeasible one, relative to the RMS output.
 _NOT_REACHED = 1e3
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residual at one gain and metric."""
+    """Residual and derivatives at one gain and metric."""
 
     residual: Array  # (r,), simulated minus recorded outputs, each divided by its scale
     dK: Array  # (r, m, n)
     dS: Array  # (r, m, m), with respect to the metric scaled as in `Controller`
-    # (r, own), with respect to what is unknown of the trial that the row belongs to: its initial
-    # state, then offsets of outputs
+    # (r, own), with respect to initial state and offsets of the trial to which the row belongs
     own: Array
-    # (r, k), with respect to the logarithms of the parameters of the family; k may be 0
+    # (r, k), with respect to the logarithms of the physical parameters; k may be 0
     dparameters: Array
-    reason: str  # Why some samples were not reached; empty when all were
+    reason: str  # Why a simulation stopped; empty if all trials are complete
     active: int  # Samples with an active bound
     weakly_active: int  # Samples at which the derivative is one-sided
-    terminal: TerminalSet | None  # The terminal set, as a hint for the next evaluation nearby
+    terminal: TerminalSet | None  # Terminal set, reused as a starting point by the next evaluation
 
     def along_gain(self, T: Array, G: Array) -> Array:
-        """Derivative (r, mn) along G^-1 K T, of natural coordinates T (n, n) and G (m, m)."""
+        """Derivative (r, mn) with respect to G^-1 K T (whitened coordinates T (n, n), G (m, m))."""
         return np.asarray(self.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T))
 
     def along_metric(self, metric: Array, changes: Array) -> Array:
-        """Derivative (r, k) along `changes` (k, m, m) of the `metric` (m, m) in its own scale."""
+        """Derivative (r, k) along `changes` (k, m, m) of the unscaled `metric` (m, m)."""
         scaled = scaled_changes(metric, changes).reshape(len(changes), metric.size)
         return np.asarray(self.dS.reshape(len(self.residual), -1) @ scaled.T)
 
@@ -92,9 +91,9 @@ def evaluate(
 ) -> Evaluation:
     """Residual and exact derivatives at a `gain` (m, n) and a `metric` (m, m).
 
-    `near` as in `controller_for`. A gain that does not stabilise the plant, or a loop that
-    diverges, gives a large finite residual and its reason, so that a search can step back. With a
-    `correction` every gain can be evaluated, and no parameters may be searched.
+    A gain that does not stabilise the plant, or a loop that diverges, gives a large finite residual
+    and a reason, so that a search can reject the step. With a `correction` every gain can be
+    evaluated, but parameters cannot be searched. `near` as in `controller_for`.
     """
     require_riccati(problem)
     plant = problem.plant
@@ -138,10 +137,9 @@ def evaluate(
 
 
 def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evaluation:
-    """The same with a row below for each stated uncertainty, in units of the `noise`.
+    """Append one row per parameter with a stated uncertainty, scaled by the noise SD `noise`.
 
-    So a parameter that is q off its nominal value counts q / deviation, as a residual of that many
-    deviations of the noise does. Covariances see the prior as rows that have been recorded.
+    A parameter q away from its nominal value counts as a residual of q / SD noise SDs.
     """
     k = int(np.count_nonzero(problem.stated))
     if k == 0:
@@ -155,7 +153,7 @@ def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evalua
 
 
 def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
-    """Residual of the only trial of a problem as a function of its initial state and offsets."""
+    """Residual of a one-trial problem as a function of its initial state and offsets."""
     controller = controller_for(problem, gain, metric)
     layout = _layout(replace(problem, family=None, logarithms=frozen([])))
     along = _all_directions(problem, controller, layout, None)
@@ -173,11 +171,7 @@ def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
 
 
 def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
-    """2-norm of the residual and an empty string, or infinity and why there is none.
-
-    At a `gain` (m, n) and a `metric` (m, m). A fifth of the time of `evaluate`, which also
-    differentiates.
-    """
+    """2-norm of the residual and "", or infinity and the reason; faster than `evaluate`."""
     residual, reason = residual_or_reason(problem, gain, metric)
     return np.inf if reason else float(np.linalg.norm(residual)), reason
 
@@ -185,7 +179,7 @@ def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[floa
 def residual_or_reason(
     problem: Problem, gain: Array, metric: Array, correction: Correction | None = None
 ) -> tuple[Array, str]:
-    """`residual_only` (r,) and an empty string, or nothing (0,) and why there is none."""
+    """Residual (r,) without derivatives and "", or an empty array and the reason."""
     refused = _refused(problem, gain, correction)
     if refused:
         return np.zeros(0), refused
@@ -205,7 +199,7 @@ def residual_or_reason(
 
 
 def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
-    """Residual without derivatives, for differences and comparisons."""
+    """Residual without derivatives; raises if the loop cannot be simulated."""
     controller, seen = controller_for(problem, gain, metric), _Seen.of(problem, None)
     return np.concatenate(
         [
@@ -216,10 +210,10 @@ def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
 
 
 def _refused(problem: Problem, gain: Array, correction: Correction | None) -> str:
-    """Why a gain is not simulated, or nothing.
+    """Reason not to simulate a gain, or an empty string.
 
-    Past the edge of stability lie local minima that a bounded input and a recording that ends hide;
-    no weights have such a gain. A plain gain is left free: it goes there and comes back.
+    With bounds, unstable gains have spurious local minima: saturation and the end of the recording
+    hide the divergence. Without bounds a search may pass through unstable gains.
     """
     plant = problem.plant
     bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
@@ -230,7 +224,7 @@ def _refused(problem: Problem, gain: Array, correction: Correction | None) -> st
 
 @dataclass(frozen=True)
 class _Seen:
-    """How the recordings of a problem are simulated, and compared with a simulation."""
+    """How the recordings of a problem are simulated and compared with the simulation."""
 
     moves: tuple[Array, Array, Array] | None
     drives: list[Scenario]
@@ -245,7 +239,7 @@ class _Seen:
         )
 
     def off(self, problem: Problem, trial: Recording, run: Simulation) -> Array:
-        """Simulated minus recorded over the scales (samples, q), zero where one is missing."""
+        """(Simulated - recorded) / scale, shape (samples, q); zero for missing values."""
         if self.moves is None:
             return missed(problem, trial, run)
         found = np.nan_to_num(modelled(problem, trial, run) - recorded(problem, trial))
@@ -255,7 +249,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Which directions stand where: gain, metric, what is a trial's own, parameters."""
+    """Column ranges of the derivative: gain, metric, unknowns of one trial, parameters."""
 
     gain: slice
     metric: slice
@@ -328,7 +322,7 @@ def _slope(
     layout: _Layout,
     differential: PlantDifferential | None,
 ) -> Array:
-    """Derivative of `_Seen.off` (samples q, count), with the outputs' rows and offsets."""
+    """Derivative of `_Seen.off` (samples q, count), including parameters in C."""
     p = len(problem.plant.outputs)
     slope = measured_slope(problem, trial, moved, layout.own.start, seen.weighting)
     if differential is not None:
@@ -345,10 +339,9 @@ def measured_slope(
     own: int | None = None,
     weighting: Array | None = None,
 ) -> Array:
-    """Outputs and commands over their scales, as a simulation moves them (samples, q, k).
+    """Derivative of scaled outputs and commands (samples, q, k); zero for missing values.
 
-    Zero where something is missing; offsets, if there are columns of a trial's `own`, behind its
-    states.
+    Offset columns follow the initial states, starting at column `own`.
     """
     outputs, W = problem.plant.outputs, weighting
     W, p = np.diag(1 / problem.output_scale) if W is None else W, len(outputs)
@@ -372,10 +365,10 @@ def residual_along(problem: Problem, controller: Controller, along: Directions) 
 
 
 def _symmetric(columns: Array, m: int) -> Array:
-    """Derivatives along symmetric directions as (r, m, m)."""
+    """Derivatives along symmetric directions, expanded to (r, m, m)."""
     dS = np.zeros((len(columns), m, m))
     if m > 1:
-        # Off-diagonal directions move two entries at once; half the derivative goes to each.
+        # An off-diagonal direction moves two entries: each gets half of the derivative.
         rows, places = np.tril_indices(m)
         dS[:, rows, places] = columns * np.where(rows == places, 1.0, 0.5)
         dS[:, places, rows] = dS[:, rows, places]
@@ -383,7 +376,7 @@ def _symmetric(columns: Array, m: int) -> Array:
 
 
 def _difference(problem: Problem, seen: _Seen, trial: Recording, run: Simulation) -> Array:
-    """Simulated minus recorded outputs over their scales (samples, p), large where not reached."""
+    """Scaled residual (samples, q), set to a large value after the last feasible sample."""
     difference = seen.off(problem, trial, run)
     if not run.complete:
         difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
@@ -395,7 +388,7 @@ def _scale(problem: Problem, trial: Recording) -> float:
 
 
 def unusable(problem: Problem, reason: str) -> Evaluation:
-    """A large finite residual with its reason, for a search to step back from."""
+    """Evaluation with a large finite residual and a reason, so that a search rejects the step."""
     m, n = problem.plant.m, problem.plant.n
     residual = np.concatenate(
         [
@@ -418,10 +411,7 @@ def unusable(problem: Problem, reason: str) -> Evaluation:
 
 
 def scaled_changes(metric: Array, changes: Array) -> Array:
-    """`changes` (k, m, m) of a metric (m, m) as those of one with a mean diagonal of 1 (k, m, m).
-
-    That is how the controller scales it before it is differentiated (`Evaluation.dS`).
-    """
+    """Map `changes` (k, m, m) of a metric (m, m) to those of the metric scaled to trace m."""
     trace = np.trace(metric)
     shares = np.trace(changes, axis1=1, axis2=2)[:, None, None] / trace
     return np.asarray(len(metric) / trace * (changes - shares * metric))
@@ -435,5 +425,5 @@ def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
 
 
 def keeps_hard(problem: Problem, weights: Weights) -> bool:
-    """Whether the controller of some weights keeps what the search had softened."""
+    """Whether all trials stay feasible with hard state bounds and terminal set."""
     return all(run.complete for run in verify_hard(problem, weights))

@@ -1,11 +1,8 @@
-"""Linear programs over matrix inequalities (Boyd and Vandenberghe 2004, section 4.6).
-
-They are handed to Clarabel as they are.
+"""Linear programs with matrix inequalities (Boyd and Vandenberghe 2004, section 4.6).
 
     minimise  c'y  subject to  every  b_i - A_i y  in its cone
 
-cvxpy would read better, but needs 4 to 9 ms to write down what Clarabel solves in 0.2 ms for two
-states, and 0.8 s to be imported.
+Passed to Clarabel directly: cvxpy needs 4 to 9 ms to build what Clarabel solves in 0.2 ms.
 """
 
 from __future__ import annotations
@@ -27,30 +24,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cone:
-    """right - rows @ y lies in a cone of Clarabel's."""
+    """Constraint: right - rows @ y lies in a Clarabel cone."""
 
     rows: Array  # (r, k)
     right: Array  # (r,)
-    kind: Any  # Clarabel's object for the cone
+    kind: Any  # Clarabel cone object
 
 
 @dataclass(frozen=True)
 class SemidefiniteSolution:
-    """What Clarabel returned."""
+    """Solution returned by Clarabel."""
 
     y: Array  # The variables (k,), finite
-    # Clarabel's word. It may say that a point good to 1e-12 is almost solved: judge by the
-    # residuals of what is built from ``y``.
+    # Status of Clarabel. It can be "almost solved" for a point good to 1e-12: rely on residuals of
+    # what is built from ``y``.
     status: str
-    prove: Callable[[], float]  # Computes `bound`, which takes a fifth of the time of the program
+    prove: Callable[[], float]  # computes `bound` on request, at a fifth of the solution time
 
     @cached_property
     def bound(self) -> float:
-        """What no feasible point is below.
+        """Lower bound of the objective over all feasible points.
 
-        With `reach`, proved: no feasible point within it is lower, the solver's residuals and
-        rounding counted. Without, the dual objective as it is: wrong by as much as residuals times
-        variables, which was 1e-3 of the value where variables were 2e4 and residuals 1e-8.
+        With `reach` it is proved for feasible points within it, including solver residuals and
+        rounding. Otherwise it is the dual objective of the solver, wrong by about residuals times
+        variables.
         """
         return self.prove()
 
@@ -64,7 +61,7 @@ def matrix_inequality(constant: Array, basis: Array) -> Cone:
 def norm_bound(
     vectors: Array, bound: Array, *, offset: Array | None = None, constant: float = 0.0
 ) -> Cone:
-    """||offset + sum y_i vectors_i|| <= constant + bound @ y."""
+    """Constraint ||offset + sum y_i vectors_i|| <= constant + bound @ y."""
     rows = -np.vstack([bound, vectors.T])
     right = np.concatenate([[constant], np.zeros(len(rows) - 1) if offset is None else offset])
     return Cone(rows, right, clarabel.SecondOrderConeT(len(rows)))
@@ -95,14 +92,13 @@ def solve_each(
     scaled: bool = False,
     tolerance: float = 1e-11,
 ) -> list[SemidefiniteSolution]:
-    """Minimise each of some objectives over the same cones, written down once."""
+    """Minimise several objectives over the same cones, built once."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    # Without Clarabel's own scaling and without refining each linear system a program takes half of
-    # the time on the seat. Over 200 random plants ends at 1e-10 lay about as near to their proved
-    # bounds as with both, at a tenth of what 1e-8 had left; of 14 ends on the seat the worst is
-    # 2e-5 of itself from the best found.
+    # Clarabel's own scaling and iterative refinement double the time on the seat and improve
+    # little: without them solutions come as close to their proved bounds (200 random plants,
+    # tolerance 1e-10).
     own_scaling = reach is None and not scaled
     settings.equilibrate_enable = settings.iterative_refinement_enable = own_scaling
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
@@ -126,7 +122,11 @@ def _solution(
 ) -> SemidefiniteSolution:
     y = np.asarray(found.x, dtype=np.float64)
     if not np.all(np.isfinite(y)):
-        raise SolverError("semidefinite program", f"Clarabel: {found.status}", "scale the states")
+        raise SolverError(
+            "semidefinite program",
+            f"Clarabel stopped: {found.status}",
+            "rescale the states (use other units)",
+        )
 
     def prove() -> float:
         if reach is None:
@@ -145,20 +145,21 @@ def _solved(quadratic: Any, objectives: Array, *program: Any) -> list[Any]:
             ended.append(solver.solve())
         return ended
     except BaseException as error:
-        # Of Rust: no Exception, and of a class that cannot be imported. Two fits of 1176 met it, at
-        # eigenvalues that LAPACK did not find.
+        # A Rust panic is no Exception and its class cannot be imported (2 of 1176 fits).
         if type(error).__name__ != "PanicException":
             raise
         reason = f"Clarabel: {error}"
-        raise SolverError("semidefinite program", reason, "scale the states") from None
+        raise SolverError(
+            "semidefinite program", reason, "rescale the states (use other units)"
+        ) from None
 
 
 def _proved_bound(objective: Array, cones: list[Cone], dual: Array, reach: Array) -> float:
-    """A lower bound of c'y over |y_i| <= reach_i in the cones, from any dual point.
+    """Lower bound of c'y over |y_i| <= reach_i in the cones, from any dual point.
 
     With z in the dual cones and r = c + A'z,  c'y = r'y - b'z + z'(b - Ay) >= -b'z - |r|'reach.
-    z is projected into the cones; then r, which the solver leaves at 1e-8, is taken away by
-    Z -> Z + ZWZ, which keeps Z >= 0 while it is small. Each such bound holds; the best is returned.
+    z is projected into the cones; then r (1e-8 at the solver's solution) is reduced by
+    Z -> Z + ZWZ, which keeps Z >= 0 while it is small. The best of these valid bounds is returned.
     """
     if not np.all(np.isfinite(dual)):
         return -np.inf
@@ -173,7 +174,7 @@ def _proved_bound(objective: Array, cones: list[Cone], dual: Array, reach: Array
         ]
         dual = np.concatenate(parts)
         left = objective + rows.T @ dual
-        # Sums of this many terms, and eigenvalues of the projection that rounding makes negative.
+        # Rounding: sums of this many terms, and negative eigenvalues of the projection.
         rounding = 4 * len(dual) * np.finfo(float).eps * float(np.linalg.norm(dual)) * size
         bound = max(bound, float(-right @ dual - np.abs(left) @ reach) - rounding)
         if last:
@@ -186,7 +187,7 @@ def _proved_bound(objective: Array, cones: list[Cone], dual: Array, reach: Array
 
 
 def _projected(part: Array, cone: Cone) -> Array:
-    """The nearest point of the cone, which is its own dual."""
+    """Nearest point of the (self-dual) cone."""
     if not _is_matrix(cone):
         length = float(np.linalg.norm(part[1:]))
         head = max(float(part[0]), 0.0)
@@ -196,7 +197,7 @@ def _projected(part: Array, cone: Cone) -> Array:
 
 
 def _sandwiched(part: Array, cone: Cone) -> Array:
-    """Z A_i Z of each column of a matrix cone, as columns; zero in the others, which stay."""
+    """Z A_i Z for each column of a matrix cone, as columns; zero for other cones."""
     if not _is_matrix(cone):
         return np.zeros_like(cone.rows)
     Z = _matrices(part[None])[0]
@@ -208,7 +209,7 @@ def _is_matrix(cone: Cone) -> bool:
 
 
 def _matrices(triangles: Array) -> Array:
-    """Inverse of `_triangle`: symmetric matrices (k, d, d) of rows (k, d(d+1)/2)."""
+    """Symmetric matrices (k, d, d) of rows (k, d(d+1)/2); inverse of `_triangle`."""
     d = int(np.sqrt(2 * triangles.shape[1]))
     rows, columns = np.tril_indices(d)
     stack = np.zeros((len(triangles), d, d))
@@ -218,6 +219,6 @@ def _matrices(triangles: Array) -> Array:
 
 
 def _triangle(stack: Array) -> Array:
-    """Upper triangles by columns, off-diagonals times sqrt(2): Clarabel's order."""
+    """Upper triangles by columns, off-diagonals times sqrt(2), as Clarabel orders them."""
     rows, columns = np.tril_indices(stack.shape[-1])
     return np.asarray(np.where(rows == columns, 1.0, np.sqrt(2.0)) * stack[:, columns, rows])

@@ -1,14 +1,11 @@
-"""Weights of a structure behind recordings: from any gain that fits to the weights that fit best.
+"""Fit the cost weights of a structure, starting near a gain that fits.
 
-    a gain near the recordings  ->  cost weights whose gain comes nearest, from many starts ->
-    searches
+    fitted gain  ->  cost weights with the nearest gain, from many starts  ->  searches
 
-The misfit of trajectories has local minima in the cost weights. Near a gain that fits it is all but
-a quadratic form of the gain, known from one simulation: |J (K(z) - K)|^2, J the derivative of the
-residual with respect to the gain, without what initial states and parameters can make up for. The
-regulators of this small problem take a millisecond, so it is solved from cost weights by Bryson's
-rule at many cost weights of the command; from the few ends that differ the recordings themselves
-are searched (docs/structures.md).
+The misfit of trajectories has local minima in the cost weights. Near a gain that fits it is almost
+the quadratic form |J (K(z) - K)|^2, J the derivative of the residual with respect to the gain after
+projection on initial states and parameters. This form is minimised from starts by Bryson's rule
+over a range of command weights; the distinct solutions start searches on the recordings.
 """
 
 from __future__ import annotations
@@ -38,23 +35,23 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.structure import Structure
 
-# Decades of the cost weight of the command, as in `bryson_weights`.
+# Natural logarithms of the command weight relative to Bryson's rule: -6 to 6 decades.
 _EFFORTS = np.log(10.0) * np.arange(-6, 7, 2)
-# Logarithm of a cost weight: a factor of 150 about Bryson's, where the nearest gain leaves it free.
+# Prior SD of a log cost weight about Bryson's (factor 150), if the nearest gain leaves it free.
 _SPREAD = 5.0
 _ATTEMPTS = 3
-# Two searches that end at the same misfit, to a third of chi-squared's unit on 18000 samples.
+# Relative difference of two misfits that count as equal: 1/3 chi-squared unit at 18000 samples.
 _AGREE = 1e-5
-# Logarithm of a parameter for which a free gain has made up: there it has no slope to return on.
+# A log parameter beyond this has compensated for the free gain; the search restarts at its nominal.
 _RUNAWAY = 3.0
-# Ends whose gains differ by less, in deviations of the recordings, are one.
+# Gains closer than this, in noise SDs of the recordings, count as equal.
 _ALIKE = 0.5
 
 
 def fit_structure(
     problem: Problem, structure: Structure, gain: Array, metric: Array, *starts: Array
 ) -> StructuredEnd:
-    """Fit the unknowns of a structure; `gain` (m, n); `metric` (m, m); `*starts` (count,)."""
+    """Fit a structure near a `gain` (m, n), `metric` (m, m), and from `*starts` (count,)."""
     target = _Target(problem, structure, gain, metric)
     ladder = bryson_cost_weights(problem, structure, gain, metric)
     ends = _distinct([target.nearest(cost_weights) for cost_weights in ladder])
@@ -73,23 +70,21 @@ def fit_structure(
     if best is None:
         raise SolverError(
             f"structure {structure.name}",
-            "none of its regulators can be simulated on the recordings",
-            "cost weight other features",
+            "no controller of this structure can be simulated on the recordings",
+            "penalise other features",
         )
     return dataclasses.replace(best, evaluations=spent)
 
 
 def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Estimate:
-    """Fit a structure from an estimate that fits, with its initial states and parameters."""
+    """Fit a structure, starting from an estimate with its initial states and parameters."""
     own = (np.array(getattr(near.problem, name)) for name in ("starts", "logarithms", "shifts"))
     posed = problem.at(*own)
     end = fit_structure(posed, structure, np.array(near.gain), np.array(near.metric))
     given = np.array(problem.logarithms)
     if np.any(np.abs(near.problem.logarithms - given) > _RUNAWAY):
         there = problem.at(np.array(end.problem.starts), given, np.array(end.problem.shifts))
-        with contextlib.suppress(
-            WeightsError
-        ):  # a cost weight of zero may leave no regulator there
+        with contextlib.suppress(WeightsError):  # a zero cost weight may have no Riccati solution
             again = search_from(there, structure, end.cost_weights)
             spent = end.evaluations + again.evaluations
             best = min(end, again, key=lambda one: one.misfit)
@@ -98,9 +93,9 @@ def fit_structured(problem: Problem, structure: Structure, near: Estimate) -> Es
 
 
 def feature_sizes(problem: Problem, structure: Structure, gain: Array, metric: Array) -> Array:
-    """Root-mean-square of each feature (k,), in its unit; of one that never moves the least other.
+    """RMS of each feature (k,), in its unit, under a `gain` (m, n) and `metric` (m, m).
 
-    Under the controller of a `gain` (m, n) and a `metric` (m, m).
+    A feature that never moves gets the least of the others.
     """
     runs = simulated(problem, gain, metric)
     x = np.concatenate([run.x[: run.reached + 1] for run in runs])
@@ -111,7 +106,7 @@ def feature_sizes(problem: Problem, structure: Structure, gain: Array, metric: A
 def bryson_cost_weights(
     problem: Problem, structure: Structure, gain: Array, metric: Array
 ) -> list[Array]:
-    """Unknowns (count,) by which every feature costs a multiple of the command, at its size."""
+    """Unknowns (count,) at which every feature costs a multiple of the command, at its RMS."""
     sizes = feature_sizes(problem, structure, gain, metric)
     runs = simulated(problem, gain, metric)
     u = np.concatenate([run.u[: max(run.reached, 1)] for run in runs])
@@ -134,7 +129,7 @@ class _Nearest:
 
 
 class _Target:
-    """The quadratic form of gain and metric that the recordings are near a fit."""
+    """Quadratic approximation of the misfit as a function of the gain, near a fit."""
 
     def __init__(self, problem: Problem, structure: Structure, gain: Array, metric: Array) -> None:
         self.problem, self.structure = problem, structure
@@ -143,17 +138,17 @@ class _Target:
         seen = self.space.without_nuisance(start)
         samples = problem.recorded_numbers
         self.noise = float(np.linalg.norm(self.space.at(start).residual)) / np.sqrt(samples)
-        # Of the gain alone: the metric shows only where commands are at their limits.
+        # Only the gain: the metric has an effect only while bounds are active.
         count = len(self.space.gains)
         here = self.space.natural(self.space.changes(self.space.unpack(start), start)[0][:count])
         self.form = np.linalg.qr(seen[:, :count], mode="r") @ here.reshape(count, -1)
         self.gain = self.space.natural(gain)
 
     def nearest(self, cost_weights: Array) -> tuple[_Nearest, Array] | None:
-        """The weights whose gain comes nearest, from a start; None where there is no regulator."""
+        """Weights with the nearest gain, from a start; None if no Riccati solution exists."""
         weight = max(self.noise, 1e-9) / _SPREAD
 
-        @functools.lru_cache(maxsize=1)  # the search asks for residual and derivative one by one
+        @functools.lru_cache(maxsize=1)  # scipy asks for residual and derivative separately
         def regulated(step: tuple[float, ...]) -> tuple[Array, Array]:
             z = cost_weights + np.array(step)
             solution = solve_lqr(self.problem.plant, self.structure.weights(z))
@@ -185,7 +180,7 @@ class _Target:
 def _distinct(
     found: Sequence[tuple[_Nearest, Array] | None],
 ) -> list[tuple[_Nearest, Array]]:
-    """Those with different gains, the nearest first."""
+    """Solutions with different gains, nearest first."""
     kept: list[tuple[_Nearest, Array]] = []
     for item in sorted((one for one in found if one is not None), key=lambda one: one[0].distance):
         if all(np.linalg.norm(item[0].gain - other.gain) > _ALIKE for other, _ in kept):
@@ -194,7 +189,7 @@ def _distinct(
 
 
 def _ranked(problem: Problem, structure: Structure, starts: Sequence[Array]) -> list[Array]:
-    """Those that can be simulated, the least misfit first."""
+    """Starts that can be simulated, least misfit first."""
     usable = []
     for cost_weights in starts:
         try:
@@ -209,7 +204,7 @@ def _ranked(problem: Problem, structure: Structure, starts: Sequence[Array]) -> 
 
 
 def structured_estimate(problem: Problem, structure: Structure, end: StructuredEnd) -> Estimate:
-    """The end of a search as the estimate of the method "structured"."""
+    """Estimate of the method "structured" from the end of a search."""
     return simulated_estimate(
         "structured",
         replace(end.problem, structure=structure),

@@ -1,16 +1,14 @@
-"""The search for the unknowns of a structure: cost weights, initial states, physical parameters.
+"""Search over the unknowns of a structure: cost weights, initial states, parameters.
 
     minimise |Y_sim(z) - Y|^2 over z = (unknowns of the structure | x0 of each trial | parameters)
 
 by trust-region least squares with exact derivatives: unknowns -> (Q, R) -> Riccati -> (K, S) ->
-residual. A change of a parameter moves the gain too, because the weights stay. The unknowns are
-logarithms, so a cost weight that the recordings want to be zero slides down without end. Such a
-cost weight is set to zero and the search goes on without it; the answer stands when the misfit is
-no larger.
+residual. Unknowns are logarithms, so a cost weight whose optimum is zero would diverge: it is set
+to zero if the misfit does not grow.
 
-Noise leaves combinations of unknowns all but free. They keep a weak prior while the search looks
-for its basin; at its end what the recordings identify to a factor of e^3 is fitted without
-(docs/structures.md).
+With noise, some combinations of unknowns are almost free. A weak prior holds them during the
+search; at its end combinations known to within a factor of e^3 are refitted without it
+(docs/howto/weights.md).
 """
 
 from __future__ import annotations
@@ -38,33 +36,30 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Evaluation
     from impc.model.structure import Structure
 
-# Logarithm of a cost weight: a factor of 150 about the start, while the basin is looked for.
+# Prior SD of a log cost weight during the search: a factor of 150 about the start.
 _SPREAD = 5.0
-# A combination with a larger deviation keeps that prior to the end.
+# Combinations with a larger standard error keep that prior to the end.
 _FREE = 3.0
 _ROUNDS = 8
-# Misfits that differ by less, of themselves, are the same.
+# Relative difference below which two misfits count as equal.
 _NOISY_TOLERANCE = 1e-6
-# Least share of the misfit of exact recordings, up to which they are explained (`gain_search`).
+# Relative misfit of exact recordings (`gain_search`).
 _EXACT = 1e-9
-# A cost weight whose logarithm has a deviation beyond this is tried at zero.
+# A log cost weight with a larger standard error is tried at zero.
 _NEARLY_ZERO = 2.0
 _EVALUATIONS = 60
 _MOST = 120
-# Nats at which a search ends, and of rounding, of the recorded outputs.
+# Nats at which a search ends; rounding relative to the recorded outputs.
 _FINE, _ROUNDING = 1e-3, 1e-13
 _ENDLESS = 1e6
-# Of chi-squared's units: a misfit that falls by less when the prior is begun anew was not held.
+# Least decrease of chi-squared that continues the removal of the prior.
 _PULL = 0.1
 
 
 def regulator_slopes(
     problem: Problem, structure: Structure, z: Array, solution: LqrSolution
 ) -> tuple[Array, Array]:
-    """Change of K (q, m, n) and S (q, m, m) with the unknowns (count,), then with the parameters.
-
-    `z` (count,).
-    """
+    """Derivatives of K (q, m, n) and S (q, m, m) by unknowns `z` (count,) and parameters."""
     plant = problem.plant
     dQ, dR = structure.changes(z)
     moved = len(problem.logarithms)
@@ -79,7 +74,7 @@ def regulator_slopes(
 
 
 class WeightCoordinates(Coordinates):
-    """The unknowns of a structure in the place of gain and metric; z is the way from the start."""
+    """Coordinates with the unknowns of a structure instead of gain and metric."""
 
     def __init__(self, problem: Problem, structure: Structure, cost_weights: Array) -> None:
         first = solve_lqr(problem.plant, structure.weights(cost_weights))
@@ -93,7 +88,7 @@ class WeightCoordinates(Coordinates):
         self.solved: tuple[bytes, LqrSolution] = (self.start.tobytes(), first)
 
     def placed(self, there: Problem) -> Array:
-        """z (q,) of the weights of the start and the initial states and parameters of a problem."""
+        """z (q,) of the starting weights at the initial states and parameters of `there`."""
         z = self.start.copy()
         first, last = int(self.ends[1]), int(self.ends[2])
         if last > first:
@@ -103,13 +98,13 @@ class WeightCoordinates(Coordinates):
         return z
 
     def unknowns(self, z: Array) -> Array:
-        """Unknowns of the structure at z (q,): (count,)."""
+        """Unknowns of the structure (count,) at z (q,)."""
         found = self.cost_weights.copy()
         found[self.moving] += z[: self.ends[0]]
         return found
 
     def unpack(self, z: Array) -> Point:
-        """The values at z (q,)."""
+        """Gain, metric and problem at z (q,)."""
         _, _, starts, parameters = np.split(z, self.ends[:-1])
         problem = self.problem_at(starts, parameters)
         if self.solved[0] != z.tobytes():
@@ -119,7 +114,7 @@ class WeightCoordinates(Coordinates):
         return Point(np.array(found.K), np.array(found.S), problem)
 
     def evaluated(self, z: Array, known: Evaluation | None = None) -> tuple[Evaluation, Compressed]:
-        """Residual and derivative at z (q,), a large residual where there is no regulator."""
+        """Residual and derivative at z (q,); a large residual without a Riccati solution."""
         try:
             return super().evaluated(z, known)
         except WeightsError as error:
@@ -130,7 +125,7 @@ class WeightCoordinates(Coordinates):
             return self.last[1:]
 
     def residual(self, z: Array) -> Array | None:
-        """Residual (r,) at z (q,); None where there is none, nor a regulator."""
+        """Residual (r,) at z (q,); None if infeasible or without a Riccati solution."""
         try:
             return super().residual(z)
         except WeightsError as error:
@@ -138,7 +133,7 @@ class WeightCoordinates(Coordinates):
             return None
 
     def changes(self, here: Point, z: Array) -> tuple[Array, Array]:
-        """Change of K (q, m, n), and of S scaled to trace m (q, m, m), with each of z (q,)."""
+        """Derivatives of K (q, m, n) and of S scaled to trace m (q, m, m) by z (q,)."""
         slopes = regulator_slopes(here.problem, self.structure, self.unknowns(z), self.solved[1])
         count = self.structure.count
         dK, dS = np.zeros((len(z), self.m, self.n)), np.zeros((len(z), self.m, self.m))
@@ -148,28 +143,26 @@ class WeightCoordinates(Coordinates):
         return dK, scaled_changes(here.S, dS)
 
     def deviations(self, z: Array, noise: float) -> tuple[Array, Array]:
-        """How far the moving unknowns (a,) are identified, once all else has taken what it can."""
+        """Directions of the free unknowns and their standard errors, nuisance eliminated (a,)."""
         _, values, rows = np.linalg.svd(self.without_nuisance(z), full_matrices=False)
         return rows, noise / np.maximum(values, 1e-300)
 
 
 @dataclass(frozen=True)
 class StructuredEnd:
-    """Where a search ended."""
+    """End of a search."""
 
-    cost_weights: (
-        Array  # Unknowns of the structure (count,); minus infinity is a cost weight of zero
-    )
+    cost_weights: Array  # Unknowns of the structure (count,); minus infinity: cost weight zero
     K: Array  # (m, n)
     S: Array  # (m, m)
-    problem: Problem  # At the initial states and the parameters
+    problem: Problem  # At the fitted initial states and parameters
     misfit: float  # 2-norm of the residual
     evaluations: int  # Simulations with derivatives
-    settled: bool  # Whether it ended by itself
+    settled: bool  # Whether the search converged
 
 
 def search_from(problem: Problem, structure: Structure, cost_weights: Array) -> StructuredEnd:
-    """One search from given unknowns; `cost_weights` (count,)."""
+    """One search from given unknowns `cost_weights` (count,)."""
     space = WeightCoordinates(problem, structure, cost_weights)
     beside = len(problem.logarithms)
     shared = np.concatenate([np.full(int(space.ends[0]), 1 / _SPREAD), np.ones(beside)])
@@ -184,7 +177,7 @@ def search_from(problem: Problem, structure: Structure, cost_weights: Array) -> 
 
 @dataclass(frozen=True)
 class _Place:
-    """A point of a search: unknowns, and a problem at initial states and parameters."""
+    """Point of a search: unknowns, and a problem at initial states and parameters."""
 
     posed: Problem
     structure: Structure
@@ -192,13 +185,13 @@ class _Place:
     there: Problem
 
     def space(self) -> tuple[WeightCoordinates, Array]:
-        """Coordinates that begin at these weights, the prior about what was posed; and z here."""
+        """Coordinates that start at these weights, prior at the posed problem; and z of `there`."""
         space = WeightCoordinates(self.posed, self.structure, self.cost_weights)
         return space, space.placed(self.there)
 
 
 def _polished(place: _Place, spent: int, settled: bool) -> StructuredEnd:
-    """Without the prior along what the recordings identify of the weights, with one about here."""
+    """Refit without the prior along identified combinations of weights."""
     space, z = place.space()
     noise = _misfit(space, z) / np.sqrt(space.problem.recorded_numbers)
     rows, deviations = space.deviations(z, noise)
@@ -223,7 +216,7 @@ def _stop(space: WeightCoordinates, budget: int) -> Stop:
 
 
 def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:
-    """The same with cost weights of zero where the recordings want none smaller than any number."""
+    """Set cost weights to zero if the misfit does not grow."""
     tried: set[int] = set()
     while end.evaluations < budget:
         here = replace(place, cost_weights=np.array(end.cost_weights), there=end.problem)
@@ -237,7 +230,7 @@ def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd
             without = _polished(
                 replace(here, cost_weights=cost_weights), end.evaluations, end.settled
             )
-        except WeightsError:  # the loop stands on that cost weight
+        except WeightsError:  # no Riccati solution without that cost weight
             continue
         if without.misfit <= end.misfit * (1 + _NOISY_TOLERANCE):
             end = without
@@ -245,7 +238,7 @@ def _with_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd
 
 
 def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> StructuredEnd:
-    """The same with a cost weight where zero was not the best: other weights had to move for it."""
+    """Restore zero cost weights whose restoration reduces the misfit."""
     for index in np.flatnonzero(np.isneginf(end.cost_weights) & np.isfinite(place.cost_weights)):
         if end.evaluations >= budget:
             break
@@ -254,7 +247,7 @@ def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> Structured
         here = replace(place, cost_weights=cost_weights, there=end.problem)
         try:
             found = _polished(here, end.evaluations, end.settled)
-        except WeightsError:  # on the edge of what has a regulator
+        except WeightsError:  # no Riccati solution
             continue
         if found.misfit < end.misfit * (1 - _NOISY_TOLERANCE):
             end = found
@@ -262,7 +255,7 @@ def _without_zeros(end: StructuredEnd, place: _Place, budget: int) -> Structured
 
 
 def _seen_from(end: StructuredEnd, place: _Place, index: int) -> float:
-    """Logarithm of the cost weight that moves the outputs by one deviation, all else held."""
+    """Log cost weight that moves the outputs by one noise SD, all else fixed."""
     solution = solve_lqr(end.problem.plant, place.structure.weights(np.array(end.cost_weights)))
     dK, dS = regulator_slopes(end.problem, place.structure, np.array(end.cost_weights), solution)
     found = evaluate(end.problem, np.array(solution.K), np.array(solution.S))
@@ -273,7 +266,7 @@ def _seen_from(end: StructuredEnd, place: _Place, index: int) -> float:
 
 
 def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> StructuredEnd:
-    """The same where the prior, begun anew about the end, has nothing more to hold back."""
+    """Recentre the prior at the solution until it no longer affects the misfit."""
     samples = end.problem.recorded_numbers
     for _ in range(_ROUNDS):
         if end.evaluations >= budget:
@@ -289,7 +282,7 @@ def _without_pull(end: StructuredEnd, structure: Structure, budget: int) -> Stru
 
 
 def _widest(place: _Place, misfit: float, tried: set[int]) -> int | None:
-    """The weight of a state with the widest deviation, if it is wide, not the last, and untried."""
+    """Cost weight of a state with the largest standard error; None if none is left to try."""
     structure = place.structure
     space, z = place.space()
     if structure.coupled or np.count_nonzero(space.moving[: len(structure.labels)]) < 2:

@@ -1,13 +1,12 @@
-"""Table 3.1 for recordings without noise, in the units of the plant: `impc example` runs it.
+"""Table 3.1 of the dissertation for noise-free recordings, in the units of the plant.
 
-    line 1      feedback gain, no bounds (3.12)
-    lines 2-7   inverse LQR: weights with exactly that gain (LMI); where there are none those with
-                the nearest gain (gradient), then these well conditioned (3.7)
+    line 1      feedback gain without bounds (3.12)
+    lines 2-7   inverse LQR: weights with exactly that gain (LMI), else those with the nearest gain
+                (gradient), then well-conditioned weights (3.7)
     line 9      inverse MPC (3.6) from there; (3.16) is the same without bounds
 
-The direct form (3.6) searches weights. The reduced form reaches the same weights through the gain:
-what the recordings determine is K (and S), and the weights of least condition number among all
-those with that gain are one semidefinite program.
+The direct form (3.6) searches weights. The reduced form fits the gain (and metric), then computes
+the weights of least condition number with that gain by one semidefinite program.
 """
 
 from __future__ import annotations
@@ -46,10 +45,11 @@ if TYPE_CHECKING:
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
-# c of (3.5) to (3.7) is lost. Small enough that the exact fit wins in the 2-norm (docs/theory.md).
-#: Weight of the condition number in (3.6) and (3.16), against 1 for a misfit of a typical output.
+# The value of c in (3.5) to (3.7) is unknown. This one is small enough that an exact fit
+# minimises (3.6) in the 2-norm (docs/why/theory.md).
+#: Weight of the condition number in (3.6) and (3.16); a typical-output misfit has weight 1.
 CONDITION_WEIGHT = 1e-4
-# Steps of the direct form inside the reduced one: it need not end, only change the valley.
+# Iterations of the direct form within the reduced one: it only has to leave a local minimum.
 _DETOUR = 60
 
 
@@ -60,29 +60,30 @@ def table_3_1(
     absolute: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Estimate]:
-    """Table 3.1 from end to end, line by line, for recordings without noise.
+    """Run all methods of Table 3.1 on noise-free recordings.
 
     Parameters
     ----------
     problem : Problem
-    absolute : bool
-        Whether the weights of the condition number are 1e-3 in (3.7) and 1e-4 in (3.6) and (3.16)
-        as they stand, in the units of the plant. By default they are those shares of the size of
-        the gain and of a typical output, so that no answer depends on units.
+        Recordings and the closed loop to identify.
+    absolute : bool, default False
+        If True, use condition-number weights 1e-3 in (3.7) and 1e-4 in (3.6) and (3.16), in the
+        units of the plant. If False, scale them by the norm of the gain and by a typical output, so
+        that results do not depend on units.
     progress : callable, optional
-        Given the name of each line when it is done, such as `print`.
+        Called with the name of each completed method, e.g. `print`.
 
     Returns
     -------
     dict of str to Estimate
         By method, in the order of the table: feedback_gain, inverse_lqr_lmi, inverse_lqr_gradient,
-        inverse_lqr_auxiliary, inverse_lqr_output, inverse_mpc, inverse_mpc_reduced. A line without
-        an answer says why.
+        inverse_lqr_auxiliary, inverse_lqr_output, inverse_mpc, inverse_mpc_reduced. A method
+        without a result gives an estimate with `reason` set.
 
     Raises
     ------
     WeightsError, SolverError
-        When there is no feedback gain, or no weights to start inverse MPC from.
+        If there is no feedback gain, or no weights from which inverse MPC can start.
 
     Examples
     --------
@@ -141,7 +142,7 @@ def _regulator(name: str, problem: Problem, weights: Weights | None) -> Estimate
 
 
 def starting_weights(problem: Problem) -> Weights:
-    """Lines 2 to 7: where inverse MPC starts."""
+    """Starting weights of inverse MPC (lines 2 to 7)."""
     _, lmi, _, auxiliary = itertools.islice(_lines(problem, absolute=False), 4)
     return auxiliary.stage_weights if lmi.weights is None else lmi.weights
 
@@ -158,29 +159,22 @@ def inverse_mpc(
 ) -> Estimate:
     """Direct inverse MPC (3.6): misfit of the constrained closed loop plus condition number.
 
-    Terminal weight and terminal set follow (Q, R) at every iterate. Without `explain`, and of a
-    problem without bounds, it is inverse LQR on the outputs (3.16).
+    Terminal weight and terminal set follow (Q, R) at every iterate. Without bounds and `explain` it
+    is inverse LQR on the outputs (3.16).
 
     Parameters
     ----------
     start : Weights
-        Positive definite, from Table 3.1 for example.
+        Positive definite starting weights.
     condition_weight : float, optional
-        Against a fit weight of 1. By default 1e-4 of a typical output (over its scale), so that the
-        answer does not depend on units.
+        Weight of the condition number; None: 1e-4 of a typical scaled output. The misfit has 1.
     squared : bool
-        Whether the misfit is the square of its 2-norm; see `Objective`.
+        Whether the misfit is the squared 2-norm; see `Objective`.
     max_iterations : int
-        Steps that are solved at most.
+        Largest number of steps.
     explain : bool
-        Whether weights that explain the recordings are looked for where the minimum does not, and
-        taken instead: the minimum at every condition weight that is small enough (docs/theory.md,
-        section 6). Only in the 2-norm, and without a condition weight of the caller's.
-
-    Raises
-    ------
-    WeightsError, SolverError
-        As `conditioned_fit`.
+        Whether to search for weights that explain the recordings exactly if the minimum does not
+        (docs/why/theory.md); only in the 2-norm and with the default `condition_weight`.
     """
     weight = condition_weight
     if weight is None:
@@ -206,16 +200,11 @@ def inverse_mpc(
 
 @checked
 def inverse_mpc_reduced(problem: Problem) -> Estimate:
-    """Reduced inverse MPC: fit the gain through the constrained controller, then one program.
+    """Reduced inverse MPC: fit the gain of the constrained controller, then solve for weights.
 
-    When the gain does not explain the recordings, or no weights have it, a search that stays among
-    weights (the direct form) follows, and goes on as a search for a gain from where that ends. Its
-    answer then is the gain, with the weights that come nearest and the reason why they miss.
-
-    Raises
-    ------
-    SolverError
-        When the recordings cannot be simulated from where any search begins.
+    If the gain does not explain the recordings or has no weights, the direct form runs, and a gain
+    search continues from its solution. The estimate then has this gain, the nearest weights and the
+    reason why they do not explain the recordings.
     """
     return with_or_without_set(problem, _reduced, lambda found: found.explained)
 
@@ -228,7 +217,7 @@ def _reduced(problem: Problem) -> Estimate:
         direct = inverse_mpc(
             problem, _most_promising(problem), max_iterations=_DETOUR, explain=False
         )
-    except SolverError:  # the loop falls with every regulator that a search begins at
+    except SolverError:  # the loop diverges with every starting regulator
         if first.equivalent is None:
             raise
         return _missing(first, first.equivalent.weights)
@@ -242,8 +231,8 @@ def _reduced(problem: Problem) -> Estimate:
 
 
 def _explaining(name: str, behind: WeightsBehind, evaluations: int) -> Estimate:
-    """The weights of least condition number that explain the recordings."""
-    assert behind.equivalent is not None  # they explain
+    """Estimate with the weights of least condition number that explain the recordings."""
+    assert behind.equivalent is not None  # explained
     problem, weights = behind.gain.problem, behind.equivalent.weights
     solution = solve_lqr(problem.plant, weights)
     return _simulated(
@@ -258,7 +247,7 @@ def _explaining(name: str, behind: WeightsBehind, evaluations: int) -> Estimate:
 
 
 def _missing(behind: WeightsBehind, weights: Weights) -> Estimate:
-    """A gain with weights that come near it."""
+    """Estimate of a gain whose weights do not explain the recordings."""
     gain = behind.gain
     return _simulated(
         "inverse_mpc_reduced",
@@ -273,7 +262,7 @@ def _missing(behind: WeightsBehind, weights: Weights) -> Estimate:
 
 
 def _most_promising(problem: Problem) -> Weights:
-    """Of balanced regulators that of least misfit, whether or not every sample is reached."""
+    """Balanced regulator with the least misfit, complete simulation or not."""
 
     def distance(solution: LqrSolution) -> float:
         return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))

@@ -1,9 +1,9 @@
-"""The weights of a horizon that ends in a terminal weight of the user's own.
+"""Fit weights when the user fixes the terminal weight P.
 
-Its controller has a gain and a metric for each stage (docs/theory.md, section 2), so no single gain
-stands between recordings and weights: least squares go over the unknowns of a structure, by default
-all of Q and R, and over initial states and offsets that are not known. How much of the weights is
-identified is not known beforehand: it is the rank of the derivative at the answer.
+Such a controller has a gain and a metric per stage (docs/why/theory.md), so that no single gain
+links recordings and weights: least squares run over the unknowns of a structure (default: all of Q
+and R), initial states and offsets. The rank of the derivative at the solution counts the
+identified directions.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-# Random starts about each of Bryson's, their standard deviation, and from how many it is searched.
+# Random starts per Bryson start, their SD (log cost weight), and how many starts are searched.
 _DRAWN, _SPREAD, _SEARCHED = 3, 1.0, 6
-# Residual, over typical outputs, of what is not reached; squared misfits that are one, of each.
+# Residual after an infeasible sample over the typical output; relative tolerance of equal costs.
 _NOT_REACHED, _SAME = 1e3, 1e-3
 
 
 def fit_weights(problem: Problem) -> Estimate:
-    """Fit the weights beside a terminal weight of the user's own, from several starts."""
+    """Fit the weights for a terminal weight given by the user, from several starts."""
     structure = problem.structure or Structure(problem.plant, "full", "full")
     posed = replace(problem, terminal_set=False, structure=structure)
     loose, first = replace(posed, terminal_weight=None), regulators(problem)[0]
@@ -81,27 +81,31 @@ def fit_weights(problem: Problem) -> Estimate:
         cost_weights=z,
         rank=int(np.count_nonzero(determined(found, values))),
     )
-    estimate = replace(estimate, weights=weights)  # in the scale of the terminal weight
+    estimate = replace(estimate, weights=weights)  # keep the scale of the terminal weight
     if not all(run.complete for run in estimate.simulations):
-        raise SolverError("weights", "none can be simulated on the recordings", "check the plant")
+        raise SolverError(
+            "weights",
+            "no weights found whose controller can be simulated on all trials",
+            "check plant and bounds",
+        )
     return estimate
 
 
 def _parted(problem: Problem, y: Array) -> tuple[Array, Problem]:
-    """Unknowns of the structure, and the problem at initial states and offsets, of all y."""
+    """Split y: unknowns of the structure, and the problem at initial states and offsets."""
     shape = len(problem.recordings), problem.own_unknowns
     z, own = np.split(y, [len(y) - shape[0] * shape[1]])
     return z, with_own(problem, own.reshape(shape))
 
 
 def _evaluated(problem: Problem, structure: Structure, y: Array) -> tuple[Array, Array]:
-    """Residual (r,) and its derivative along the weights and what is a trial's own (r, len(y))."""
+    """Residual (r,) and its derivative (r, len(y)) by weights and unknowns of each trial."""
     z, there = _parted(problem, y)
     q, far = len(z), _NOT_REACHED * typical_output(problem)
     count, searched = q + problem.own_unknowns, problem.searched_states
     try:
         law = weights_controller(there, structure.weights(z))
-    except ImpcError:  # no controller in double precision: a search steps back
+    except ImpcError:  # no Riccati solution in double precision: the search rejects the step
         rows = sum(problem.trial_sizes)
         return np.full(rows, far), np.zeros((rows, len(y)))
     dQ, dR = (
@@ -126,9 +130,9 @@ def _evaluated(problem: Problem, structure: Structure, y: Array) -> tuple[Array,
 def _searched(
     problem: Problem, structure: Structure, begin: Array
 ) -> scipy.optimize.OptimizeResult:
-    """One search by scipy's trust region."""
+    """One trust-region search (scipy)."""
 
-    @functools.lru_cache(maxsize=1)  # both are asked for one by one
+    @functools.lru_cache(maxsize=1)  # scipy asks for residual and derivative separately
     def at(y: tuple[float, ...]) -> tuple[Array, Array]:
         return _evaluated(problem, structure, np.array(y))
 

@@ -1,11 +1,8 @@
-"""Box bounds on states and inputs, and their rows  E x + F u <= b.
+"""Box bounds on states and inputs, and their rows E x + F u <= b (docs/why/theory.md, section 3).
 
-The bounds of (3.1), as docs/theory.md, section 3, takes them.
-
-Only finite bounds make a row. A bound of a state that is the last command of a control (see
-`with_rates`) is one of the command as it is applied, the next value of that state. The order of the
-rows is fixed: input upper, input lower, state upper, state lower, each in the order of the signals,
-so that a row can be named in a message.
+Only finite bounds make a row. A bound on a state that is the last command of a control
+(`with_rates`) applies to the command as it is applied, the next value of that state. Order of the
+rows: input upper, input lower, state upper, state lower, each in the order of the signals.
 """
 
 from __future__ import annotations
@@ -28,29 +25,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, init=False)
 class Bounds(Value):
-    """Lower and upper bounds on states and inputs; what is not given is infinite.
+    """Lower and upper bounds on states and inputs; infinite by default.
 
     Parameters
     ----------
     plant : Plant
-        Gives the sizes and the names.
+        Plant that is bounded.
     x_min, x_max, u_min, u_max : array_like or mapping of str to float, optional
-        A number for all signals, or one for each, (n,) and (m,), in their units, or a dictionary of
-        those that have a bound, by name. The origin is the equilibrium that is regulated to, so it
-        must lie strictly inside.
+        One number for all signals, an array (n,) or (m,), or a dictionary of bounds by name, in the
+        units of the signals. The origin is the equilibrium and must lie strictly inside.
 
     Attributes
     ----------
-    x_min, x_max : Array
-        State bounds (n,), in the units of the states.
-    u_min, u_max : Array
-        Input bounds (m,), in the units of the inputs.
+    x_min, x_max : ndarray of shape (n,)
+        State bounds, in the units of the states.
+    u_min, u_max : ndarray of shape (m,)
+        Input bounds, in the units of the inputs.
 
     Raises
     ------
     BoundsError
-        When a bound is NaN, has the wrong length, names a signal that the plant has not, crosses
-        its counterpart, or excludes the origin.
+        If a bound is NaN, has the wrong length, names an unknown signal, crosses its counterpart,
+        or excludes the origin.
 
     Examples
     --------
@@ -96,16 +92,16 @@ class Bounds(Value):
 
 @dataclass(frozen=True)
 class BoundRows(Value):
-    """The finite bounds as rows  E x + F u <= b  of one stage."""
+    """Finite bounds of one stage as rows E x + F u <= b."""
 
-    E: Array  # Shapes (c, n), (c, m) and (c,)
-    F: Array
-    b: Array
-    on_state: BoolArray  # Whether the row bounds a state (c,); the others bound a command
-    names: tuple[str, ...]  # One name a row, such as ``"u <= 1"``
+    E: Array  # (c, n)
+    F: Array  # (c, m)
+    b: Array  # (c,)
+    on_state: BoolArray  # (c,), whether the row bounds a state; the others bound a command
+    names: tuple[str, ...]  # one per row, such as "u <= 1"
 
     def along_limit(self, control: int) -> Array:
-        """Change of `b` (c,) with the logarithm of the limits of one control."""
+        """Derivative of `b` (c,) with respect to the logarithm of the limits of a control."""
         return np.where((self.F[:, control] != 0) & ~self.on_state, self.b, 0.0)
 
 
@@ -145,16 +141,18 @@ def _side(
     if isinstance(values, Mapping):
         for key in values:
             if key not in signals:
-                raise BoundsError(name, f"there is no {key!r}", f"choose of {', '.join(signals)}")
+                raise BoundsError(
+                    name, f"there is no signal {key!r}", f"choose from {', '.join(signals)}"
+                )
         values = [values.get(signal, default) for signal in signals]
     try:
         side = np.array(np.broadcast_to(np.asarray(values, dtype=float), (size,)))
     except ValueError:
         raise BoundsError(
-            name, f"got shape {np.shape(values)}", f"give a number or {size} of them"
+            name, f"got shape {np.shape(values)}", f"give one number, or {size} of them"
         ) from None
     if np.any(np.isnan(side)):
-        raise BoundsError(name, f"has NaN: {side.tolist()}", "use inf where there is no bound")
+        raise BoundsError(name, f"has NaN: {side.tolist()}", "use inf for no bound")
     return side
 
 
@@ -165,8 +163,8 @@ def _check_pair(name: str, signals: tuple[str, ...], lower: Array, upper: Array)
         if low == 0 or high == 0:
             raise BoundsError(
                 name,
-                f"leave {signal} no room on one side of 0: [{low:g}, {high:g}]",
-                "count the signal from its value at rest: subtract it from u_min and u_max too",
+                f"has a bound of {signal} at 0: [{low:g}, {high:g}]",
+                "subtract the value at rest from the signal, u_min and u_max, so that 0 is inside",
             )
         if not low < 0 < high:
             raise BoundsError(

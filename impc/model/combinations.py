@@ -1,6 +1,7 @@
-"""Linear combinations of states as users write them, such as "theta1 - 0.5 theta2_rate".
+"""Linear combinations of states as text, such as "theta1 - 0.5 theta2_rate".
 
-They are features of the cost and senses of a person (docs/structures.md, docs/noisy-people.md).
+They define features of the cost and sensed signals of a subject (docs/howto/weights.md,
+docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from impc.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Of the largest factor of a feature: its square is a number still, and its norm none too small.
+# Range of the largest factor of a feature; its square stays a normal floating-point number.
 _SIZES = 1e-50, 1e50
 _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def linear_combination(text: str, names: Sequence[str]) -> Array:
-    """Coefficients (n,) of a text such as ``theta2 - 0.5 theta1`` over `names` (n,)."""
+    """Parse a text such as ``theta2 - 0.5 theta1`` into coefficients (n,) over `names` (n,)."""
     row, at = np.zeros(len(names)), 0
     longest_first = sorted(range(len(names)), key=lambda index: -len(names[index]))
     while at < len(text.rstrip()):
@@ -62,7 +63,7 @@ def _blank(text: str, at: int) -> int:
 
 
 def _stands(text: str, at: int, name: str) -> bool:
-    """Whether a name stands there, and no longer word."""
+    """Whether `name` occurs at `at`, not followed by further letters or digits."""
     after = text[at + len(name) : at + len(name) + 1]
     return text.startswith(name, at) and not (after.isalnum() or after == "_")
 

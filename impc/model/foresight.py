@@ -1,14 +1,15 @@
-"""Plants that say what their controller knows of the world: lasting disturbances, targets to come.
+"""Plants whose controller knows lasting disturbances or future targets.
 
-    dh_{t+1} = dh_t + (1 - exp(-rate dt)) (d_t - dh_t)          what is believed to last
+Estimate of a lasting disturbance:
 
-With targets known p samples ahead the deviation e = x - x_s moves by the coming changes D of the
-targets, which are states of their own, known one sample later than the one before:
+    dh_{t+1} = dh_t + (1 - exp(-rate dt)) (d_t - dh_t)
+
+With targets known p samples ahead, the deviation e = x - x_s also depends on the coming changes D
+of the targets, which are states that shift by one place per sample:
 
     e+ = A e + B (u - u_s) - M D_0,    D_j+ = D_{j+1},    x_s = M r
 
-so that the gain on them is the feedforward of the linear quadratic regulator (docs/theory.md,
-section 7).
+so that the gain on them is the feedforward of the LQR (docs/why/theory.md, section 7).
 """
 
 from __future__ import annotations
@@ -33,25 +34,30 @@ if TYPE_CHECKING:
 
 @checked
 def with_observer(plant: Plant, rate: ArrayLike) -> Plant:
-    """The same plant, whose controller counters disturbances that last.
+    """Return the plant with a controller that compensates lasting disturbances.
 
-    The controller learns each disturbance d at a `rate`, dh' = rate (d - dh), as an observer does
-    that sees the state, and regulates to where the plant rests under dh: without an offset of the
-    signals that have a target; where none has, to the rest that is nearest to 0. In a
-    `PlantFamily` the rate is a parameter like any other, which a fit finds.
+    The controller estimates each disturbance d by dh' = rate (d - dh), like an observer that
+    measures the state, and regulates to the equilibrium under dh: without offset of the signals
+    that have a target; without targets, to the equilibrium nearest to 0. In a `PlantFamily` the
+    rate is a parameter like any other, which a fit can estimate.
 
     Parameters
     ----------
     plant : Plant
-        Discrete, with disturbances.
+        Discrete-time plant with disturbances.
     rate : array_like
-        1/s, for all disturbances or each (d,): 0 where it is not countered, infinite where the
-        controller knows it from the first sample on.
+        Rate in 1/s for all disturbances, or for each (d,): 0 if it is not compensated, infinite if
+        the controller knows it from the first sample on.
+
+    Returns
+    -------
+    Plant
+        Same plant with `observer` set.
 
     Raises
     ------
     PlantError
-        When the plant has no disturbance, or a rate is negative.
+        If the plant has no disturbance, or a rate is negative.
 
     Examples
     --------
@@ -69,8 +75,8 @@ def with_observer(plant: Plant, rate: ArrayLike) -> Plant:
     if given.shape not in ((), (1,), (count,)) or not count or not np.all(given >= 0):
         raise PlantError(
             "rate",
-            f"has shape {given.shape}, a negative value, or {count} disturbances to be for",
-            "give 1/s, of at least 0; the plant's inputs that are no controls are disturbances",
+            f"has shape {given.shape} or a negative value, for {count} disturbances",
+            "give one rate >= 0 in 1/s, or one for each disturbance (input that is no control)",
         )
     given = np.broadcast_to(given, count)
     return replace(plant.require_discrete(), observer=frozen(given))
@@ -78,25 +84,30 @@ def with_observer(plant: Plant, rate: ArrayLike) -> Plant:
 
 @checked(samples=(1, 1000))
 def with_preview(plant: Plant, signals: Sequence[str], samples: int) -> Plant:
-    """The plant for a controller that knows targets of some signals ahead.
+    """Return the plant for a controller that knows targets of some signals in advance.
 
-    Its first states are those of the plant; then follow the changes of the targets that are to
-    come, the next first. Recordings and scenarios of it take the same outputs, disturbances and
-    `x0` as those of the plant, and targets of these signals.
+    Its first states are those of the plant, followed by the coming changes of the targets, the next
+    one first. Its recordings and scenarios take the same outputs, disturbances and `x0` as those of
+    the plant, and targets of these signals.
 
     Parameters
     ----------
     plant : Plant
-        Discrete and linear.
+        Discrete-time, linear plant.
     signals : sequence of str
         Outputs or states by name.
     samples : int
-        How far ahead their targets are known.
+        Number of samples by which their targets are known in advance.
+
+    Returns
+    -------
+    Plant
+        Plant with `samples` further states for each signal.
 
     Raises
     ------
     PlantError
-        When the plant has a nonlinear body or a preview, or is continuous.
+        If the plant has a nonlinear body or a preview, or is continuous.
 
     Examples
     --------
@@ -114,11 +125,11 @@ def with_preview(plant: Plant, signals: Sequence[str], samples: int) -> Plant:
     """
     plant.require_discrete()
     if plant.body is not None or plant.ahead:
-        kind = "has a nonlinear body" if plant.body is not None else "knows targets ahead already"
-        raise PlantError("plant", kind, "give plant.linear(), without a preview")
+        kind = "has a nonlinear body" if plant.body is not None else "has a preview already"
+        raise PlantError("plant", kind, "pass plant.linear(), without a preview")
     names, n, q = tuple(signals), plant.n, len(signals)
     if not q:
-        raise PlantError("signals", "names none", "name the outputs or states with targets")
+        raise PlantError("signals", "is empty", "name the outputs or states with targets")
     rest = SteadyStates(plant, signal_rows(plant, names), Bounds(plant))
     M = rest.at(np.eye(q), np.zeros((q, plant.E.shape[1])))[0][:, :n].T
     width = n + q * samples
@@ -148,22 +159,22 @@ def with_preview(plant: Plant, signals: Sequence[str], samples: int) -> Plant:
 
 
 def physical_states(plant: Plant) -> int:
-    """How many states are no changes of targets to come: the first ones."""
+    """Number of states (the first ones) that are not coming changes of targets."""
     return plant.n - plant.ahead * len(plant.previewed)
 
 
 def physical_disturbances(plant: Plant) -> int:
-    """How many disturbances are no changes of targets: the first ones."""
+    """Number of disturbances (the first ones) that are not changes of targets."""
     return plant.E.shape[1] - 2 * len(plant.previewed)
 
 
 def with_steps(
     plant: Plant, x0: ArrayLike, pushes: Array, values: Array, names: tuple[str, ...]
 ) -> tuple[Array, Array]:
-    """Initial state (n,) and disturbance (steps, d) of a plant that may know its targets ahead.
+    """Initial state (n,) and disturbance (steps, d) of a plant, extended by previewed targets.
 
-    From those of its physical part, (n - ahead q,) and (steps, .), and targets (steps or one more,
-    targets); after the last of these nothing changes.
+    `x0` and `pushes` are those of the physical part; `values` the targets (steps or one more, q),
+    constant after the last.
     """
     start, size = as_numbers("x0", x0), physical_states(plant)
     start = finite_array("x0", start, (plant.n if start.shape == (plant.n,) else size,))
@@ -171,9 +182,7 @@ def with_steps(
         return start, pushes
     missing = [name for name in plant.previewed if name not in names]
     if missing:
-        raise PlantError(
-            "target", f"has none of {', '.join(missing)}", "give target={name: values}"
-        )
+        raise PlantError("target", f"lacks {', '.join(missing)}", "pass target={name: values}")
     known = values[:, [names.index(name) for name in plant.previewed]]
     steps, p = len(pushes), plant.ahead
     places = np.minimum(np.arange(steps + p + 2), len(known) - 1)

@@ -1,14 +1,13 @@
-"""The plant as arrays: what the rest of the package reads from a `control.StateSpace`.
+"""The plant: matrices and signal names read from a `control.StateSpace`.
 
     x_{t+1} = A x_t + B u_t + E d_t,    y_t = C x_t          (discrete)
     dx/dt   = A x   + B u   + E d,      y   = C x            (continuous)
 
-u are the inputs that the controller commands, d the recorded disturbances. A plant without
-disturbances has an E with no columns. What the controller makes of it: docs/theory.md, section 1.
-A plant may also offer the body that really moves, x_{t+1} = f(x_t, u_t, d_t), whose linearisation
-at rest the matrices are: every simulation moves that one, and the controller predicts with these.
-Units of gains and weights follow from those of the signals: a gain takes a state to an input, a
-weight cost weights a product of two against R[0, 0] = 1, the square of the first input.
+where u are the inputs that the controller commands and d the recorded disturbances
+(docs/why/theory.md, section 1). A plant may also have a nonlinear body x_{t+1} = f(x_t, u_t, d_t).
+The matrices are its linearisation at rest: simulations use the body, the controller predicts with
+the matrices. Units of gains and weights follow from those of the signals; weights are scaled to
+R[0, 0] = 1.
 """
 
 from __future__ import annotations
@@ -39,44 +38,47 @@ class Plant(Value):
         Discrete (``dt`` positive, or True for one second) or continuous (``dt`` zero).
     controls : sequence of str, optional
         Names of the inputs that the controller commands; the others are disturbances. By default
-        every input is a control.
+        all inputs are controls.
     units : mapping of str to str, optional
-        Unit of each signal by its name, as in "rad/s"; "1" where it has none. By default those of
-        `system.units`, which a function that makes a plant may set; what neither says is unknown.
+        Unit of each signal by name, such as "rad/s"; "1" for a signal without unit. By default
+        `system.units`; signals in neither have an unknown unit.
     words : mapping of str to str, optional
-        What each signal is in words, by its name, for pages: "tilt of the seat". By default those
-        of `system.words`.
+        Description of each signal by name, for reports: "tilt of the seat". By default
+        `system.words`.
+    body : casadi.Function or callable, optional
+        Nonlinear body (state, input) -> next state, or a function that returns it. By default
+        `system.body`, if it exists.
 
     Attributes
     ----------
-    A, B, E, C : Array
+    A, B, E, C : ndarray
         State matrix (n, n), control matrix (n, m), disturbance matrix (n, d), output matrix (p, n).
     dt : float
-        Sample time in seconds; 0 for continuous time.
+        Sample time in s; 0 for continuous time.
     states, controls, disturbances, outputs : tuple of str
         Names of the signals, in the order of the arrays.
     units : tuple of (str, str)
-        Names of signals with their units; `unit` finds one.
+        Pairs of signal and unit; `unit` looks one up.
     words : tuple of (str, str)
-        Names of signals with what they are; `word` finds one.
+        Pairs of signal and description; `word` looks one up.
     commands : tuple of str
-        States that are the last command of a control (`with_rates`); none otherwise.
+        States that are the last command of a control (`with_rates`); usually none.
     body : Body or None
-        What moves in every simulation; None where it is the linear plant itself.
-    observer : Array
-        Rate at which the controller learns each disturbance, 1/s (d,): 0 where it takes none for
-        lasting, infinite where it knows it; see `with_observer`.
+        Nonlinear body that simulations use; None for the linear plant itself.
+    observer : ndarray of shape (d,)
+        Rate in 1/s at which the controller estimates each disturbance: 0 if it does not, infinite
+        if it knows the disturbance; see `with_observer`.
     ahead : int
-        Samples that targets are known ahead; see `with_preview`.
+        Number of samples by which targets are known in advance; see `with_preview`.
     previewed : tuple of str
-        Signals whose targets are.
+        Signals whose targets are known in advance.
 
     Raises
     ------
     PlantError
-        When the matrices are missing or not finite, when an output depends directly on an input,
-        when a control is not among the inputs, a unit or words are of no signal, when (A, B) is
-        not stabilisable, or the matrices are not the linearisation of the body at rest.
+        If matrices are missing or not finite, an output depends directly on an input, a control is
+        not an input, a unit or description names no signal, (A, B) is not stabilisable, or the
+        matrices are not the linearisation of the body at rest.
 
     Examples
     --------
@@ -132,11 +134,13 @@ class Plant(Value):
         unknown = [name for name in chosen if name not in names]
         if unknown or not chosen:
             raise PlantError(
-                "controls", f"{unknown or 'none given'}: the inputs are {list(names)}", "name some"
+                "controls",
+                f"{unknown or 'none given'}: the inputs are {list(names)}",
+                "name at least one of them",
             )
         rest = tuple(name for name in names if name not in chosen)
         moves = getattr(system, "body", None) if body is None else body
-        if callable(moves) and not hasattr(moves, "n_in"):  # it is made where it is needed
+        if callable(moves) and not hasattr(moves, "n_in"):  # factory of the body
             moves = moves()
         order = [names.index(name) for name in (*chosen, *rest)]
         self._fill(
@@ -150,7 +154,7 @@ class Plant(Value):
             disturbances=rest,
             outputs=tuple(system.output_labels),
             units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
-            words=_texts(system, "words", words, 'few words, as in {"angle": "tilt of the seat"}'),
+            words=_texts(system, "words", words, 'text, as in {"angle": "tilt of the seat"}'),
             body=None if moves is None else read_body(moves, order, len(matrices["A"])),
             observer=frozen(np.zeros(len(rest))),
             ahead=0,
@@ -173,19 +177,19 @@ class Plant(Value):
 
     @property
     def moves(self) -> str:
-        """Which body every simulation moves: "nonlinear" or "linear"."""
+        """Kind of body that simulations use: "nonlinear" or "linear"."""
         return "linear" if self.body is None else "nonlinear"
 
     def linear(self) -> Plant:
-        """The same plant without a body of its own: the matrices alone move."""
+        """Return the plant without its nonlinear body."""
         return replace(self, body=None)
 
     def unit(self, name: str) -> str:
-        """The unit of a signal by its `name`; "SI" where it is not known."""
+        """Unit of signal `name`; "SI" if unknown."""
         return dict(self.units).get(name, UNKNOWN)
 
     def word(self, name: str) -> str:
-        """What a signal is, in words, by its `name`; empty where the plant does not say."""
+        """Description of signal `name`; empty if the plant has none."""
         return dict(self.words).get(name, "")
 
     @property
@@ -194,17 +198,17 @@ class Plant(Value):
         return self.dt > 0
 
     def require_discrete(self) -> Plant:
-        """Return the plant itself when it is discrete.
+        """Return the plant itself if it is discrete.
 
         Raises
         ------
         PlantError
-            When it is continuous.
+            If the plant is continuous.
         """
         if not self.discrete:
             raise PlantError(
                 "plant",
-                "is continuous, a discrete one is needed",
+                "is continuous, but a discrete one is needed",
                 "sample it: control.c2d(sys, dt)",
             )
         return self
@@ -212,7 +216,7 @@ class Plant(Value):
 
 @checked(T="n n", G="m m")
 def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
-    """Return the linear plant in z = T^-1 x and v = G^-1 u, T (n, n), G (m, m); names stay."""
+    """Return the linear plant in z = T^-1 x and v = G^-1 u, T (n, n), G (m, m); same names."""
     back = np.linalg.inv(T)
     inputs = np.eye(plant.m) if G is None else G
     return replace(
@@ -228,7 +232,11 @@ def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
 def _matrices(system: Any) -> dict[str, Array]:
     if not all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt", "input_labels")):
         kind = type(system).__name__
-        raise PlantError("plant", f"expected a control.StateSpace, got {kind}", "use control.ss")
+        raise PlantError(
+            "plant",
+            f"expected a control.StateSpace, got {kind}",
+            "pass control.ss(A, B, C, D, dt)",
+        )
     matrices = {name: frozen(getattr(system, name)) for name in "ABCD"}
     for name, matrix in matrices.items():
         if not np.all(np.isfinite(matrix)):
@@ -243,7 +251,7 @@ def _matrices(system: Any) -> dict[str, Array]:
 
 
 def _texts(system: Any, kind: str, given: Any, such: str) -> tuple[tuple[str, str], ...]:
-    """A text for each of some signals, by name: what is given, or the system's own."""
+    """Pairs (signal, text) from `given` or the system's own attribute `kind`."""
     given = getattr(system, kind, {}) if given is None else given
     known = {*system.state_labels, *system.input_labels, *system.output_labels}
     pairs = tuple(given.items()) if isinstance(given, Mapping) else ((kind, given),)
@@ -251,24 +259,24 @@ def _texts(system: Any, kind: str, given: Any, such: str) -> tuple[tuple[str, st
         if name not in known or not isinstance(text, str) or not text.isprintable():
             raise PlantError(
                 f"plant.{kind}",
-                f"names {brief(name)} with {brief(text)}",
-                f"give by the name of a signal a {such}",
+                f"maps {brief(name)} to {brief(text)}",
+                f"map the name of a signal to a {such}",
             )
     return pairs
 
 
 def _sample_time(dt: object) -> float:
     if dt is None:
-        raise PlantError("plant.dt", "is not given", "set dt, or 0 for a continuous plant")
+        raise PlantError("plant.dt", "is missing", "set dt, or 0 for a continuous plant")
     if dt is True:
         return 1.0
     return float(dt)  # type: ignore[arg-type]  # python-control: a number from here on
 
 
 def _require_linearisation(plant: Plant, body: Any, B: Array) -> None:
-    """At rest the body stays there, and its slopes are A and B (n, all inputs), to a thousandth.
+    """Require that rest is an equilibrium of the body, with slopes A and B to 1e-3.
 
-    By central differences with a step of 1e-4: their error is of the body's curvature times 1e-8.
+    Central differences with step 1e-4: their error is the body's curvature times 1e-8.
     """
     n, count = B.shape
     step = 1e-4 * np.eye(n + count)
@@ -281,24 +289,24 @@ def _require_linearisation(plant: Plant, body: Any, B: Array) -> None:
     if not np.max(np.abs(rest)) <= 1e-9 or not np.max(np.abs(found - wanted) / sizes) <= 1e-3:
         raise PlantError(
             "plant.body",
-            "has another linearisation at rest than A and B",
-            "linearise it there, with the order of its states and inputs",
+            "does not have the linearisation A, B at rest",
+            "linearise it at rest, with its order of states and inputs",
         )
 
 
 def _of_length_one(B: Array) -> Array:
-    """Columns divided by their largest entries, where that is not zero."""
+    """Columns divided by their largest entries, unless these are zero."""
     return np.asarray(B / np.maximum(np.max(np.abs(B), axis=0), 1e-300))
 
 
 def _require_stabilisable(plant: Plant) -> None:
-    """Hautus test on the modes that do not decay: [A - s I, B] must keep full row rank.
+    """Hautus test on the modes that do not decay: [A - s I, B] must have full row rank.
 
-    The states are balanced and the inputs scaled first, so that units do not decide. The rank is
-    then taken at 1e-10 of the largest singular value; a mode that is stabilisable by less would
-    need gains beyond the reach of double precision.
+    States are balanced and inputs scaled first, so that units do not matter. The rank is taken at
+    1e-10 of the largest singular value; a less stabilisable mode would need gains beyond double
+    precision.
     """
-    # scipy.linalg.matrix_balance casts the scales, 1e200 and more beside a denormal, to integers.
+    # scipy.linalg.matrix_balance casts extreme scales (1e200 with a denormal) to integers.
     A, _, _, scale, _ = scipy.linalg.lapack.dgebal(plant.A, scale=1, permute=0)
     B = _of_length_one(_of_length_one(plant.B) / scale[:, None]) * max(1.0, np.max(np.abs(A)))
     for mode in scipy.linalg.eigvals(A):
@@ -314,17 +322,17 @@ def _require_stabilisable(plant: Plant) -> None:
             )
 
 
-#: What is written where a plant does not say in which unit a signal is.
+#: Unit of a signal for which the plant states none.
 UNKNOWN = "SI"
 
 
 def gain_unit(plant: Plant, control: str, state: str) -> str:
-    """Unit of the gain from a `state` to a `control`, both by name: "N m/rad"."""
+    """Unit of the gain from a `state` to a `control`, such as "N m/rad"."""
     return _ratio(plant.unit(control), plant.unit(state))
 
 
 def weight_unit(plant: Plant, one: str, other: str) -> str:
-    """Unit of the weight on the product of two signals, `one` and `other`: "(N m)²/rad²"."""
+    """Unit of the weight on the product of signals `one` and `other`, such as "(N m)²/rad²"."""
     first = _power(plant.unit(plant.controls[0]))
     pair = plant.unit(one), plant.unit(other)
     if UNKNOWN in pair:
@@ -340,7 +348,7 @@ def _ratio(top: str, bottom: str) -> str:
 
 
 def _factor(unit: str) -> str:
-    """In brackets where a division before it would be read in two ways."""
+    """Denominator, in brackets if it would be ambiguous otherwise."""
     return unit if unit.endswith("²") and unit.count("²") == 1 else _grouped(unit)
 
 

@@ -1,11 +1,10 @@
-"""Plants that differ in physical parameters which are not known exactly.
+"""Families of plants that depend on uncertain physical parameters.
 
-The parameters are positive (masses, lengths, stiffnesses, time constants) and are searched in
-their logarithms about the nominal values. The plant's matrices are analytic functions of them, so
-the derivative is taken by Richardson's extrapolation of central differences of step h and h/2 in
-the logarithm: an error of order h^4 and of rounding/h. At h = 1e-3 both are 1e-12, and the two
-central differences say how far the extrapolation can be trusted. docs/fitting.md says how a
-parameter is freed.
+The parameters are positive (masses, lengths, stiffnesses, time constants); searches use the
+logarithms of their ratios to the nominal values. The plant's matrices are analytic functions of
+them. Derivatives are Richardson extrapolations of central differences with steps h and h/2 in the
+logarithm, with errors of order h^4 and rounding/h (both 1e-12 at h = 1e-3); the two differences
+also show whether the extrapolation can be trusted. See docs/howto/fit.md.
 """
 
 from __future__ import annotations
@@ -30,57 +29,56 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _STEP, _FINE_STEP = 1e-3, 1e-4
-#: What may be uncertain beside the parameters of a plant.
+#: Uncertainties that are not parameters of `make`.
 DELAY, LIMIT = "extra_delay", "u_max"
-# A step of a free parameter's logarithm that counts as large.
+# Scale of the logarithm of a free parameter.
 _FREE = 1 / 3
-# Samples of delay that one more state can stand for.
+# Largest delay in samples that one more state can represent.
 _LONGEST = 2.0
-# Difference of the two central differences, relative to the derivative: h^2 for a smooth plant.
+# Largest relative difference of the two central differences; h^2 for a smooth plant.
 _ROUGH = 1e-3
 
 
-@dataclass(frozen=True, init=False, eq=False)  # itself alone: its derivatives may be cached
+@dataclass(frozen=True, init=False, eq=False)  # compared by identity: its derivatives are cached
 class PlantFamily(Value):
-    """A plant for every value of some physical parameters, which are fitted with the gain.
+    """Plants for all values of some physical parameters, which are fitted with the gain.
 
     Parameters
     ----------
     make : callable
-        Values of the parameters (k,), in their units -> plant.
+        Function of parameter values (k,) that returns the plant.
     names : sequence of str
-        Of the parameters.
+        Names of the parameters, length k.
     nominal : sequence of float
-        Their values when nothing is known, in their units; positive.
+        Nominal values of the parameters, positive, in their units.
     uncertainty : mapping of str to float or str, optional
-        Standard deviation with which a parameter is known, by its name: in its own unit, or
-        relative as "5 %". Such a parameter keeps to its nominal value as far as that says, and
-        every interval contains its uncertainty. A parameter without one is free: any positive
-        value. Two more may be named: "extra_delay", by which commands reach the plant later than
-        `make` says, in seconds and at most two samples, and "u_max", the limits of the controls.
+        Prior standard deviation of a parameter by name, in its unit or relative as "5 %". A fit
+        keeps such a parameter near its nominal value, and all intervals include its uncertainty. A
+        parameter without one is free. Two more names are allowed: "extra_delay", an additional
+        delay of the commands in s (at most two samples), and "u_max", the limits of the controls.
 
     Attributes
     ----------
     make : callable
-        Values (k,) in the parameters' units -> `Plant`.
+        Function of parameter values (k,) that returns the `Plant`.
     names : tuple of str
-        (k,).
-    nominal : Array
-        Values about which they are searched (k,), positive.
-    deviations : Array
-        Standard deviation of the logarithm of each (k,); infinite where it is free.
+        Names of the parameters, length k.
+    nominal : ndarray of shape (k,)
+        Nominal values.
+    deviations : ndarray of shape (k,)
+        Prior standard deviation of the logarithm of each parameter; infinite if it is free.
     limit_deviation : float
-        Of the logarithm of the limits of the controls; 0 where they are known.
+        Prior standard deviation of the logarithm of the control limits; 0 if they are known.
 
     Raises
     ------
     InputError
-        When a nominal value is not a positive number: give it in a unit in which it is; when an
-        uncertainty is of no parameter, or no standard deviation.
+        If a nominal value is not positive, or an uncertainty names no parameter or is not a
+        standard deviation.
 
     Examples
     --------
-    A mass (kg) that is pushed for a second at a time, known to 4 kg.
+    A mass (kg) that is pushed for 1 s at a time, known to 4 kg.
 
     >>> import control
     >>> import impc
@@ -109,7 +107,7 @@ class PlantFamily(Value):
     ) -> None:
         if len(names) != len(nominal):
             raise InputError(
-                "nominal", f"has {len(nominal)} values", f"give {len(names)}, one a name"
+                "nominal", f"has {len(nominal)} values", f"give {len(names)}, one for each name"
             )
         for name, value in zip(names, nominal, strict=True):
             if not 0 < value < np.inf:
@@ -122,7 +120,7 @@ class PlantFamily(Value):
         unknown = [name for name in given if name not in names]
         if unknown:
             known = ", ".join([*names, DELAY, LIMIT])
-            raise InputError(f"uncertainty {unknown[0]}", "is of no parameter", f"known: {known}")
+            raise InputError(f"uncertainty {unknown[0]}", "is no parameter", f"known: {known}")
         found = [
             relative_deviation(name, given[name], value) if name in given else np.inf
             for name, value in zip(names, nominal, strict=True)
@@ -134,7 +132,7 @@ class PlantFamily(Value):
             deviations=frozen(found),
             limit_deviation=limit,
         )
-        if 0.0 in found:  # known exactly
+        if 0.0 in found:  # zero uncertainty: fixed
             uncertain = np.array(found) > 0
             self._fill(**vars(self.part(uncertain, np.zeros(len(found)))))
         if relative_deviation(DELAY, late, 1.0) > 0:
@@ -143,26 +141,26 @@ class PlantFamily(Value):
 
     @property
     def stated(self) -> BoolArray:
-        """Which parameters have a stated uncertainty (k,); the others are free."""
+        """Mask (k,) of the parameters with a prior; the others are free."""
         return np.isfinite(self.deviations)
 
     @property
     def unit(self) -> Array:
-        """What one unit of each coordinate of a search is of its logarithm (k,)."""
+        """Scale (k,) of each search coordinate in units of the logarithm."""
         return np.where(self.stated, self.deviations, _FREE)
 
     def values(self, logarithms: Array) -> Array:
-        """The parameters (k,), in their units, at logarithms (k,) of them over their nominal."""
+        """Parameter values (k,) at the logarithms (k,) of their ratios to the nominal ones."""
         begins = self.make(self.nominal).dt if DELAY in self.names else 0.0
         late = np.array([name == DELAY for name in self.names], float)
         return np.asarray(self.nominal * np.exp(logarithms) - begins * late)
 
     def linear(self) -> PlantFamily:
-        """The same family without bodies of their own: the matrices alone move."""
+        """Return the same family without nonlinear bodies."""
         return replace(self, make=lambda values: self.make(values).linear())
 
     def part(self, chosen: BoolArray, logarithms: Array) -> PlantFamily:
-        """The `chosen` parameters alone (k,), the others held at `logarithms` (k,)."""
+        """Family of the `chosen` parameters (k,) only; the others fixed at `logarithms` (k,)."""
         whole, made = self.nominal * np.exp(logarithms), self.make
 
         def make(values: Array) -> Plant:
@@ -185,15 +183,7 @@ class PlantFamily(Value):
         deviations: Sequence[float],
         change: Callable[[Plant, Array], Plant] = lambda plant, _: plant,
     ) -> PlantFamily:
-        """The family with more parameters.
-
-        Parameters
-        ----------
-        names, nominal, deviations : sequence
-            Of the further parameters, as of the class.
-        change : callable
-            Plant and values (more,) of the further parameters -> plant.
-        """
+        """Return the family with more parameters; `change` maps plant and their values (more,)."""
         count, make = len(self.names), self.make
         return replace(
             self,
@@ -204,11 +194,11 @@ class PlantFamily(Value):
         )
 
     def with_delay(self, deviation: float, dt: float) -> PlantFamily:
-        """The family with a delay of the commands, known to `deviation` samples of `dt` (s)."""
+        """Extend by a delay of the commands with a prior of `deviation` samples of `dt` s."""
         if deviation > _LONGEST:
-            remedy = "make a plant with a delay of its own"
+            remedy = "model the delay in the plant"
             raise InputError(f"uncertainty {DELAY}", f"is more than {_LONGEST:g} samples", remedy)
-        # It is counted from one sample on, so that its logarithm is a number where there is none.
+        # Counted from one sample on, so that its logarithm is finite at zero delay.
         return self.wider(
             [DELAY],
             [dt],
@@ -217,24 +207,24 @@ class PlantFamily(Value):
         )
 
     def with_limits(self, plant: Plant, bounds: Bounds) -> PlantFamily:
-        """The family with the limits of the controls among its parameters, where uncertain."""
+        """Extend by the limits of the controls as parameters, if they are uncertain."""
         bounded = np.flatnonzero(np.isfinite(bounds.u_max))
         if self.limit_deviation == 0 or len(bounded) == 0:
             return self
         if np.any(bounds.u_max != -bounds.u_min) or plant.commands:
-            remedy = "leave it out of the uncertainty"
-            raise InputError(f"uncertainty {LIMIT}", "needs a limit alike on both sides", remedy)
+            remedy = "remove it from the uncertainty"
+            raise InputError(f"uncertainty {LIMIT}", "needs u_min = -u_max", remedy)
         names = [f"{LIMIT}.{plant.controls[place]}" for place in bounded]
         limits, known = np.array(bounds.u_max)[bounded], [self.limit_deviation] * len(bounded)
         return replace(self.wider(names, limits.tolist(), known), limit_deviation=0.0)
 
     def limits(self, plant: Plant) -> list[tuple[int, int]]:
-        """Places of the limits among the parameters, each with that of its control."""
+        """Pairs (index of the parameter, index of the control) of the limits."""
         named = {f"{LIMIT}.{control}": place for place, control in enumerate(plant.controls)}
         return [(k, named[name]) for k, name in enumerate(self.names) if name in named]
 
     def bounds_at(self, plant: Plant, bounds: Bounds, logarithms: Array) -> Bounds:
-        """The bounds with the limits that belong to these `logarithms` (k,)."""
+        """Bounds with the limits at these `logarithms` (k,)."""
         found = self.limits(plant)
         u_max = np.array(bounds.u_max)
         for place, control in found:
@@ -243,7 +233,7 @@ class PlantFamily(Value):
 
 
 def relative_deviation(name: str, given: float | str, nominal: float | None) -> float:
-    """Standard deviation of a logarithm, from "5 %" or a number in the unit of `nominal`."""
+    """Standard deviation of a logarithm from "5 %" or from a number in units of `nominal`."""
     where, share = f"uncertainty {name}", isinstance(given, str) and given.strip().endswith("%")
     try:
         number = float(str(given).strip().removesuffix("%"))
@@ -252,14 +242,16 @@ def relative_deviation(name: str, given: float | str, nominal: float | None) -> 
     if not 0 <= number < np.inf:
         raise InputError(where, f"got {given!r}", 'give a standard deviation, or "5 %"')
     if not share and number and nominal is None:
-        raise InputError(where, f"got {given!r}", 'give a share of the limit, as "5 %"')
+        raise InputError(where, f"got {given!r}", 'give a percentage of the limit, as "5 %"')
     return number / 100 if share else number / (nominal or 1.0)
 
 
 def with_late_commands(plant: Plant, lag: float) -> Plant:
-    """The plant whose commands arrive `lag` samples late, part of the last one in each sample."""
+    """Delay the commands by `lag` samples; each sample mixes the last and the new command."""
     if plant.body is not None:
-        raise PlantError("plant.body", "has no delay of commands", "write one into the body")
+        raise PlantError(
+            "plant.body", "excludes a delay of commands", "model the delay in the body"
+        )
     n, m = plant.n, plant.m
     A, B = np.zeros((n + m, n + m)), np.zeros((n + m, m))
     A[:n, :n], A[:n, n:] = plant.A, lag * plant.B
@@ -277,21 +269,21 @@ def with_late_commands(plant: Plant, lag: float) -> Plant:
 
 
 class PlantDifferential(NamedTuple):
-    """Derivatives with respect to the logarithms of parameters, whose axis is last."""
+    """Derivatives with respect to the logarithms of the parameters (last axis)."""
 
     A: Array  # (n, n, k)
     B: Array  # (n, m, k)
     E: Array  # (n, d, k)
     C: Array  # (p, n, k)
-    observer: Array  # Of the rates of the observer (d, k)
-    # For each parameter, bodies nearby with their factors: the sum of what they do at a sample is
-    # the derivative of the plant's own. Empty where it has none.
+    observer: Array  # (d, k), of the observer rates
+    # for each parameter, nearby bodies with factors: their weighted sum is the derivative of the
+    # body; empty for a linear plant
     bodies: tuple[tuple[tuple[float, Body], ...], ...]
 
 
 @checked(logarithms="*")
 def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
-    """The plant at nominal * exp(logarithms), logarithms (k,)."""
+    """Plant at nominal * exp(logarithms), logarithms (k,)."""
     return family.make(family.nominal * np.exp(logarithms))
 
 
@@ -300,13 +292,13 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
     return _differential(family, frozen(logarithms).tobytes())
 
 
-@functools.lru_cache(maxsize=4)  # of a point it is asked for again and again
+@functools.lru_cache(maxsize=4)  # the same point is requested repeatedly
 def _differential(family: PlantFamily, point: bytes) -> PlantDifferential:
     logarithms = np.frombuffer(point)
     parts: list[tuple[Array, ...]] = []
     bodies: list[tuple[tuple[float, Body], ...]] = []
     for index, name in enumerate(family.names):
-        if family.stated[index]:  # to 1e-7, and nothing rests on more
+        if family.stated[index]:  # accurate to 1e-7, which suffices for the prior parameters
             slopes, _ = _central(family, logarithms, index, _FINE_STEP)
             parts.append(slopes)
             bodies.append(())
@@ -316,7 +308,9 @@ def _differential(family: PlantFamily, point: bytes) -> PlantDifferential:
         for one, other in zip(coarse, fine, strict=True):
             if np.max(np.abs(one - other), initial=0) > _ROUGH * np.max(np.abs(other), initial=0):
                 raise PlantError(
-                    f"parameter {name}", "the plant is not smooth in it", "do not free it"
+                    f"parameter {name}",
+                    "the plant is not a smooth function of it",
+                    "remove it from the free parameters",
                 )
         parts.append(tuple((4 * b - a) / 3 for a, b in zip(coarse, fine, strict=True)))
         shares = [(4 / 3 * factor, body) for factor, body in near]
@@ -340,5 +334,5 @@ def _central(
     ends = ((1 / (2 * step), above.body), (-1 / (2 * step), below.body))
     slopes = tuple((up - down) / (2 * step) for up, down in pairs)
     if above.body and below.body and above.body.constants is below.body.constants:
-        return slopes, ()  # its linear part alone moves, as the matrices do
+        return slopes, ()  # only its linear part changes, as the matrices do
     return slopes, tuple((factor, body) for factor, body in ends if body is not None)

@@ -1,11 +1,11 @@
-"""Commands of which the change from sample to sample is limited, or has a cost weight.
+"""Plants whose controls are changes of their commands, which can be bounded or penalised.
 
     x+ = A x + B (c + w) + E d,    c+ = c + w,    u = c + w
 
-c is the last command, w its change, u what is applied. The cost of the last commands and changes,
-c'Rc + w'Vw, is that of commands and changes, u'Ru + w'Vw, one sample later. Without end both differ
-by the first c'Rc alone, which nothing can change: so with the terminal weight of the Riccati
-equation they make the same controller.
+where c is the last command, w its change and u the applied command. The cost c'Rc + w'Vw of last
+commands and changes equals u'Ru + w'Vw one sample later. Over an infinite horizon both differ only
+by the first c'Rc, which is constant: with the terminal weight of the Riccati equation both give the
+same controller.
 """
 
 from __future__ import annotations
@@ -20,31 +20,30 @@ from impc.model.plant import Plant
 
 @checked
 def with_rates(plant: Plant) -> Plant:
-    """Return the plant whose controls are the changes of its commands, per sample.
+    """Return the plant whose controls are the changes of its commands per sample.
 
-    A cost weight of the change is one of its control (R), a cost weight of the command one of the
-    state that has its name (Q). A bound of that state is one of the command as it is applied, at
-    every sample of the horizon, and like those of controls always hard.
+    The cost weight of the change is the one of its control (R); the cost weight of the command is
+    that of the state of the same name (Q). A bound on that state applies to the command at every
+    sample of the horizon and is always hard, like bounds on controls.
 
     Parameters
     ----------
     plant : Plant
-        Discrete. A control "torque" becomes the state "torque", the command of the sample before,
-        and the control "change of torque", in the same unit. For a family of plants:
+        Discrete-time plant. A control "torque" becomes the state "torque", the command of the
+        previous sample, and the control "change of torque", in the same unit. For a family use
         ``PlantFamily(lambda values: with_rates(make(values)), names, nominal)``.
 
     Returns
     -------
     Plant
-        With the states and the m last commands, the same outputs and disturbances. A recording has
-        the command before its first sample in its `x0`; the command that is applied at a sample is
-        the state of the next.
+        Plant with the m last commands as further states. The `x0` of a recording contains the
+        command before its first sample; the command applied at a sample is the state of the next.
 
     Raises
     ------
     PlantError
-        When the plant is continuous, has a body that is not linear, or another signal has the name
-        of a control.
+        If the plant is continuous, has a nonlinear body, or another signal has the name of a
+        control.
 
     Examples
     --------
@@ -61,9 +60,9 @@ def with_rates(plant: Plant) -> Plant:
     """
     plant.require_discrete()
     if plant.body is not None:
-        raise PlantError("plant", "has a body that is not linear", "give plant.linear()")
+        raise PlantError("plant", "has a nonlinear body", "pass plant.linear()")
     if plant.ahead:
-        raise PlantError("plant", "knows targets ahead", "give with_preview(with_rates(plant))")
+        raise PlantError("plant", "has a preview", "use with_preview(with_rates(plant), ...)")
     taken = {*plant.states, *plant.outputs, *plant.disturbances}.intersection(plant.controls)
     if taken:
         raise PlantError("plant", f"has two signals {taken.pop()!r}", "give each its own name")

@@ -1,4 +1,4 @@
-"""A recorded trial as the fits take it: outputs and disturbance on the plant's clock."""
+"""Recorded trials: outputs, commands and disturbance on the plant's clock."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Label(Value):
-    """Whose trial it is; empty where the recording does not say.
+    """Label of a trial; parts that are not known are empty.
 
     Attributes
     ----------
     subject, visit, condition, trial : str
-        Names, as the files or the study give them.
+        Names, as given by the files or the study.
 
     Examples
     --------
@@ -55,50 +55,52 @@ class Recording(Value):
     Parameters
     ----------
     plant : Plant
-        Gives the number of outputs, disturbances and states.
+        Determines the numbers of outputs, disturbances and states.
     outputs : array_like
-        (samples, p), or (samples,) for one output; at least two samples. NaN where one is missing.
+        Outputs (samples, p), or (samples,) for one; at least two samples. NaN marks missing values.
     disturbance : array_like, optional
-        (samples, d), or (samples,) for one; zero by default. The last row is not used and may be
-        left out, as of what drove a simulation.
+        Disturbance (samples, d), or (samples,) for one; zero by default. The last row is not used
+        and may be omitted.
     x0 : array_like, optional
-        (n,). By default the first output, which must then be the full state; a plant with other
-        outputs starts at rest.
+        Initial state (n,). By default the first output if the output is the full state, else zero.
     target : mapping, optional
-        Set points of outputs or states by name, in their units: a number, or (samples,). What has
-        none is regulated to rest.
+        Set points of outputs or states by name, in their units: a number, or (samples,). Signals
+        without one are regulated to rest.
     commands : array_like, optional
-        Commands that were recorded (samples - 1, m) or, the last not used, (samples, m); of one
-        control (samples - 1,). NaN where one is missing. They are fitted beside the outputs.
+        Recorded commands (samples - 1, m), or (samples, m) with an unused last row; (samples - 1,)
+        for one control. NaN marks missing values. They are fitted in addition to the outputs.
     offset : array_like, optional
-        What the recorded outputs have too much (p,); zero by default. See `Problem.offsets`.
+        Offset (p,) contained in the recorded outputs; zero by default. See `Problem.offsets`.
     label : Label, optional
+        Label of the trial.
     findings : tuple of str
-        What the checks of the file found, for the report.
+        Findings of the file checks, for the report.
 
     Attributes
     ----------
-    outputs : Array
-        (samples, p), in the units of the plant's outputs; NaN where missing.
-    disturbance : Array
-        (samples, d); row k acts between samples k and k + 1, so that the last is not used.
-    x0 : Array
-        State at the first sample (n,): known, or where a fit of it starts.
-    target : Array
-        Set points of some signals (samples, q), and their names `signals`.
+    outputs : ndarray of shape (samples, p)
+        Outputs in the units of the plant; NaN where missing.
+    disturbance : ndarray of shape (samples, d)
+        Row k acts between samples k and k + 1; the last row is not used.
+    x0 : ndarray of shape (n,)
+        State at the first sample: known, or the start of its fit.
+    target : ndarray of shape (samples, q)
+        Set points of the signals named in `signals`.
     signals : tuple of str
-    commands : Array
-        Recorded commands (samples, m), the last row NaN; (0, m) where there are none.
-    offset : Array
-        (p,), in the units of the outputs.
+        Signals with a target.
+    commands : ndarray of shape (samples, m)
+        Recorded commands, the last row NaN; shape (0, m) if there are none.
+    offset : ndarray of shape (p,)
+        Offset in the units of the outputs.
     label : Label
+        Label of the trial.
     findings : tuple of str
-        What the checks of its file found and let pass, one sentence each.
+        Findings of the file checks, one sentence each.
 
     Raises
     ------
     DataError
-        When something is missing, not finite, or of the wrong shape.
+        If values are missing, not finite, or of the wrong shape.
 
     Examples
     --------
@@ -148,7 +150,7 @@ class Recording(Value):
         if len(y) < 2:
             raise DataError("outputs", f"has {len(y)} samples", "give at least 2")
         if not np.any(np.isfinite(y)):
-            raise DataError("outputs", "has no number", "give a recording")
+            raise DataError("outputs", "has missing values only", "pass recorded values")
         width = physical_disturbances(plant)
         d = _pushes(disturbance, len(y), width)
         start = x0
@@ -177,7 +179,7 @@ class Recording(Value):
 
     @property
     def without_offset(self) -> Array:
-        """Outputs less their offset (samples, p)."""
+        """Outputs minus their offset (samples, p)."""
         return np.asarray(self.outputs - self.offset)
 
     @property
@@ -192,7 +194,7 @@ class Recording(Value):
 
 
 def _require_no_end(values: Array) -> None:
-    """A simulation that no input could continue is NaN from there on, and is no recording."""
+    """Reject outputs that are NaN from some sample on, as of a simulation that stopped."""
     if values.ndim != 2:
         return
     finite = np.all(np.isfinite(values), axis=1)
@@ -200,20 +202,20 @@ def _require_no_end(values: Array) -> None:
     if 0 < end < len(finite) and np.all(finite[:end]) and np.all(np.isnan(values[end:])):
         raise DataError(
             "outputs",
-            f"end at sample {end}, and NaN follows",
-            "a simulation that ended has no more: start it elsewhere or widen its bounds",
+            f"are NaN from sample {end} on",
+            "cut them there; if simulated, use another initial state or wider bounds",
         )
 
 
 def _with_gaps(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """The same as float64 of that shape, in which NaN says that a sample is missing."""
+    """Array of float64 of that shape, with NaN for missing values."""
     array = with_shape(name, as_numbers(name, values), shape)
     require_finite(name, np.where(np.isnan(array), 0.0, array))
     return array
 
 
 def _commands(given: ArrayLike | None, samples: int, width: int) -> Array:
-    """Recorded commands with a row a sample, the last of which is not used; or none (0, m)."""
+    """Recorded commands with one row per sample (the last unused); (0, m) without any."""
     if given is None:
         return np.zeros((0, width))
     u = _with_gaps("commands", _columns(given), (None, width))
@@ -223,7 +225,7 @@ def _commands(given: ArrayLike | None, samples: int, width: int) -> Array:
 
 
 def _pushes(given: ArrayLike | None, samples: int, width: int) -> ArrayLike:
-    """The disturbance with a row a sample."""
+    """Disturbance with one row per sample."""
     if given is None:
         return np.zeros((samples, width))
     d = np.asarray(_columns(given))
@@ -231,7 +233,7 @@ def _pushes(given: ArrayLike | None, samples: int, width: int) -> ArrayLike:
         remedy = (
             "name its controls: Plant(system, controls=[...]); the other inputs are disturbances"
         )
-        raise DataError("disturbance", "is given, and the plant has none", remedy)
+        raise DataError("disturbance", "is given, but the plant has none", remedy)
     short = d.ndim == 2 and len(d) == samples - 1
     return np.vstack([d, np.zeros((1, d.shape[1]))]) if short else d
 

@@ -7,11 +7,9 @@ At the optimum the Riccati equation is stationary in K, so its differential keep
 
     dP = F'dP F + dQ + K'dR K,      dK = S^-1 (B'dP F - dR K)        (discrete)
 
-A row of dK/d(Q, R) is obtained by the adjoint of this pair: one Lyapunov equation for each entry
-of K, instead of one for each entry of Q.
-
-With another terminal weight a horizon has a gain for each stage, by the same equations backwards:
-P_k from P_{k+1}, and dP_k from dP_{k+1}.
+A row of dK/d(Q, R) follows from the adjoint of this pair: one Lyapunov equation per entry of K
+instead of one per entry of Q. With another terminal weight each stage of the horizon has its own
+gain, from the same equations backwards: P_k from P_{k+1}, and dP_k from dP_{k+1}.
 """
 
 from __future__ import annotations
@@ -33,39 +31,39 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
-# Least eigenvalue of a metric, of the largest, with which its inverse has no digit left.
+# Smallest eigenvalue ratio of a metric; below it the inverse has no correct digit.
 _SINGULAR = 1e-14
 
 
 @dataclass(frozen=True)
 class LqrSolution(Frozen):
-    """A plant, its weights, and the regulator that they make."""
+    """A plant, its weights, and their regulator."""
 
     plant: Plant
     weights: Weights
-    P: Array  # Riccati solution (n, n), the terminal weight
-    K: Array  # Gain (m, n) of u = -Kx
-    S: Array  # Metric (m, m) in which the constrained controller stays near the gain: R + B'PB
-    F: Array  # Closed loop A - BK, (n, n)
+    P: Array  # (n, n), Riccati solution, the terminal weight
+    K: Array  # (m, n), gain of u = -Kx
+    S: Array  # (m, m), metric R + B'PB of deviations from the gain
+    F: Array  # (n, n), closed loop A - BK
 
 
 @dataclass(frozen=True)
 class FiniteHorizonLqr(Frozen):
-    """The regulator of a horizon that ends in a terminal weight: a gain for each stage."""
+    """Regulator of a finite horizon with a terminal weight: one gain per stage."""
 
     plant: Plant
     weights: Weights
-    P: Array  # Cost to go from each stage (N + 1, n, n); the last is the terminal weight
-    K: Array  # Gains (N, m, n)
-    S: Array  # Metrics R + B'P_{k+1}B (N, m, m)
+    P: Array  # (N + 1, n, n), cost-to-go of each stage; the last is the terminal weight
+    K: Array  # (N, m, n), gains
+    S: Array  # (N, m, m), metrics R + B'P_{k+1}B
 
 
 @dataclass(frozen=True)
 class Gradients(Frozen):
-    """Derivatives of every entry of a matrix (a, b) with respect to the weights."""
+    """Derivatives of the entries of a matrix (a, b) with respect to the weights."""
 
-    Q: Array  # Shape (a, b, n, n), symmetric in the last two: d entry = sum(Q[a, b] * dQ)
-    R: Array  # Shape (a, b, m, m), symmetric in the last two
+    Q: Array  # (a, b, n, n), symmetric in the last two: d entry = sum(Q[a, b] * dQ)
+    R: Array  # (a, b, m, m), symmetric in the last two
 
 
 @checked
@@ -77,15 +75,20 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     plant : Plant
         Discrete or continuous, stabilisable.
     weights : Weights
-        Q (n, n) and R (m, m) of the plant's size.
+        Q (n, n) and R (m, m).
+
+    Returns
+    -------
+    LqrSolution
+        Riccati solution `P`, gain `K`, metric `S` and closed loop `F`.
 
     Raises
     ------
     InputError
-        When the sizes differ.
+        If the sizes differ.
     WeightsError
-        When no stabilising solution exists: Q leaves a mode on or outside the stability limit
-        without weight.
+        If no stabilising solution exists: Q does not penalise a mode on or beyond the stability
+        limit.
 
     Examples
     --------
@@ -101,7 +104,7 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     )
     try:
         P = np.asarray(solver(plant.A, plant.B, weights.Q, weights.R))
-    except (np.linalg.LinAlgError, ValueError) as error:  # ValueError: reordering that failed
+    except (np.linalg.LinAlgError, ValueError) as error:  # ValueError: failed reordering
         raise _no_solution(str(error).split(".")[0].lower()) from None
     P = (P + P.T) / 2
     if plant.discrete:
@@ -112,7 +115,7 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
         K = scipy.linalg.solve(S, plant.B.T @ P, assume_a="pos")
     F = plant.A - plant.B @ K
     if not is_stable(F, discrete=plant.discrete):
-        raise _no_solution("the closed loop that came out is not stable")
+        raise _no_solution("the resulting closed loop is not stable")
     return LqrSolution(plant, weights, frozen(P), frozen(K), frozen(S), frozen(F))
 
 
@@ -126,7 +129,7 @@ def _require_sizes(plant: Plant, weights: Weights) -> None:
 
 
 def terminal_matrix(plant: Plant, given: ArrayLike) -> Array:
-    """The terminal weight P (n, n) of what a user gives: a matrix, or 0 for none."""
+    """Terminal weight P (n, n) from user input: a matrix, or 0 for none."""
     none = np.ndim(given) == 0 and np.all(np.asarray(given) == 0)
     P = symmetric_matrix("terminal_weight", np.zeros(2 * (plant.n,)) if none else given, plant.n)
     require_semidefinite("terminal_weight", P)
@@ -136,7 +139,7 @@ def terminal_matrix(plant: Plant, given: ArrayLike) -> Array:
 def solve_finite_horizon(
     plant: Plant, weights: Weights, terminal: Array, horizon: int
 ) -> FiniteHorizonLqr:
-    """The Riccati difference recursion back from a `terminal` weight (n, n) at stage N."""
+    """Backward Riccati recursion from a `terminal` weight (n, n) at stage N."""
     _require_sizes(plant, weights)
     A, B, P, K, S = plant.A, plant.B, [terminal], [], []
     for _ in range(horizon):
@@ -144,7 +147,7 @@ def solve_finite_horizon(
         eigenvalues = np.linalg.eigvalsh(S[-1])
         if not eigenvalues[0] > _SINGULAR * eigenvalues[-1]:
             problem = "have a stage metric R + B'PB that is singular in double precision"
-            raise WeightsError("Q, R", problem, "weigh the inputs more alike")
+            raise WeightsError("Q, R", problem, "use more similar weights for the inputs")
         K.append(np.linalg.solve(S[-1], B.T @ P[-1] @ A))
         F = A - B @ K[-1]
         before = F.T @ P[-1] @ F + weights.Q + K[-1].T @ weights.R @ K[-1]
@@ -155,7 +158,7 @@ def solve_finite_horizon(
 def finite_horizon_changes(
     found: FiniteHorizonLqr, dQ: Array, dR: Array, dP: Array
 ) -> tuple[Array, Array]:
-    """Change of gains (N, k, m, n) and metrics (N, k, m, m) along k changes of Q, R and last P."""
+    """Derivatives of gains (N, k, m, n) and metrics (N, k, m, m) along k directions."""
     A, B, dK, dS = found.plant.A, found.plant.B, [], []
     for K, S in zip(found.K[::-1], found.S[::-1], strict=True):
         F = A - B @ K
@@ -175,23 +178,21 @@ def is_stable(F: Array, *, discrete: bool) -> bool:
 
 
 def stabilises(plant: Plant, gain: Array) -> bool:
-    """Whether the loop of u = -Kx is stable, K the `gain` (m, n): docs/theory.md, section 2."""
+    """Whether u = -Kx with the `gain` K (m, n) gives a stable loop (docs/why/theory.md, 2)."""
     return is_stable(plant.A - plant.B @ gain, discrete=plant.discrete)
 
 
 def lyapunov_series(F: Array, right: Array) -> Array:
     """Solve X = F X F' + right for a stack of right sides by Smith's doubling (Smith 1968).
 
-    X = sum F^k right F'^k; each doubling squares F, so the number of products grows with the
-    logarithm of the time constant and the whole stack shares the powers. The relative truncation
-    error is below the unit round-off when the loop ends.
-
+    X = sum F^k right F'^k; each doubling squares F, so that the number of products grows with the
+    logarithm of the time constant. The relative truncation error is below the unit round-off.
     `F` (n, n); `right` (p, n, n); returns (p, n, n).
     """
     if not is_stable(F, discrete=True):
         raise _no_solution("the closed loop is not stable")
     power, total = np.array(F), np.array(right)
-    for _ in range(60):  # 2^60 samples: beyond any loop that is stable in double precision
+    for _ in range(60):  # 2^60 samples: more than any loop that is stable in double precision needs
         update = power @ total @ power.T
         total += update
         if np.max(np.abs(update), initial=0.0) <= 1e-17 * np.max(np.abs(total), initial=0.0):
@@ -226,11 +227,10 @@ def metric_gradients(solution: LqrSolution) -> Gradients:
 def regulator_changes(
     solution: LqrSolution, dQ: Array, dR: Array, dA: Array, dB: Array
 ) -> tuple[Array, Array]:
-    """Change of the gain and of the metric of a discrete plant along k directions.
+    """Derivatives of gain and metric of a discrete plant along k directions.
 
-    With dF = dA - dB K and the gain held:  dP = F'dP F + dF'PF + F'P dF + dQ + K'dR K,
+    With dF = dA - dB K and the gain fixed:  dP = F'dP F + dF'PF + F'P dF + dQ + K'dR K,
     S dK = dB'PF + B'dP F + B'P dF - dR K,  dS = dR + dB'PB + B'dP B + B'P dB.
-
     `dQ` (k, n, n); `dR` (k, m, m); `dA` (k, n, n); `dB` (k, n, m).
     """
     B, P, K, F = solution.plant.B, solution.P, solution.K, solution.F
@@ -259,5 +259,5 @@ def _no_solution(reason: str) -> WeightsError:
     return WeightsError(
         "Q, R",
         f"have no stabilising Riccati solution ({reason})",
-        "weigh every mode that does not decay by itself",
+        "penalise every mode that does not decay by itself",
     )

@@ -1,12 +1,11 @@
-"""What may be costed: weights that are made of a few named cost weights.
+"""Cost structures: weights built from a few named cost weights (docs/howto/weights.md).
 
-    Q = F' W F,   R = G' V G,     rows of F (k, n) and G (l, m) given, W, V made of the unknowns z
+    Q = F' W F,   R = G' V G,     rows of F (k, n) and G (l, m) given; W, V depend on the unknowns z
 
-Each row is a feature of the states or of the inputs, a linear combination by name. Where features
-are penalised one by one, W = diag(exp(z)); a cost weight of zero is z = -inf. Where their products
-have cost weights too, W = L L' with L = diag(exp(z_1 .. z_k)) C and C lower triangular, ones on its
-diagonal. The entries below it are the other unknowns, which do not depend on units. The first cost
-weight of the inputs is one, for scale (docs/structures.md).
+Each row is a feature of the states or inputs, a linear combination by name. Without products of
+features W = diag(exp(z)); a cost weight of zero is z = -inf. With products W = L L' with
+L = diag(exp(z_1 .. z_k)) C, C unit lower triangular; the entries of C are further unknowns, which
+do not depend on units. The first cost weight of the inputs is 1, for scale.
 """
 
 from __future__ import annotations
@@ -29,50 +28,54 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _WORDS = ("diagonal", "full", "outputs")
-# Features whose cost weights differ by less than this, of their own size, make the same weights.
+# Features count as dependent below this ratio of singular values: their cost weights are ambiguous.
 _SAME = 1e-9
-# A mode that is nearer to the limit of stability than this does not decay.
+# A mode closer than this to the limit of stability does not count as decaying.
 _DECAYS = 1e-9
 
 
 @dataclass(frozen=True, init=False)
 class Structure(Value):
-    """Which states and inputs have a cost weight, and which cost weights are unknown.
+    """A cost structure: which features of states and inputs have unknown cost weights.
 
     Parameters
     ----------
     plant : Plant
-        Whose states and inputs are meant.
+        Plant whose states and inputs are meant.
     Q : "diagonal", "full", "outputs", or sequence of str
-        A cost weight for each feature; cost weights of all products of two features; a cost weight
-        for each output; or the features themselves, as in ``["theta1", "theta2 - theta1"]``, each
-        with a cost weight.
+        A cost weight for each feature; also cost weights of all products of two features; a cost
+        weight for each output; or a list of features, such as ``["theta1", "theta2 - theta1"]``,
+        each with a cost weight.
     R : "diagonal", "full", or sequence of str
-        The same for the inputs. With one input there is nothing to choose.
+        The same for the inputs. It has no effect with one input.
     over : sequence of str, optional
-        The features that ``Q = "diagonal"`` or ``"full"`` are over; all states by default.
+        Features for ``Q = "diagonal"`` or ``"full"``; by default all states.
     name : str, optional
-        What it is called in tables and sentences.
+        Name in tables and sentences.
 
     Attributes
     ----------
     name : str
-        What it is called.
+        Name in tables and sentences.
     labels : tuple of str
-        Of the features of the states (k,).
-    features : Array
-        One a row (k, n).
+        Features of the states, length k.
+    features : ndarray of shape (k, n)
+        Their coefficients, one feature per row.
     coupled : bool
-        Whether their products have cost weights too.
-    input_labels, input_features, input_coupled
-        The same of the inputs: (l,) and (l, m).
+        Whether products of features have cost weights too.
+    input_labels : tuple of str
+        Features of the inputs, length l.
+    input_features : ndarray of shape (l, m)
+        Their coefficients, one feature per row.
+    input_coupled : bool
+        Whether products of input features have cost weights too.
 
     Raises
     ------
     InputError
-        When a feature cannot be read, or cost weights of different features make the same weights.
+        If a feature cannot be parsed, or different cost weights give the same weights.
     WeightsError
-        When no feature sees a mode that does not decay by itself, or one sees no input.
+        If a mode that does not decay by itself, or an input, appears in no feature.
 
     Examples
     --------
@@ -129,36 +132,36 @@ class Structure(Value):
 
     @property
     def unknowns(self) -> tuple[str, ...]:
-        """Their names (count,): cost weights of features, then of pairs; the states' first."""
+        """Names of the unknowns (count,): features, then pairs; those of the states first."""
         inputs = _names(self.input_labels, coupled=self.input_coupled)
         return (*_names(self.labels, coupled=self.coupled), *inputs[1:])
 
     @property
     def is_cost_weight(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Which unknowns are logarithms of cost weights, not entries of C (count,)."""
+        """Mask (count,) of the unknowns that are logarithms of cost weights, not entries of C."""
         k, rest = len(self.labels), len(self.input_labels) - 1
         each = (k, self._split - k, rest, self.count - self._split - rest)
         return np.repeat([True, False, True, False], each)
 
     def weights(self, z: Array) -> Weights:
-        """The weights at the unknowns z (count,); minus infinity is a cost weight of zero.
+        """Return the weights at the unknowns z (count,); -inf is a cost weight of zero.
 
         Raises
         ------
         WeightsError
-            When a cost weight is no number any more.
+            If a cost weight overflows.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             states, inputs = self._factors(np.asarray(z, dtype=np.float64))
             Q, R = states.T @ states, inputs.T @ inputs
         if not (np.all(np.isfinite(Q)) and np.all(np.isfinite(R))):
-            raise WeightsError("Q, R", "a cost weight is beyond all numbers", "start elsewhere")
+            raise WeightsError("Q, R", "a cost weight overflows", "start from other unknowns")
         return Weights(Q, R)
 
     def changes(self, z: Array) -> tuple[Array, Array]:
-        """Change of Q (count, n, n) and R (count, m, m) with each unknown, at z (count,).
+        """Derivatives of Q (count, n, n) and R (count, m, m) with respect to z (count,).
 
-        Where a cost weight is zero, with the cost weight itself: its logarithm moves nothing.
+        For a cost weight of zero, with respect to the cost weight itself.
         """
         z = np.asarray(z, dtype=np.float64)
         own, beside = z[: self._split], np.concatenate([[0.0], z[self._split :]])
@@ -171,22 +174,10 @@ class Structure(Value):
         )
 
     def reported(self, z: Array) -> tuple[Array, Array]:
-        """The unknowns as they are identified.
+        """Unknowns as reported (count,), and their Jacobian (count, count) by `z` (count,).
 
-        Logarithms of the cost weights of features, W_ii; where they are coupled, of each pair the
-        correlation W_ij / sqrt(W_ii W_jj), between -1 and 1.
-
-        Parameters
-        ----------
-        z : Array
-            (count,).
-
-        Returns
-        -------
-        Array
-            (count,).
-        Array
-            Their derivative with respect to z (count, count).
+        These are logarithms of the cost weights W_ii and, if coupled, for each pair the correlation
+        W_ij / sqrt(W_ii W_jj), between -1 and 1.
         """
         z = np.asarray(z, dtype=np.float64)
         beside = np.concatenate([[0.0], z[self._split :]])
@@ -197,7 +188,7 @@ class Structure(Value):
 
     @property
     def _split(self) -> int:
-        """How many of the unknowns are those of Q."""
+        """Number of unknowns of Q."""
         return len(_names(self.labels, coupled=self.coupled))
 
     def _factors(self, z: Array) -> tuple[Array, Array]:
@@ -217,16 +208,16 @@ def _features(
         raise InputError(which, f"got {given!r}", f"give {words} or a list of features")
     if isinstance(given, str) and given == "outputs":
         if over is not None:
-            raise InputError("over", "goes with diagonal and full", "leave it out for outputs")
+            raise InputError("over", "needs diagonal or full", "leave it out for outputs")
         return tuple(plant.outputs), np.array(plant.C)
     if isinstance(given, str):
         chosen = tuple(plant.states if over is None else over)
     elif over is None:
         chosen = _texts(which, given)
     else:
-        raise InputError("over", "goes with diagonal and full", "leave it out beside a list")
+        raise InputError("over", "needs diagonal or full", "leave it out with a list of features")
     if not chosen:
-        raise InputError(which, "names no feature", "name one at least")
+        raise InputError(which, "is empty", "name at least one feature")
     return chosen, np.array([linear_combination(text, plant.states) for text in chosen])
 
 
@@ -258,20 +249,20 @@ def _default_name(Q: Any, over: Sequence[str] | None, labels: tuple[str, ...]) -
 def _require_different(
     which: str, labels: tuple[str, ...], features: Array, *, coupled: bool
 ) -> None:
-    """Features whose squares (coupled: which themselves) are linearly dependent have no weights."""
+    """Require linearly independent features (if not coupled, outer products of features)."""
     unit = features / np.linalg.norm(features, axis=1)[:, None]
     products = np.array([np.outer(row, row).ravel() for row in unit])
     values = np.linalg.svd(unit if coupled else products, compute_uv=False)
     if len(values) < len(labels) or values[-1] < _SAME * values[0]:
         raise InputError(
             which,
-            f"different cost weights of {', '.join(labels)} make the same weights",
-            "leave one out",
+            f"different cost weights of {', '.join(labels)} give the same weights",
+            "remove one",
         )
 
 
 def _require_detectable(plant: Plant, features: Array) -> None:
-    """Every mode that does not decay by itself is seen by a feature."""
+    """Require that every mode that does not decay by itself appears in a feature."""
     limit = 1 - _DECAYS if plant.discrete else -_DECAYS
     unit = features / np.linalg.norm(features, axis=1)[:, None]
     for mode in np.linalg.eigvals(plant.A):
@@ -300,7 +291,7 @@ def _names(labels: tuple[str, ...], *, coupled: bool) -> tuple[str, ...]:
 
 
 def _factor(size: int, z: Array, *, coupled: bool) -> Array:
-    """L of W = L L'."""
+    """Factor L of W = L L'."""
     scale = np.diag(np.exp(z[:size] / (1 if coupled else 2)))
     if not coupled:
         return np.asarray(scale)
@@ -310,7 +301,7 @@ def _factor(size: int, z: Array, *, coupled: bool) -> Array:
 
 
 def _identified(size: int, z: Array, *, coupled: bool) -> tuple[Array, Array]:
-    """Logarithms of W_ii and correlations, and their derivative with respect to z."""
+    """Logarithms of W_ii and correlations, and their Jacobian with respect to z."""
     if not coupled:
         return z, np.eye(size)
     L, steps = _factor(size, z, coupled=True), _steps(size, z)
@@ -335,7 +326,7 @@ def _changes(features: Array, z: Array, *, coupled: bool) -> Array:
 
 
 def _steps(size: int, z: Array) -> Array:
-    """Derivative of L with respect to z."""
+    """Derivatives of L with respect to z."""
     L = _factor(size, z, coupled=True)
     steps = []
     for index in range(size):

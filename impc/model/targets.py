@@ -1,13 +1,13 @@
-"""Where a plant can rest: the target calculator.
+"""Steady states of a plant for given targets (target calculator).
 
     minimise |H x_s - r|^2 + |D z_s|^2 over z_s = (x_s, u_s)
     subject to x_s = A x_s + B u_s + E d,  E_b x_s + F_b u_s <= b
 
-r are targets of the signals H x, d a lasting disturbance. D spans what neither the equation nor the
-targets determine, so that there the smallest of all targets is taken. Where a disturbance leaves no
-rest within the bounds they are left out: the controller then stays at its limit. With the active
-bounds at hand z_s solves one linear system, whose derivative is that of the target (docs/theory.md,
-section 7).
+where r are targets of the signals H x and d is a lasting disturbance. D spans what neither the
+equation nor the targets determine, so that the solution of minimum norm is taken. If no steady
+state lies within the bounds they are ignored: the controller then stays at its limit. For given
+active bounds z_s solves one linear system, whose derivative is that of the target
+(docs/why/theory.md, section 7).
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from impc.model.bounds import BoundRows
     from impc.model.plant import Plant
 
-# Violation of a bound, of the bound, up to which a target keeps it.
+# Relative violation up to which a target satisfies a bound.
 _KEPT = 1e-12
 
 
 @dataclass(frozen=True)
 class PlantChange:
-    """Changes of a plant along p directions, which are the last axis of every array."""
+    """Derivatives of a plant along p directions (last axis)."""
 
-    A: Array  # (n, n, p), (n, m, p), (n, d, p) and (q, n, p), of the targets' rows
-    B: Array
-    E: Array
-    H: Array
-    bounds: Array  # Of the right sides (c, p)
+    A: Array  # (n, n, p)
+    B: Array  # (n, m, p)
+    E: Array  # (n, d, p)
+    H: Array  # (q, n, p), rows of the signals with targets
+    bounds: Array  # (c, p), right sides
 
 
 @checked
@@ -55,27 +55,30 @@ def steady_state(
     disturbance: ArrayLike | None = None,
     bounds: Bounds | None = None,
 ) -> tuple[Array, Array]:
-    """State and command at which a plant rests at a target, as near as its bounds allow.
+    """Return the steady state and command of a plant at a target, as near as its bounds allow.
 
     Parameters
     ----------
     plant : Plant
-        Discrete.
+        Discrete-time plant.
     target : mapping of str to float, optional
         Values of outputs or states by name, in their units.
     disturbance : array_like, optional
-        Lasting disturbance (d,); none by default.
+        Lasting disturbance (d,); zero by default.
     bounds : Bounds, optional
+        Bounds of states and inputs; none by default.
 
     Returns
     -------
-    x, u : Array
-        (n,) and (m,). Of several such states the smallest.
+    x : ndarray of shape (n,)
+        State; of several solutions the one of minimum norm.
+    u : ndarray of shape (m,)
+        Command.
 
     Raises
     ------
     DataError
-        When the plant has no such signal, or a value is not finite.
+        If the plant has no such signal, or a value is not finite.
 
     Examples
     --------
@@ -100,7 +103,7 @@ def steady_state(
 def reference(
     plant: Plant, target: Mapping[str, Any] | None, samples: int
 ) -> tuple[Array, tuple[str, ...]]:
-    """Targets by name as columns (samples, q), with their names; a number holds for all samples."""
+    """Targets as columns (samples, q), and their names; a number holds for all samples."""
     names = tuple(target or {})
     signal_rows(plant, names)
     columns = np.empty((samples, len(names)))
@@ -110,27 +113,27 @@ def reference(
             raise DataError(
                 f"target {name}",
                 f"has shape {values.shape}, or values that are not finite",
-                f"give a number or {samples} of them",
+                f"give one number, or {samples} of them",
             )
         columns[:, place] = values
     return columns, names
 
 
 def signal_rows(plant: Plant, names: tuple[str, ...]) -> Array:
-    """Rows (q, n) of outputs or states by name."""
+    """Rows (q, n) that give outputs or states by name."""
     rows = dict(zip(plant.states, np.eye(plant.n), strict=True))
     rows |= dict(zip(plant.outputs, plant.C, strict=True))
     for name in names:
         if name not in rows:
             known = ", ".join(dict.fromkeys((*plant.outputs, *plant.states)))
-            raise DataError("target", f"there is no signal {name!r}", f"choose of {known}")
+            raise DataError("target", f"there is no signal {name!r}", f"choose from {known}")
     return np.array([rows[name] for name in names]).reshape(len(names), plant.n)
 
 
 def expected_disturbance(plant: Plant, disturbance: Array, rates: Array) -> tuple[Array, Array]:
-    """What the observer of a plant expects (steps, d), and its derivative along rates (d, p).
+    """Disturbance estimated by the plant's observer (steps, d); derivative along rates (d, p).
 
-    dh+ = dh + (1 - exp(-rate dt)) (d - dh), from dh = 0; d itself where the rate is infinite.
+    dh+ = dh + (1 - exp(-rate dt)) (d - dh), from dh = 0; d itself if the rate is infinite.
     """
     expected = np.array(disturbance)
     slopes = np.zeros((*disturbance.shape, rates.shape[1]))
@@ -147,7 +150,7 @@ def expected_disturbance(plant: Plant, disturbance: Array, rates: Array) -> tupl
 
 
 class SteadyStates:
-    """Targets of one plant with given rows (q, n) of the signals that have one."""
+    """Target calculator of a plant with rows H (q, n) of the signals that have a target."""
 
     def __init__(self, plant: Plant, H: Array, bounds: Bounds) -> None:
         self.plant, self.n, size = plant, plant.n, plant.n + plant.m
@@ -160,9 +163,9 @@ class SteadyStates:
         self.count = len(H)
 
     def at(self, values: Array, pushes: Array) -> tuple[Array, list[tuple[tuple[int, ...], Array]]]:
-        """Targets (T, n + m) at `values` (T, q) and `pushes` (T, d), and their active bounds.
+        """Steady states (T, n + m) at `values` (T, q) and `pushes` (T, d); active bounds.
 
-        The latter are pairs of the active bounds with the places that have them.
+        The latter are pairs (active bounds, indices of the samples at which they are active).
         """
         z = self._solve((), values, pushes)[:, : self.G.shape[1]]
         excess = z @ self.G.T - self.rows.b
@@ -186,13 +189,13 @@ class SteadyStates:
         groups: list[tuple[tuple[int, ...], Array]],
         along: PlantChange,
     ) -> Array:
-        """Derivatives (T, n + m, p) of targets along changes of the plant and the pushes."""
+        """Derivatives (T, n + m, p) of targets along changes of plant and pushes."""
         width, p = self.G.shape[1], along.A.shape[2]
         slopes = np.zeros((len(values), width, p))
         drest = np.concatenate([along.A, along.B], axis=1)
         dwide = np.zeros((*self.wide.shape, p))
         dwide[: self.count, : self.n] = along.H
-        # The basis of what is free turns with the plant: dD' = -N^+ dN D', N = [A - I, B; H, 0].
+        # The null-space basis rotates with the plant: dD' = -N^+ dN D', N = [A - I, B; H, 0].
         free, kept = self.wide[self.count :], np.vstack([self.rest, self.wide[: self.count]])
         dkept = np.concatenate([drest, dwide[: self.count]])
         dwide[self.count :] = -np.einsum("jr,rip,ki->kjp", np.linalg.pinv(kept), dkept, free)
@@ -228,10 +231,10 @@ class SteadyStates:
         return np.asarray(np.linalg.solve(self._system(active), right.T).T)
 
     def _active(self, slack: Array) -> tuple[int, ...]:
-        """Bounds that are active at the target; none where no target keeps them.
+        """Bounds that are active at the target; none if no target satisfies them.
 
-        From the unbounded target z the cost is |y|^2 with y = R c, z + N c, QR = wide N: a problem
-        of least distance, solved by least squares with multipliers of one sign (Lawson and Hanson).
+        From the unbounded target z the cost is |y|^2 with y = R c, z + N c, QR = wide N: a
+        least-distance problem, solved as non-negative least squares (Lawson and Hanson).
         """
         N = scipy.linalg.null_space(self.rest)
         R = np.linalg.qr(self.wide @ N, mode="r")

@@ -1,6 +1,6 @@
-"""Stage weights (Q, R): validation, scale, condition number and Cholesky parameters.
+"""Stage weights (Q, R): validation, scale and condition number.
 
-The controller does not change when Q, R and P are multiplied by one positive number, so weights
+The controller does not change if Q, R and P are multiplied by the same positive number, so weights
 are compared after `normalised`: R[0, 0] = 1, which for a single input is the R := 1 of (3.6).
 """
 
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, init=False)
 class Weights(Value):
-    """Stage weights of the cost  sum x'Qx + u'Ru.
+    """Stage weights of the cost sum x'Qx + u'Ru.
 
     Parameters
     ----------
     Q, R : array_like
-        Shapes (n, n) and (m, m); a number stands for a 1 x 1 matrix.
+        Matrices of shape (n, n) and (m, m); a number stands for a 1 x 1 matrix.
 
     Attributes
     ----------
-    Q : Array
-        State weight (n, n), symmetric, positive semidefinite.
-    R : Array
-        Input weight (m, m), symmetric, positive definite.
+    Q : ndarray of shape (n, n)
+        State weight, symmetric, positive semidefinite.
+    R : ndarray of shape (m, m)
+        Input weight, symmetric, positive definite.
 
     Raises
     ------
     DataError, InputError
-        When a matrix is not square, finite and symmetric.
+        If a matrix is not square, finite and symmetric.
     WeightsError
-        When Q has an eigenvalue below -1e-9 of its largest, or R one that is not positive.
+        If Q has an eigenvalue below -1e-9 of its largest, or R is not positive definite.
 
     Examples
     --------
@@ -68,8 +68,8 @@ class Weights(Value):
         if r_eigenvalues[0] <= 0:
             raise WeightsError(
                 "R",
-                f"is not positive definite: its least eigenvalue is {r_eigenvalues[0]:.4g}",
-                "every input needs a positive cost",
+                f"is not positive definite: its smallest eigenvalue is {r_eigenvalues[0]:.4g}",
+                "give every input a positive cost weight",
             )
         self._fill(Q=frozen(q), R=frozen(r))
 
@@ -80,30 +80,40 @@ class Weights(Value):
 
 
 def require_semidefinite(name: str, matrix: Array) -> None:
-    """Require that no eigenvalue of a matrix (n, n) is negative but for rounding."""
+    """Require a positive semidefinite matrix (n, n), up to rounding."""
     eigenvalues = np.linalg.eigvalsh(matrix)
     if eigenvalues[0] < -1e-9 * max(eigenvalues[-1], 1e-300):
-        problem = f"is not positive semidefinite: its least eigenvalue is {eigenvalues[0]:.4g}"
+        problem = f"is not positive semidefinite: its smallest eigenvalue is {eigenvalues[0]:.4g}"
         raise WeightsError(name, problem, f"give {name} = LL'")
 
 
 @checked
 def condition_number(weights: Weights) -> float:
-    """Condition number of blkdiag(Q, R), the kappa of (3.5); infinite when Q is singular."""
+    """Condition number of blkdiag(Q, R), kappa of (3.5); infinite if Q is singular."""
     eigenvalues = np.linalg.eigvalsh(weights.block)
     return float(eigenvalues[-1] / eigenvalues[0]) if eigenvalues[0] > 0 else float("inf")
 
 
 @checked
 def normalised(weights: Weights) -> Weights:
-    """Return the same weights scaled to R[0, 0] = 1."""
+    """Return the weights scaled to R[0, 0] = 1."""
     scale = float(weights.R[0, 0])
     return replace(weights, Q=weights.Q / scale, R=weights.R / scale)
 
 
 @checked
 def weight_error(estimate: Weights, truth: Weights) -> float:
-    """Frobenius distance of blkdiag(Q, R) after scaling both to R[0, 0] = 1, equation (3.10).
+    """Return the distance of two weights: Frobenius norm at R[0, 0] = 1, equation (3.10).
+
+    Parameters
+    ----------
+    estimate, truth : Weights
+        Weights to compare; both are scaled first.
+
+    Returns
+    -------
+    float
+        Norm of the difference of the matrices blkdiag(Q, R).
 
     Examples
     --------

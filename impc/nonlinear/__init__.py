@@ -1,4 +1,4 @@
-"""Optional: optimal control problems of the user's own, all of them (docs/nonlinear.md)."""
+"""Optional: fit optimal control problems that the user defines (docs/howto/nonlinear.md)."""
 
 from impc.checking import add_value
 

@@ -1,11 +1,9 @@
-"""The closed loop of a problem: at every sample its plan's first input is applied.
+"""Closed loop of an optimal control problem: the first input of a new plan at every sample.
 
     u_t = first input of the plan from x_t,      x_{t+1} = f(x_t, u_t, d_t; theta)
-
     dx_{t+1} = f_x dx_t + f_u du_t + f_theta dtheta,      du_t = U_theta dtheta + U_x dx_t
 
-with U from the exact derivatives of each plan (docs/nonlinear.md). The controller reckons with no
-disturbance.
+where U are the exact derivatives of each plan. The controller assumes zero disturbance.
 """
 
 from __future__ import annotations
@@ -29,11 +27,11 @@ if TYPE_CHECKING:
 class ClosedLoop(Frozen):
     """A simulation of T samples and its derivatives with respect to theta and x_0."""
 
-    x: Array  # States (steps + 1, n)
-    u: Array  # Inputs (steps, m)
-    dx: Array  # Derivative of x (steps + 1, n, p + n)
-    du: Array  # Derivative of u (steps, m, p + n)
-    plans: tuple[Plan, ...]  # T of them
+    x: Array  # (steps + 1, n), states
+    u: Array  # (steps, m), inputs
+    dx: Array  # (steps + 1, n, p + n), derivative of x
+    du: Array  # (steps, m, p + n), derivative of u
+    plans: tuple[Plan, ...]  # one per sample
 
 
 def closed_loop_from(
@@ -44,7 +42,7 @@ def closed_loop_from(
     mu: float,
     before: ClosedLoop | None = None,
 ) -> ClosedLoop:
-    """Simulate, beginning at a plan near the first, and near those of a simulation before.
+    """Simulate, starting each plan near the previous one, or near those of an earlier simulation.
 
     `theta` (p,); `x0` (n,); `d` (steps, d). Raises SolverError at a sample without a plan.
     """
@@ -59,7 +57,7 @@ def closed_loop_from(
         near = [last] if before is None else [before.plans[t], last]
         found = (nearby_plan(one, theta, x[t], mu) for one in near)
         plan = next((one for one in found if one is not None), None)
-        if plan is None:  # from the last sample's plan, a sample later
+        if plan is None:  # start from the last plan, shifted by one sample
             ahead = np.vstack([x[t], last.x[2:], last.x[-1:]])
             later = np.vstack([last.u[1:], last.u[-1:]])
             plan = solved_plan(problem, theta, first.d, ahead, later, "ipopt", mu)

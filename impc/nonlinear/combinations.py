@@ -1,11 +1,11 @@
-"""Which combinations of the parameters the recordings identify: singular values, with names.
+"""Identifiable combinations of the parameters, by singular values.
 
-To first order the residual moves by J dphi, phi the logarithms of the positive parameters and the
-signed ones themselves. Directions of J with a singular value of nothing are combinations that the
-recordings do not identify; written with as few parameters as there are, their exponents may be
-those of a scaling (l by a, m by a^-2): one that holds at factors of 1.2 and 2 when it is simulated.
-Any other is the tangent of a curve, and is said to hold near these values only. The identified ones
-are the products that no scaling changes. docs/nonlinear.md.
+To first order the residual changes by J dphi, where phi are the logarithms of positive parameters
+and the values of signed ones. Directions of J with zero singular value are unidentified. Written
+with as few parameters as possible, their exponents may be those of a scaling (l by a, m by a^-2),
+which is verified by simulation at factors of 1.2 and 2; any other direction is the tangent of a
+curve and holds only near the estimate. Identified are the products that no scaling changes
+(docs/howto/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
     from impc.nonlinear.problem import OptimalControlProblem
 
-# Relative to the largest singular value. On the four systems of docs/nonlinear.md the weakest
-# identified direction has 3e-4 and the strongest unidentified one, of a bound that nothing touches,
-# 5e-11.
+# Singular values below this share of the largest count as zero. On four systems the weakest
+# identified direction has 3e-4 and the strongest unidentified one, of a bound that is never
+# reached, 5e-11 (experiments/nonlinear.md).
 _NOTHING = 1e-8
-_ROUGH = 0.5  # of a logarithm: twice that is a factor of e
-_ROUND = 1e-3  # of an exponent: nearer to nothing, or to a multiple of a sixth, it is that
-_LARGEST = 4.0  # exponent of a scaling: larger ones are of tangents
+_ROUGH = 0.5  # standard error of a logarithm; twice that is a factor of e
+_ROUND = 1e-3  # exponents this close to 0, or to a multiple of 1/6, are rounded
+_LARGEST = 4.0  # largest exponent of a scaling; larger ones belong to tangents
 # Factors at which a scaling has to hold.
 _FACTORS = (1.2, 2.0)
 
 
 def interval(value: float, deviation: float, additive: bool, level: float) -> tuple[float, float]:
-    """Normal, of a value or of its logarithm."""
+    """Normal interval of a value or of its logarithm."""
     reach = float(scipy.stats.norm.ppf(0.5 + level / 2)) * deviation
     if additive:
         return value - reach, value + reach
@@ -49,37 +49,35 @@ def interval(value: float, deviation: float, additive: bool, level: float) -> tu
 class Combination:
     """A product of powers of parameters."""
 
-    exponents: dict[str, float]  # By name; of a signed parameter the factor of its difference
-    value: float  # Of the product at the estimate, 1 for an unidentified one
-    deviation: float  # Standard deviation of its logarithm; infinite for an unidentified one
-    # Whether it is a signed parameter by itself, and deviation that of its value
+    exponents: dict[str, float]  # by name; of a signed parameter the factor of its difference
+    value: float  # of the product at the estimate; 1 if unidentified
+    deviation: float  # standard error of its logarithm; infinite if unidentified
+    # whether it is a single signed parameter, and `deviation` the standard error of its value
     difference: bool = False
-    # Of an unidentified one: whether any factor is possible, as simulated; else it holds near these
-    # values
+    # if unidentified: whether any factor is possible, verified by simulation; otherwise only near
+    # the estimate
     scaling: bool = True
 
     @property
     def identified(self) -> str:
-        """Whether it is: "yes", "roughly" (to a factor of more than e only, at 95 %) or "no"."""
+        """Identified: "yes", "roughly" (95 % interval beyond a factor of e) or "no"."""
         if np.isinf(self.deviation):
             return "no"
         return "roughly" if self.deviation > _ROUGH and not self.difference else "yes"
 
     @property
     def name(self) -> str:
-        """Such as m1 l1^2 or l2 / l1."""
+        """Name such as "m1 l1^2" or "l2 / l1"."""
         over = [_power(name, item) for name, item in self.exponents.items() if item > 0]
         under = [_power(name, -item) for name, item in self.exponents.items() if item < 0]
         return " / ".join([" ".join(over) or "1", *under])
 
     @property
     def sentence(self) -> str:
-        """What an unidentified one leaves open."""
+        """What an unidentified combination leaves open."""
         if len(self.exponents) == 1:
             (name,) = self.exponents
-            return (
-                f"{name} is not identified: near its value nothing that was measured depends on it."
-            )
+            return f"{name} is not identified: near its value it affects nothing that was measured."
         if not self.scaling:
             named = ", ".join(self.exponents)
             return f"Near these values the recordings cannot distinguish {named}."
@@ -89,25 +87,25 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class Combinations(Frozen):
-    """What is identified and what is not."""
+    """Identified and unidentified combinations of the parameters."""
 
-    identified: tuple[Combination, ...]  # Together as many as there are parameters
+    identified: tuple[Combination, ...]  # with `unidentified` as many as there are parameters
     unidentified: tuple[Combination, ...]
-    singular_values: Array  # (p,), falling
-    # Standard deviation of each logarithm or signed parameter (p,); infinite where it is part of an
+    singular_values: Array  # (p,), decreasing
+    # standard error of each logarithm or signed parameter (p,); infinite if it is part of an
     # unidentified combination
     deviations: Array
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """One for each unidentified combination, one for the others, and one for those rough."""
+        """One sentence per unidentified combination, one on identified, one on rough ones."""
         found = [one.sentence for one in self.unidentified]
         kinds = {"yes": "Identified", "roughly": "Identified roughly (see the intervals)"}
         for kind, words in kinds.items():
             values = [
                 f"{one.name} = {one.value:.6g}"
                 for one in self.identified
-                # Of larger exponents nobody could mean the product.
+                # Products with larger exponents have no meaning for a reader.
                 if one.identified == kind and np.max(np.abs([*one.exponents.values()])) <= _LARGEST
             ]
             found += [f"{words}: {', '.join(values)}."] if values else []
@@ -122,7 +120,7 @@ def combinations(
     signals: IntArray,
     holds: Callable[[Array], bool],
 ) -> Combinations:
-    """Split the parameters.
+    """Split the parameters into identified and unidentified combinations.
 
     `theta` (p,); `jacobian` (r, k); `residual` (r,); `signals` (r,); `holds` (p,).
     """
@@ -132,8 +130,8 @@ def combinations(
         own = own - rest @ np.linalg.lstsq(rest, own, rcond=None)[0]
     _, values, right = np.linalg.svd(own, full_matrices=True)
     values = np.append(values, np.zeros(p - len(values)))
-    # Not by the noise: what it leaves open by a factor of ten is identified roughly, and which
-    # products are identified does not change from one recording to the next (docs/nonlinear.md).
+    # The threshold is independent of the noise: what is known to a factor of ten is identified
+    # roughly, and the set of identified products does not change between recordings.
     identified = values > _NOTHING * values[0]
     covariance = _covariance(jacobian, residual, signals, int(np.sum(~identified)))[:p, :p]
     basis, pivots = _sparse(right[~identified])
@@ -172,7 +170,7 @@ def _is_scaling(
 
 
 def _covariance(jacobian: Array, residual: Array, signals: IntArray, unidentified: int) -> Array:
-    """Of the estimate along identified directions, each signal with the noise left of it."""
+    """Covariance of the estimate in identified directions, by the residuals of each signal."""
     left, values, right = np.linalg.svd(jacobian, full_matrices=False)
     rank = len(values) - unidentified
     gains = right[:rank].T @ (left[:, :rank] / values[:rank]).T
@@ -185,11 +183,11 @@ def _covariance(jacobian: Array, residual: Array, signals: IntArray, unidentifie
 
 
 def _sparse(basis: Array) -> tuple[Array, list[int]]:
-    """The same space (k, p) by rows that are one in a column where the others are zero."""
+    """Basis of the same space (k, p) whose rows are one in a column where the others are zero."""
     columns = scipy.linalg.qr(basis, mode="r", pivoting=True)[1][: len(basis)]
     rows, pivots = np.linalg.solve(basis[:, columns], basis), []
     rows[np.abs(rows) < _ROUND] = 0.0
-    for index, row in enumerate(rows):  # by the smallest entry: exponents are whole
+    for index, row in enumerate(rows):  # divide by the smallest entry: exponents become integers
         alone = np.flatnonzero((row != 0) & (np.count_nonzero(rows, axis=0) == 1))
         sizes = np.abs(row[alone])
         pivots.append(int(alone[sizes < np.min(sizes) * (1 + _ROUND)][0]))

@@ -1,7 +1,6 @@
-"""Expressions and symbols of CasADi that a user gives, checked, and made functions.
+"""Validate CasADi expressions and symbols of the user and convert them to functions.
 
-Every function is one of (x, u, d, theta) in SX: a scalar form is evaluated fastest
-(docs/nonlinear.md).
+Every function has the arguments (x, u, d, theta) and is expanded to SX, which evaluates fastest.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca
 
 
 def symbols_of(subject: str, given: Any) -> list[Any]:
-    """Symbols of SX or MX; SX are taken apart, so that each has its name."""
+    """Symbols of SX or MX; vectors of SX are split, so that each entry has its name."""
     found: list[Any] = []
     for item in given if isinstance(given, list | tuple) else [given]:
         if not isinstance(item, ca.SX | ca.MX) or not item.is_valid_input():
@@ -32,7 +31,7 @@ def symbols_of(subject: str, given: Any) -> list[Any]:
 
 
 def names_of(symbols: Iterable[Any]) -> tuple[str, ...]:
-    """Of scalar `symbols` their own; of the entries of MX, the vector's with a number."""
+    """Names of scalar `symbols`; for vectors of MX the name with an index."""
     return tuple(name for item in symbols for name in _entries(item.name(), item.numel()))
 
 
@@ -41,14 +40,14 @@ def _entries(name: str, size: int) -> list[str]:
 
 
 def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
-    """The expressions of `given` below each other, by name, and a name for each row."""
+    """Stack the expressions of `given`; name each row."""
     parts: list[Any] = []
     names: list[str] = []
     for name, expression in given.items():
         symbolic = isinstance(expression, ca.SX | ca.MX)
         items: list[Any] = expression.elements() if isinstance(expression, ca.SX) else [expression]
         if symbolic and any(item.is_op(kind) for item in items for kind in _COMPARISONS):
-            remedy = "write what must not exceed 0: u - 1 for u <= 1"
+            remedy = "write the expression that must be <= 0: u - 1 for u <= 1"
             raise InputError(f"constraint {name}", "is a comparison", remedy)
         parts.append(ca.vec(expression) if symbolic else ca.DM(expression))
         names += _entries(name, parts[-1].numel())
@@ -58,11 +57,11 @@ def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
 def function_of(
     name: str, expression: Any, symbols: Sequence[list[Any]], size: int, alone: bool = False
 ) -> Any:
-    """A function of (x, u, d, theta) in SX, of x and theta `alone` if it is of the end."""
+    """Function of (x, u, d, theta) in SX; if `alone`, it may depend on x and theta only."""
     flat = [item for group in symbols for item in group]
     kind: Any = type(flat[0])
     if any(not isinstance(item, kind) for item in flat):
-        raise InputError("symbols", "are of SX and of MX", "make all of them with one of the two")
+        raise InputError("symbols", "mix SX and MX", "make all of them with one of the two")
     try:
         vector = ca.densify(kind(expression))
         raw = ca.Function(name, flat, [vector], {"allow_free": True})
@@ -74,21 +73,21 @@ def function_of(
         raise InputError(name, f"has shape {vector.shape}", f"give ({size}, 1)")
     if raw.has_free():
         raise InputError(
-            name, f"has the symbol {', '.join(raw.get_free())}",
-            "which is neither a state, an input, a disturbance nor a parameter: give it a value",
+            name, f"has the unknown symbol {', '.join(raw.get_free())}",
+            "make it a state, input, disturbance or parameter, or give it a value",
         )  # fmt: skip
     parts = [[ca.SX.sym(letter, item.numel()) for item in group]
              for letter, group in zip("xudp", symbols, strict=True)]  # fmt: skip
     value = raw(*(item for group in parts for item in group))
     made = ca.Function(name, [ca.vertcat(ca.SX(0, 1), *group) for group in parts], [value])
     if alone and any(made.jac_sparsity(0, index).nnz() for index in (1, 2)):
-        raise InputError(name, "depends on an input or a disturbance", "give it of the last state")
+        raise InputError(name, "depends on an input or a disturbance", "use the last state only")
     return made
 
 
 def require_influence(names: Sequence[str], functions: Sequence[Any]) -> None:
-    """Every parameter is in an expression."""
+    """Require that every parameter occurs in an expression."""
     seen = sum(np.array(ca.DM(one.jac_sparsity(0, 3), 1)).sum(axis=0) for one in functions)
     for name, count in zip(names, seen, strict=True):
         if not count:
-            raise InputError(f"parameter {name}", "is in no expression", "take it out")
+            raise InputError(f"parameter {name}", "occurs in no expression", "remove it")

@@ -1,9 +1,8 @@
-"""`impc fit` of a problem of the user's own: its settings, its recordings in files, and the fit.
+"""`impc fit` of an optimal control problem: settings, recordings in files, and the fit.
 
-A state is wanted at the instants k dt, an input and a disturbance as held from k dt to
-(k + 1) dt (`impc.files.resampling`). A signal without a column, and on the problem's own clock a
-sample that is missing, is NaN: not measured. What stands in the last row of an input acts behind
-the recording and is not used. docs/nonlinear.md.
+States are resampled to the instants k dt, inputs and disturbances to means over k dt to (k + 1) dt
+(`impc.files.resampling`). Signals without a column, and missing samples on the problem's own clock,
+are NaN (not measured). The last row of an input is not used.
 """
 
 from __future__ import annotations
@@ -50,33 +49,60 @@ if TYPE_CHECKING:
 
 
 class ParameterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A parameter of the problem: where its search begins, or its value."""
+    """A parameter of the problem: starting value, or known value.
 
-    start: float | None = None  # First value of a search
-    known: float | None = None  # Its value, when it is not searched
-    unit: str = ""  # Of the number; that of the problem where it is empty
+    Attributes
+    ----------
+    start : float, optional
+        Starting value of the search, if the parameter is estimated.
+    known : float, optional
+        Value of the parameter, if it is not estimated. Give either `start` or `known`.
+    unit : str, optional
+        Unit of the number; by default that of the problem.
+    """
+
+    start: float | None = None
+    known: float | None = None
+    unit: str = ""
 
     def __post_init__(self) -> None:
         if (self.start is None) == (self.known is None):
-            raise ValueError("has no number" if self.known is None else "has both start and known")
+            raise ValueError(
+                "needs start or known" if self.known is None else "has both start and known"
+            )
 
 
 @dataclass(frozen=True)
 class OptimalFitSettings:
-    """What a user may set of the fit of an optimal control problem."""
+    """Settings of the fit of an optimal control problem.
 
-    # Every parameter of the problem by its name: `ParameterSettings`
+    Attributes
+    ----------
+    parameters : table
+        Every parameter of the problem by name, with `start` or `known`.
+    recorded : "loop" or "plan", optional
+        Whether a recording is a closed loop that replans at every sample, or a single plan.
+    horizon : int, optional
+        Prediction horizon in samples; by default that of the problem.
+    x0 : table, optional
+        Initial values of states in SI units; by default the first recorded values.
+    unknown_start : bool, optional
+        Whether initial states are estimated, starting from these values.
+    solver : str, optional
+        Solver of the plans: "ipopt" or "fatrop".
+    evaluations : int, optional
+        Budget of evaluations for each start of the search.
+    starts : int, optional
+        Number of starts, used if the first explains little or has no plan.
+    """
+
     parameters: dict[str, Any] = field(default_factory=dict)
-    # Whether a recording is of a controller that plans anew at every sample, or is one plan
     recorded: Literal["loop", "plan"] = "loop"
-    horizon: int | None = None  # In samples, in place of the problem's
-    # Initial values of states, in SI units, in place of what was recorded
+    horizon: int | None = None
     x0: dict[str, float] = field(default_factory=dict)
-    # Whether initial states are searched, from what was recorded of them and from `x0`
     unknown_start: bool = True
-    solver: str = "ipopt"  # One of `impc.nonlinear.plan.SOLVERS`
-    evaluations: Annotated[int, Meta(ge=1)] = 200  # After how many the search from a start stops
-    # From how many starts, where the first explains little or has no plan
+    solver: str = "ipopt"
+    evaluations: Annotated[int, Meta(ge=1)] = 200
     starts: Annotated[int, Meta(ge=1, le=1000)] = 5
 
 
@@ -90,7 +116,7 @@ def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
         def where(path: str, name: str = name) -> str:
             return f"[fit.parameters] {brief(name, 80)} {path.lstrip('.')}".rstrip()
 
-        remedy = "write { start = 1.0 }, or { known = 1.0 }"
+        remedy = "write { start = 1.0 } or { known = 1.0 }"
         parameters[name] = converted(where, item, ParameterSettings, remedy)
     return replace(settings, parameters=parameters)
 
@@ -98,7 +124,7 @@ def optimal_fit_settings(table: Mapping[str, Any]) -> OptimalFitSettings:
 def posed(
     problem: OptimalControlProblem, settings: OptimalFitSettings
 ) -> tuple[OptimalControlProblem, dict[str, float], dict[str, float]]:
-    """The problem as it is fitted, where the search begins, and what is known; by name."""
+    """Problem as fitted, starting values and known values by name."""
     _require_own("parameters", settings.parameters, problem.parameter_names, "parameter")
     start: dict[str, float] = {}
     known: dict[str, float] = {}
@@ -116,11 +142,11 @@ def posed(
 
 
 def _factor(name: str, written: str, expected: str) -> float:
-    """From the unit that is written to that of the problem."""
+    """Factor from the unit `written` to that of the problem."""
     unit, own = si_unit(written), si_unit(expected or written)
     if own.base != unit.base:
         raise InputError(
-            f"[fit.parameters] {name}.unit", f"is {written!r}, and the problem has {expected}",
+            f"[fit.parameters] {name}.unit", f"is {written!r}, but the problem has {expected}",
             "correct the unit",
         )  # fmt: skip
     return unit.factor / (own.factor if expected else 1.0)
@@ -136,14 +162,14 @@ def _require_own(table: str, given: Iterable[str], known: Sequence[str], kind: s
 
 
 def require_signals(configuration: Configuration, problem: OptimalControlProblem) -> None:
-    """The `configuration` names signals of the `problem`, and each of its disturbances."""
+    """Require that the configuration names signals of the problem, and all disturbances."""
     known = (*problem.state_names, *problem.input_names, *problem.disturbance_names)
     require_known("signals.{}".format, configuration.signals, known, "is no signal of the problem")
     for name, entry in configuration.signals.items():
         require_filled_in(name, entry)
         for key, given, remedy in (
             ("shift", entry.shift != 0, "shift the column in the file"),
-            ("target", entry.target is not None, "make it a disturbance that the cost knows"),
+            ("target", entry.target is not None, "make it a disturbance that the cost uses"),
         ):
             if given:
                 unused = "is not used by an optimal control problem"
@@ -151,14 +177,14 @@ def require_signals(configuration: Configuration, problem: OptimalControlProblem
         require_kind(name, entry.unit, problem.units.get(name, UNKNOWN))
     for name in problem.disturbance_names:
         if name not in configuration.signals:
-            raise InputError(f"signals.{name}", "is missing", "a disturbance has to be recorded")
+            raise InputError(f"signals.{name}", "is missing", "record every disturbance")
 
 
 def read_recording(
     table: Table, clock: Clock, configuration: Configuration, problem: OptimalControlProblem,
     settings: OptimalFitSettings,
 ) -> tuple[OptimalRecording, list[str]]:  # fmt: skip
-    """A file as a recording of the problem in SI units on its clock, and what was let pass."""
+    """Read a file as a recording of the problem in SI units at its rate, with findings."""
     dt = problem.dt or clock.period
     checks.comparable_rates(table.source, clock.period, dt)
     findings, columns = list(clock.findings), {}
@@ -166,7 +192,7 @@ def read_recording(
         held = name not in problem.state_names
         columns[name], found = _series(table, clock, configuration, name, dt, held)
         findings += found
-    # A configuration names a signal, so there is a column.
+    # The configuration names at least one signal.
     nothing = np.full(len(next(iter(columns.values()))), np.nan)
     checks.too_few(table.source, len(nothing), 2)
     groups = (problem.state_names, problem.input_names, problem.disturbance_names)
@@ -180,14 +206,14 @@ def read_recording(
 def first_state(
     problem: OptimalControlProblem, recorded: Array, settings: OptimalFitSettings
 ) -> list[float]:
-    """The first state as it was `recorded` (n,), or as the settings have it."""
+    """Initial state from the settings, or as `recorded` (n,)."""
     _require_own("x0", settings.x0, problem.state_names, "state")
     first = dict(zip(problem.state_names, recorded, strict=True)) | settings.x0
     for name, value in first.items():
         if np.isnan(value):
             raise InputError(
                 f"[fit.x0] {name}", "is missing, and was not recorded",
-                "give it, or a guess with unknown_start = true",
+                "set it; a guess suffices with unknown_start = true",
             )  # fmt: skip
     return list(first.values())
 
@@ -195,7 +221,7 @@ def first_state(
 def _series(
     table: Table, clock: Clock, configuration: Configuration, name: str, dt: float, held: bool
 ) -> tuple[Array, list[str]]:
-    """A signal on the problem's clock, and what was let pass."""
+    """A signal at the problem's rate, and findings."""
     entry = configuration.signals[name]
     channel = channel_of(table, clock, name, entry)
     found = [
@@ -226,7 +252,7 @@ def fit_files(
     configuration: Configuration,
     solver: str | None,
 ) -> OptimalFit:
-    """Read recordings of a problem from files, and fit it as the configuration says."""
+    """Read recordings of a problem from files, and fit it with the settings of [fit]."""
     settings = optimal_fit_settings(configuration.fit)
     if solver is not None:
         settings = replace(settings, solver=require_solver(solver))

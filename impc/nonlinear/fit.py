@@ -1,11 +1,11 @@
-"""Nonlinear inverse MPC: the parameters of an optimal control problem behind its recordings.
+"""Nonlinear inverse MPC: fit the parameters of an optimal control problem to recordings.
 
     minimise over theta    sum ((x_sim(theta) - x) / scale)^2 + ((u_sim(theta) - u) / scale)^2
 
-by Levenberg and Marquardt's method with exact derivatives, positive parameters in their logarithms.
-The plans are those of the relaxed conditions s lam = mu, with mu falling in steps: at 1e-1 a
-constraint is felt from afar, also one that the first parameters never reach, and the derivative is
-smooth over changes of the active rows; at 1e-10 it is the problem itself. docs/nonlinear.md.
+by the Levenberg-Marquardt method with exact derivatives, positive parameters in logarithms. Plans
+satisfy the relaxed conditions s lam = mu with decreasing mu: at 1e-1 constraints act from a
+distance, even ones that the starting parameters never reach, and the derivative is smooth across
+changes of the active rows; 1e-10 is the problem itself (docs/howto/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -40,54 +40,50 @@ if TYPE_CHECKING:
     from impc.reporting.document import Report
     from impc.reporting.provenance import Provenance
 
-#: The falling sequence of mu, over the mean cost of a recorded stage where that is below one.
+#: Decreasing mu, relative to the mean cost of a recorded stage if that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
-_SPREAD = 0.3  # of further starts, in a logarithm
-# A scaling holds while it moves all trajectories by less than this share of them, or of the noise
-# of one number.
+_SPREAD = 0.3  # standard deviation of further starts, in a logarithm
+# A scaling is accepted if it moves all trajectories by less than this share of them, or of the
+# noise of one number.
 _UNMOVED, _LITTLE = 1e-5, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class OptimalControlEstimate(Frozen):
-    """What was found, and which part of it the recordings identify."""
+    """Estimated parameters of an optimal control problem, and their identifiability."""
 
     problem: OptimalControlProblem
     recordings: tuple[OptimalRecording, ...]
-    start: dict[str, float]  # Values by name at which the search began
-    theta: dict[str, float]  # Values by name
-    loss: float  # Sum of squares of all that was measured, in its units
-    residual: Array  # Differences over their scales (r,)
-    # Its derivative (r, k) by logarithms of positive parameters, by signed ones, and by unknown
+    start: dict[str, float]  # starting values by name
+    theta: dict[str, float]  # estimates by name
+    loss: float  # sum of squared residuals, in the units of the signals
+    residual: Array  # (r,), differences over their scales
+    # (r, k), derivative by logarithms of positive parameters, by signed ones, and by unknown
     # initial states over their scales
     jacobian: Array
-    # Of each residual the index of its state, or n and the index of its input (r,)
-    signals: IntArray
-    scales: Array  # Root-mean-square of each state and input in the recordings (n + m,)
-    combinations: (
-        Combinations  # What is identified and what is not, with the singular values that say so
-    )
-    x0: tuple[Array, ...]  # Initial state of each recording (n,)
-    # Of each recording the states (steps + 1, n) and inputs (steps, m) that the estimate has
+    signals: IntArray  # (r,), index of each residual's signal: state, or n + input
+    scales: Array  # (n + m,), root mean square of each state and input in the recordings
+    combinations: Combinations  # identified and unidentified combinations
+    x0: tuple[Array, ...]  # (n,), initial state of each recording
+    # states (steps + 1, n) and inputs (steps, m) of the estimate for each recording
     runs: tuple[tuple[Array, Array], ...]
-    settled: bool  # Whether the search ended by itself
-    evaluations: int  # How often all recordings were solved and differentiated
-    seconds: float  # Of the search, s
+    settled: bool  # whether the search converged
+    evaluations: int  # number of evaluations of all recordings with derivatives
+    seconds: float  # run time of the search in s
 
     def page(self, provenance: Provenance) -> Report:
-        """Page, tables and figures, as `impc.report` writes them."""
-        from impc.nonlinear.page import OptimalFit, optimal_report  # noqa: PLC0415 - it shows this
+        """Report, tables and figures, for `impc.report`."""
+        from impc.nonlinear.page import OptimalFit, optimal_report  # noqa: PLC0415 - import cycle
 
         names = tuple(f"recording {index + 1}" for index in range(len(self.recordings)))
         fit = OptimalFit(self, names, ((),) * len(names), self.problem.dt)
         return optimal_report(fit, provenance)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Low and high end of each parameter by its name, at a `level` between 0 and 1.
+        """Return the interval of each parameter by name, at a `level` between 0 and 1.
 
-        Normal in the logarithms of positive parameters; the noise of each signal is the root mean
-        square of what is left of it. A parameter that is part of an unidentified combination has an
-        infinite interval.
+        Normal in the logarithms of positive parameters, with the residual noise of each signal.
+        Parameters in an unidentified combination have an infinite interval.
         """
         if not 0 < level < 1:
             raise InputError("level", f"got {level:g}", "give one between 0 and 1")
@@ -108,79 +104,80 @@ def fit_optimal_control(
     evaluations: int = 200,
     starts: int = 1,
 ) -> OptimalControlEstimate:
-    """Search the parameters from a start.
+    """Estimate the parameters of an optimal control problem from recordings.
 
     Parameters
     ----------
     problem : OptimalControlProblem
+        Problem with unknown parameters.
     recordings : sequence of OptimalRecording
-        Of `problem.recorded_plan` and `problem.recorded_loop`.
+        Results of `problem.recorded_plan` and `problem.recorded_loop`.
     start : dict
-        First value of each parameter by its name.
+        Starting value of each parameter by name.
     solver : str
-        One of `impc.nonlinear.plan.SOLVERS`.
+        Solver of the plans, "ipopt" or "fatrop".
     evaluations : int
-        After how many the search from a start is stopped.
+        Budget of evaluations for each start of the search.
     starts : int
-        From how many starts, where the recordings are not explained from the first or it has no
-        plan: the others are about it by 0.3 in a logarithm.
+        Number of starts. Further ones are used if the first does not explain the recordings or has
+        no plan; they are distributed about it with SD 0.3 in a logarithm.
 
     Returns
     -------
     OptimalControlEstimate
-        Its `settled` says whether the search ended by itself.
+        `settled` is True if the search converged.
 
     Raises
     ------
     DataError
-        When there are no recordings.
+        If there are no recordings.
     InputError
-        When a start is not usable, or a parameter moves nothing that was measured at any mu.
+        If a start is invalid, or a parameter affects nothing that was measured at any mu.
     InfeasibleError, SolverError
-        When there is no plan at any start.
+        If there is no plan at any start.
 
     Examples
     --------
-    A point with drag, pushed to the origin; drag and price are not known.
+    A point with drag, pushed to the origin; drag and cost weight are unknown.
 
     >>> import casadi as ca
     >>> import impc
-    >>> x, u, drag, price = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("drag"), ca.SX.sym("w")
+    >>> x, u, drag, weight = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("drag"), ca.SX.sym("w")
     >>> problem = impc.OptimalControlProblem(
-    ...     x, u, {"drag": drag, "price": price},
+    ...     x, u, {"drag": drag, "weight": weight},
     ...     next_state=x + 0.1 * ca.vertcat(x[1], u - drag * x[1] ** 3),
-    ...     stage_cost=price * x[0] ** 2 + u**2,
+    ...     stage_cost=weight * x[0] ** 2 + u**2,
     ...     constraints={"push": ca.vertcat(u - 1, -u - 1)},
     ...     horizon=15,
     ... )
-    >>> loop = problem.closed_loop({"drag": 0.3, "price": 5.0}, [1.0, 0.5], steps=20)
+    >>> loop = problem.closed_loop({"drag": 0.3, "weight": 5.0}, [1.0, 0.5], steps=20)
     >>> recording = problem.recorded_loop(loop.x, loop.u)
-    >>> found = impc.fit_optimal_control(problem, [recording], {"drag": 0.5, "price": 3.0})
+    >>> found = impc.fit_optimal_control(problem, [recording], {"drag": 0.5, "weight": 3.0})
     >>> {name: round(value, 6) for name, value in found.theta.items()}
-    {'drag': 0.3, 'price': 5.0}
+    {'drag': 0.3, 'weight': 5.0}
     >>> found.combinations.unidentified
     ()
     """
     solver = require_solver(solver)
     if not recordings:
-        raise DataError("recordings", "there are none", "give at least one")
+        raise DataError("recordings", "is empty", "give at least one recording")
     if any(one.problem is not problem for one in recordings):
-        raise InputError("recordings", "are of another problem", "record them with this one")
+        raise InputError("recordings", "belong to another problem", "record them with this one")
     began = time.perf_counter()
     theta, budget = problem.values(start), Budget()
     given = Residuals(problem, tuple(recordings), solver, scales_of(recordings))
     mu_steps, explained = _scaled(recordings, theta), EXPLAINED * given.size
     best: tuple[Evaluation, bool] | None = None
-    refused: Exception = SolverError("start", "no search got away from it", "begin nearer")
+    refused: Exception = SolverError("start", "no search could leave it", "start nearer")
     for place, steps in _places(given, theta, mu_steps, starts, evaluations, budget):
         budget.take()
         try:
             first = begin(given, given.unknowns(place), steps[0])
-        except (InfeasibleError, SolverError) as error:  # said if no place has a plan
+        except (InfeasibleError, SolverError) as error:  # raised if no start has a plan
             refused = error if best is None and place is theta else refused
             continue
-        # Initial states stay at their samples until the rest is found: from afar their search ends
-        # elsewhere.
+        # Initial states stay at their samples until the rest has converged: from a distant start
+        # they would converge elsewhere.
         held, free = given.free(sampled=False), given.free()
         found = along_mu(given, first, steps, held, budget)
         if found[1] and not np.array_equal(held, free):
@@ -206,9 +203,9 @@ def _places(
     evaluations: int,
     budget: Budget,
 ) -> Iterator[tuple[Array, Sequence[float]]]:
-    """The start and others about it, each after where closed loops guide from there, with their mu.
+    """Yield the start and others about it, preceded by their guided versions, with their mu.
 
-    They are the same for the same start.
+    The sequence is reproducible.
     """
     for index in range(starts):
         budget.left, here = evaluations, theta
@@ -222,7 +219,7 @@ def _places(
 
 
 def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> Sequence[float]:
-    """mu in the size of the cost: at 0.1 of it a limit is felt from afar and moves little else."""
+    """mu relative to the cost: at 0.1 of it, limits act from a distance without further effect."""
     costs = [
         abs(float(one.problem.functions[1](x, u, d, theta)))
         for one in recordings

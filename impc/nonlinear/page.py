@@ -1,4 +1,4 @@
-"""The page of a problem's fit: verdict, movement, parameters, result.json (docs/nonlinear.md)."""
+"""Report of a fitted optimal control problem: verdict, movement, parameters, result.json."""
 
 from __future__ import annotations
 
@@ -27,35 +27,34 @@ if TYPE_CHECKING:
     from impc.nonlinear.fit import OptimalControlEstimate
     from impc.reporting.provenance import Provenance
 
-#: Recordings of which every sample is written, the first ones.
+#: Number of recordings of which every sample is written.
 MOST_TRIALS = 6
-# Of the largest value that a row has: nearer to zero it is at its limit. An active row with a
-# multiplier of lam is kept at a distance of 1e-10 / lam.
+# A row counts as at its limit within this share of its largest value. An active row with a
+# multiplier lam stays at a distance of 1e-10 / lam.
 _AT_LIMIT = 1e-5
 _EXACT = 1e-9
-_LITTLE = 50.0  # % of a signal below which a fit explains less than it leaves
+_LITTLE = 50.0  # VAF in % below which a signal counts as not explained
 _LEVEL = 0.95
 _MOST_PANELS = 4  # of the figure
 _ENDS = {"low": "95 % CI low", "high": "95 % CI high"}
-#: Under which name its numbers stand among the methods of result.json.
+#: Name among the methods of result.json.
 METHOD = "nonlinear_inverse_mpc"
 
 
 @dataclass(frozen=True, eq=False)
 class OptimalFit(Frozen):
-    """An estimate, and where its recordings come from."""
+    """An estimate and the origin of its recordings."""
 
     estimate: OptimalControlEstimate
-    trials: tuple[str, ...]  # A name for each recording
-    findings: tuple[tuple[str, ...], ...]  # What the checks of each let pass
-    dt: float | None = None  # Sample time, s; None where nobody says it
-    # Parameters that were not searched: value and unit
-    known: Mapping[str, tuple[float, str]] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)  # As the user gave them
+    trials: tuple[str, ...]  # name of each recording
+    findings: tuple[tuple[str, ...], ...]  # findings of the file checks of each
+    dt: float | None = None  # sample time in s, if known
+    known: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # fixed: value and unit
+    settings: Mapping[str, Any] = field(default_factory=dict)  # as the user gave them
 
 
 def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
-    """VAF of each state and input over all recordings, %; NaN where nothing was measured."""
+    """VAF of each state and input over all recordings in %; NaN where nothing was measured."""
     recorded = np.vstack([np.hstack([one.x[1:], one.u]) for one in estimate.recordings])
     simulated = np.vstack([np.hstack([x[1:], u]) for x, u in estimate.runs])
     size = np.nansum(recorded**2, axis=0)
@@ -66,7 +65,7 @@ def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
 
 
 def reached(estimate: OptimalControlEstimate) -> pd.DataFrame:
-    """At how many samples each constraint of the path is at its limit, in the estimate's runs."""
+    """Number of samples at which each path constraint is at its limit, in the estimate's runs."""
     heads, rows = ["constraint", "at_its_limit", "samples"], estimate.problem.rows
     if not rows:
         return pd.DataFrame(columns=heads)
@@ -85,24 +84,24 @@ def reached(estimate: OptimalControlEstimate) -> pd.DataFrame:
 
 
 def _verdict(fit: OptimalFit, explained: str) -> Verdict:
-    """What may be made of the fit; what forbids most comes first."""
+    """Verdict of the fit, most severe case first."""
     vaf, found = signal_vaf(fit.estimate), fit.estimate.combinations
     poor = ", ".join(_words(name) for name, value in vaf.items() if value < _LITTLE)
     open_ones = ", ".join(dict.fromkeys(key for one in found.unidentified for key in one.exponents))
     explains = "The problem explains this movement"
     if not fit.estimate.settled:
-        headline = "The search ended before it converged."
-        return Verdict(Level.RED, headline, "Its parameters are no answer.")
+        headline = "The search stopped before it converged."
+        return Verdict(Level.RED, headline, "Do not use its parameters.")
     if poor:
         headline = "The problem explains less than half of this movement."
-        said = f"That is so of {poor}: equations, cost or limits do not fit the recordings."
+        said = f"This concerns {poor}: equations, cost or limits do not fit the recordings."
         return Verdict(Level.RED, headline, said)
     if not found.identified:
         headline = f"{explains}, but no parameter is identified."
         return Verdict(Level.RED, headline, f"{explained}.")
     level, headline, alerts = Level.GREEN, f"{explains}, and each parameter is identified.", []
     names = ", ".join(one.name for one in found.identified)
-    may_not = [Claim("The cost as the only one.", "Another form may explain the movement too.")]
+    may_not = [Claim("This cost is the only one.", "Another form may explain the movement too.")]
     if open_ones:
         level, headline = Level.AMBER, f"{explains}, but {open_ones} cannot be determined."
         alerts = [Alert(
@@ -111,10 +110,10 @@ def _verdict(fit: OptimalFit, explained: str) -> Verdict:
             " ".join(one.sentence for one in found.unidentified),
             "Other values of these parameters lead to the same movement.",
             ["Report the products that are identified, with their intervals.",
-             "Give one of these parameters as known, or record a movement that depends on it."],
+             "Fix one of these parameters, or record a movement that depends on it."],
         )]  # fmt: skip
-        may_not.insert(0, Claim("What is not identified.", f"{open_ones}."))
-    may = [Claim("What is identified, with its intervals.", f"{names}.")]
+        may_not.insert(0, Claim("Values that are not identified.", f"{open_ones}."))
+    may = [Claim("Identified values, with their intervals.", f"{names}.")]
     return Verdict(level, headline, f"{explained}.", alerts, may, may_not)
 
 
@@ -123,7 +122,7 @@ def _words(name: str) -> str:
 
 
 def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
-    """Page, result.json, tables of parameters, products and samples, and the figure."""
+    """Report, result.json, tables of parameters, products and samples, and the figure."""
     estimate, problem = fit.estimate, fit.estimate.problem
     vaf = {name: value for name, value in signal_vaf(estimate).items() if np.isfinite(value)}
     each = ", ".join(f"{_words(name)} {number(value, 4)} %" for name, value in vaf.items())
@@ -165,11 +164,11 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
         ],
         ["Optimal control problem", recordings, provenance.made[:10]],
         Picture("movement", "Recorded and modelled signals over time",
-                f"Grey: recorded; blue: model, from the first state alone ({fit.trials[0]})."),
+                f"Grey: recorded; blue: model, from the first state only ({fit.trials[0]})."),
         keys,
         {"movement": lambda narrow: _draw_movement(fit, narrow)},
         Copy(methods, f"{explained}. {values}.") if verdict.level is Level.GREEN
-        else "There is text to copy when no check is open.",
+        else "Text to copy appears here when no check is open.",
         beside=[_samples(fit), Finding("limits", limits, "Samples at a limit.")],
         data=_data(fit, provenance),
         provenance=provenance,
@@ -177,7 +176,7 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
 
 
 def _status(estimate: OptimalControlEstimate) -> Status:
-    """How the search ended."""
+    """Status of the search."""
     recorded = [np.hstack([one.x[1:], one.u]) / estimate.scales for one in estimate.recordings]
     size = sum(float(np.nansum(item**2)) for item in recorded)
     if float(estimate.residual @ estimate.residual) <= _EXACT**2 * size:
@@ -186,7 +185,7 @@ def _status(estimate: OptimalControlEstimate) -> Status:
 
 
 def _draw_movement(fit: OptimalFit, narrow: bool) -> Figure:
-    """The first signals of the first recording, over time."""
+    """Draw the first signals of the first recording over time."""
     problem, one, (x, u) = fit.estimate.problem, fit.estimate.recordings[0], fit.estimate.runs[0]
     pairs = [*zip(one.x.T, x.T, strict=True), *zip(one.u.T, u.T, strict=True)]
     names = (*problem.state_names, *problem.input_names)
@@ -232,7 +231,7 @@ def _combinations(fit: OptimalFit) -> Finding:
 
 
 def _samples(fit: OptimalFit) -> Finding:
-    """A row a sample: recorded and simulated signals, and disturbances."""
+    """Table with one row per sample: recorded and simulated signals, and disturbances."""
     problem, tables = fit.estimate.problem, []
     names = {"x": problem.state_names, "u": problem.input_names, "d": problem.disturbance_names}
     runs = zip(fit.trials, fit.estimate.recordings, fit.estimate.runs, strict=True)

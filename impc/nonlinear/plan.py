@@ -1,16 +1,16 @@
-"""The optimal plan of a problem by CasADi's solvers, and its exact derivatives.
+"""Optimal plan of a problem by CasADi's solvers, with exact derivatives.
 
     grad L = 0,    c = 0,    h + s = 0,    s lam = mu,    s, lam > 0
 
-with y the multipliers of the equations c and of the rows h (lam), and s the slacks of the rows,
-define the unknowns w = (x_0, u_0, x_1, ...) smoothly in theta and x_0. IPOPT solves them for a
-target mu, begun at what another solver found or near another plan. Its word on how it ended is not
-used: steps of Newton's method on the conditions end it, and what they leave decides.
+with multipliers y of the equations c and of the rows h (lam), and slacks s of the rows, define the
+unknowns w = (x_0, u_0, x_1, ...) smoothly in theta and x_0. IPOPT solves them for a target mu,
+starting from the result of another solver or a nearby plan. Its return status is not used: Newton
+steps on the conditions finish the solution, and their residual decides.
 
     [H   A'         ] [dw]     [grad L        ]
     [A   - s / lam  ] [dy] = - [c,  h + mu/lam],     A the derivative of c and h
 
-is their sparse system, factorised once for every parameter and x_0 at a plan. docs/nonlinear.md.
+is their sparse system, factorised once per plan for the derivatives by all parameters and x_0.
 """
 
 from __future__ import annotations
@@ -33,16 +33,17 @@ if TYPE_CHECKING:
 
     from impc.nonlinear.problem import OptimalControlProblem
 
-# Of the conditions, relative to the largest multiplier (gradient) or as they are (c and h + s).
+# Tolerance of the gradient relative to the largest multiplier, and of c and h + s.
 _TOLERANCE = 1e-10
-_PRODUCT = 1e-3  # of s lam - mu, relative to mu
+_PRODUCT = 1e-3  # tolerance of s lam - mu, relative to mu
 _STEPS = 8
 _CENTRAL = 1e-2
-_EXCESS = 1e-6  # of a row, above which a problem without a plan is called infeasible
-# Multiplier over slack: at mu = 1e-10 an active row with a multiplier of one has 1e10.
+_EXCESS = 1e-6  # excess of a row from which a problem without a plan is called infeasible
+# Range of multiplier over slack that counts as weakly active: at mu = 1e-10 an active row with
+# multiplier 1 has 1e10.
 _WEAK = (1e-3, 1e3)
 _SILENT: dict[str, Any] = {"print_time": False, "error_on_fail": False}
-# mu means the same as in the conditions only if IPOPT scales and relaxes nothing.
+# mu has the same meaning in the conditions only if IPOPT neither scales nor relaxes.
 _IPOPT = IPOPT_ALONE | {
     "max_iter": 300, "tol": 1e-8, "nlp_scaling_method": "none", "bound_relax_factor": 0.0,
 }  # fmt: skip
@@ -56,12 +57,12 @@ _OPTIONS: dict[str, dict[str, Any]] = {
         "structure_detection": "auto", "fatrop": {"print_level": 0, "tol": 1e-8, "max_iter": 300},
     },
 }  # fmt: skip
-#: Interior points, with the structure of the stages or without.
+#: Interior-point solvers, without or with use of the stage structure.
 SOLVERS = tuple(_OPTIONS)
 
 
 def require_solver(name: str) -> str:
-    """Return the name of one of `SOLVERS` that CasADi has; it may be given in capitals."""
+    """Return the name of an available solver in lower case."""
     given, name = name, name.lower()
     if name not in SOLVERS:
         raise InputError("solver", f"got {given!r:.40}", f"choose one of {', '.join(SOLVERS)}")
@@ -71,9 +72,9 @@ def require_solver(name: str) -> str:
 
 
 class Program:
-    """The whole program of a problem, of p = (x_0, d, theta), with its derivatives.
+    """Nonlinear program of a problem with p = (x_0, d, theta), and its derivatives.
 
-    x_0 is an unknown that one equation fixes, and stages follow each other, as fatrop wants it.
+    x_0 is an unknown fixed by an equation, and stages are consecutive, as fatrop requires.
     """
 
     def __init__(self, problem: OptimalControlProblem) -> None:
@@ -81,7 +82,7 @@ class Program:
         n, m, N = problem.n, problem.m, problem.horizon
         x0, d = ca.SX.sym("x0", n), ca.SX.sym("d", problem.disturbance_count, N)
         theta, x = ca.SX.sym("theta", len(problem.parameter_names)), ca.SX.sym("x", n)
-        # Rows that no input moves: at the first sample nothing can be done about them.
+        # Rows that the input does not affect are dropped at the first sample.
         movable = ca.DM(h.jac_sparsity(0, 1), 1).full().any(axis=1)
         w, g, total = [], [], ca.SX(0)
         equal: list[bool] = []
@@ -109,11 +110,11 @@ class Program:
         H = ca.hessian(price * total + ca.dot(y, rows), unknowns)[0]
         slope = gradient + A.T @ y
         self.nlp = {"x": unknowns, "p": p, "f": total, "g": rows}
-        #: At a price of 1.
+        #: With a cost factor of 1.
         self.conditions = ca.Function("c", [unknowns, y, p, price], [slope, rows, H, A])
         sides = ca.jacobian(ca.vertcat(slope, rows), own)
         self.sides = ca.Function("sides", [unknowns, y, p], [sides])
-        #: Made once, for IPOPT at every mu.
+        #: Shared by the IPOPT solvers of all mu.
         self.derivatives = {
             "grad_f": ca.Function("g", [unknowns, p], [total, gradient]),
             "jac_g": ca.Function("j", [unknowns, p], [rows, A]),
@@ -122,7 +123,7 @@ class Program:
         self._solvers: dict[tuple[str, float, bool], Any] = {}
 
     def _solver(self, name: str, mu: float, near: bool) -> Any:
-        """CasADi's solver by its name; of IPOPT for a target mu, begun far from a plan or near."""
+        """CasADi solver by name; IPOPT for a target mu, with or without a warm start."""
         options = _SILENT | _OPTIONS[name]
         if name == "fatrop":
             options["equality"] = self.equal.tolist()
@@ -134,7 +135,7 @@ class Program:
     def answer(
         self, name: str, p: Array, w: Array, y: Array | None, mu: float
     ) -> tuple[Array, Array]:
-        """What a solver makes of a guess w, and y if it is near: no claim, it may be anything."""
+        """Run a solver from a guess w (and y for a warm start); the result is not checked."""
         key = (name, mu if name == "ipopt" else 0.0, y is not None)
         if key not in self._solvers:
             self._solvers[key] = self._solver(*key)
@@ -145,7 +146,7 @@ class Program:
 
 @functools.lru_cache(maxsize=64)
 def program_of(problem: OptimalControlProblem) -> Program:
-    """Its program, made once."""
+    """Program of a problem, cached."""
     return Program(problem)
 
 
@@ -155,14 +156,14 @@ class Plan(Frozen):
 
     problem: OptimalControlProblem
     p: Array  # x_0, disturbances and parameters
-    w: Array  # States and inputs, x_0, u_0, x_1, ...
-    y: Array  # Multipliers of equations and rows
-    s: Array  # Slacks of the rows
-    slope: Array  # Derivative of (w, y), each (p + n,)
-    x: Array  # States (N + 1, n)
-    u: Array  # Inputs (N, m)
-    dx: Array  # Derivative of the states (N + 1, n, p + n)
-    du: Array  # Derivative of the inputs (N, m, p + n)
+    w: Array  # states and inputs, x_0, u_0, x_1, ...
+    y: Array  # multipliers of equations and rows
+    s: Array  # slacks of the rows
+    slope: Array  # derivative of (w, y), each (p + n,)
+    x: Array  # (N + 1, n), states
+    u: Array  # (N, m), inputs
+    dx: Array  # (N + 1, n, p + n), derivative of the states
+    du: Array  # (N, m, p + n), derivative of the inputs
 
     @property
     def theta(self) -> Array:
@@ -171,7 +172,7 @@ class Plan(Frozen):
 
     @property
     def d(self) -> Array:
-        """Disturbances that the plan reckons with (N, d)."""
+        """Disturbances that the plan assumes (N, d)."""
         known = self.p[self.problem.n : -len(self.problem.parameter_names)]
         return known.reshape(self.problem.horizon, -1)
 
@@ -182,7 +183,7 @@ class Plan(Frozen):
 
     @property
     def weakly_active(self) -> tuple[tuple[str, int], ...]:
-        """Name and sample of the rows at which the derivative is between two slopes."""
+        """Name and sample of the rows that are about to become active or inactive."""
         return self._rows(*_WEAK)
 
     def _rows(self, low: float, high: float) -> tuple[tuple[str, int], ...]:
@@ -201,7 +202,7 @@ def solve_plan(
     mu: float = 1e-10,
     guess: tuple[Array, Array] | None = None,
 ) -> Plan:
-    """Solve from nothing or a guess, at `theta` (p,), `x0` (n,) and `d` (N, d); raise if none."""
+    """Solve from a guess or from rest at `theta` (p,), `x0` (n,), `d` (N, d); raise if none."""
     solver = require_solver(solver)
     if not 1e-12 <= mu <= 1e6:
         raise InputError("mu", f"got {mu:g}", "give 1e-12 to 1e6")
@@ -227,10 +228,9 @@ def solved_plan(
     solver: str,
     mu: float,
 ) -> Plan | None:
-    """By a solver from a guess x (N + 1, n), u (N, m), at theta (p,) and d (N, d).
+    """Solve from a guess x (N + 1, n), u (N, m), at theta (p,) and d (N, d); None if it fails.
 
-    None where there is none. It is tried at a large mu too: far from every bound the program is
-    easier.
+    A large mu is tried too: far from all bounds the program is easier.
     """
     p, w = _parameters(x[0], d, theta), _stages(x, u)
     paths = ([(solver, first), ("ipopt", mu)] for first in dict.fromkeys([mu, max(mu, 1e-1)]))
@@ -238,15 +238,12 @@ def solved_plan(
 
 
 def nearby_plan(plan: Plan, theta: Array, x0: Array, mu: float) -> Plan | None:
-    """The plan at other parameters theta (p,), another state x0 (n,) or mu; None if there is none.
-
-    IPOPT begins at the plan moved along its derivative.
-    """
+    """Plan at other theta (p,), x0 (n,) or mu, from a warm start along its derivative, or None."""
     change = np.concatenate([theta - plan.theta, x0 - plan.x[0]])
     moved = np.concatenate([plan.w, plan.y]) + plan.slope @ change
     w, y = np.split(moved, [len(plan.w)])
     y = np.where(program_of(plan.problem).equal, y, np.maximum(y, 0.1 * plan.y))
-    # From a larger mu where a multiplier must come off: at 1e-10 its slack holds it there.
+    # A larger mu helps where a multiplier must vanish: at 1e-10 its slack keeps it.
     paths = [[("ipopt", mu)], [("ipopt", max(mu, _CENTRAL)), ("ipopt", mu)]]
     return _first(plan.problem, _parameters(x0, plan.d, theta), w, y, paths)
 
@@ -260,7 +257,7 @@ def _stages(x: Array, u: Array) -> Array:
 
 
 def _states_and_inputs(problem: OptimalControlProblem, w: Array) -> tuple[Array, Array]:
-    """Of stages (N (n + m) + n, ...), each (N + 1, n, ...) and (N, m, ...)."""
+    """Split stages (N (n + m) + n, ...) into (N + 1, n, ...) and (N, m, ...)."""
     n = problem.n
     stages = w[:-n].reshape(problem.horizon, n + problem.m, *w.shape[1:])
     return np.concatenate([stages[:, :n], w[None, -n:]]), stages[:, n:]
@@ -273,7 +270,7 @@ def _first(
     y: Array | None,
     paths: Iterable[list[tuple[str, float]]],
 ) -> Plan | None:
-    """The first plan that solvers find, each after the other along a path of names and mu."""
+    """First plan that is found along paths of (solver, mu) pairs."""
     for path in paths:
         found: tuple[Array, Any] = w, y
         for solver, mu in dict.fromkeys(path):
@@ -285,13 +282,13 @@ def _first(
 
 
 def _ended(problem: OptimalControlProblem, p: Array, w: Array, y: Array, mu: float) -> Plan | None:
-    """The plan that Newton's method makes of a solver's answer w, y; None if it was none."""
+    """Plan from a solver's result w, y by Newton steps on the conditions; None if they fail."""
     program = program_of(problem)
     rows, y, s = ~program.equal, y.copy(), np.zeros(0)
     for step in range(_STEPS):
         gradient, g, H, A = program.conditions(w, y, p, 1)
         gradient, g, A = gradient.full().ravel(), g.full().ravel(), A.sparse()
-        if step == 0:  # of each pair (s, lam) the larger is believed
+        if step == 0:  # keep the larger of each pair (s, lam)
             s = np.maximum(-g[rows], np.sqrt(mu))
             held = y[rows] > s
             y[rows] = np.where(held, y[rows], mu / s)
@@ -321,9 +318,9 @@ def _ended(problem: OptimalControlProblem, p: Array, w: Array, y: Array, mu: flo
 
 
 def _flat(problem: OptimalControlProblem, p: Array, w: Array, y: Array, s: Array) -> str:
-    """Where the second derivative along the dynamics is not positive, in words; or nothing.
+    """Description of where the second derivative along the dynamics is not positive, or "".
 
-    It is positive when the Riccati recursion over the stages has positive pivots; rows count with
+    It is positive if the Riccati recursion over the stages has positive pivots; rows enter with
     their multiplier over their slack s.
     """
     program, n, size = program_of(problem), problem.n, problem.n + problem.m
@@ -359,7 +356,7 @@ def _require_finite_start(
 
 
 def _no_plan(problem: OptimalControlProblem, p: Array, w: Array) -> InfeasibleError | SolverError:
-    """Why there is none: the row that a plan of least total excess exceeds most, or its cost."""
+    """Error without a plan: the row with the largest excess at minimum total excess, or cost."""
     program = program_of(problem)
     rows, nlp = np.flatnonzero(~program.equal), program.nlp
     if len(rows):
@@ -378,15 +375,15 @@ def _no_plan(problem: OptimalControlProblem, p: Array, w: Array) -> InfeasibleEr
         name, sample = program.labels[int(np.argmax(left))]
         if np.max(left) > _EXCESS:
             return InfeasibleError(
-                f"constraint {name}", f"no plan was found that keeps it at sample {sample}: the"
+                f"constraint {name}", f"no plan was found that satisfies it at sample {sample}: the"
                 f" least excess is {np.max(left):.3g}",
-                "give other first parameters or another initial state",
+                "use other starting parameters or another initial state",
             )  # fmt: skip
     w, y = program.answer("ipopt", p, w, None, 1e-10)
     y = np.where(program.equal, y, np.maximum(y, 0))
     s = np.maximum(-program.conditions(w, y, p, 1)[1].full().ravel()[rows], 1e-10)
     reason = _flat(problem, p, w, y, s) if np.isfinite(w).all() else ""
     return SolverError(
-        "plan", reason or "the search for a plan did not end",
-        "give every input a price" if reason else "begin nearer, or try another solver",
+        "plan", reason or "the search for a plan did not converge",
+        "give every input a cost weight" if reason else "start nearer, or try another solver",
     )  # fmt: skip

@@ -1,11 +1,10 @@
-"""An optimal control problem with parameters anywhere, from CasADi expressions of the user's own.
+"""Optimal control problem with unknown parameters, from CasADi expressions of the user.
 
     minimise    e(x_N; theta) + sum_{k<N} l(x_k, u_k; theta)      over u_0 .. u_{N-1}, subject to
                 x_{k+1} = f(x_k, u_k, d_k; theta),   x_0 given,
                 h(x_k, u_k; theta) <= 0,   k = 0 .. N-1,       h_N(x_N; theta) <= 0
 
-A row of h that no input moves is not asked for at k = 0, where nothing can be done about it.
-docs/nonlinear.md has the derivation and an example.
+A row of h that no input affects is dropped at k = 0 (docs/howto/nonlinear.md).
 """
 
 from __future__ import annotations
@@ -36,85 +35,85 @@ if TYPE_CHECKING:
     from impc.nonlinear.plan import Plan
     from impc.nonlinear.recordings import OptimalRecording
 
-_LONGEST = 10_000  # stages: the program has as many as it has unknowns times states
+_LONGEST = 10_000  # stages; the size of the program is proportional
 
 
 @dataclass(frozen=True, init=False, eq=False)
 class OptimalControlProblem(Frozen):
-    """The problem as a value: CasADi functions, names and sizes, checked once.
+    """An optimal control problem with unknown parameters.
 
     Parameters
     ----------
     states, inputs : casadi.SX or casadi.MX, or a list of them
-        Symbols x (n) and u (m): one vector, or scalars whose names are those of the signals.
+        Symbols x (n) and u (m): one vector, or scalars named after the signals.
     parameters : dict
-        Name of each unknown -> its scalar symbol in the expressions.
+        Scalar symbol of each unknown parameter by name.
     next_state : casadi expression
-        f(x, u, d; theta) (n).
+        Next state f(x, u, d; theta), length n.
     stage_cost : casadi expression
-        l(x, u; theta), a number; as a rule prices times features, one price a known number.
+        Scalar cost l(x, u; theta); usually cost weights times features, with one weight fixed to a
+        number.
     horizon : int
-        N, samples.
+        Prediction horizon N in samples.
     terminal_cost : casadi expression
-        e(x; theta), a number; none by default.
+        Scalar cost e(x; theta); zero by default.
     constraints, terminal_constraints : dict
-        Name -> expression, every entry of which is to be at most 0: rows of h(x, u; theta) and of
+        Expressions by name, all entries of which must be <= 0: rows of h(x, u; theta) and of
         h_N(x; theta).
     disturbances : casadi.SX or casadi.MX
-        Symbols d; they are known to the plant and 0 to a controller that looks ahead.
+        Symbols d; the plant is simulated with them, while predictions of the closed loop assume 0.
     signed : sequence of str
-        Parameters that may have any sign; the others are positive and are searched in logarithms.
+        Parameters of any sign; the others are positive and are estimated in logarithms.
     units : dict
-        Unit of a parameter, a state, an input or a disturbance by its name, for tables.
+        Units of parameters and signals by name, for tables.
     dt : float
-        Sample time, s, of recordings in files.
+        Sample time of recordings in files, s.
 
     Attributes
     ----------
     horizon : int
-        N.
+        Prediction horizon N in samples.
     state_names, input_names, disturbance_names, parameter_names : tuple of str
-        n, m, d and p of them.
+        Names, of lengths n, m, d and p.
     rows, terminal_rows : tuple of str
-        A name for each row of h and h_N.
-    positive : BoolArray
-        Which parameters are (p,).
+        Name of each row of h and h_N.
+    positive : ndarray of shape (p,)
+        Which parameters are positive.
     units : dict
-        Units of parameters and signals by name, where they are given.
+        Units of parameters and signals by name, where given.
     dt : float or None
-        Sample time, s; None where it is not said.
+        Sample time, s.
     functions : tuple
         casadi.Function of (x, u, d, theta): f, l, e, h, h_N.
 
     Raises
     ------
     InputError
-        When an expression has a symbol that is not among states, inputs, disturbances and
-        parameters, or the wrong size; when a parameter is in no expression.
+        If an expression has the wrong size or a symbol that is not a state, input, disturbance or
+        parameter; or if a parameter occurs in no expression.
 
     Examples
     --------
-    A point that is driven to the origin at the least effort, its force limited; mass and price are
-    not known.
+    A point that is driven to the origin with limited force; mass and cost weight are unknown.
 
     >>> import casadi as ca
     >>> import impc
     >>> x, u = ca.SX.sym("x", 2), ca.SX.sym("force")
-    >>> mass, price = ca.SX.sym("mass"), ca.SX.sym("price")
+    >>> mass, weight = ca.SX.sym("mass"), ca.SX.sym("weight")
     >>> problem = impc.OptimalControlProblem(
-    ...     x, u, {"mass": mass, "price": price},
+    ...     x, u, {"mass": mass, "weight": weight},
     ...     next_state=x + 0.1 * ca.vertcat(x[1], u / mass),
-    ...     stage_cost=price * ca.sumsqr(x) + u**2,
+    ...     stage_cost=weight * ca.sumsqr(x) + u**2,
     ...     constraints={"force": ca.vertcat(u - 1, -u - 1)},
     ...     horizon=20,
     ... )
-    >>> plan = problem.plan({"mass": 1.5, "price": 10.0}, [1.0, 0.0])
+    >>> plan = problem.plan({"mass": 1.5, "weight": 10.0}, [1.0, 0.0])
     >>> plan.x.shape, bool(plan.u.min() > -1.0 - 1e-9)
     ((21, 2), True)
     """
 
-    #: Why commands for linear plants refuse it.
-    no_plant = ("is an optimal control problem", "impc fit takes one, this does not")
+    #: Message of commands for linear plants.
+    no_plant = ("is an optimal control problem", "use `impc fit`, which accepts one")
 
     horizon: int
     state_names: tuple[str, ...]
@@ -150,7 +149,7 @@ class OptimalControlProblem(Frozen):
             raise InputError("dt", f"got {dt}", "give a sample time above 0, s")
         if hasattr(next_state, "updfcn"):
             raise InputError("next_state", "is a system of python-control", "call its function"
-                             " with the symbols, as docs/nonlinear.md does")  # fmt: skip
+                             " with the symbols: docs/howto/nonlinear.md")  # fmt: skip
         x, u = symbols_of("states", states), symbols_of("inputs", inputs)
         d = [] if disturbances is None else symbols_of("disturbances", disturbances)
         theta = []
@@ -160,7 +159,7 @@ class OptimalControlProblem(Frozen):
                 raise InputError(f"parameter {name}", "is not a scalar symbol", "give each a name")
         for subject, symbols in {"states": x, "inputs": u, "parameters": theta}.items():
             if not symbols:
-                raise InputError(subject, "there are none", "give at least one")
+                raise InputError(subject, "is empty", "give at least one")
         path, rows = stacked(constraints or {})
         last, terminal_rows = stacked(terminal_constraints or {})
         groups, signals = (x, u, d, theta), [names_of(item) for item in (x, u, d)]
@@ -201,22 +200,22 @@ class OptimalControlProblem(Frozen):
 
     @checked(horizon=(1, _LONGEST))
     def with_horizon(self, horizon: int) -> OptimalControlProblem:
-        """The same problem over another `horizon` in samples."""
+        """Return the same problem with another `horizon` in samples."""
         return self._changed(horizon=horizon)
 
     @checked
     def with_known(self, known: Mapping[str, float]) -> OptimalControlProblem:
-        """The same problem with the values of some parameters `known` by name.
+        """Return the same problem with some parameters fixed at `known` values by name.
 
         Raises
         ------
         InputError
-            When one is unknown or has no such value, or when none is left.
+            If a name is unknown, a value is invalid, or no parameter is left.
         """
         numbers = {name: self._value(name, value) for name, value in known.items()}
         free = [k for k, name in enumerate(self.parameter_names) if name not in numbers]
         if not free:
-            raise InputError("parameters", "are all known", "leave one to be searched")
+            raise InputError("parameters", "are all known", "leave at least one to be estimated")
         theta = ca.SX(ca.DM([numbers.get(name, 0.0) for name in self.parameter_names]))
         theta[free] = left = ca.SX.sym("theta", len(free))
         given = [ca.SX.sym(key, self.functions[0].numel_in(k)) for k, key in enumerate("xud")]
@@ -236,12 +235,12 @@ class OptimalControlProblem(Frozen):
 
     @checked
     def values(self, theta: Mapping[str, float]) -> Array:
-        """Values of the parameters (p,) in their order, from `theta`, values by name.
+        """Return the parameters as an array (p,) from values `theta` by name.
 
         Raises
         ------
         InputError
-            When one is missing, unknown, not finite, or not positive and not signed.
+            If one is missing, unknown, not finite, or neither positive nor signed.
         """
         found = {name: self._value(name, value) for name, value in theta.items()}
         for name in self.parameter_names:
@@ -265,12 +264,12 @@ class OptimalControlProblem(Frozen):
     def plan(
         self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
     ) -> Plan:
-        """The optimal plan from a state x0 (n,), at values theta of the parameters by name.
+        """Return the optimal plan from a state x0 (n,), at values theta by name.
 
-        `solver` is one of `impc.nonlinear.plan.SOLVERS`, and mu that of the relaxed conditions
-        lam g = -mu. Raises InfeasibleError or SolverError where there is none.
+        `solver` is "ipopt" or "fatrop"; mu is that of the relaxed conditions lam g = -mu. Raises
+        InfeasibleError or SolverError if there is no plan.
         """
-        from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - it stands on this module
+        from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - import cycle
 
         start = finite_array("x0", x0, (self.n,))
         return solve_plan(self, self.values(theta), start, solver=solver, mu=mu)
@@ -286,12 +285,12 @@ class OptimalControlProblem(Frozen):
         solver: str = "ipopt",
         mu: float = 1e-10,
     ) -> ClosedLoop:
-        """The closed loop of `steps` samples: at each the first input of the plan from there.
+        """Simulate the closed loop for `steps` samples, each with the first input of a new plan.
 
-        Disturbances d (steps, d) are seen by the plant and not by the controller; theta, x0 (n,),
-        solver and mu are as in `plan`.
+        Disturbances d (steps, d) act on the plant and are unknown to the controller; theta, x0
+        (n,), solver and mu as in `plan`.
         """
-        from impc.nonlinear.closed_loop import closed_loop_from  # noqa: PLC0415 - see plan
+        from impc.nonlinear.closed_loop import closed_loop_from  # noqa: PLC0415 - import cycle
 
         shape = (steps, self.disturbance_count)
         known = finite_array("d", np.zeros(shape) if d is None else d, shape)
@@ -299,15 +298,15 @@ class OptimalControlProblem(Frozen):
         return closed_loop_from(first, first.theta, first.x[0], known, mu)
 
     def recorded_plan(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
-        """A recording that is one plan: x (N + 1, n), u (N, m); NaN is not measured.
+        """Make a recording of one plan: x (N + 1, n), u (N, m); NaN marks missing values.
 
-        More may be d (N, d), x0 (n,) and `unknown_start`: whether x0 is searched from what is
-        given, by default where it is the first of x.
+        Further arguments: d (N, d), x0 (n,) and `unknown_start`, whether x0 is estimated; by
+        default it is if x0 is not given.
         """
         return optimal_recording(self, x, u, closed_loop=False, **more)
 
     def recorded_loop(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
-        """A recording of the closed loop: x (steps + 1, n), u (steps, m), as `recorded_plan`."""
+        """Make a recording of a closed loop: x (steps + 1, n), u (steps, m), as `recorded_plan`."""
         return optimal_recording(self, x, u, closed_loop=True, **more)
 
 

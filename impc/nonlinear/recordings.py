@@ -1,7 +1,4 @@
-"""Recordings that an optimal control problem is to explain: one plan, or a closed loop.
-
-What is not measured is NaN. docs/nonlinear.md.
-"""
+"""Recordings of an optimal control problem, of one plan or a closed loop; NaN: not measured."""
 
 from __future__ import annotations
 
@@ -21,14 +18,13 @@ if TYPE_CHECKING:
 class OptimalRecording(Frozen):
     """States and inputs over T samples; NaN where they are not measured."""
 
-    problem: OptimalControlProblem  # Whose plan or closed loop it is
-    x: Array  # States (steps + 1, n)
-    u: Array  # Inputs (steps, m)
-    d: Array  # Disturbances, of shape (steps, d)
-    x0: Array  # Initial state (n,): the true one, or a guess when it is unknown
-    # Whether every input is the first of a plan of its own, and not all of one plan
-    closed_loop: bool
-    unknown_start: bool  # Whether the initial state is searched too
+    problem: OptimalControlProblem
+    x: Array  # (steps + 1, n), states
+    u: Array  # (steps, m), inputs
+    d: Array  # (steps, d), disturbances
+    x0: Array  # (n,), initial state, or a guess if it is unknown
+    closed_loop: bool  # whether every input is the first of its own plan
+    unknown_start: bool  # whether the initial state is estimated
 
 
 def optimal_recording(
@@ -41,7 +37,7 @@ def optimal_recording(
     x0: Any = None,
     unknown_start: bool | None = None,
 ) -> OptimalRecording:
-    """A recording, checked.
+    """Make a checked recording.
 
     `x` (steps + 1, n); `u` (steps, m); `d` (steps, d); `x0` (n,).
     """
@@ -55,7 +51,7 @@ def optimal_recording(
     known = finite_array("disturbances", np.zeros(shape) if d is None else d, shape)
     start = finite_array("x0", states[0] if x0 is None else x0, (problem.n,))
     if not np.any(np.isfinite(states[1:])) and not np.any(np.isfinite(inputs)):
-        raise DataError("recording", "has nothing that was measured", "give states or inputs")
+        raise DataError("recording", "has missing values only", "give states or inputs")
     return OptimalRecording(
         problem, frozen(states), frozen(inputs), frozen(known), frozen(start), closed_loop,
         x0 is None if unknown_start is None else unknown_start,
@@ -67,5 +63,5 @@ def _table(name: str, values: Any, samples: int | None, columns: int) -> Array:
     table = with_shape(name, table[:, None] if table.ndim == columns == 1 else table,
                        (samples, columns))  # fmt: skip
     if np.any(np.isinf(table)):
-        raise DataError(name, "has infinite entries", "give NaN where nothing was measured")
+        raise DataError(name, "has infinite entries", "use NaN for missing values")
     return table

@@ -1,12 +1,12 @@
-"""Differences of recordings from a problem's plans and closed loops, and their least squares.
+"""Residuals of recordings from plans and closed loops, and their least squares.
 
     r = ((x_sim(theta) - x) / scale, (u_sim(theta) - u) / scale),        dr / dphi
 
-phi the logarithms of positive parameters, the signed ones themselves, and the initial state of
-every recording, over their scales: root mean squares of the signals in the recordings. They are
-searched over a falling sequence of mu (docs/nonlinear.md). `guided` takes every recorded state of a
-closed loop for the start of a plan of its own, of which the first input and the next state were
-recorded. Such plans do not run away from the recording where theta is wrong.
+where phi are the logarithms of positive parameters, the values of signed ones, and the initial
+state of every recording over its scale; scales are root mean squares of the recorded signals. The
+search uses a decreasing sequence of mu (docs/howto/nonlinear.md). `guided` treats every recorded
+state of a closed loop as the start of a plan whose first input and next state were recorded: such
+plans stay near the recording even if theta is wrong.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ if TYPE_CHECKING:
     from impc.nonlinear.problem import OptimalControlProblem
     from impc.nonlinear.recordings import OptimalRecording
 
-#: Share of the squares of recordings above which plans are taken to be of another kind: a cart-pole
-#: that does not swing up leaves 0.8 of them, noise of 16 dB leaves 0.025.
+#: Unexplained share of squares above which the plans may be of another kind: a cart-pole that does
+#: not swing up leaves 0.8, noise of 16 dB leaves 0.025.
 EXPLAINED = 0.03
-_LONGEST_STEP = 0.7  # in a logarithm: a factor of two
+_LONGEST_STEP = 0.7  # in a logarithm, a factor of two
 _SMALL_STEP = 1e-9
 _LEAST_DAMPING, _MOST_DAMPING = 1e-14, 1e6
-_STILL = 1e-9  # of the largest signal: what is smaller stands still
+_STILL = 1e-9  # share of the largest signal below which a signal counts as constant zero
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """The recordings, with what is fixed in a search."""
+    """Recordings and what is fixed in a search."""
 
-    problem: OptimalControlProblem  # Whose parameters are searched
+    problem: OptimalControlProblem  # whose parameters are estimated
     recordings: tuple[OptimalRecording, ...]
-    solver: str  # One of `impc.nonlinear.plan.SOLVERS`
-    scales: Array  # Of states and inputs (n + m,)
+    solver: str  # one of `impc.nonlinear.plan.SOLVERS`
+    scales: Array  # (n + m,), of states and inputs
 
     @property
     def size(self) -> float:
-        """Sum of squares of all that was measured, over the scales."""
+        """Sum of squares of all measured values over their scales."""
         recorded = np.vstack([np.hstack([one.x[1:], one.u]) for one in self.recordings])
         return float(np.nansum((recorded / self.scales) ** 2))
 
     def free(self, sampled: bool = True) -> BoolArray:
-        """Which unknowns are searched (k,); not `sampled`: no initial state that has a sample."""
+        """Mask (k,) of the estimated unknowns; not `sampled`: without recorded initial states."""
         states = [one.unknown_start and (sampled or not np.array_equal(one.x0, one.x[0]))
                   for one in self.recordings]  # fmt: skip
         return np.append(np.ones_like(self.problem.positive), np.repeat(states, self.problem.n))
@@ -65,13 +65,13 @@ class Residuals:
         return np.concatenate([logarithms, *own])
 
     def split(self, unknowns: Array) -> tuple[Array, Array]:
-        """Parameters (p,), and the initial state (n,) of each recording, of unknowns (k,)."""
+        """Parameters (p,) and initial states (recordings, n) of unknowns (k,)."""
         n, p = self.problem.n, len(self.problem.parameter_names)
         theta = np.where(self.problem.positive, np.exp(unknowns[:p]), unknowns[:p])
         return theta, unknowns[p:].reshape(-1, n) * self.scales[:n]
 
     def signals(self) -> IntArray:
-        """Of each residual the column of its state or input (r,)."""
+        """Column of the state or input of each residual (r,)."""
         pairs = [_measured(one) for one in self.recordings]
         parts = [(np.flatnonzero(first), np.nonzero(kept)[1]) for kept, first in pairs]
         return np.concatenate([item for pair in parts for item in pair])
@@ -82,20 +82,20 @@ def scales_of(recordings: Sequence[OptimalRecording]) -> Array:
     columns = [column[np.isfinite(column)] for kind in ("x", "u")
                for column in np.vstack([getattr(one, kind) for one in recordings]).T]  # fmt: skip
     sizes = np.array([np.sqrt(np.mean(one**2)) if len(one) else 0.0 for one in columns])
-    # A signal that stands still has no size of its own: it is measured by the largest.
+    # A signal that does not move is scaled by the largest one.
     largest = float(np.max(sizes)) or 1.0
     return np.where(sizes > _STILL * largest, sizes, largest)
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The residual somewhere."""
+    """Residual and derivative at one point."""
 
     unknowns: Array  # (k,)
-    mu: float  # Of the relaxed conditions
+    mu: float  # of the relaxed conditions
     residual: Array  # (r,)
     jacobian: Array  # (r, k)
-    runs: tuple[Plan | ClosedLoop, ...]  # Of each recording
+    runs: tuple[Plan | ClosedLoop, ...]  # one per recording
 
     @property
     def loss(self) -> float:
@@ -104,7 +104,7 @@ class Evaluation:
 
 
 def begin(given: Residuals, unknowns: Array, mu: float) -> Evaluation:
-    """Solve every recording from what was recorded, at unknowns (k,) and mu."""
+    """Solve every recording, starting from the recorded signals, at unknowns (k,) and mu."""
     theta, starts = given.split(unknowns)
     runs: list[Plan | ClosedLoop] = []
     for one, x0 in zip(given.recordings, starts, strict=True):
@@ -120,7 +120,7 @@ def begin(given: Residuals, unknowns: Array, mu: float) -> Evaluation:
 def _evaluate(
     given: Residuals, unknowns: Array, mu: float, before: Evaluation
 ) -> Evaluation | None:
-    """Solve every recording at unknowns (k,) and mu near a solution; None where one has none."""
+    """Solve every recording at unknowns (k,) and mu near a solution; None if one fails."""
     theta, starts = given.split(unknowns)
     runs: list[Plan | ClosedLoop | None] = []
     for one, old, x0 in zip(given.recordings, before.runs, starts, strict=True):
@@ -132,7 +132,7 @@ def _evaluate(
             continue
         run = nearby_plan(old, theta, x0, mu)
         if run is None and before.loss > EXPLAINED * given.size:
-            # Plans of this kind do not explain the recording: another one may.
+            # Plans of this kind do not explain the recording; solve anew.
             guess = np.vstack([x0, old.x[1:]])
             run = solved_plan(old.problem, theta, old.d, guess, old.u, given.solver, mu)
         runs.append(run)
@@ -161,19 +161,19 @@ def _assembled(
 
 
 def _measured(one: OptimalRecording) -> tuple[BoolArray, BoolArray]:
-    """Which entries behind the first sample count, and which of the initial state."""
+    """Masks of the measured entries after the first sample, and of the initial state."""
     return np.isfinite(np.hstack([one.x[1:], one.u])), np.isfinite(one.x[0]) & one.unknown_start
 
 
 @dataclass
 class Budget:
-    """How many evaluations are left of a start's, and how many there were of all."""
+    """Evaluations left for one start, and number of all evaluations."""
 
     left: int = 0
     done: int = 0
 
     def take(self) -> bool:
-        """Count one more, if one is left."""
+        """Count one evaluation, if one is left."""
         some = self.left > 0
         self.left, self.done = self.left - some, self.done + some
         return some
@@ -186,9 +186,9 @@ def along_mu(
     free: BoolArray,
     budget: Budget,
 ) -> tuple[Evaluation, bool]:
-    """Search the `free` unknowns (k,) at each of the falling `mu_steps`.
+    """Search the `free` unknowns (k,) at each of the decreasing `mu_steps`.
 
-    Whether the last search ended by itself is the second value.
+    The second value is whether the last search converged.
     """
     settled = True
     for mu in mu_steps:
@@ -204,10 +204,10 @@ def along_mu(
 def _levenberg(
     given: Residuals, current: Evaluation, last: bool, free: BoolArray, budget: Budget
 ) -> tuple[Evaluation, bool]:
-    """Levenberg and Marquardt's steps until the loss no longer falls; on the way a rough answer.
+    """Levenberg-Marquardt steps until the loss no longer falls; before the last mu, roughly.
 
-    Damping keeps directions that nothing moves where they are. scipy's trust region walked along
-    them and named wrong combinations in two fits: rocket (S = .3), quadrotor (S = .1).
+    Damping keeps the unidentified directions unchanged. scipy's trust region moved along them and
+    gave wrong combinations in two fits: rocket (S = .3), quadrotor (S = .1).
     """
     damping, patience, enough = (1e-3, 60, 1e-13) if last else (1e-2, 12, 1e-2)
     for _ in range(patience):
@@ -241,10 +241,9 @@ def _levenberg(
 def guided(
     given: Residuals, theta: Array, mu_steps: Sequence[float], budget: Budget
 ) -> Array | None:
-    """Parameters (p,) by each recorded state's own plan, from theta (p,) along falling `mu_steps`.
+    """Parameters (p,) by a separate plan from each recorded state, along decreasing `mu_steps`.
 
-    States from which theta has no plan are left out; None when none is left, or no input of a loop
-    was measured.
+    States without a plan are left out; None if none is left, or no input of a loop was measured.
     """
     if not any(one.closed_loop and np.any(np.isfinite(one.u)) for one in given.recordings):
         return None
@@ -268,14 +267,14 @@ def guided(
 
 
 def _first_steps(one: OptimalRecording) -> list[OptimalRecording]:
-    """Of a closed loop the first step of a plan from every state that was measured whole."""
+    """First steps of plans from every completely measured state of a closed loop."""
     found, N, (steps, m) = [], one.problem.horizon, one.u.shape
     for t in range(steps):
         if not np.all(np.isfinite(one.x[t])) or not np.any(np.isfinite(one.u[t])):
             continue
         x, u = np.full((N + 1, one.problem.n), np.nan), np.full((N, m), np.nan)
         x[0], u[0] = one.x[t], one.u[t]
-        if not np.any(one.d[t]):  # the controller knew where the plant would go
+        if not np.any(one.d[t]):  # the controller's prediction was exact
             x[1] = one.x[t + 1]
         found.append(replace(
             one, x=frozen(x), u=frozen(u), d=np.zeros((N, one.d.shape[1])), x0=frozen(one.x[t]),

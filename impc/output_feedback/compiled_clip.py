@@ -1,6 +1,6 @@
-"""Compiled code: what is expected of a command that is clipped, where it is only expected.
+"""Compiled code: moments of a clipped normal command.
 
-The filter of `likelihood` asks for it (docs/noisy-people.md, section "The likelihood").
+Used by the filter of `likelihood` (docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -12,45 +12,45 @@ import numpy as np
 
 from impc.jit import njit
 
-# A bound that is so many deviations away is not met: a normal number is there once in 1e13.
+# Bounds beyond this many standard deviations are ignored (normal tail probability 1e-13).
 _FAR, _EXACT = 7.5, 1e-12
 
 
 class Clip(NamedTuple):
-    """How one input follows from a law that has no bound at the present sample.
+    """Clipping of the command by its bounds at the present sample.
 
     The cost of a plan is convex in its first input, so the input is that of the program without
-    bounds at the present sample, clipped. Where the filter expects it to be g with a deviation s,
+    bounds at the present sample, clipped. If that has mean g and standard deviation s, then
 
-        E clip,   its slope  P(low < g + s xi < high) times that of g,   and a variance beside
+        E clip,   its slope  P(low < g + s xi < high) times that of g,   and a further variance
 
     follow from the normal distribution (statistical linearisation).
     """
 
-    used: bool  # Whether it is clipped at all; several inputs take the law as it is, with its slope
-    low: float  # Bounds of the input, in its unit
+    used: bool  # whether to clip; with several inputs the law and its slope are used as they are
+    low: float  # bounds of the input, in its unit
     high: float
-    unit: float  # A deviation of s below 1e-12 of this is none
+    unit: float  # s below 1e-12 of this counts as zero
 
 
 class Clipped(NamedTuple):
-    """What is expected of min(max(g + s xi, low), high), xi normal, and its derivatives."""
+    """Moments of min(max(g + s xi, low), high), xi normal, and their derivatives."""
 
-    beyond: int  # 1 where g itself is beyond a bound, else 0
-    near: bool  # Whether a bound is anywhere near; where none is, nothing is clipped
-    value: float  # The expectation, and its derivative along s; that along g is `inside`
-    value_s: float
-    inside: float  # Probability of no bound, by which slopes are multiplied, and its derivatives
+    beyond: int  # 1 if g itself is beyond a bound, else 0
+    near: bool  # whether a bound is near; otherwise nothing is clipped
+    value: float  # mean; its derivative with respect to g is `inside`
+    value_s: float  # derivative of the mean with respect to s
+    inside: float  # probability of no active bound, by which slopes are multiplied
     inside_g: float
     inside_s: float
-    variance: float  # What no slope explains, and its derivatives
+    variance: float  # variance that the slope does not explain
     variance_g: float
     variance_s: float
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def clipped(clip: Clip, g: float, s: float) -> Clipped:
-    """What is expected of a command that is expected to be g, with a deviation s."""
+    """Moments of the clipped command with mean g and standard deviation s."""
     low, high = clip.low - g, clip.high - g
     if low < -_FAR * s and high > _FAR * s:
         return Clipped(0, False, g, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -82,7 +82,7 @@ def clipped(clip: Clip, g: float, s: float) -> Clipped:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
-    """Of a normal number below a: its probability, density, a times it; and s a, squared, below."""
+    """For a standard normal number below a: probability, density, a density, s a p, (s a)^2 p."""
     if a == -np.inf:
         return 0.0, 0.0, 0.0, 0.0, 0.0
     below = math.erfc(-a / np.sqrt(2.0)) / 2

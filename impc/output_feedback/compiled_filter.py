@@ -1,13 +1,14 @@
-"""Compiled code: the filter of plant and estimate of one trial, with its derivatives.
+"""Compiled code: filter of plant and estimate over one trial, with its derivatives.
 
-The equations are those of `likelihood`. With the gain g = P C'S^-1 and P|t what is left of P,
+The equations are those of `likelihood`. With the filter gain g = P C'S^-1 and the updated
+covariance P|t,
 
     P|t = P - g C P,    P+ = F P|t F' + Q,     L = F g,    G = F - L C,    dG = dF - L dC
     dP+ = G dP G' + dG P|t F' + F P|t dG' + dQ + L dR L'
 
-as in `kalman`: g makes P|t least, so that dP+ leaves dg alone. F has the command's slope in it.
-Of q directions the first k move covariances; k is the first axis of their derivatives, so that each
-product is one of matrices. While no bound is near the covariance soon stands still.
+as in `kalman`: g minimises P|t, so that dg does not enter dP+. F includes the command's slope. Of
+the q directions only the first k change covariances; k is the first axis of their derivatives.
+Away from bounds the covariance soon becomes stationary.
 """
 
 from __future__ import annotations
@@ -35,53 +36,53 @@ from impc.jit import njit
 from impc.output_feedback.compiled_clip import Clip, Clipped, clipped
 from impc.output_feedback.joint_loop import JointLoop
 
-# The covariance is taken for the stationary one when no entry differs by more than this, of the
-# deviations of its row and column; nor its derivative by more than the second.
+# The covariance counts as stationary if no entry differs by more than the first tolerance, in the
+# standard deviations of its row and column, and its derivative by no more than the second.
 _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
-# A first state is forgotten when none of its directions moves an innovation by more than this, of
-# its deviation.
+# The initial state is forgotten once no direction of it moves an innovation by more than this, in
+# its standard deviation.
 _FORGOTTEN = 1e-9
 
 
 class Steady(NamedTuple):
-    """The stationary filter where no bound is active, and its derivatives along k directions."""
+    """Stationary filter without active bounds, and its derivatives along k directions."""
 
-    P: Buffer  # Covariance of z given all earlier outputs (z, z), and (k, z, z)
-    dP: Buffer
-    known: bool  # Whether there is one
+    P: Buffer  # (z, z), covariance of z given all earlier outputs
+    dP: Buffer  # (k, z, z)
+    known: bool  # whether it exists
 
 
 class FilterParts(NamedTuple):
-    """What is filtered with, along q directions of which the first k move covariances."""
+    """Model of the filter, along q directions of which the first k change covariances."""
 
-    # Of the controller's law, as in `compiled_kernel.run`, along all q directions; unit (m,)
+    # controller, as in `compiled_kernel.run`, along all q directions; unit (m,)
     loop: LoopMatrices
     dloop: LoopMatrices
     rows: Rows
     drows: RowDirections
     unit: Buffer
-    clip: Clip  # What is done to the law's command
-    joint: JointLoop  # The system, and its derivatives along the first k directions
+    clip: Clip  # clipping of the command
+    joint: JointLoop  # system, and its derivatives along the first k directions
     djoint: JointLoop
-    moving: bool  # Whether any direction moves B, C, E or G
-    turning: Buffer  # Which direction moves F or Q (k,)
+    moving: bool  # whether any direction changes B, C, E or G
+    turning: Buffer  # (k,), which directions change F or Q
     steady: Steady
-    at: int  # Where the estimate stands in z
-    lasting: int  # How many directions, the first ones, move more than the first state
+    at: int  # first index of the estimate in z
+    lasting: int  # number of leading directions that change more than the initial state
 
 
 class Likelihood(NamedTuple):
-    """What one trial says, sample by sample; the filter writes it."""
+    """Output of the filter for one trial, one row per sample."""
 
-    identified: Buffer  # Log-likelihood of each sample given the earlier ones (samples,), nats
-    score: Buffer  # Its derivatives along q directions (samples, q)
-    information: Buffer  # Fisher's, expected (q, q)
-    innovations: Buffer  # Recorded outputs minus what the filter expects (samples, p)
-    spreads: Buffer  # Their covariances (samples, p, p)
-    filtered: Buffer  # Expected z given all outputs so far (samples, z)
-    u: Buffer  # Command expected there (samples, m)
-    status: Buffer  # `Status` of each sample (samples,)
-    counted: int  # The first sample whose likelihood counts: earlier ones are given
+    identified: Buffer  # (samples,), log-likelihood of each sample given the earlier ones, nats
+    score: Buffer  # (samples, q), its gradient
+    information: Buffer  # (q, q), expected Fisher information
+    innovations: Buffer  # (samples, p), recorded minus predicted outputs
+    spreads: Buffer  # (samples, p, p), covariances of the innovations
+    filtered: Buffer  # (samples, z), mean of z given all outputs up to the sample
+    u: Buffer  # (samples, m), expected command
+    status: Buffer  # (samples,), `Status`
+    counted: int  # first sample in the log-likelihood; earlier ones are conditioned on
 
     @property
     def value(self) -> float:
@@ -90,17 +91,17 @@ class Likelihood(NamedTuple):
 
 
 class _Weighed(NamedTuple):
-    """What follows from the covariance of z before a sample of the outputs."""
+    """Quantities that follow from the covariance of z before a sample."""
 
-    S: Buffer  # Covariance of the innovation, its inverse (p, p) and log det
-    inverse: Buffer
-    volume: float
-    gain: Buffer  # g (z, p)
-    left: Buffer  # P|t (z, z)
-    dPC: Buffer  # Derivatives of P C' (k, z, p) and of S (k, p, p), and dS S^-1
-    dS: Buffer
-    weighed: Buffer
-    half: Buffer  # tr(S^-1 dS S^-1 dS) / 2 for each pair of directions (k, k)
+    S: Buffer  # (p, p), covariance of the innovation
+    inverse: Buffer  # (p, p), S^-1
+    volume: float  # log det S
+    gain: Buffer  # (z, p), g
+    left: Buffer  # (z, z), P|t
+    dPC: Buffer  # (k, z, p), derivatives of P C'
+    dS: Buffer  # (k, p, p)
+    weighed: Buffer  # (k, p, p), dS S^-1
+    half: Buffer  # (k, k), tr(S^-1 dS S^-1 dS) / 2 for each pair of directions
 
 
 @njit(cache=True, nogil=True)
@@ -116,13 +117,12 @@ def run_filter(
     result: Likelihood,
     first: int,
 ) -> int:
-    """Filter one trial from the first sample on; returns the sample at which it ends.
+    """Filter one trial from sample `first` on; return the sample at which it stops.
 
-    It ends after the last sample; at one whose status has been written, at which the law has no
-    answer or the state leaves every range; and at the first one that remembers nothing of the first
-    state, from where `lasting` directions are enough. z, dz, P and dP are those before that sample.
-
-    `outputs` (samples, p); `disturbance` (samples, d), with an aim a sample; `z` (z,);
+    It stops after the last sample; at a sample whose status is set, where the law has no solution
+    or the state diverges; and at the first sample at which the initial state is forgotten, from
+    where `lasting` directions suffice. z, dz, P and dP are those before that sample.
+    `outputs` (samples, p); `disturbance` (samples, d), with an aim per sample; `z` (z,);
     `dz` (z, q); `P` (z, z); `dP` (k, z, z).
     """
     joint, djoint, steady, at = parts.joint, parts.djoint, parts.steady, parts.at
@@ -174,14 +174,14 @@ def run_filter(
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _times(changes: Buffer, vector: Buffer) -> Buffer:
-    """Changes (k, i, j) times a vector (j,), as columns (i, k)."""
+    """Product of changes (k, i, j) with a vector (j,), as columns (i, k)."""
     k, i, j = changes.shape
     return (changes.reshape(k * i, j) @ vector).reshape(k, i).T
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _weigh(parts: FilterParts, P: Buffer, dP: Buffer) -> _Weighed:
-    """What follows from P (z, z) and dP (k, z, z)."""
+    """Innovation covariance, gain and updated covariance from P (z, z) and dP (k, z, z)."""
     joint, djoint, C = parts.joint, parts.djoint, parts.joint.C
     (p, size), k = C.shape, len(dP)
     CP = C @ P
@@ -214,9 +214,9 @@ def _update(
     result: Likelihood,
     t: int,
 ) -> bool:
-    """Likelihood and score of one sample; z and dz become those given the sample.
+    """Log-likelihood and score of one sample; condition z and dz on it.
 
-    Returns whether directions from `lasting` on move neither the innovation nor its covariance.
+    Returns whether directions from `lasting` on change neither the innovation nor its covariance.
     """
     C, S, inverse, dS, k = parts.joint.C, known.S, known.inverse, known.dS, len(known.dS)
     p, lasting = len(C), parts.lasting
@@ -234,7 +234,7 @@ def _update(
             score[:k] -= known.weighed[:, a, a] / 2
         result.information[: len(score), : len(score)] += de.T @ wde
         result.information[:k, :k] += known.half
-    # The gain is P C'S^-1: with w = S^-1 e it moves by (d(P C') - gain dS) w where it is applied.
+    # The gain is P C'S^-1: with w = S^-1 e its effect changes by (d(P C') - gain dS) w.
     z += known.gain @ e
     dz += known.gain @ de
     dz[:, :k] += _times(known.dPC, we) - known.gain @ moved
@@ -249,10 +249,9 @@ def _update(
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _slope_of_law(parts: FilterParts, work: Workspace, plain: Buffer) -> tuple[Buffer, Buffer]:
-    """Slope of the command with the state (m, n) at the active rows, its derivatives (k, m, n).
+    """Slope of the command by the state (m, n) for the active rows, derivatives (k, m, n).
 
     With the active rows a it is -K - (Gram_aa^-1 N_a0)' T_a, N_a0 the columns of the first stage.
-
     `plain` (k, m, n): derivatives of the gain.
     """
     loop, dloop, rows, drows = parts.loop, parts.dloop, parts.rows, parts.drows
@@ -298,7 +297,7 @@ def _clip_command(
     dslope: Buffer,
     dnoise: Buffer,
 ) -> Clipped:
-    """Command and slope become those that are expected of a clipped command; see `Clip`."""
+    """Replace command and slope by the moments of the clipped command; see `Clip`."""
     C, at, n, k = parts.joint.C, parts.at, slope.shape[1], len(dslope)
     seen = np.zeros(len(known.left))
     seen[at : at + n] = slope[0]
@@ -309,7 +308,7 @@ def _clip_command(
         return found
     ds, along = np.zeros(k), du[0, :k].copy()
     if found.inside_g != 0.0 or found.inside_s != 0.0:
-        # Of seen' P|t seen: d(P|t) = (I - g C) dP (I - g C)' + g dR g' less what dC moves.
+        # Derivative of seen' P|t seen: d(P|t) = (I - g C) dP (I - g C)' + g dR g' minus dC terms.
         answer = seen @ known.gain
         before = seen - C.T @ answer
         ds += before @ _times(dP, before)
@@ -342,9 +341,9 @@ def _advance(
     noise: Buffer,
     dnoise: Buffer,
 ) -> None:
-    """P and dP become those before the next sample.
+    """Predict P and dP for the next sample.
 
-    `noise` (m,) and `dnoise` (k, m): variance that enters with each command, beside motor noise.
+    `noise` (m,) and `dnoise` (k, m): variance of each command in addition to motor noise.
     """
     joint, djoint, at, B, Gm = parts.joint, parts.djoint, parts.at, parts.joint.B, parts.joint.G
     (m, n), size, k, p, C = slope.shape, len(P), len(dP), len(joint.C), joint.C
@@ -358,7 +357,7 @@ def _advance(
     product = (dP.reshape(k * size, size) @ G.T).reshape(k, size, size)
     turned = np.ascontiguousarray(product.transpose((0, 2, 1)))
     product = (turned.reshape(k * size, size) @ G.T).reshape(k, size, size)
-    # Of the rest a half is written, as what enters by a few columns: to dP go it and its mirror.
+    # The remaining terms have few columns; half of them is formed and added with its transpose.
     columns = np.concatenate((B, Gm, L), axis=1)
     changes, estimate = np.empty((k, size, 2 * m + p)), np.ascontiguousarray(ahead[:, at : at + n])
     for c in range(k):
@@ -385,7 +384,7 @@ def _advance(
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _is_near(P: Buffer, dP: Buffer, steady: Steady) -> bool:
-    """Whether covariance and derivative are the stationary ones, but for what is left out."""
+    """Whether covariance and derivatives are stationary within tolerance."""
     deviations = np.sqrt(np.diag(steady.P))
     unit = np.outer(deviations, deviations)
     if not np.all(np.abs(P - steady.P) <= _STEADY * unit):

@@ -1,9 +1,9 @@
-"""How sure a person at the largest likelihood is: gain, levels of noise, and which are confused.
+"""Precision of an output-feedback fit: covariance of gain and noise SDs, and confounding.
 
-    expected   I^-1                    I: Fisher's information about all unknowns
-    sandwich   I^-1 cov(sum s_t) I^-1  s_t: the score of a sample; its sum by Newey and West
+    expected   I^-1                    I: Fisher information of all unknowns
+    sandwich   I^-1 cov(sum s_t) I^-1  s_t: score of a sample; its sum by Newey and West
 
-agree where the model is true; where it is not, the last still says how estimates scatter.
+agree if the model is true; if not, the sandwich covariance still describes the sampling error.
 """
 
 from __future__ import annotations
@@ -20,64 +20,64 @@ from impc.errors import InputError
 if TYPE_CHECKING:
     from impc.output_feedback.fit import OutputFeedbackFit
 
-#: Ways to a covariance.
+#: Kinds of covariance.
 KINDS = ("expected", "sandwich")
-# Of a coordinate, which none leaves by much more than one: the prior that is left.
+# Largest standard deviation of a coordinate, from the remaining prior.
 _FARTHEST = 1e3
 
 
 @dataclass(frozen=True)
 class PersonCovariance(Frozen):
-    """Covariance of what was searched."""
+    """Covariance of the estimated unknowns."""
 
-    kind: str  # One of `KINDS`
-    covariance: Array  # Of the unknowns of the fit (q, q)
-    names: tuple[str, ...]  # Of the levels (l,)
-    levels: Array  # Standard deviations of the logarithms of the levels (l,)
-    entries: Array  # Standard deviations of the entries of the gain (m, n), in their units
-    # Of the coordinates of gain or cost weights, one a row (g, g), the best identified first
+    kind: str  # one of `KINDS`
+    covariance: Array  # (q, q), of the unknowns of the fit
+    names: tuple[str, ...]  # of the noise SDs, length l
+    levels: Array  # (l,), standard errors of the logarithms of the noise SDs
+    entries: Array  # (m, n), standard errors of the gain entries, in their units
+    # principal directions of the coordinates of gain or cost weights, one per row (g, g), the most
+    # precise first
     directions: Array
-    deviations: Array  # Standard deviation along each (g,)
+    deviations: Array  # (g,), standard error along each
 
     def level_intervals(self, values: Array) -> Array:
-        """Intervals of 95 % of the levels (l, 2), in their units; `values` (l,)."""
-        factors = np.exp(np.minimum(TWO_SIDED * self.levels, 700.0))  # still numbers
+        """95 % intervals of the noise SDs (l, 2), in their units; `values` (l,)."""
+        factors = np.exp(np.minimum(TWO_SIDED * self.levels, 700.0))  # no overflow
         return frozen(np.stack([values / factors, values * factors], axis=-1))
 
     def entry_intervals(self, K: Array) -> Array:
-        """Intervals of 95 % of the entries of a gain (entries, 2), in their units; `K` (m, n)."""
+        """95 % intervals of the entries of a gain (entries, 2), in their units; `K` (m, n)."""
         about = TWO_SIDED * np.ravel(self.entries)[:, None] * [-1, 1]
         return frozen(np.ravel(K)[:, None] + about)
 
 
 @dataclass(frozen=True)
 class Confusion(Frozen):
-    """The step of gain and levels together that the recordings distinguish least."""
+    """The joint change of gain and noise SDs that the recordings distinguish least."""
 
-    # Largest correlation of a combination of gain coordinates with one of levels
-    correlation: float
-    gain: Array  # The step of the gain (m, n), one deviation long, in its units
-    levels: Array  # The logarithms of the levels that go with it (l,)
+    correlation: float  # largest one between combinations of gain coordinates and of noise SDs
+    gain: Array  # (m, n), change of the gain, one standard error long, in its units
+    levels: Array  # (l,), accompanying change of the logarithms of the noise SDs
 
 
 def person_covariance(fit: OutputFeedbackFit, kind: str = "sandwich") -> PersonCovariance:
-    """Covariance of a fit of `fit_output_feedback`."""
+    """Covariance of the estimates of `fit_output_feedback`."""
     if kind not in KINDS:
-        raise InputError("kind", f"got {kind!r}", f"give one of {', '.join(KINDS)}")
+        raise InputError("kind", f"got {kind!r}", f"choose from {', '.join(KINDS)}")
     information = np.array(fit.identified.information)
     values, vectors = np.linalg.eigh(information)
     kept = np.maximum(values, _FARTHEST**-2)
     unit = vectors / np.sqrt(kept)
     if kind != "sandwich":
         return _described(fit, kind, unit @ unit.T)
-    # As seen where the information is one, and with as much of the prior as it needs for that: of a
-    # direction that is not identified scores are rounding, and the bread is the square of 1e6.
+    # In coordinates in which the information is the identity, completed by the prior: along
+    # unidentified directions scores are rounding, which the bread would multiply by 1e12.
     middle = _meat(fit, unit) + np.diag(1 - values / kept)
     return _described(fit, kind, unit @ middle @ unit.T)
 
 
 def _described(fit: OutputFeedbackFit, kind: str, covariance: Array) -> PersonCovariance:
-    """What follows from a covariance (q, q) of all unknowns."""
+    """Derived quantities of a covariance (q, q) of all unknowns."""
     space, shared = fit.space, fit.space.gain
     dK, _ = space.changes(fit.theta)
     entries = np.einsum("iab,ij,jab->ab", dK, covariance[: len(dK), : len(dK)], dK)
@@ -94,9 +94,9 @@ def _described(fit: OutputFeedbackFit, kind: str, covariance: Array) -> PersonCo
 
 
 def confusion(fit: OutputFeedbackFit) -> Confusion:
-    """What of gain and levels the recordings distinguish least, by the first canonical pair.
+    """Canonical pair of gain and noise SDs with the largest correlation.
 
-    Coordinates that are hardly identified keep the deviation of one that the search gives them.
+    Hardly identified coordinates keep the standard deviation of their prior.
     """
     space = fit.space
     about = np.diag(np.where(np.arange(len(fit.theta)) < space.own, 1.0, _FARTHEST**-2))
@@ -112,9 +112,9 @@ def confusion(fit: OutputFeedbackFit) -> Confusion:
 
 
 def _meat(fit: OutputFeedbackFit, unit: Array) -> Array:
-    """Covariance of the sum of all scores along the columns of `unit` (q, q).
+    """Newey-West covariance of the sum of all scores along the columns of `unit` (q, q).
 
-    By Newey and West (1987), up to the root of the length.
+    The lag window extends to the square root of the length (Newey and West 1987).
     """
     total = np.zeros((len(fit.theta),) * 2)
     for own in fit.identified.scores:

@@ -1,4 +1,4 @@
-"""Fit a person who senses with noise by maximum likelihood (docs/noisy-people.md, "The fit")."""
+"""Maximum likelihood fit of output-feedback MPC (docs/why/output_feedback.md)."""
 
 from __future__ import annotations
 
@@ -33,56 +33,55 @@ if TYPE_CHECKING:
     from impc.output_feedback.observer import Observer
     from impc.output_feedback.unknowns import LikelihoodTerms
 
-# Likelihoods for all but the gain, or the cost weights, at first: while levels are far off the gain
-# that explains most is on the border of those that stabilise, and three searches of 21 ended there.
+# Evaluations of the first stage, in which the gain is fixed: with noise SDs far off, the best gain
+# lies on the stability boundary, where 3 of 21 searches ended.
 _FIRST = 10
-# A search that comes farther in a round, of the prior's deviation, begins anew from there: its
-# coordinates and prior are those of a gain that is not the person's (docs/noisy-people.md).
+# If a round moves the gain farther than this (in standard deviations of the prior), coordinates and
+# prior are recomputed there; second: evaluations per round.
 _NEAR, _ROUND = 0.5, 30
-# Likelihoods after which a search with every sense anew is given up unless it is higher by so much
-# than where one ended, nats: from four ends 18 to 90 nats too low ten were enough. A likelihood
-# that jumps is known to no less.
+# A second search with re-initialised sensory noise is abandoned after this many evaluations unless
+# it gains this much, in nats: from four ends 18 to 90 nats too low, ten evaluations were enough.
+# The likelihood has jumps of that size.
 _LOOK, _HIGHER = 15, 0.5
-# Logarithm by which cost weights are larger at the other start: a low cost weight and a noisy sense
-# both answer late, and a search from least squares, which knows no such sense, may end at the
+# Increase of the log cost weights at the second start: a low cost weight and noisy senses both
+# delay the response, and a search from least squares, which assumes exact senses, may end at the
 # first.
 _FAR = 4.0
 
 
 @dataclass(frozen=True)
 class OutputFeedbackFit(Frozen):
-    """A person behind recordings, at the largest likelihood."""
+    """Maximum likelihood fit of output-feedback MPC."""
 
-    K: Array  # Gain (m, n)
-    S: Array  # Metric (m, m)
-    problem: Problem  # At the initial states, as the person takes them, and the parameters
-    observer: Observer  # At the levels found; a level of zero was not searched
-    recorder: Array  # Standard deviations of the recorder's noise (p,), in the outputs' units
-    cost_weights: Array | None  # Unknowns of the problem's structure, where it has one (count,)
-    log_likelihood: float  # Of all samples of all trials, nats; without the prior
-    # What the search made largest: likelihood times prior, less what levels lose, nats
-    value: float
-    count: int  # How many numbers were searched
-    converged: bool  # Whether the search ended by itself
-    evaluations: int  # Filters of all recordings with derivatives, about
-    theta: Array  # The unknowns, in the coordinates of `space` (count,)
-    identified: LikelihoodTerms  # What the recordings say there
-    unseen: Array  # Slope that scores do not have (q,), nats: of what levels lose
-    prior: Prior  # What the search was held by
+    K: Array  # (m, n), gain
+    S: Array  # (m, m), metric
+    problem: Problem  # at the fitted initial states (as the subject estimates them) and parameters
+    observer: Observer  # with the fitted noise SDs; those that are zero were not estimated
+    recorder: Array  # (p,), standard deviations of the recording noise, in the outputs' units
+    cost_weights: Array | None  # (count,), log cost weights of the problem's structure, if any
+    log_likelihood: float  # of all samples of all trials, nats, without the prior
+    value: float  # objective: log-likelihood + log-prior - correction for the noise SDs, nats
+    count: int  # number of estimated unknowns
+    converged: bool  # whether the search converged
+    evaluations: int  # approximate number of likelihood evaluations with derivatives
+    theta: Array  # (count,), unknowns in the coordinates of `space`
+    identified: LikelihoodTerms  # likelihood with derivatives at `theta`
+    unseen: Array  # (q,), gradient of the correction for the noise SDs, nats
+    prior: Prior  # prior of the fit
 
     @property
     def space(self) -> PersonCoordinates:
-        """The coordinates of the search."""
+        """Coordinates of the search."""
         return self.prior.space
 
     @property
     def levels(self) -> Array:
-        """The levels of noise that were searched (l,), as `space.names` calls them."""
+        """Fitted noise SDs (l,), named by `space.names`."""
         return np.asarray(np.exp(self.theta[self.space.own :]))
 
     @property
     def criterion(self) -> float:
-        """Akaike's: 2 count - 2 log L; the smaller the better."""
+        """Akaike information criterion, 2 count - 2 log L; smaller is better."""
         return 2 * self.count - 2 * self.log_likelihood
 
 
@@ -97,44 +96,43 @@ def fit_output_feedback(
     held: Sequence[str] = (),
     counted: int = 0,
 ) -> OutputFeedbackFit:
-    """Fit gain or weights, levels of noise, initial states and parameters by maximum likelihood.
+    """Fit gain or weights, noise SDs, initial states and parameters by maximum likelihood.
 
     Parameters
     ----------
     found : Estimate
-        Where the search begins; of the method "structured", cost weights are searched and not a
-        gain, of somebody who estimates from larger ones too. Of another method, where the problem
-        has a structure that leaves states without a cost weight and no parameters are searched, the
-        gain keeps to the span of gains that such weights have.
+        Starting point. For the method "structured" cost weights are estimated instead of a gain,
+        for an observer with an estimator also from larger ones. For other methods, if the problem
+        has a structure that leaves states unpenalised and no parameters are fitted, the gain stays
+        in the span of gains of such weights.
     observer : Observer
-        What is sensed, and which noise there is: a level that is not zero is searched, from there
-        and from what the residuals of the first fit suggest.
-    recorder : Array, optional
-        Standard deviations of the recorder's noise where a search begins (p,), in the outputs'
-        units; by default of the size of the residuals.
+        Sensed signals and noise: standard deviations above zero are estimated, starting from these
+        values and from values suggested by the residuals of the first fit.
+    recorder : array_like, optional
+        Initial standard deviations of the recording noise (p,), in the outputs' units; by default
+        of the size of the residuals.
     spread : float
-        Standard deviation of a normal prior about the start, of each coordinate (`Coordinates`)
-        of gain, initial states and parameters, or of each cost weight's logarithm; infinite for
-        none.
+        Standard deviation of the normal prior about the start: of each coordinate of gain, initial
+        states and parameters, or of each log cost weight; infinite for no prior.
     max_evaluations : int
-        Filters of all recordings with derivatives, about; those of both starts together.
+        Approximate budget of likelihood evaluations with derivatives, for both starts together.
     held : sequence of str
-        Kinds of levels that are not searched but known: of "motor", "share", "process", "sensory"
-        and "walk".
+        Kinds of noise that are fixed instead of estimated: of "motor", "share", "process",
+        "sensory" and "walk".
     counted : int
-        The first sample of each trial that is identified: those before are given, so that how a
-        person began is not taken for how the person goes on.
+        Index of the first sample of each trial in the likelihood; earlier samples are conditioned
+        on, which excludes the start of a movement.
 
     Returns
     -------
-    PersonFit
+    OutputFeedbackFit
 
     Raises
     ------
     InputError
-        When a kind of levels is none of these, or a trial has no sample that is identified.
+        If a name in `held` is unknown, or a trial has no sample after `counted`.
     SolverError
-        When no start has a likelihood.
+        If the likelihood is undefined at every start.
 
     Examples
     --------
@@ -160,13 +158,13 @@ def fit_output_feedback(
     """
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
-    problem = found.problem.with_body_fixed()  # what is uncertain of it, as it was found
+    problem = found.problem.with_body_fixed()  # uncertain parameters keep their fitted values
     _require_plain(problem)
     require_riccati(problem)
     shortest = min(trial.samples for trial in problem.recordings)
     if counted >= shortest:
-        left = f"got {counted}, and the shortest trial has {shortest} samples"
-        raise InputError("counted", left, "give fewer")
+        left = f"got {counted}, but the shortest trial has {shortest} samples"
+        raise InputError("counted", left, "use a smaller value")
     asked = Asked(observer, recorder, held, spread, counted)
     first = [Point(np.array(found.gain), np.array(found.metric), problem)]
     starts: list[tuple[list[Point], Array | None]] = [(first, found.cost_weights)]
@@ -196,20 +194,20 @@ def fit_output_feedback(
 
 
 def _require_plain(problem: Problem) -> None:
-    """Refuse what the likelihood has no terms for."""
+    """Reject problems with features that the likelihood does not support."""
     gaps = any(trial.has_gaps for trial in problem.recordings)
     for there, what, remedy in (
         (gaps, "outputs with missing samples", "cut the trials there"),
-        (bool(problem.offsets), "unknown offsets", "take them out of the recordings"),
+        (bool(problem.offsets), "unknown offsets", "remove them from the recordings"),
         (len(problem.measured) > len(problem.plant.outputs), "commands", "leave them out"),
-        (problem.plant.ahead > 0, "targets known ahead", "give a plant without preview"),
+        (problem.plant.ahead > 0, "targets known in advance", "use a plant without preview"),
     ):
         if there:
-            raise InputError("problem", f"has {what}, which this fit does not know", remedy)
+            raise InputError("problem", f"has {what}, which this fit does not support", remedy)
 
 
 class _End(NamedTuple):
-    """Where a search has come to from one start."""
+    """End of a search from one start."""
 
     prior: Prior
     place: Place
@@ -219,13 +217,13 @@ class _End(NamedTuple):
 
 
 def _levelled(prior: Prior, theta: Array, budget: int) -> _End:
-    """The first likelihoods from theta (q,), in which the gain stands."""
+    """First stage of the search from theta (q,), with the gain fixed."""
     rest, none = np.eye(len(theta))[:, prior.space.gain :], np.zeros(len(theta))
     return _End(prior, *climb(prior, prior.at(theta), budget, rest, none))
 
 
 def _looked_beside(end: _End, asked: Asked, budget: int) -> _End:
-    """The higher end, of a search and of one from where it ended with every sense anew."""
+    """Higher of two ends: of a search, and of one from there with sensory noise reset."""
     prior, theta = end.prior, end.place.theta.copy()
     senses = prior.space.senses
     theta[senses] = prior.scales[senses - prior.space.own]
@@ -240,7 +238,7 @@ def _looked_beside(end: _End, asked: Asked, budget: int) -> _End:
 
 
 def _searched(start: _End, asked: Asked, budget: int) -> _End:
-    """Climb in rounds, coordinates and prior made anew where one went far, and then to the end."""
+    """Search in rounds, recomputing coordinates and prior after large moves, then to the end."""
     prior, place, spent = start.prior, start.place, 0
     while spent < budget:
         none, part = np.zeros(len(place.theta)), min(_ROUND, budget - spent + 1)
@@ -263,7 +261,7 @@ def _searched(start: _End, asked: Asked, budget: int) -> _End:
 def person_at(
     prior: Prior, place: Place, unseen: Array, settled: bool, spent: int
 ) -> OutputFeedbackFit:
-    """What is said of a person where a search has come to; `unseen` (q,)."""
+    """Fit at the current iterate; `unseen` (q,)."""
     space = prior.space
     person, cost_weights = space.unpack(place.theta), cost_weights_at(space, place.theta)
     return OutputFeedbackFit(

@@ -1,18 +1,18 @@
-"""A person who senses with noise, and what is recorded, as one system of plant and estimate.
+"""Plant, sensorimotor model and recording as one linear system of plant state and estimate.
 
-With the error e = x - xh of the estimate the state is z = (e, xh, dh), or z = x for a person who
-sees every state, and
+With the error e = x - xh of the estimate the state is z = (e, xh, dh), or z = x for a subject who
+observes every state exactly, and
 
     z+ = F z + B u + E d + G w + noise of covariance Q,    u = MPC(xh),    y = C z + noise of R
 
-where nothing but u depends on the controller. An error that nobody commands keeps F in blocks:
+where only u depends on the controller. As the command does not affect the error, F has blocks:
 
     e+  = (A - L C_s) e - E dh + E d + B w + p - L v      (with a known perturbation: without E)
     xh+ = A xh + E dh + B u + L C_s e + L v
-    dh+ = r dh + L_d C_s e + L_d v      (r the persistence that is believed, 1 for a random walk)
+    dh+ = r dh + L_d C_s e + L_d v      (r: assumed AR(1) coefficient, 1 for a random walk)
 
-At the first sample the estimate is a value to be given, and the error has the covariance that it
-keeps: the person has been at it for some time (docs/noisy-people.md).
+At the first sample the estimate is given, and the error has its stationary covariance
+(docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -31,30 +31,26 @@ if TYPE_CHECKING:
     from impc.output_feedback.observer import Observer
 
 
-# Of a derivative: its square is nothing beside one.
+# Complex step: its square vanishes next to 1.
 _STEP = 1e-30j
 
 
 class JointLoop(NamedTuple):
-    """The system, or its derivatives along k directions, which are then a first axis.
+    """System matrices, or their derivatives along k directions (first axis)."""
 
-    A named tuple because compiled code takes it as it is.
-    """
-
-    F: Buffer  # (z, z), (z, m), (z, d) and (z, m): transition, commands, perturbations, motor noise
-    B: Buffer
-    E: Buffer
-    G: Buffer
+    F: Buffer  # (z, z), transition
+    B: Buffer  # (z, m), commands
+    E: Buffer  # (z, d), perturbations
+    G: Buffer  # (z, m), motor noise
     C: Buffer  # (p, z)
-    # Covariances of the noise (z, z), of the recorder's (p, p) and of the first state (z, z)
-    Q: Buffer
-    R: Buffer
-    P0: Buffer
-    share: Buffer  # Of the command that is motor noise (m,)
+    Q: Buffer  # (z, z), covariance of the process noise
+    R: Buffer  # (p, p), covariance of the recording noise
+    P0: Buffer  # (z, z), covariance of the first state
+    share: Buffer  # (m,), signal-dependent motor noise as a share of the command
 
 
 class PlantMoves(NamedTuple):
-    """Changes of a plant along k directions, which are the first axis."""
+    """Derivatives of a plant along k directions (first axis)."""
 
     A: Array  # (k, n, n)
     B: Array  # (k, n, m)
@@ -63,7 +59,7 @@ class PlantMoves(NamedTuple):
 
 
 def joint_loop(plant: Plant, person: Observer, recorder: Array) -> JointLoop:
-    """The system of a `person` at a `plant`, with the `recorder`'s noise (p,)."""
+    """Assemble the system of `person` and `plant`, with `recorder` noise SDs (p,)."""
     L = believed_filter(plant, person).L if person.estimates else None
     body = PlantMoves(plant.A, plant.B, plant.E, plant.C)
     found = _assembled(body, person, [*_levels(person), np.asarray(recorder)], L)
@@ -76,10 +72,9 @@ def joint_loop(plant: Plant, person: Observer, recorder: Array) -> JointLoop:
 def joint_directions(
     plant: Plant, person: Observer, recorder: Array, moves: PlantMoves, levels: Array
 ) -> JointLoop:
-    """Derivatives of `joint_loop` along k directions, for a person who believes what is true.
+    """Derivatives of `joint_loop` along k directions; the subject's model follows the plant.
 
-    All but two equations are products, of which a complex step is exact (Squire and Trapp 1998).
-
+    All but two equations are products, for which a complex step is exact (Squire and Trapp 1998).
     `recorder` (p,); `levels` (k, levels + p).
     """
     count, n, own = len(levels), plant.n, _apart(plant, person)
@@ -119,20 +114,20 @@ def _levels(person: Observer) -> list[Array]:
 
 
 def _apart(plant: Plant, person: Observer) -> tuple[Array, ...]:
-    """What no command moves, rows and columns of z: error and believed perturbation."""
+    """Indices of z that no command affects: error and perturbation estimate."""
     n, d = plant.n, 0 if person.walk is None else plant.E.shape[1]
     return np.ix_(*[np.r_[:n, 2 * n : 2 * n + d]] * 2)
 
 
 def _moving(B: Array, motor: Array, process: Array) -> Array:
-    """Covariance of what moves the body."""
+    """Covariance of process and motor noise."""
     return np.asarray(B @ _diagonal(motor**2) @ np.swapaxes(B, -1, -2) + _diagonal(process**2))
 
 
 def _assembled(
     body: PlantMoves, person: Observer, levels: list[Array], L: Array | None
 ) -> JointLoop:
-    """The system without P0, of arrays that may be complex and have k directions before all."""
+    """Assemble the system without P0; arrays may be complex, with k directions as first axis."""
     (A, B, E, C), (motor, share, process, sensory, _, white) = body, levels
     moved, R = _moving(B, motor, process), _diagonal(white**2)
     if L is None:
@@ -165,7 +160,7 @@ def _assembled(
 
 
 def _diagonal(values: Array) -> Array:
-    """Diagonal matrices (..., a, a) of rows (..., a)."""
+    """Diagonal matrices (..., a, a) from rows (..., a)."""
     return np.asarray(values[..., None] * np.eye(values.shape[-1]))
 
 

@@ -1,16 +1,14 @@
-"""The stationary Kalman filter, and its exact derivatives.
+"""The stationary Kalman filter and its exact derivatives.
 
     z+ = F z + w,  w ~ N(0, Q),      y = C z + e,  e ~ N(0, R)
     P = F P F' + Q - L S L',         S = C P C' + R,         L = F P C' S^-1
 
-P is the covariance of z given all earlier y. The equation is the regulator's with F', C' for A, B,
-and as there it is stationary in L, so that its differential leaves L alone: with G = F - L C and
-dG = dF - L dC,
+where P is the covariance of z given all earlier y. The equation is the regulator's with F', C' for
+A, B, and likewise stationary in L, so that its differential does not contain dL: with G = F - L C
+and dG = dF - L dC,
 
     dP = G dP G' + dG P G' + G P dG' + dQ + L dR L'
     dL = (dF P C' + F dP C' + F P dC' - L dS) S^-1,    dS = C dP C' + dC P C' + C P dC' + dR
-
-(docs/noisy-people.md).
 """
 
 from __future__ import annotations
@@ -23,23 +21,23 @@ from impc.arrays import Array
 from impc.errors import SolverError
 from impc.model.riccati import is_stable, lyapunov_series
 
-# Doublings: 2^40 samples are beyond any filter that is stable in double precision.
+# Doublings: 2^40 samples exceed the memory of any filter that is stable in double precision.
 _DOUBLINGS = 40
 _SETTLED = 1e-16
-# What grows beyond this grows without end: its square is still a number.
+# Entries beyond this count as divergent; their square is still finite.
 _LARGEST = 1e100
 
 
 class StationaryFilter(NamedTuple):
     """A stationary filter."""
 
-    P: Array  # Covariance of the state given all earlier outputs (n, n)
-    L: Array  # Gain (n, p) from an innovation to the next state
-    S: Array  # Covariance of an innovation (p, p)
+    P: Array  # (n, n), covariance of the state given all earlier outputs
+    L: Array  # (n, p), gain from an innovation to the next state
+    S: Array  # (p, p), covariance of an innovation
 
 
 class FilterChanges(NamedTuple):
-    """Derivatives of a `StationaryFilter` along k directions, which are the first axis."""
+    """Derivatives of a `StationaryFilter` along k directions (first axis)."""
 
     P: Array  # (k, n, n)
     L: Array  # (k, n, p)
@@ -47,7 +45,7 @@ class FilterChanges(NamedTuple):
 
 
 def stationary_filter(F: Array, C: Array, Q: Array, R: Array) -> StationaryFilter:
-    """Solve the Riccati equation by doubling (Anderson 1978), which no scale of units disturbs.
+    """Solve the Riccati equation by doubling (Anderson 1978), insensitive to scaling.
 
     `F` (n, n); `C` (p, n); `Q` (n, n); `R` (p, p).
     """
@@ -101,7 +99,7 @@ def filter_changes(
 
 def _no_filter() -> SolverError:
     return SolverError(
-        "filter",
-        "has no stationary gain: what does not decay is not sensed, or nothing disturbs it",
-        "let another signal be sensed, or give some motor or process noise",
+        "observer",
+        "has no stationary Kalman filter: a mode that does not decay is unobserved or noise-free",
+        "add a signal to `sensed`, or set motor or process noise above zero",
     )

@@ -1,6 +1,6 @@
-"""A fitted subject as values that JSON keeps, so that an interrupted command goes on from there.
+"""Store a fitted sensorimotor model as JSON values, for interrupted commands.
 
-One likelihood says again, to the last digit, what the recordings say at its unknowns.
+Evaluating the likelihood once at the stored unknowns reproduces the fit to the last digit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def encode_model(model: PersonModel) -> dict[str, Any]:
-    """A model, fitted or not."""
+    """JSON values of a model, fitted or not."""
     fit = None if model.fit is None else encode_person(model.fit)
     return {"fit": fit, "reason": model.reason}
 
@@ -32,13 +32,13 @@ def encode_model(model: PersonModel) -> dict[str, Any]:
 def decode_model(
     name: str, problem: Problem, observer: Observer, kept: dict[str, Any]
 ) -> PersonModel:
-    """Make the model again."""
+    """Rebuild the model."""
     fit = None if kept["fit"] is None else decode_person(problem, observer, kept["fit"])
     return PersonModel(name, fit, kept["reason"])
 
 
 def encode_person(fit: OutputFeedbackFit) -> dict[str, Any]:
-    """What coordinates and prior of the search began with, and where it ended."""
+    """JSON values of a fit: start of coordinates and prior, and final unknowns."""
     own, space = fit.space.space, fit.space
     K, S = own.given
     return {
@@ -56,7 +56,7 @@ def encode_person(fit: OutputFeedbackFit) -> dict[str, Any]:
 
 
 def decode_person(problem: Problem, observer: Observer, kept: dict[str, Any]) -> OutputFeedbackFit:
-    """Make the fit again."""
+    """Rebuild the fit."""
     posed = problem.at(np.array(kept["starts"]), np.array(kept["logarithms"], dtype=np.float64))
     point = Point(np.array(kept["K"]), np.array(kept["S"]), posed)
     levels, split = np.array(kept["levels"]), len(observer.levels)

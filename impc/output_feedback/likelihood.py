@@ -1,4 +1,4 @@
-"""The likelihood of recordings of a person who senses with noise, and its exact derivatives.
+"""Log-likelihood of recordings under output-feedback MPC, with exact derivatives.
 
 With z of `joint_loop` (plant and estimate) and the innovation e_t = y_t - C z_t of a Kalman filter,
 
@@ -6,9 +6,9 @@ With z of `joint_loop` (plant and estimate) and the innovation e_t = y_t - C z_t
     z_t|t = z_t + P_t C'S_t^-1 e_t,            P_t|t = P_t - P_t C'S_t^-1 C P_t
     z_t+1 = F z_t|t + B u_t + E d_t,           P_t+1 = F_t P_t|t F_t' + Q,     F_t = F + B D_t H
 
-with u_t = MPC(H z_t|t) and D_t its slope there: H picks the estimate out of z. While no bound is
-near all is linear and the likelihood is exact; elsewhere a command of one input is clipped as its
-distribution says (`Clip`), and several inputs take an extended filter (docs/noisy-people.md).
+with u_t = MPC(H z_t|t) and D_t its slope there: H selects the estimate from z. Away from bounds the
+system is linear and the likelihood exact; near them the moments of the clipped command are used
+with one input (`Clip`), and an extended Kalman filter with several (docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -43,25 +43,25 @@ if TYPE_CHECKING:
     from impc.output_feedback.joint_loop import JointLoop
     from impc.output_feedback.observer import Observer
 
-# How a sample ends at which there is no likelihood.
+# Status of samples at which the likelihood is undefined.
 _FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)
 
 
 @dataclass(frozen=True)
 class NoiseDirections:
-    """What else moves along q directions, beside what `Directions` has; the last axis of each."""
+    """Further derivatives along q directions (last axis), in addition to `Directions`."""
 
-    C: Array  # Outputs of the plant (p, n, q)
-    levels: Array  # Levels of the person's noise, then of the recorder's (levels + p, q)
-    covariances: int  # How many of the directions, the first ones, move more than the first state
+    C: Array  # (p, n, q), outputs of the plant
+    levels: Array  # (levels + p, q), noise SDs of the subject, then of the recording
+    covariances: int  # number of leading directions that change more than the first state
 
 
 @dataclass(frozen=True)
 class PreparedFilter:
-    """All that recordings share; made by `prepare_filter`."""
+    """Everything that recordings share; made by `prepare_filter`."""
 
-    law: PreparedLoop  # Of one input without its bounds at the present sample, see `Clip`
-    parts: FilterParts  # With it, and with the system
+    law: PreparedLoop  # with one input without its bounds at the present sample, see `Clip`
+    parts: FilterParts
 
 
 def prepare_filter(
@@ -71,7 +71,7 @@ def prepare_filter(
     along: Directions,
     noise: NoiseDirections,
 ) -> PreparedFilter:
-    """Build all that does not depend on a recording; `recorder` (p,)."""
+    """Build everything that does not depend on a recording; `recorder` (p,)."""
     plant = controller.plant
     law, clip = _unclipped(prepare_loop(controller, along))
     count = along.count if np.any(person.share) or clip.used else noise.covariances
@@ -102,7 +102,7 @@ def prepare_filter(
 def joint_likelihoods(
     prepared: PreparedFilter, recordings: Sequence[Recording], counted: int = 0
 ) -> list[Likelihood]:
-    """Likelihood of each recording; the compiled filter lets other threads run."""
+    """Likelihood of each recording, in parallel threads."""
     with ThreadPoolExecutor(min(len(recordings), os.cpu_count() or 1)) as pool:
         return list(pool.map(lambda trial: _filtered(prepared, trial, counted), recordings))
 
@@ -110,7 +110,7 @@ def joint_likelihoods(
 def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likelihood:
     """Likelihood of one recording.
 
-    Once its first state is forgotten the trial goes on along the directions that are left.
+    After its first state is forgotten the filter continues along the remaining directions.
     """
     law, parts = prepared.law, prepared.parts
     plant, q, count = law.controller.plant, law.along.count, trial.samples
@@ -140,13 +140,15 @@ def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likel
     if len(failed):
         status = Status(int(result.status[failed[0]]))
         raise SolverError(
-            f"sample {failed[0]}", f"{status.sentence}, as the filter expects it", "start elsewhere"
+            f"sample {failed[0]}",
+            f"{status.sentence}, in the prediction of the filter",
+            "use another starting point",
         )
     return result
 
 
 def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
-    """The law of one input without its bounds at the present sample, and these; or the law."""
+    """With one input, split the law into one without present bounds, and the clip; else as is."""
     controller, rows, moved = law.controller, law.rows, law.row_directions
     low, high = (float(side[0]) for side in (controller.bounds.u_min, controller.bounds.u_max))
     if controller.plant.m > 1 or not (np.isfinite(low) or np.isfinite(high)):
@@ -165,7 +167,7 @@ def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
 def _steady(
     controller: Controller, joint: JointLoop, moves: JointLoop, dK: Array, at: int
 ) -> Steady:
-    """The stationary filter without bounds, where there is one."""
+    """Stationary filter without bounds, if it exists."""
     K, estimate = controller.K, slice(at, at + controller.plant.n)
     if np.any(joint.share):
         return Steady(joint.P0, moves.P0, known=False)
@@ -175,7 +177,7 @@ def _steady(
     dF[:, :, estimate] -= moves.B @ K + joint.B @ np.moveaxis(dK, -1, 0)
     try:
         found = stationary_filter(F, joint.C, joint.Q, joint.R)
-    except SolverError:  # a gain that does not stabilise: the covariance has no end
+    except SolverError:  # the gain does not stabilise: the covariance diverges
         return Steady(joint.P0, moves.P0, known=False)
     changes = filter_changes(found, (F, joint.C), dF, moves.C, moves.Q, moves.R)
     return Steady(np.ascontiguousarray(found.P), np.ascontiguousarray(changes.P), known=True)

@@ -1,4 +1,4 @@
-"""Models of how a person senses, fitted to the same recordings; Akaike's criterion of each."""
+"""Fit competing sensorimotor models to the same recordings and compare them by AIC."""
 
 from __future__ import annotations
 
@@ -35,18 +35,17 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
 
-# Samples ahead of which predictions are judged, as seconds; and how many starts in a trial at most.
+# Horizons in s at which predictions are evaluated; largest number of starts in a trial.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
-# Likelihoods with derivatives of the model that was asked for, and of those beside it, whose page
-# says where that was not enough.
+# Evaluation budgets: requested model, comparison models; the report says if a fit hit its budget.
 _ASKED, _BESIDE = 250, 60
-# Of the command that is noise, where the search begins: what isometric force has, and less.
+# Initial signal-dependent motor noise as a share of the command (typical of isometric force).
 _SHARE = 0.1
-# One second of lags shows a rhythm that was missed; fewer than ten show nothing.
+# Lags of the whiteness test: 1 s, which shows a missed rhythm; at least this many.
 _LEAST_LAGS = 10
 
 
-#: (name, compute, encode, decode) -> the model: from memory, or computed now.
+#: (name, compute, encode, decode) -> the model, from the store or computed.
 Remember = Callable[
     [str, Callable[[], PersonModel], Callable[[PersonModel], Any], Callable[[Any], PersonModel]],
     PersonModel,
@@ -62,7 +61,7 @@ def person_report(
     done: Callable[[str], None] = lambda _: None,
     remember: Remember = lambda _name, compute, _encode, _decode: compute(),
 ) -> PersonReport:
-    """Fit a person and the models beside, from a fit of least squares.
+    """Fit the requested and the comparison models, starting from a least squares fit.
 
     `walk` (d,); `remember` (name, compute, encode, decode).
     """
@@ -103,7 +102,7 @@ def person_report(
 
 
 def _nothing(models: tuple[PersonModel, ...], found: Estimate, *, profiled: bool) -> PersonReport:
-    """What is said where the person that was asked for has no likelihood."""
+    """Report if the likelihood of the requested model is undefined."""
     none = frozen(np.zeros((0, 2)))
     plant = found.problem.plant
     white = frozen([np.nan] * len(plant.outputs))
@@ -129,9 +128,9 @@ def asked_observer(
     process: bool,
     known: bool,
 ) -> tuple[Observer, Array]:
-    """The subject that [fit.observer] asks for, and the steps of an unknown perturbation (d,).
+    """Observer that [fit.observer] requests, and step SDs of an unknown perturbation (d,).
 
-    Levels stand at places to begin from; the search finds others by the residuals.
+    The noise SDs are placeholders: the search starts from those that the residuals suggest.
     """
     steps = np.concatenate([np.diff(trial.disturbance, axis=0) for trial in recordings])
     size = np.sqrt(np.mean(steps**2, axis=0))
@@ -149,10 +148,7 @@ def asked_observer(
 
 
 def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, Problem, Observer]]:
-    """Each model that is compared: its name, the problem and the person; what is asked for first.
-
-    `walk` (d,).
-    """
+    """Models to compare: name, problem and observer, the requested one first; `walk` (d,)."""
     seeing = replace(asked, sensed=(), C=asked.C[:0], sensory=asked.sensory[:0], walk=None)
     quiet = replace(seeing, motor=0 * asked.motor, share=0 * asked.share, process=0 * asked.process)
     models = []
@@ -174,7 +170,7 @@ def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, P
 
 
 def _white(fit: OutputFeedbackFit) -> Array:
-    """Of all trials together: standardised innovations, trial by trial, in a row."""
+    """Whiteness p-values of the standardised innovations of all trials, concatenated."""
     lags = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt))
     rows = []
     for trial in fit.identified.trials:
@@ -185,9 +181,9 @@ def _white(fit: OutputFeedbackFit) -> Array:
 
 
 def prediction_errors(fit: OutputFeedbackFit, ahead: tuple[int, ...]) -> Array:
-    """Root-mean-square errors (k, p) of what the filter expects k numbers of samples `ahead`.
+    """Root-mean-square prediction errors (k, p) of the filter, k numbers of samples `ahead`.
 
-    From the expectation at a sample the plant runs on without noise, perturbations as recorded.
+    From the filtered state the plant is simulated without noise, with recorded perturbations.
     """
     problem, plant = fit.problem, fit.problem.plant
     controller = controller_for(problem, fit.K, fit.S)

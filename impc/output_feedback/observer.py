@@ -1,17 +1,16 @@
-"""A person who senses with noise: what is sensed, how well, and what else moves the body.
+"""The sensorimotor model: sensed signals, sensory noise, and noise that moves the body.
 
     body       x+ = A x + B (u + w) + E d + p,   w ~ N(0, motor^2 + (share u)^2)
                                                  p ~ N(0, process^2)
     senses     s = C_s x + v,                    v ~ N(0, sensory^2)
     estimate   xh+ = A xh + B u + E dh + L (s - C_s xh)
 
-All noise is white from sample to sample and independent; a level is the standard deviation of one
-sample. A perturbation is known, dh = d, or believed to be a random walk whose steps have the
-deviation `walk`, and is estimated too: dh+ = r dh + L_d (s - C_s xh), with r = 1; with a
-`persistence` r below one it is believed to fade. L is the stationary Kalman gain of what the person
-believes of plant and levels. A share of the command is left out there, so that
-the gain stays the same. Who senses nothing in particular sees every state as it is: xh = x
-(docs/noisy-people.md).
+All noise is white and independent; its standard deviations are per sample. A perturbation is known,
+dh = d, or assumed to follow d+ = r d + n with steps n of SD `walk`, and estimated:
+dh+ = r dh + L_d (s - C_s xh), with r = 1 for a random walk and a `persistence` r < 1 for one that
+decays. L is the stationary Kalman gain for plant and noise; signal-dependent noise is left out of
+it, so that it stays constant. Without sensed signals every state is observed exactly, xh = x
+(docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -38,53 +37,53 @@ if TYPE_CHECKING:
 
 add_value("Observer", "Observer(plant, ...)")
 
-#: The levels of noise, in the order in which they are searched.
+#: Kinds of noise SDs, in the order of the unknowns.
 LEVELS = ("motor", "share", "process", "sensory", "walk")
 
 
 @dataclass(frozen=True, init=False)
 class Observer(Value):
-    """How a person senses, and the noise inside the loop.
+    """Sensed signals and noise of a subject (sensorimotor model).
 
     Parameters
     ----------
     plant : Plant
-        Whose signals are meant.
+        Plant whose signals are meant.
     sensed : sequence of str, optional
-        Combinations of states and outputs by name, as in ``["theta1", "theta2 - theta1"]``; left
-        out, every state is seen without noise.
+        Sensed combinations of states and outputs, such as ``["theta1", "theta2 - theta1"]``; by
+        default every state is observed exactly.
     motor, share, process, sensory : array_like
-        See the attributes; one number stands for all.
+        Noise standard deviations, see the attributes; one number stands for all.
     walk : array_like, optional
-        Left out, the perturbation is known.
+        Assumed random-walk step, see the attributes; by default the perturbation is known.
     persistence : array_like
-        See the attributes.
+        Assumed AR(1) coefficient, see the attributes.
 
     Attributes
     ----------
     sensed : tuple of str
-        What is sensed (s,).
-    C : Array
-        The same as rows (s, n).
-    motor : Array
-        Standard deviation of the noise on each command (m,), in its unit.
-    share : Array
-        The same as a share of the command (m,).
-    process : Array
-        Standard deviation of what else moves each state from one sample to the next (n,).
-    sensory : Array
-        Standard deviation of the noise of each sensed signal (s,), in its unit.
-    walk : Array or None
-        Standard deviation of the steps that each perturbation is believed to make (d,), in its
-        unit; None when it is known.
-    persistence : Array
-        Share of each perturbation that is believed to be left a sample later (d,), where it is not
-        known: 1 for a random walk, 0 for one that is new at every sample, of the deviation `walk`.
+        Sensed signals, length s.
+    C : ndarray of shape (s, n)
+        Sensed signals as rows over the states.
+    motor : ndarray of shape (m,)
+        Standard deviation of the noise on each command, in its unit.
+    share : ndarray of shape (m,)
+        Standard deviation of signal-dependent motor noise, as a share of the command.
+    process : ndarray of shape (n,)
+        Standard deviation of the unmodelled change of each state from sample to sample.
+    sensory : ndarray of shape (s,)
+        Standard deviation of the noise of each sensed signal, in its unit.
+    walk : ndarray of shape (d,) or None
+        Standard deviation of the steps that the subject's filter assumes for each perturbation, in
+        its unit; None if the subject knows the perturbation.
+    persistence : ndarray of shape (d,)
+        Assumed AR(1) coefficient of each unknown perturbation: 1 for a random walk, 0 for one that
+        is new at every sample, with standard deviation `walk`.
 
     Raises
     ------
     InputError
-        When a signal is not known, a level is negative, sensed signals have no noise, or a
+        If a signal is unknown, a standard deviation is negative, a sensed signal has no noise, or a
         persistence is not between 0 and 1.
 
     Examples
@@ -133,7 +132,7 @@ class Observer(Value):
         plant.require_discrete()
         rows = _sensed_rows(plant, sensed)
         if walk is not None and not len(rows):
-            raise InputError("walk", "is given, but every state is seen", "say what is sensed")
+            raise InputError("walk", "is given, but all states are observed", "set `sensed`")
         d = plant.E.shape[1]
         self._fill(
             sensed=tuple(sensed),
@@ -147,29 +146,29 @@ class Observer(Value):
         )
         if np.any(self.persistence > 1):
             got = self.persistence.tolist()
-            raise InputError("persistence", f"got {got}", "give shares between 0 and 1")
+            raise InputError("persistence", f"got {got}", "give numbers between 0 and 1")
         if np.any(self.sensory == 0):
-            raise InputError("sensory", "has a zero", "give each sensed signal some noise")
+            raise InputError("sensory", "has a zero", "give every sensed signal some noise")
 
     @property
     def estimates(self) -> bool:
-        """Whether the person senses with noise, and estimates the state."""
+        """Whether the subject has noisy senses and estimates the state."""
         return len(self.C) > 0
 
     @property
     def levels(self) -> Array:
-        """All levels in a row (l,), those of `LEVELS` one after the other."""
+        """All noise SDs (l,), in the order of `LEVELS`."""
         return np.concatenate([self.level(name) for name in LEVELS])
 
     def with_levels(self, levels: Array) -> Observer:
-        """The same person at other `levels` (l,), in their order."""
+        """Return the same model with other noise SDs, `levels` (l,)."""
         sizes = [len(self.level(name)) for name in LEVELS]
         parts = np.split(levels, np.cumsum(sizes)[:-1])
         found = {name: frozen(part) for name, part in zip(LEVELS, parts, strict=True)}
         return replace(self, **{**found, "walk": None if self.walk is None else found["walk"]})
 
     def names(self, plant: Plant) -> tuple[str, ...]:
-        """What each of `levels` is called: kind and signal of the `plant`."""
+        """Names of the noise SDs: kind and signal."""
         signals = (plant.controls, plant.controls, plant.states, self.sensed, plant.disturbances)
         return tuple(
             f"{kind} {signal}"
@@ -178,13 +177,13 @@ class Observer(Value):
         )
 
     def level(self, name: str) -> Array:
-        """Level of a kind by its `name`, one of `LEVELS`; (0,) for the walk where none is."""
+        """Noise SDs of the kind `name`, one of `LEVELS`; (0,) for a walk of None."""
         found = getattr(self, name)
         return frozen([]) if found is None else np.asarray(found)
 
 
 def believed_matrices(plant: Plant, person: Observer) -> tuple[Array, Array, Array, Array]:
-    """F, C, Q and R of what a person who estimates believes: states, then unknown perturbations."""
+    """F, C, Q and R of the subject's filter: states, then unknown perturbations."""
     unknown = person.walk is not None
     d = plant.E.shape[1] if unknown else 0
     F = scipy.linalg.block_diag(plant.A, np.diag(person.persistence[:d]))
@@ -197,12 +196,12 @@ def believed_matrices(plant: Plant, person: Observer) -> tuple[Array, Array, Arr
 
 
 def believed_filter(plant: Plant, person: Observer) -> StationaryFilter:
-    """The stationary filter of a person who estimates."""
+    """Stationary filter of a subject who estimates."""
     return stationary_filter(*believed_matrices(plant, person))
 
 
 def _sensed_rows(plant: Plant, sensed: Sequence[str]) -> Array:
-    """One row of states (s, n) for each combination of states and outputs."""
+    """Rows over the states (s, n) of combinations of states and outputs."""
     outputs = [index for index, name in enumerate(plant.outputs) if name not in plant.states]
     names = (*plant.states, *(plant.outputs[index] for index in outputs))
     meaning = np.vstack([np.eye(plant.n), plant.C[outputs]])
@@ -214,5 +213,5 @@ def _levels(name: str, given: ArrayLike, size: int) -> Array:
     values = as_numbers(name, given)
     found = finite_array(name, np.full(size, values) if values.ndim == 0 else values, (size,))
     if np.any(found < 0):
-        raise InputError(name, f"got {found.tolist()}", "give standard deviations")
+        raise InputError(name, f"got {found.tolist()}", "give standard deviations >= 0")
     return frozen(found)

@@ -1,4 +1,4 @@
-"""What a fit says of a person who senses with noise: one section of its page, and numbers."""
+"""Report section and result data of an output-feedback fit."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from impc.output_feedback.covariance import Confusion, PersonCovariance
     from impc.output_feedback.fit import OutputFeedbackFit
 
-# A level whose interval of 95 % ends beyond a factor of ten is not identified.
+# A noise SD counts as identified if its 95 % interval ends within a factor of ten.
 _IDENTIFIED = np.log(10)
-# Gain and noise that go together by more than this are hardly distinguished.
+# Correlation of gain and noise from which they can hardly be separated.
 _CONFUSED = 0.9
-# Criteria that differ by less do not decide (Burnham and Anderson 2002).
+# AIC differences below this do not decide (Burnham and Anderson 2002).
 _UNDECIDED = 4.0
 _WHITE = 0.01
-# Of simulated subjects (docs/noisy-people.md, "What the intervals hold").
+# From simulated subjects (experiments/output_feedback.md).
 _AT_LIMIT = (
-    "A limit was met, where these intervals are approximate: in simulations they contained 80 to "
+    "A limit was reached, so these intervals are approximate: in simulations they contained 80 to "
     "95 % of the true values."
 )
 _KINDS = {
@@ -44,19 +44,19 @@ _ENDS = {"low": "95 % CI low", "high": "95 % CI high", "sd": "SD"}
 
 @dataclass(frozen=True)
 class PersonModel:
-    """One model."""
+    """One competing model, fitted or not."""
 
-    name: str  # In words
-    fit: OutputFeedbackFit | None  # None where it has no likelihood
-    reason: str  # Why it has none
+    name: str  # in words
+    fit: OutputFeedbackFit | None  # None if its likelihood is undefined
+    reason: str  # why there is no fit
 
     @property
     def criterion(self) -> float:
-        """Akaike's; infinite where there is no likelihood."""
+        """AIC; infinite without a fit."""
         return np.inf if self.fit is None else self.fit.criterion
 
     def data(self) -> dict[str, Any]:
-        """For result.json."""
+        """Entry of result.json."""
         heads = {"log_likelihood": "log_likelihood", "aic": "criterion", "count": "count"}
         numbers = {head: getattr(self.fit, name, None)
                    for head, name in {**heads, "converged": "converged"}.items()}  # fmt: skip
@@ -65,37 +65,35 @@ class PersonModel:
 
 @dataclass(frozen=True)
 class PersonReport(Frozen):
-    """What is said of a person who senses with noise."""
+    """Content of the report section on noise in senses and muscles."""
 
-    models: tuple[PersonModel, ...]  # The first is the one that was asked for
+    models: tuple[PersonModel, ...]  # the requested one first
     plant: Plant
-    least: Array  # Gain of least squares (m, n)
-    fit: OutputFeedbackFit | None  # That one; None where it has no likelihood
-    # Of `fit`, by the sandwich; None where it has no likelihood
-    covariance: PersonCovariance | None
-    profiled: bool  # Whether intervals follow the likelihood
-    # Intervals of 95 % of its levels (l, 2), in their units: by the sandwich, or where profiled by
-    # profile for a level that is weakly identified
+    least: Array  # (m, n), gain of least squares
+    fit: OutputFeedbackFit | None  # of the requested model, if its likelihood is defined
+    covariance: PersonCovariance | None  # sandwich covariance of `fit`
+    profiled: bool  # whether intervals are by profile likelihood
+    # 95 % intervals of the noise SDs (l, 2), in their units: sandwich; if profiled, by profile for
+    # weakly identified ones
     levels: Array
-    # The same of the entries of its gain (entries, 2); where profiled all by profile, NaN where an
+    # 95 % intervals of the gain entries (entries, 2); if profiled, all by profile, and NaN where an
     # entry is not individually identified
     entries: Array
-    confusion: Confusion | None  # What of gain and noise is distinguished least
-    whiteness: Array  # p-values that the innovations of each output are white (p,)
-    ahead: tuple[int, ...]  # Samples ahead
-    # Root-mean-square errors of predictions so far ahead (k, p), in the outputs' units
-    errors: Array
+    confusion: Confusion | None  # combination of gain and noise that is distinguished least
+    whiteness: Array  # (p,), p-values of whiteness of the innovations of each output
+    ahead: tuple[int, ...]  # prediction horizons in samples
+    errors: Array  # (k, p), root-mean-square prediction errors, in the outputs' units
 
     @property
     def at_limit(self) -> bool:
-        """Whether a bound was met, so that the likelihood is an approximation."""
+        """Whether a bound was reached, so that the likelihood is approximate."""
         return self.fit is not None and any(
             np.any(trial.status != Status.FREE) for trial in self.fit.identified.trials
         )
 
     @property
     def preferred(self) -> bool:
-        """Whether the subject asked for was found, and no other model is to be preferred."""
+        """Whether the requested model converged and no other one has a clearly lower AIC."""
         asked = self.models[0]
         if asked.fit is None or not asked.fit.converged:
             return False
@@ -103,10 +101,10 @@ class PersonReport(Frozen):
         return asked.criterion < least + _UNDECIDED
 
     def sentences(self) -> list[str]:
-        """What may be said of the subject."""
+        """Findings as sentences."""
         asked, fit, entries = self.models[0], self.fit, np.array(self.entries)
         if fit is None or self.confusion is None:
-            return [f"Nothing can be said of a person who senses with noise: {asked.reason}."]
+            return [f"No model with noise in senses or muscles could be fitted: {asked.reason}."]
         found, together = [self._compared()], self.confusion.correlation
         if len(entries):
             count = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
@@ -121,7 +119,7 @@ class PersonReport(Frozen):
         left = [signal_name(self.plant, name) for name, p in outputs if p < _WHITE]
         if left:
             named = " and ".join(left)
-            found.append(f"The model misses something: residuals of {named} are autocorrelated.")
+            found.append(f"Residuals of {named} are autocorrelated: the model is incomplete.")
         return found
 
     def _compared(self) -> str:
@@ -131,14 +129,14 @@ class PersonReport(Frozen):
             return "No other model of sensing could be fitted for comparison."
         apart = best.criterion - asked.criterion
         if abs(apart) < _UNDECIDED:
-            return (f"It cannot be decided whether the person “{asked.name}” or “{best.name}” (AIC "
-                    f"{abs(apart):.1f} apart).")  # fmt: skip
+            return (f"The recordings do not decide between the models “{asked.name}” and "
+                    f"“{best.name}” (AIC differs by {abs(apart):.1f}).")  # fmt: skip
         first, second = (asked, best) if apart > 0 else (best, asked)
-        return (f"The model in which the person “{first.name}” explains the recordings better than "
+        return (f"The model “{first.name}” explains the recordings better than the model "
                 f"“{second.name}” (AIC lower by {abs(apart):.1f}).")  # fmt: skip
 
     def section(self) -> Section:
-        """Section of the page."""
+        """Section of the report."""
         blocks: list[Block] = [*self.sentences(), _model_finding(self)]
         if self.fit is not None:
             fold = Fold(
@@ -148,7 +146,7 @@ class PersonReport(Frozen):
         return Section("Noise in the loop", blocks)
 
     def data(self) -> dict[str, Any]:
-        """For result.json."""
+        """Entry of result.json."""
         fit = self.fit
         found: dict[str, Any] = {"models": [item.data() for item in self.models]}
         if fit is None or self.confusion is None:
@@ -191,7 +189,7 @@ def _model_finding(report: PersonReport) -> Finding:
 
 
 def _level_finding(report: PersonReport, fit: OutputFeedbackFit) -> Finding:
-    """Of noise that is not identified only the upper end is known."""
+    """Table of noise SDs; for one that is not identified only the upper end is shown."""
     rows, plant = [], report.plant
     names = zip(fit.space.names, fit.levels, report.levels, strict=True)
     for (kind, signal), value, ends in ((one[0].split(" ", 1), *one[1:]) for one in names):
@@ -216,7 +214,7 @@ def _gain_finding(report: PersonReport, fit: OutputFeedbackFit) -> Finding:
         rows.append((f"{signal_name(plant, state)}{by}", *shown, f"{unit} per {per}"))
     heads = ["gain", "maximum_likelihood", "low", "high", "without_noise_in_the_loop", "unit"]
     kept = kept_to(fit.problem)
-    among = "" if kept is None else f", among those that weights over {kept.name} can have"
+    among = "" if kept is None else f", restricted to gains of weights over {kept.name}"
     caption = f"Gain of this person{among}, with 95 % intervals{_PROFILED * report.profiled}."
     labels = {**_ENDS, "maximum_likelihood": "Value"}
     table = pd.DataFrame(rows, columns=heads)

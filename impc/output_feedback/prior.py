@@ -1,6 +1,6 @@
-"""What a search for a person makes largest: log-likelihood + log-prior - REML term for the levels.
+"""Fit objective: log-likelihood + log-prior - REML term for the noise SDs.
 
-docs/noisy-people.md, "The fit", says why there is each (Chung et al. 2013).
+docs/why/output_feedback.md explains the terms (Chung et al. 2013).
 """
 
 from __future__ import annotations
@@ -16,39 +16,36 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.output_feedback.unknowns import LikelihoodTerms, PersonCoordinates
 
-#: A number of the gain is individually identified when its deviation is below this, of a
-#: coordinate.
+#: A gain entry is individually identified if its standard error is below this, in whitened units.
 IDENTIFIED = 0.25
 
-# Without a prior a level that slides to zero, or a sense to one that is not used, has no end: along
-# what is so flat a step of ten is as far as a promise is believed.
+# Curvature that is added so that steps stay finite where the objective is flat: a noise SD near
+# zero, or a sense that is not used.
 _FLAT = 1e-2
-# Nats for each factor of e by which a gain near the border of those that stabilise lets noise
-# grow: on the seat the largest likelihood without it is on that border, and a search creeps there.
+# Nats per factor of e by which a gain near the stability boundary amplifies noise: on the seat the
+# likelihood alone is largest at that boundary, where the search makes almost no progress.
 _BARRIER = 0.5
-# Nats for each factor of e by which a level lies far from the size that is expected. With one nat
-# people all but without noise in the senses had some: two deviations too much on the cart.
+# Nats per factor of e by which a noise SD differs from its expected size. With 1 nat, simulated
+# subjects with almost no sensory noise got some: 2 SDs too much on the cart.
 _UNLIKE = 0.25
 
 
 class Place(NamedTuple):
-    """A point of a search."""
+    """Iterate of a search."""
 
     theta: Array  # (q,)
-    identified: LikelihoodTerms  # What the recordings say there
-    value: float  # What is to be largest, nats
-    lost: float  # What levels lose there (`Prior.lost`), nats
+    identified: LikelihoodTerms  # likelihood with derivatives
+    value: float  # objective, nats
+    lost: float  # REML term (`Prior.lost`), nats
 
 
 class Prior:
-    """What holds directions that nothing identifies, as a share of a log-likelihood.
+    """Prior of unidentified directions, and the REML term of the noise SDs.
 
-    A normal number about the start for each coordinate of gain, cost weights and parameters, and a
-    barrier before gains that do not stabilise. Initial states are as any other state of their
-    trials. With x a level over its scale the density of its logarithm is a power of
-    that of a half-Cauchy level (Gelman 2006), x / (1 + x^2): far away, a quarter of a nat for each
-    factor of e on either side.
-
+    A normal prior about the start for each coordinate of gain, cost weights and parameters, and a
+    barrier at the stability boundary. Initial states have the distribution of the states of their
+    trials. With x a noise SD over its scale, the density of its logarithm is a power of that of a
+    half-Cauchy SD (Gelman 2006), x / (1 + x^2): far away, 0.25 nat per factor of e on either side.
     `scales` (levels,); `driven` (n, n).
     """
 
@@ -72,16 +69,16 @@ class Prior:
         self.used = bool(np.isfinite(spread))
 
     def at(self, theta: Array) -> Place:
-        """What is to be largest, at theta (q,): likelihood times prior, less what levels lose."""
+        """Evaluate the objective at theta (q,)."""
         return self.placed(theta, self.space.identified(theta))
 
     def placed(self, theta: Array, identified: LikelihoodTerms) -> Place:
-        """The same, with what the recordings say at theta (q,)."""
+        """Evaluate the objective at theta (q,) with a known likelihood."""
         lost = self.lost(theta, identified)
         return Place(theta, identified, identified.value + self.value(theta) - lost, lost)
 
     def tried(self, theta: Array) -> Place | None:
-        """The same, or None where there is no likelihood at theta (q,), or no number."""
+        """Evaluate the objective at theta (q,); None if it is undefined or not finite."""
         try:
             there = self.at(theta)
         except ImpcError:
@@ -89,28 +86,26 @@ class Prior:
         return there if np.isfinite(there.value) else None
 
     def freed(self, along: Array) -> Prior:
-        """A prior that expects nothing of the level that is held along a direction (q,)."""
+        """Prior without expectation for the noise SD that is fixed along a direction (q,)."""
         freed = copy.copy(self)
         freed.unlikely = self.unlikely * (1 - np.abs(along[self.space.own :]))
         return freed
 
     def parabola(self, here: Place, unseen: Array) -> tuple[Array, Array]:
-        """Slope (q,) and curvature (q, q), positive definite, of what is to be largest.
+        """Gradient (q,) and negative Hessian (q, q), positive definite, of the objective.
 
-        `unseen` (q,).
+        `unseen` (q,): gradient of the REML term.
         """
         slope, bend = self.slopes(here.theta)
         gradient = here.identified.gradient + slope + unseen
         return gradient, here.identified.information + bend + _FLAT * np.eye(len(gradient))
 
     def lost(self, theta: Array, identified: LikelihoodTerms) -> float:
-        """What levels lose because all else is fitted to the same noise, nats, at theta (q,).
+        """REML term at theta (q,) in nats: noise SDs are biased because all else is fitted too.
 
-        `identified` is what the recordings say there.
-
-        The likelihood of the levels alone, all else integrated out, is by Laplace's method the
-        largest over all else, less half of the logarithm of the determinant of the information on
-        that (restricted likelihood: Patterson and Thompson 1971, Cox and Reid 1987).
+        By Laplace's method the likelihood of the noise SDs alone, all else integrated out, is the
+        maximum over all else minus half the log determinant of its information (restricted
+        likelihood: Patterson and Thompson 1971, Cox and Reid 1987).
         """
         if not self.used:
             return 0.0
@@ -119,26 +114,26 @@ class Prior:
         return float(np.linalg.slogdet(information)[1]) / 2
 
     def value(self, theta: Array) -> float:
-        """At theta (q,), nats; minus infinity where a gain does not stabilise."""
+        """Log-prior at theta (q,), nats; minus infinity if the gain does not stabilise."""
         if not self.used:
             return 0.0
         away = float((theta - self.center) @ self.weights @ (theta - self.center)) / 2
         unlike = float(np.sum(self.unlike(theta)))
-        return -away - unlike - _BARRIER * self.space.wandering(theta)[0]
+        return -away - unlike - _BARRIER * self.space.noise_growth(theta)[0]
 
     def unlike(self, theta: Array) -> Array:
-        """What each level costs (levels,) at theta (q,), nats: log cosh of how far it is off."""
+        """Penalty of each noise SD (levels,) at theta (q,), nats: log cosh of its deviation."""
         off = np.abs(theta[self.space.own :] - self.scales)
         return np.asarray(self.unlikely * (off + np.log1p(np.exp(-2 * off)) - np.log(2)))
 
     def slopes(self, theta: Array) -> tuple[Array, Array]:
-        """Derivatives at theta; the barrier is taken to bend as the logarithm of a distance does.
+        """Gradient and negative Hessian of the log-prior at theta (q,).
 
-        `theta` (q,).
+        The Hessian of the barrier is approximated by that of the logarithm of a distance.
         """
         if not self.used:
             return np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
-        own, slope = self.space.own, self.space.wandering(theta)[1]
+        own, slope = self.space.own, self.space.noise_growth(theta)[1]
         gradient = -self.weights @ (theta - self.center) - _BARRIER * slope
         turned = np.tanh(theta[own:] - self.scales)
         gradient[own:] -= self.unlikely * turned

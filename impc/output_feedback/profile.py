@@ -1,8 +1,8 @@
-"""Intervals by profile likelihood: they need no parabola (docs/noisy-people.md).
+"""Profile likelihood intervals (docs/why/output_feedback.md).
 
-The interval of 95 % of v'theta is where, with v'theta held, 2 (max F - max_held F) <= 1.96^2. F is
-what the search makes largest, but that of a level that is held nothing is expected: its interval
-is open to zero where F never falls.
+The 95 % interval of v'theta is where, with v'theta fixed, 2 (max F - max_fixed F) <= 1.96^2. F is
+the fit objective, without the prior of a noise SD that is fixed: its interval is open to zero if F
+never falls by enough.
 """
 
 from __future__ import annotations
@@ -22,22 +22,20 @@ if TYPE_CHECKING:
     from impc.output_feedback.fit import OutputFeedbackFit
     from impc.output_feedback.prior import Place, Prior
 
-# A level whose logarithm has a larger deviation is weakly identified.
+# Standard error of a log noise SD above which it counts as weakly identified.
 _HARDLY = 0.25
-# Root of half of 1.96^2, of nats, and how near to it an end of an interval is found.
+# Root of half of 1.96^2 nats, and the tolerance at an end of an interval.
 _FALLEN, _CLOSE = 1.385903, 0.04
-#: No end is looked for farther away, and what is known to no more is not identified: some
-#: thousands of a
-#: level, which is then none, or that of a sense which is not used.
+#: Largest distance of an end, in coordinates or log noise SDs; beyond it nothing is identified.
 FARTHEST = 9.0
-# A step is no longer than this.
+# Largest step.
 _LONGEST = 2.0
-# Places at which an end is looked for, and likelihoods with derivatives at each.
+# Largest number of points tried for an end, and evaluation budget at each.
 _TRIES, _BUDGET = 12, 25
 
 
 def level_intervals(fit: OutputFeedbackFit, covariance: PersonCovariance) -> Array:
-    """Intervals of 95 % of all levels (l, 2), in their units: by profile if weakly identified."""
+    """95 % intervals of all noise SDs (l, 2), in their units: profile if weakly identified."""
     found = np.array(covariance.level_intervals(fit.levels))
     for k in np.flatnonzero(covariance.levels > _HARDLY):
         found[k] = level_interval(fit, int(k))
@@ -45,7 +43,7 @@ def level_intervals(fit: OutputFeedbackFit, covariance: PersonCovariance) -> Arr
 
 
 def entry_intervals(fit: OutputFeedbackFit, covariance: PersonCovariance) -> Array:
-    """Intervals of 95 % of the entries of the gain (entries, 2) by profile, in their units."""
+    """95 % profile intervals of the gain entries (entries, 2), in their units."""
     dK, _ = fit.space.changes(fit.theta)
     found = []
     for value, slopes, deviation in zip(
@@ -63,19 +61,19 @@ def entry_intervals(fit: OutputFeedbackFit, covariance: PersonCovariance) -> Arr
 
 
 def level_interval(fit: OutputFeedbackFit, index: int) -> tuple[float, float]:
-    """Interval of 95 % of a level by profile."""
+    """95 % profile interval of a noise SD."""
     low, high = profile(fit, np.eye(len(fit.theta))[fit.space.own + index])
     return float(np.exp(low)), float(np.exp(high))
 
 
 def profile(fit: OutputFeedbackFit, along: Array) -> tuple[float, float]:
-    """Interval of 95 % of along'theta by profile; `along` (q,)."""
+    """95 % profile interval of along'theta; `along` (q,)."""
     low, high = (_end(fit, along, side) for side in (-1, 1))
     return low, high
 
 
 def fallen(fit: OutputFeedbackFit, along: Array, value: float) -> float:
-    """By how much the likelihood falls with along'theta held at a value, all else at its best.
+    """Drop of the objective with along'theta fixed at `value`, maximised over all else.
 
     `along` (q,).
     """
@@ -86,7 +84,7 @@ def fallen(fit: OutputFeedbackFit, along: Array, value: float) -> float:
 
 
 def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
-    """Where the profile has fallen by enough on one side, found by parabolas."""
+    """Point at which the profile has fallen by enough on one side, by local quadratics."""
     prior, begin = fit.prior.freed(along), float(along @ fit.theta)
     here, unseen = prior.placed(np.array(fit.theta), fit.identified), np.array(fit.unseen)
     top, inside, outside, value = here.value, begin, side * np.inf, begin
@@ -94,14 +92,14 @@ def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
         gradient, curvature = prior.parabola(here, unseen)
         ridge = np.asarray(np.linalg.solve(curvature, along), dtype=np.float64)
         spread, peak = float(along @ ridge), value + float(ridge @ gradient)
-        # There the profile falls by (value - peak)^2 / (2 spread), of its largest.
+        # There the profile is (value - peak)^2 / (2 spread) below its maximum.
         room = 2 * spread * (_FALLEN**2 - top + here.value) + (value - peak) ** 2
         goal = peak + side * np.sqrt(room) if room > 0 else inside
         goal = side * min(side * goal, side * value + _LONGEST, side * begin + FARTHEST)
         if not side * inside < side * goal < side * outside:
             goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
         found = held_person(prior, here, along, goal - value, unseen, _BUDGET)
-        if found is None:  # as far as an end may be
+        if found is None:  # undefined: treat as beyond the end
             outside = goal
             continue
         (here, unseen), value = found, goal
@@ -120,9 +118,9 @@ def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
 def held_person(
     prior: Prior, here: Place, along: Array, off: float, unseen: Array, budget: int
 ) -> tuple[Place, Array] | None:
-    """The best of all else with along'theta so far off."""
-    # On the ridge of the parabola, or beside it where that is higher: a straight ridge may leave
-    # the gains that stabilise, and moves a level that is all but none by many powers of e.
+    """Maximise the objective with along'theta shifted by `off` and fixed."""
+    # Start on the ridge of the local quadratic, or along the direction itself if that is higher: a
+    # straight ridge may leave the stabilising gains, and moves a very small noise SD too far.
     _, curvature = prior.parabola(here, unseen)
     ridge = np.asarray(np.linalg.solve(curvature, along), dtype=np.float64)
     ways = ridge / float(along @ ridge), along
@@ -135,7 +133,7 @@ def held_person(
 
 
 def _across(along: Array) -> Array:
-    """All that is orthogonal to a direction (q, q - 1); coordinates it leaves alone, as such."""
+    """Basis (q, q - 1) of the complement of a direction, with unit vectors if possible."""
     mine = np.flatnonzero(along)
     turned = np.zeros((len(along), len(mine) - 1))
     turned[mine] = scipy.linalg.null_space(along[None, mine])

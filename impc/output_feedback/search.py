@@ -1,10 +1,10 @@
-"""The largest likelihood, by Fisher's scoring in a box.
+"""Maximise the fit objective by Fisher scoring with box-shaped trust regions.
 
     maximise  g's - s'I s / 2    over  |s_i| <= radius
 
-with g the gradient and I the expected information; the radius follows from what the step brings. A
-step that is scaled as a whole, instead of a box, is held back by a level that slides to zero: it
-crept for hundreds of rounds on the seat (docs/noisy-people.md).
+with the gradient g and the expected information I; the radius follows from the actual increase. A
+step scaled as a whole is held back by a noise SD that tends to zero: on the seat it needed hundreds
+of iterations.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.output_feedback.prior import Place, Prior
 
-# A search ends when a step promises less, nats: a hundredth of a deviation along any direction
-# without a prior, a tenth with it, for the slope that scores do not have is known no better.
+# Predicted increase in nats below which a search has converged: a hundredth of a standard error in
+# any direction without prior, a tenth with it, as the gradient of the REML term is inexact.
 _SETTLED, _ENOUGH = 1e-4, 5e-3
-# The likelihood jumps where a later stage of a plan meets a bound, a seat's at its limit by half a
-# nat in a step of a deviation. A step is judged as of a function known to so much (Sun and Nocedal
-# 2023), and a search ends after so many steps that found nothing higher by so much: settled, if
-# from the highest place no more than half a nat is promised.
+# The likelihood jumps where a later stage of a plan reaches a bound: for a seat at its limit by 0.5
+# nat within one standard error. Steps are accepted as for a function with that error (Sun and
+# Nocedal 2023), and a search stops after so many steps without an increase by so much: converged
+# if the predicted increase at the best point is below 0.5 nat.
 _ROUGH, _PATIENCE, _PROGRESS = 0.5, 4, 0.05
-# A round with that slope as found by differences is the last when it wins less.
+# A further round with the REML gradient by differences is skipped if the last gained less.
 _WON = 0.25
-# Where a loop all but runs away the information of its first state has 35 digits: what of it is not
-# rounding is still a matrix of its kind, with so much of each diagonal added.
+# Close to instability the information of the first state spans 35 digits: adding this share of each
+# diagonal keeps the matrix positive definite.
 _ROUNDING = 1e-12
-# A place is beside the ridge of all but the levels when a step onto it promises more, nats.
+# Follow the ridge of all but the noise SDs if the predicted increase is larger than this, nats.
 _BESIDE = 0.05
-# Step of the differences along a level, of its logarithm; square of one that teaches half.
+# Difference step of a log noise SD; squared step at which Broyden's update is halved.
 _DIFFERENCE, _DAMPING = 0.1, 0.1
-# Longest and shortest step of any coordinate; those of initial states may be longer by a factor: of
-# them a likelihood without bounds is a parabola.
+# Largest and smallest step of any coordinate; factor for initial states, in which the likelihood
+# without bounds is quadratic.
 _STEP, _SHORTEST, _AFAR = 1.0, 1e-3, 100.0
 
 
@@ -49,7 +49,7 @@ def climb(
     along: Array | None = None,
     unseen: Array | None = None,
 ) -> tuple[Place, Array, int, bool]:
-    """The best place near one, its `unseen` slope (q,), likelihoods spent, and whether settled."""
+    """Best iterate, its REML gradient `unseen` (q,), evaluations used, and whether converged."""
     way = np.eye(len(begin.theta)) if along is None else along
     others = way[:, ~np.any(way[prior.space.own :] != 0, axis=0)]
     reach = _reach(prior, way)
@@ -57,7 +57,7 @@ def climb(
     here = best = begin
     differences = prior.used and unseen is None
     unseen = np.zeros(len(begin.theta)) if unseen is None else unseen
-    # What was won when the slope that scores do not have was asked for last, nats.
+    # Objective at the last evaluation of the REML gradient by differences, nats.
     known = -np.inf
     radius, spent, stale, left = _STEP, 1, 0, np.inf
     while True:
@@ -70,7 +70,7 @@ def climb(
             if best.value <= known + _WON or spent >= budget or not differences:
                 return best, unseen, spent, left < _ROUGH
             here, unseen, known = best, unseen_slope(prior, best), best.value
-            # One or two likelihoods a level.
+            # One or two evaluations per noise SD.
             radius, spent, stale = _STEP, spent + len(prior.scales), 0
             continue
         step, within = boxed_step(down, curvature, radius * reach)
@@ -79,7 +79,7 @@ def climb(
         if there is not None and prior.used and spent < budget:
             there, more = _followed(prior, there, others, unseen)
             spent += more
-        # What came true of the promise, both as if they were larger by what is not smooth.
+        # Ratio of actual to predicted increase, both enlarged by the size of the jumps.
         share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
         if there is None or share < 0.25:
             radius = length / 4
@@ -92,14 +92,14 @@ def climb(
 
 
 def _reach(prior: Prior, way: Array) -> Array:
-    """How much longer than others a step along each of some directions (q, r) may be (r,)."""
+    """Factor (r,) for the largest step along each of some directions (q, r)."""
     mine = way[prior.space.shared : prior.space.after]
     return np.where(np.any(mine != 0, axis=0), _AFAR, 1.0)
 
 
 def _followed(prior: Prior, here: Place, others: Array, unseen: Array) -> tuple[Place, int]:
-    """All but the levels (q, r) where the slope puts it, and likelihoods spent."""
-    # The ridge that all else makes bends with the levels, on the seat by many deviations.
+    """Step of all but the noise SDs onto their ridge, along `others` (q, r); evaluations used."""
+    # The ridge bends with the noise SDs, on the seat by many standard errors.
     slope, bend = prior.parabola(here, unseen)
     radius = _STEP * _reach(prior, others)
     step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
@@ -112,7 +112,7 @@ def _followed(prior: Prior, here: Place, others: Array, unseen: Array) -> tuple[
 
 
 def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tuple[Array, float]:
-    """The step that promises most, g's - s'C s / 2, and moves no coordinate by more than a radius.
+    """Step with the largest predicted increase g's - s'C s / 2 in the box |s_i| <= radius.
 
     `gradient` (q,); `curvature` (q, q); `radius` (q,); returns (q,).
     """
@@ -125,7 +125,7 @@ def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tupl
 
 
 def unseen_slope(prior: Prior, here: Place) -> Array:
-    """Slope of what levels lose (q,), nats, which scores do not have: by differences."""
+    """Gradient of the REML term (q,) in nats, by differences."""
     slope = np.zeros(len(here.theta))
     if prior.used:
         slope[prior.space.own :] = _lost(prior, here)
@@ -133,7 +133,7 @@ def unseen_slope(prior: Prior, here: Place) -> Array:
 
 
 def learned_slope(prior: Prior, slope: Array, here: Place, there: Place) -> Array:
-    """That slope (q,) after a step, by Broyden's update, damped: short steps say little.
+    """REML gradient (q,) after a step, by Broyden's update, damped for short steps.
 
     `slope` (q,).
     """
@@ -141,13 +141,13 @@ def learned_slope(prior: Prior, slope: Array, here: Place, there: Place) -> Arra
     moved = (there.theta - here.theta)[own:]
     missed = here.lost - there.lost - float(slope[own:] @ moved)
     slope[own:] += missed * moved / (float(moved @ moved) + _DAMPING)
-    # Twice the noise are half the deviations, and no level is more than all of it.
+    # Doubling the noise halves the standard errors, and a noise SD is at most all of the noise.
     slope[own:] = np.clip(slope[own:], 0.0, float(own))
     return slope
 
 
 def _lost(prior: Prior, here: Place) -> Array:
-    """What levels lose along each (levels,), all else on its ridge; zero without a likelihood."""
+    """REML gradient along each noise SD (levels,), all else on its ridge; zero if undefined."""
     own, slopes = prior.space.own, np.zeros(len(prior.scales))
     information = here.identified.information + prior.slopes(here.theta)[1]
     ridges = -np.linalg.solve(information[:own, :own], information[:own, own:])

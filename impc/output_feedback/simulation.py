@@ -1,7 +1,6 @@
-"""A trial of a person who senses with noise, under the constrained controller.
+"""Simulate a trial of a subject with noisy senses under the constrained controller.
 
-The system is that of `joint_loop`: commands follow from the estimate, with every bound active
-(docs/noisy-people.md). Samples run in compiled code.
+The system is that of `joint_loop` with all bounds; samples run in compiled code.
 """
 
 from __future__ import annotations
@@ -44,17 +43,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PersonTrial(Frozen):
-    """What a person does, and what is recorded of it."""
+    """Movement and recording of a simulated subject."""
 
-    outputs: Array  # Recorded, with the recorder's noise (samples, p)
-    states: Array  # What is, and what the person takes it for (samples, n)
-    estimates: Array
-    u: Array  # Commands without motor noise (samples, m)
-    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # `Status` of each sample (samples,)
+    outputs: Array  # (samples, p), recorded, with recording noise
+    states: Array  # (samples, n), true states
+    estimates: Array  # (samples, n), states as the subject estimates them
+    u: Array  # (samples, m), commands without motor noise
+    status: np.ndarray[tuple[int], np.dtype[np.int8]]  # (samples,), `Status`
 
     @property
     def reached(self) -> int:
-        """Samples with a command; where it is less than all, the rest repeats the last."""
+        """Number of samples with a command; later samples repeat the last."""
         return int(np.count_nonzero(self.status <= Status.SOFTENED))
 
 
@@ -70,7 +69,7 @@ def simulate_person(
     target: Mapping[str, Any] | None = None,
     seed: Any = 0,
 ) -> PersonTrial:
-    """Simulate one trial; `recorder` (p,); `x0` (n,)."""
+    """Simulate one trial; `recorder` noise SDs (p,); `x0` (n,)."""
     plant = controller.plant
     given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance, target)
     rng, p = np.random.default_rng(seed), len(plant.outputs)
@@ -101,7 +100,7 @@ def run_joint(
     aim: Aim,
     noise: tuple[Array, Array],
 ) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
-    """States of plant and estimate, and commands, with noise that has been drawn."""
+    """Simulate states of plant and estimate, and commands, for given noise samples."""
     steps, (m, n) = len(disturbance), law.controller.K.shape
     z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
     z[0] = start
@@ -126,7 +125,7 @@ def run_joint(
 
 
 def _root(covariance: Array) -> Array:
-    """The one symmetric A with A A' the covariance, so that the same is drawn everywhere."""
+    """Symmetric A with A A' the covariance; unique, so that draws are reproducible."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
@@ -148,7 +147,7 @@ def run_person(
     u: Buffer,
     status: Buffer,
 ) -> int:
-    """Simulate from z[0] with noise that has been drawn, without derivatives."""
+    """Simulate from z[0] with given noise samples, without derivatives."""
     n = loop.K.shape[1]
     work = workspace(rows, drows, u.shape[1])
     lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))

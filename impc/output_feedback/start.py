@@ -1,7 +1,7 @@
-"""Where a search for a person begins: a gain, and levels that what it leaves suggests.
+"""Starting point of an output-feedback fit: a gain, and noise SDs that explain its residuals.
 
-Of several gains the one is taken whose first guess of the levels is the likeliest. Of its residual
-each kind of noise is thought to make a share (docs/noisy-people.md).
+Of several gains the one with the highest likelihood is taken; each kind of noise is assumed to
+explain a share of the residual (docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -29,28 +29,27 @@ if TYPE_CHECKING:
     from impc.inverse.coordinates import Point
     from impc.output_feedback.observer import Observer
 
-# Of the residual, shares that a search begins with: inside the loop, of the senses, the recorder's.
-# The likeliest is taken. On a seat whose recorder has a thirtieth of the residual the search had
-# not ended after 40 steps (docs/noisy-people.md).
+# Assumed shares of the residual: process and motor noise, senses, recording. The one with the
+# highest likelihood is taken. For a seat whose recording noise is 1/30 of the residual, a single
+# start had not converged after 40 steps.
 _SHARES = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
-# Recorded exactly, a residual has no size: its levels begin at this share of the outputs.
+# Noise-free recordings have no residual: noise SDs start at this share of the outputs.
 _LEAST = 1e-6
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What a search is asked for."""
+    """Settings of a fit."""
 
-    observer: Observer  # Which levels there are; those that are not searched, at what they are
-    # Standard deviations where a search begins (p,); of the size of the residuals by default
-    recorder: Array | None
-    held: Sequence[str]  # Kinds of levels that are not searched
-    spread: float  # Standard deviation of the prior
-    counted: int  # The first sample of each trial that is identified
+    observer: Observer  # which noise exists; fixed noise SDs have their values here
+    recorder: Array | None  # (p,), initial recording noise SDs; None: of the size of the residuals
+    held: Sequence[str]  # kinds of noise that are fixed
+    spread: float  # standard deviation of the prior
+    counted: int  # first sample of each trial in the likelihood
 
 
 def gain_space(point: Point, cost_weights: Array | None) -> Coordinates:
-    """Coordinates of gain or cost weights about a point; `cost_weights` (count,) if searched."""
+    """Coordinates of gain, or cost weights (count,) if these are estimated, about a point."""
     structure = point.problem.structure
     if cost_weights is not None and structure is not None:
         return WeightCoordinates(point.problem, structure, np.array(cost_weights))
@@ -62,13 +61,13 @@ def gain_space(point: Point, cost_weights: Array | None) -> Coordinates:
 
 
 def cost_weights_at(space: PersonCoordinates, theta: Array) -> Array | None:
-    """Cost weights (count,) at theta (q,), where they are searched."""
+    """Log cost weights (count,) at theta (q,), if they are estimated."""
     own = space.space
     return own.unknowns(theta[: space.own]) if isinstance(own, WeightCoordinates) else None
 
 
 def prior_about(space: PersonCoordinates, asked: Asked) -> Prior:
-    """The prior about the start of some coordinates."""
+    """Prior about the start of `space`."""
     return _prior(space, asked, _sizes(space.space.unpack(space.space.start)))
 
 
@@ -80,7 +79,7 @@ def _prior(space: PersonCoordinates, asked: Asked, size: _Sizes) -> Prior:
 def likeliest_start(
     points: Sequence[Point], cost_weights: Array | None, asked: Asked
 ) -> tuple[Prior, Array]:
-    """Where a search begins, of several points; `cost_weights` (count,); returns (q,)."""
+    """Starting point (q,) with the highest likelihood; `cost_weights` (count,)."""
     found, highest, reason = None, -np.inf, "no number"
     for point in points:
         try:
@@ -96,13 +95,13 @@ def likeliest_start(
         if value > highest:
             found, highest = (space, size, guesses), value
     if found is None:
-        raise SolverError("person", f"no start has a likelihood: {reason}", "give other levels")
+        raise SolverError("observer", f"no start has a likelihood: {reason}", "set other noise SDs")
     space, size, guesses = found
     return _prior(space, asked, size), max(guesses, key=lambda theta: _value(space, theta))
 
 
 def _guesses(space: PersonCoordinates, asked: Asked, size: _Sizes) -> list[Array]:
-    """Unknowns (q,) where a search may begin: shares of what is left, then the levels given."""
+    """Possible starting points (q,): shares of the residual, then the given noise SDs."""
     guesses = []
     for inside, sensed, recorded in _SHARES if asked.recorder is None else ():
         levels = _suggested(asked.observer, size, inside, sensed)
@@ -112,7 +111,7 @@ def _guesses(space: PersonCoordinates, asked: Asked, size: _Sizes) -> list[Array
 
 
 def _value(space: PersonCoordinates, theta: Array) -> float:
-    """Log-likelihood at theta (q,); minus infinity where there is none."""
+    """Log-likelihood at theta (q,); minus infinity if undefined."""
     try:
         return space.value(theta)
     except ImpcError:
@@ -121,7 +120,7 @@ def _value(space: PersonCoordinates, theta: Array) -> float:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Levels of which each alone would make residuals of the size that there is."""
+    """Noise SDs each of which alone would explain the size of the residuals."""
 
     motor: Array
     process: Array
@@ -144,7 +143,7 @@ def _sizes(point: Point) -> _Sizes:
 
 
 def _suggested(observer: Observer, size: _Sizes, inside: float, sensed: float) -> Array:
-    """Levels of the observer's kinds that share what the first fit leaves."""
+    """Noise SDs of the observer's kinds that together explain the residuals."""
     moved = int(np.any(observer.motor)) + int(np.any(observer.process))
     share = inside / np.sqrt(max(moved, 1))
     signals = np.sqrt(np.einsum("si,ij,sj->s", observer.C, size.sensory, observer.C))

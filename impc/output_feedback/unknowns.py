@@ -1,6 +1,6 @@
-"""The unknowns of a likelihood: those of a search for a gain or for weights, then levels of noise.
+"""Unknowns of an output-feedback fit: those of a gain or of weights, then log noise SDs.
 
-theta = (coordinates of `Coordinates` or `WeightCoordinates` | logarithms of the levels searched)
+theta = (coordinates of `Coordinates` or `WeightCoordinates` | log noise SDs that are estimated)
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ if TYPE_CHECKING:
     from impc.output_feedback.compiled_filter import Likelihood
     from impc.output_feedback.observer import Observer
 
-# Largest logarithm, either way, of a level whose square double precision can still multiply.
+# Largest absolute log noise SD: its square stays in the range of double precision.
 _SQUARED = 300.0
 
 
 @dataclass(frozen=True)
 class Person:
-    """A point of a search."""
+    """Controller and noise at one point of a search."""
 
-    point: Point  # Gain, metric, and the problem at initial states and parameters
-    observer: Observer  # At its levels
-    recorder: Array  # Standard deviations of the recorder's noise (p,)
+    point: Point  # gain, metric, and the problem at initial states and parameters
+    observer: Observer  # with its noise SDs
+    recorder: Array  # (p,), recording noise SDs
 
 
 @dataclass(frozen=True)
 class LikelihoodTerms:
-    """What all recordings say at a point."""
+    """Log-likelihood of all recordings at one point, with derivatives."""
 
-    value: float  # Log-likelihood, nats
-    gradient: Array  # Along theta (q,)
-    information: Array  # Fisher's, expected (q, q)
-    scores: list[Array]  # Derivative of each sample's log-likelihood (samples, q), trial by trial
+    value: float  # nats
+    gradient: Array  # (q,)
+    information: Array  # (q, q), expected Fisher information
+    scores: list[Array]  # (samples, q), gradient of each sample's log-likelihood, by trial
     trials: list[Likelihood]
 
 
 class PersonCoordinates:
-    """The unknowns of one search; `recorder` (p,)."""
+    """Unknowns of one search; `recorder` (p,)."""
 
     def __init__(
         self,
@@ -71,51 +71,50 @@ class PersonCoordinates:
         free = np.array([*(kind not in held for kind in kinds), *[True] * len(recorder)])
         self.moving = np.flatnonzero((self.first > 0) & free)
         self.start = np.concatenate([space.start, np.log(self.first[self.moving])])
-        #: How many coordinates gain or cost weights have, where initial states begin and end, and
-        #: how
-        #: many unknowns are not levels.
+        #: Number of coordinates of gain or cost weights; range of the initial states; number of
+        #: unknowns that are not noise SDs.
         self.gain = int(space.ends[0])
         self.shared, self.after = int(space.ends[1]), int(space.ends[2])
         self.own = len(space.start)
         sensed = np.array([*(kind == "sensory" for kind in kinds), *[False] * len(recorder)])
-        #: Which unknowns are levels of the senses.
+        #: Indices of the unknowns that are sensory noise SDs.
         self.senses = self.own + np.flatnonzero(sensed[self.moving])
 
     @property
     def names(self) -> list[str]:
-        """What the levels are called that are searched."""
+        """Names of the estimated noise SDs."""
         plant = self.space.problem.plant
         every = [*self.observer.names(plant), *(f"recorder {name}" for name in plant.outputs)]
         return [every[index] for index in self.moving]
 
     def levels(self, theta: Array) -> Array:
-        """All levels (levels + p,) at theta (q,), those of zero among them."""
+        """All noise SDs (levels + p,) at theta (q,), including zeros."""
         logarithms = theta[self.own :]
         if not np.all(np.abs(logarithms) <= _SQUARED):
-            raise SolverError("level of noise", "has no square in double precision", "begin nearer")
+            raise SolverError("noise SD", "is out of range of double precision", "start nearer")
         found = self.first.copy()
         found[self.moving] = np.exp(logarithms)
         return found
 
     def changes(self, theta: Array) -> tuple[Array, Array]:
-        """Changes of K (a, m, n) and S (a, m, m) with the unknowns but levels, at theta (q,)."""
+        """Derivatives of K (a, m, n) and S (a, m, m) by all unknowns but noise SDs, at theta."""
         return self.space.changes(self.space.unpack(theta[: self.own]), theta[: self.own])
 
     def unpack(self, theta: Array) -> Person:
-        """The person at theta (q,)."""
+        """Controller and noise at theta (q,)."""
         levels = self.levels(theta)
         split = len(self.observer.levels)
         person = self.observer.with_levels(levels[:split])
         return Person(self.space.unpack(theta[: self.own]), person, frozen(levels[split:]))
 
     def value(self, theta: Array) -> float:
-        """Log-likelihood at theta (q,), in a fraction of the time of `identified`."""
+        """Log-likelihood at theta (q,) without derivatives, which is faster."""
         person = self.unpack(theta)
         nothing = _Moved(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0)
         return sum(item.value for item in self._trials(theta, person, [nothing]))
 
     def identified(self, theta: Array) -> LikelihoodTerms:
-        """Log-likelihood and its derivatives at theta (q,)."""
+        """Log-likelihood with derivatives at theta (q,)."""
         person, q = self.unpack(theta), len(theta)
         columns = [self._columns(trial) for trial in range(self.space.trials)]
         trials = self._trials(theta, person, columns)
@@ -130,12 +129,10 @@ class PersonCoordinates:
         value = sum(item.value for item in trials)
         return LikelihoodTerms(value, gradient, information, scores, trials)
 
-    def wandering(self, theta: Array) -> tuple[float, Array]:
-        """Logarithm of how far white noise at the inputs drives the loop, beside the start's.
+    def noise_growth(self, theta: Array) -> tuple[float, Array]:
+        """Log of the noise gain of the loop, relative to the start, and its gradient (q,).
 
-        It grows without end towards the border of gains that stabilise. Cost weights never meet it.
-
-        `theta` (q,); returns (q,).
+        It tends to infinity at the stability boundary; cost weights never reach that. `theta` (q,).
         """
         space, gradient = self.space, np.zeros(len(theta))
         if isinstance(space, WeightCoordinates):
@@ -167,7 +164,7 @@ class PersonCoordinates:
         return float(np.log(size / len(X))), gradient
 
     def _columns(self, trial: int) -> _Moved:
-        """Which unknowns move one trial: its own initial state stands last."""
+        """Unknowns that affect one trial: its own initial state comes last."""
         start = np.arange(self.shared, self.after)
         n = self.space.n if len(start) else 0
         shared = np.delete(np.arange(len(self.start)), start)
@@ -179,9 +176,9 @@ class PersonCoordinates:
         problem, plant = here.problem, here.problem.plant
         bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
         if bounded and not stabilises(plant, here.K):
-            raise SolverError("gain", "does not stabilise the plant", "start elsewhere")
+            raise SolverError("gain", "does not stabilise the plant", "use another start")
         controller = controller_for(problem, here.K, here.S)
-        # The initial states of all trials have the same unit, so one law serves them all.
+        # All initial states have the same scale, so one law serves all trials.
         along, noise = self._directions(theta, controller, person, columns[0])
         prepared = prepare_filter(controller, person.observer, person.recorder, along, noise)
         return joint_likelihoods(prepared, problem.recordings, self.counted)
@@ -219,7 +216,7 @@ class PersonCoordinates:
 
 @dataclass(frozen=True)
 class _Moved:
-    """Unknowns of one trial: those that all share, and so many of its initial state after them."""
+    """Unknowns of one trial: shared ones, then its initial state (length `start`)."""
 
     all: np.ndarray[tuple[int], np.dtype[np.int64]]
     shared: np.ndarray[tuple[int], np.dtype[np.int64]]

@@ -1,4 +1,4 @@
-"""Compile what likelihoods of subjects with sensory noise run."""
+"""Compile the numba code of the likelihood with sensory noise in advance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impc.output_feedback.simulation import simulate_person
 
 
 def compile_filter() -> None:
-    """Simulate a subject at a limit and take the likelihood."""
+    """Simulate a subject at a limit and evaluate the likelihood."""
     law, drive = cart()
     plant = law.plant
     person, recorder = Observer(plant, ["x", "v"], motor=0.3, sensory=[0.1, 0.2]), np.array([0.02])

@@ -1,7 +1,7 @@
-"""A report as one value: its verdict, the sections of its page, and the files beside it.
+"""Content of a report: verdict, sections of the page, figures, and files.
 
-Text is escaped when the page is made. Where a sentence holds a piece of code or a link it is a
-`markupsafe.Markup`, whose `format` escapes what is put into it.
+Text is escaped when the page is rendered. Sentences with code or links are `markupsafe.Markup`,
+whose `format` escapes its arguments.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from impc.reporting.verdict import Alert, Key, Verdict
 
 @dataclass(frozen=True)
 class Lines:
-    """Sentences as a list."""
+    """Sentences as a numbered list."""
 
-    lines: Sequence[str]  # One an entry
+    lines: Sequence[str]
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Terms, and what is said of each."""
+    """Pairs of a term and its description."""
 
     terms: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Quiet:
-    """Why something does not stand where a reader looks for it."""
+    """Explanation why an expected result is not shown."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of a list of checks."""
+    """One check and its outcome."""
 
     level: Level
     name: str
@@ -56,28 +56,28 @@ class Check:
 
 @dataclass(frozen=True)
 class Checks:
-    """What was checked, and how it came out."""
+    """List of checks."""
 
     checks: Sequence[Check]
 
 
 @dataclass(frozen=True)
 class Fold:
-    """What a reader has to open."""
+    """Collapsible part of the page."""
 
-    summary: str  # What is inside, always shown
+    summary: str  # Title, always visible
     blocks: Sequence[Block]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two parts beside each other, on a phone below each other."""
+    """Two blocks side by side; one below the other on a phone."""
 
     left: Block
     right: Block
 
 
-#: What a section is made of; a str is a paragraph.
+#: Content of a section; a str is a paragraph.
 Block = str | Finding | Picture | Chart | Lines | Terms | Quiet | Checks | Alert | Fold | Pair
 
 
@@ -85,57 +85,57 @@ Block = str | Finding | Picture | Chart | Lines | Terms | Quiet | Checks | Alert
 class Section:
     """A section of the page."""
 
-    title: str  # Its heading
-    blocks: Sequence[Block]  # What stands in it, in this order
-    contents: str = ""  # Its name in the contents; by default the title
+    title: str  # Heading
+    blocks: Sequence[Block]
+    contents: str = ""  # Name in the table of contents; default: the title
 
     @property
     def anchor(self) -> str:
-        """Its id on the page."""
+        """HTML id of the section."""
         words = self.contents or self.title
         return "".join(mark if mark.isalnum() else "-" for mark in words.lower())
 
 
 @dataclass(frozen=True)
 class Copy:
-    """What may be copied into a paper."""
+    """Text to copy into a paper."""
 
     methods: str
     results: str
 
 
-#: How a figure is drawn; True for the drawing of a phone.
+#: Function that draws a figure; True: narrow version for phones.
 Draw = Callable[[bool], Figure]
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that a command leaves behind; nothing is written here."""
+    """Content of all files that a command writes."""
 
-    window: str  # Title of the browser's window
-    kind: str  # Such as "fit report"
+    window: str  # Title of the browser window
+    kind: str  # For example "fit report"
     verdict: Verdict
     sections: Sequence[Section]
-    meta: Sequence[str] = ()  # What the page is about, in a few words each
-    hero: Picture | None = None  # Beside the verdict
-    keys: Sequence[Key] = ()
+    meta: Sequence[str] = ()  # Line above the verdict: subject, number of trials, date
+    hero: Picture | None = None  # Figure next to the verdict
+    keys: Sequence[Key] = ()  # Key numbers at the top of the page
     figures: Mapping[str, Draw] = field(default_factory=dict)
-    copy: Copy | str | None = None  # Or why there is nothing to copy
-    beside: Sequence[Finding] = ()  # Whose tables are written as files and stand on no page
-    # Content of result.json beside the findings and what every one has (docs/results.md)
+    copy: Copy | str | None = None  # Text for a paper, or the reason why there is none
+    beside: Sequence[Finding] = ()  # Tables that are written as files and not shown on the page
+    # Content of result.json in addition to findings and common keys (docs/ref/results.md)
     data: Mapping[str, Any] = field(default_factory=dict)
-    provenance: Provenance = field(default_factory=Provenance)  # Where the result comes from
+    provenance: Provenance = field(default_factory=Provenance)
 
     def page(self) -> str:
-        """The page as one HTML text that needs no other file."""
+        """Self-contained HTML page."""
         return render_page(self, any(isinstance(one, Chart) for one in self._blocks()))
 
     def picture(self, shown: Picture) -> Markup:
-        """The drawing of a picture within the page."""
+        """Inline SVG of a figure."""
         return inline(self.figures[shown.name], shown.name, shown.alternative, phone=shown.phone)
 
     def findings(self) -> list[Finding]:
-        """Those of the page, in the order in which they stand there."""
+        """Findings of the page, in page order."""
         return [one for one in self._blocks() if isinstance(one, Finding)]
 
     def _blocks(self) -> list[Block]:
@@ -146,7 +146,7 @@ class Report:
         return {item.name: item.table for item in found if item.table is not None}
 
     def files(self, *, pdf: bool = False) -> dict[str, bytes]:
-        """Page, result.json, tables and figures by name; with `pdf` the figures as PDF too."""
+        """Files by name: page, result.json, tables and figures; with `pdf` also PDF figures."""
         tables = self._tables()
         heads = {one.name: one.labels for one in [*self.findings(), *self.beside]}
         sheets = {
@@ -170,7 +170,7 @@ class Report:
         }
 
     def _readme(self, sheets: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-        """The first sheet: what the workbook is, and what each other sheet holds."""
+        """First sheet of the workbook: verdict, command, and a description of each sheet."""
         captions = {item.name: item.caption for item in [*self.findings(), *self.beside]}
         rows = [
             ("verdict", f"{self.verdict.words}: {self.verdict.headline}"),
@@ -178,7 +178,7 @@ class Report:
             ("command", self.provenance.command),
             *((name, captions[name]) for name in sheets),
         ]
-        return pd.DataFrame(rows, columns=["sheet", "what it holds"])
+        return pd.DataFrame(rows, columns=["sheet", "contents"])
 
 
 def _flat(blocks: Sequence[Block]) -> list[Block]:
@@ -196,5 +196,5 @@ def _flat(blocks: Sequence[Block]) -> list[Block]:
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
-    """The `content` of result.json, UTF-8; what is not a number is null."""
+    """The `content` of result.json in UTF-8; NaN and infinity become null."""
     return (json.dumps(plain(content), indent=1, allow_nan=False) + "\n").encode()

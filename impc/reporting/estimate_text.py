@@ -1,4 +1,4 @@
-"""What an estimate says in a terminal, in a notebook and in a figure: methods of `Estimate`."""
+"""Text, HTML and figure of an estimate: methods of `Estimate`."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _WIDTH = 78
-# Rows of a matrix that is printed whole.
+# Largest number of rows of a matrix that is printed in full.
 _SMALL = 4
 
 
 def summary(estimate: Estimate) -> str:
-    """Method, problem, agreement and doubts, then gain with intervals and weights."""
+    """Method, problem, VAF and doubts, then gain with intervals, and weights."""
     lines = [METHODS[estimate.method].label, "=" * _WIDTH, *_problem(estimate)]
     if estimate.K is None:
         return "\n".join([*lines, "-" * _WIDTH, estimate.status.sentence, estimate.reason])
@@ -34,7 +34,7 @@ def summary(estimate: Estimate) -> str:
     shares = zip(plant.outputs, estimate.vaf, strict=True)
     lines.append("VAF, %:     " + ", ".join(f"{name} {value:.4g}" for name, value in shares))
     said = (estimate.status.sentence, estimate.reason, *estimate.doubts)
-    lines += [text for text in said if text]  # before the numbers that they are about
+    lines += [text for text in said if text]  # warnings come before the numbers
     staged = estimate.problem.terminal_weight is not None
     table = gain_table(plant, estimate.gain) if staged else estimate.intervals()
     lines += ["-" * _WIDTH, table.round(6).to_string(), "-" * _WIDTH]
@@ -47,7 +47,7 @@ def summary(estimate: Estimate) -> str:
             lines.append(f"{name} = {text}")
         if not staged:
             lines.append(
-                "The intervals are of the gain by itself; .K is the gain of these weights."
+                "Intervals: of the gain fitted without weights. .K is the gain of these weights."
             )
     return "\n".join(lines)
 
@@ -82,12 +82,12 @@ def _problem(estimate: Estimate) -> list[str]:
     for name, values in zip(plant.outputs, problem.shifts.T, strict=True):
         if np.any(values):
             listed = ", ".join(f"{value:.4g}" for value in values)
-            lines.append(f"Offsets:    {name} {listed} {plant.unit(name)}, a trial each")
+            lines.append(f"Offsets:    {name} {listed} {plant.unit(name)}, one per trial")
     return lines
 
 
 def as_html(estimate: Estimate) -> str:
-    """Status and gain for a notebook; everything is escaped."""
+    """Status and gain as escaped HTML for a notebook."""
     head = f"<p>{escape(METHODS[estimate.method].label)}: {escape(estimate.status.sentence)}</p>"
     if estimate.K is None:
         return head + f"<p>{escape(estimate.reason)}</p>"
@@ -98,7 +98,7 @@ def as_html(estimate: Estimate) -> str:
 
 
 def gain_table(plant: Plant, gain: Array) -> pd.DataFrame:
-    """A gain (m, n) of u = -Kx, a row an entry: input, state, unit and value."""
+    """Table of a gain (m, n) of u = -Kx: input, state, unit and value of each entry."""
     import pandas as pd  # noqa: PLC0415  # a third of a second
 
     rows = [
@@ -110,20 +110,20 @@ def gain_table(plant: Plant, gain: Array) -> pd.DataFrame:
 
 
 def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
-    """Outputs, recorded and simulated, and inputs within their bounds, of one trial."""
+    """Plot recorded and simulated outputs, and inputs with their bounds, of one trial."""
     import matplotlib.pyplot as plt  # noqa: PLC0415  # a second
 
     problem, plant = estimate.problem, estimate.problem.plant
     if not isinstance(trial, int) or not 0 <= trial < len(problem.recordings):
         last = len(problem.recordings) - 1
-        raise InputError("trial", f"got {trial!r:.40}", f"give 0 to {last}")
+        raise InputError("trial", f"got {trial!r:.40}", f"pass an integer from 0 to {last}")
     run, recorded = estimate.simulations[trial], problem.recordings[trial].without_offset
     count = len(plant.outputs) + plant.m
     if axes is None:
         _, axes = plt.subplots(count, sharex=True, layout="constrained")
     shown = np.ravel(np.asarray(axes, dtype=object))
     if len(shown) != count:
-        raise InputError("axes", f"got {len(shown)}", f"give {count}: outputs, then inputs")
+        raise InputError("axes", f"got {len(shown)}", f"pass {count}: outputs, then inputs")
     for k, name in enumerate(plant.outputs):
         factor, _ = shown_unit(plant, name)
         shown[k].plot(run.time, factor * recorded[:, k], color="0.7", linewidth=3, label="recorded")

@@ -1,7 +1,6 @@
-"""A finding: what one assessment says, as one value.
+"""Result of one assessment, from which page, CSV, workbook and result.json are made.
 
-Page, CSV, workbook and result.json are made from the list of findings (`impc.reporting.document`):
-a new assessment is one function that returns a `Finding`, and one line in the sections of a page.
+To add an assessment, write a function that returns a `Finding` and add it to a section of a page.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ T = TypeVar("T")
 
 
 class Level(enum.Enum):
-    """How far a finding restricts what may be said of the subject."""
+    """How far a finding restricts the statements about a person."""
 
-    GREEN = "green"  # Nothing speaks against it
+    GREEN = "green"  # No restriction
     AMBER = "amber"  # Some statements must not be made
-    RED = "red"  # Nothing may be said about the person's control
+    RED = "red"  # No statement about the person's control may be made
     NOTE = "note"  # For information
 
 
@@ -37,26 +36,26 @@ class Level(enum.Enum):
 class Picture:
     """A figure of the report."""
 
-    name: str  # Of its drawing among the report's figures
-    alternative: str  # In place of the picture for those who do not see it
-    caption: str  # Below it
-    phone: bool = True  # Whether it has a drawing for the width of a phone
+    name: str  # Key among the report's figures
+    alternative: str  # Text alternative for screen readers
+    caption: str
+    phone: bool = True  # Whether there is a narrow version for phones
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves that a reader may zoom, move and switch on and off; without scripts nothing of it."""
+    """Interactive curves; empty if scripts are disabled."""
 
     title: str
-    data: Mapping[str, Any]  # The curves, as `impc.studies.charts` makes them
+    data: Mapping[str, Any]  # Curves in the form of `impc.studies.charts`
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Name, table, sentences and figure of one assessment, and how far it restricts a report.
+    """Result of one assessment: table, sentences, figure, and level of restriction.
 
-    Heads of the table are words joined by `_`, which R and MATLAB take for names, and numbers are
-    numbers in the units of the plant. `p` and heads that begin with `p_` are of probabilities.
+    Column names are words joined by `_`, valid names in R and MATLAB; numbers are in the units of
+    the plant. Column `p` and columns that begin with `p_` hold p-values.
     """
 
     name: str  # Key in result.json, name of the CSV file and of the sheet
@@ -65,30 +64,30 @@ class Finding:
     sentences: Sequence[str] = ()  # Before the figure
     figure: Picture | Chart | None = None
     level: Level = Level.NOTE
-    folded: str = ""  # What the table is called where a reader has to unfold it on the page
-    digits: int = 4  # Of its numbers on the page
-    # Heads for readers, by the names of columns; others are their names in words
+    folded: str = ""  # Title if the table is collapsed on the page
+    digits: int = 4  # Significant digits on the page
+    # Column headings by column name; default: the name with spaces
     labels: Mapping[str, str] = field(default_factory=dict)
-    hidden: Sequence[str] = ()  # Columns that stand in the files alone
-    links: Mapping[str, str] = field(default_factory=dict)  # Addresses of first cells, on the page
-    badges: Mapping[str, Level] = field(default_factory=dict)  # Cells that are badges on the page
+    hidden: Sequence[str] = ()  # Columns that are written to files only
+    links: Mapping[str, str] = field(default_factory=dict)  # Link targets by text of the first cell
+    badges: Mapping[str, Level] = field(default_factory=dict)  # Cell texts that are shown as badges
 
     @property
     def shown(self) -> list[str]:
-        """The columns of the page."""
+        """Names of the columns on the page."""
         names = [] if self.table is None else list(map(str, self.table.columns))
         return [name for name in names if name not in self.hidden]
 
     @property
     def heads(self) -> list[str]:
-        """Heads of the table for readers."""
+        """Column headings on the page."""
         words = {name: name.replace("percent", "(%)").replace("_", " ") for name in self.shown}
         heads = [self.labels.get(name, words[name]) for name in self.shown]
         return [head[:1].upper() + head[1:] for head in heads]
 
     @property
     def rows(self) -> list[list[str]]:
-        """Cells of the table for readers."""
+        """Formatted cells, row by row."""
         if self.table is None:
             return []
         columns = [
@@ -97,17 +96,17 @@ class Finding:
         return [list(row) for row in zip(*columns, strict=True)]
 
     def text(self) -> str:
-        """The table in columns of a fixed width, for a terminal."""
+        """Table in fixed-width columns for a terminal."""
         return in_columns([self.heads, *self.rows])
 
     def data(self) -> dict[str, Any]:
-        """For result.json."""
+        """Entry in result.json."""
         table = {} if self.table is None else {"table": self.table.to_dict("list")}
         return {"level": self.level.value, "sentences": list(self.sentences), **table}
 
 
 def table_of(items: Iterable[T], columns: Mapping[str, Callable[[T], Any]]) -> pd.DataFrame:
-    """A table with a row for each of the `items`; every column has its name and its function."""
+    """Table with one row per item; `columns` maps each name to the function of its cells."""
     found = list(items)
     return pd.DataFrame(
         {name: pd.Series([cell(item) for item in found], dtype=None if found else object)
@@ -116,13 +115,13 @@ def table_of(items: Iterable[T], columns: Mapping[str, Callable[[T], Any]]) -> p
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
-    """A table as CSV in UTF-8 that a spreadsheet may open: none of its texts is a formula."""
+    """Table as CSV in UTF-8; texts are escaped so that no spreadsheet runs them as formulas."""
     stream = io.StringIO()
     as_data(table).to_csv(stream, index=False, lineterminator="\n")
     return stream.getvalue().encode()
 
 
-#: Cells of a table that is in the workbook too; a larger one, some seconds to write, is CSV alone.
+#: Largest table (cells) in the workbook; larger ones, slow to write, are CSV only.
 MOST_CELLS = 200_000
 
 

@@ -1,4 +1,4 @@
-"""Terms that not every reader knows: each is explained where it stands first on a page."""
+"""Tooltips: each technical term is explained at its first occurrence on a page."""
 
 from __future__ import annotations
 
@@ -7,39 +7,41 @@ from dataclasses import dataclass, field
 
 from markupsafe import Markup, escape
 
-#: Term -> what it means. It is found in any case of its first letter, and in the plural.
+#: Term -> explanation. Matches in any case of its first letter, and in the plural.
 TERMS: dict[str, str] = {
     "AIC": "Akaike's information criterion: misfit plus a penalty for each fitted number. Lower is "
-    "better; differences below 2 decide nothing.",
-    "autocorrelated": "Neighbouring samples resemble each other, as those of people usually do.",
+    "better; differences below 2 are not meaningful.",
+    "autocorrelated": "Correlated with earlier samples, as human movement is and white noise is "
+    "not.",
     "bootstrap": "Intervals by repetition: the fit is repeated on recordings simulated from it.",
     "95 % CI": "95 % confidence interval.",
     "coherence": "The share of the movement at this frequency that follows the perturbation "
     "linearly: 1 all of it, 0 none.",
     "condition number": "Largest over smallest eigenvalue of the cost weights.",
     "cost weight": "How much the square of a tilt, velocity or torque adds to the cost that the "
-    "controller keeps small.",
-    "Fisher information": "What recordings say of parameters; its inverse is the least variance.",
-    "gain": "How much the controller commands per unit of a tilt or velocity, as long as the limit "
-    "is not reached.",
-    "Hedges' g": "Difference of two means over their standard deviation, corrected for small "
+    "controller minimises.",
+    "Fisher information": "Information of recordings about parameters; the diagonal of its inverse "
+    "is the smallest possible variance of unbiased estimates.",
+    "gain": "Command of the controller per unit of a tilt or velocity, as long as the limit is not "
+    "reached.",
+    "Hedges' g": "Difference of two means divided by their standard deviation, corrected for small "
     "groups.",
-    "Holm": "A correction of p-values, so that all comparisons together err in 5 of 100 only.",
-    "ICC": "Intraclass correlation: the share of the variance that is between people. 1: a second "
-    "visit finds the same order of people.",
+    "Holm": "Correction for several tests: the probability of any false positive is at most 5 %.",
+    "ICC": "Intraclass correlation: the share of the variance that is between people. 1: repeated "
+    "measurements of a person agree exactly.",
     "inverse LQR": "The classical method: it identifies cost weights as if torque were unlimited.",
-    "left-out trials": "Each trial is predicted by a model fitted to the others, which has not "
-    "seen it.",
+    "left-out trials": "Each trial is predicted by a model that was fitted to the other trials "
+    "only.",
     "model predictive control": "At every sample the controller plans a short time ahead within "
     "its limits, and carries out the first step of the plan.",
-    "neural delay": "The time that nerves take, as a chain of internal states. Their gains have no "
-    "meaning one by one.",
-    "profile likelihood": "An interval by moving one number, all others fitted again, until the "
-    "recordings contradict it.",
+    "neural delay": "Conduction time of nerves, modelled as a chain of internal states. Their "
+    "single gains have no meaning.",
+    "profile likelihood": "Interval of one number: all values that the recordings do not "
+    "contradict when the other numbers are fitted again.",
     "residual": "Recorded minus modelled output.",
     "RMS": "Root mean square: the size of a signal.",
-    "SEM": "Standard error of measurement: the scatter of one person's result.",
-    "typical": "Of the size that it has in these recordings (root mean square).",
+    "SEM": "Standard error of measurement: standard deviation of repeated results of one person.",
+    "typical": "Root mean square in these recordings.",
     "variance accounted for": "100 % if model and recording coincide, 0 % if the model is no "
     "better than a constant zero.",
     "VAF": "Variance accounted for: 100 % if model and recording coincide, 0 % if the model is no "
@@ -49,12 +51,12 @@ TERMS: dict[str, str] = {
 
 @dataclass
 class Glossary:
-    """The terms of one page; each is explained where it stands first."""
+    """Adds tooltips to the text of one page."""
 
     _explained: set[str] = field(default_factory=set)
 
     def marked(self, text: str) -> str:
-        """The `text` with an explanation at each term that is new on the page."""
+        """The `text` with a tooltip at each term that has none on the page yet."""
         if isinstance(text, Markup):
             return text
         left = TERMS.keys() - self._explained

@@ -1,5 +1,5 @@
 "use strict";
-// Copy, open what a link leads to, sort tables, explore curves. Without scripts the page is whole too.
+// Copy button, links into folded parts, sortable tables, interactive curves. The page works without scripts.
 (() => {
   const all = (query, place = document) => [...place.querySelectorAll(query)];
   const make = (tag, place, words = "") => {
@@ -36,7 +36,7 @@
     });
   }
 
-  // Numbers by size, what is no number after them by its letters.
+  // Numbers by size; other cells after them in alphabetical order.
   const order = (one, other) => {
     const [a, b] = [one, other].map((text) => parseFloat(text.replace("\u2212", "-")));
     if (isNaN(a) !== isNaN(b)) return isNaN(a) ? 1 : -1;
@@ -61,7 +61,7 @@
     });
   }
 
-  // A panel a signal, all over the same time: drag to zoom, double click for all.
+  // One panel per signal with a common time axis: drag to zoom, double-click to reset.
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const explore = (place) => {
     const data = JSON.parse(place.querySelector("script").textContent);

@@ -1,4 +1,4 @@
-"""Where a result comes from: plant, command, versions and date."""
+"""Provenance of a result: plant, command, input files, versions and date."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return "not installed"  # impc itself, run from a checkout by its path
+        return "not installed"  # for example impc itself, run from a source tree
 
 
 def _now() -> str:
@@ -34,20 +34,20 @@ def _now() -> str:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a reader needs to make a result again; versions and date are those of its making."""
+    """Information needed to reproduce a result."""
 
-    plant_name: str = ""  # Import path or file; empty where a result has none
-    command: str = ""  # Command line that made the result
-    # What the plant's function was called with
+    plant_name: str = ""  # Import path or file; empty if there is no plant
+    command: str = ""  # Command line
+    # Arguments of the plant's function
     plant_arguments: Mapping[str, object] = field(default_factory=dict)
     files: tuple[str, ...] = ()  # Names of the recordings, without their folders
-    inputs: Inputs | None = None  # Digests of all files that went in; None where there were none
-    # Of Python and of the packages that compute
+    inputs: Inputs | None = None  # Digests of all input files; None if there are none
+    # Versions of Python and of the numerical packages
     versions: Mapping[str, str] = field(default_factory=_versions)
-    made: str = field(default_factory=_now)  # Date and time, UTC, ISO 8601
+    made: str = field(default_factory=_now)  # Date and time of creation, UTC, ISO 8601
 
     def data(self) -> dict[str, Any]:
-        """As result.json has it."""
+        """Entries in result.json."""
         return {
             "files": self.files,
             "command": self.command,
@@ -58,24 +58,24 @@ class Provenance:
 
     @property
     def terms(self) -> list[tuple[str, str]]:
-        """For the last section of a page; what is not known is left out."""
+        """Terms of the section "Provenance"; unknown entries are omitted."""
         code = Markup("<code>{}</code>")
         found = [("Recordings", ", ".join(self.files))]
         found += [("Command", self.command and code.format(self.command))]
         found += [("Plant", self.plant_name and code.format(self.plant_name + self.arguments))]
         found += [("Created", self.made), ("Software", self.all_versions)]
         if self.inputs is not None:
-            seal = f"{self.inputs.digest[:16]} (SHA-256 of all inputs; in full in result.json)"
+            seal = f"{self.inputs.digest[:16]} (SHA-256 of all input files; full in result.json)"
             found.append(("Fingerprint", seal))
         return [(name, text) for name, text in found if text]
 
     @property
     def arguments(self) -> str:
-        """What the plant was made with, in brackets."""
+        """Arguments of the plant in brackets."""
         given = ", ".join(f"{name} {value}" for name, value in self.plant_arguments.items())
         return f" ({given})" if given else ""
 
     @property
     def all_versions(self) -> str:
-        """The versions in one line."""
+        """All versions in one line."""
         return ", ".join(f"{name} {version}" for name, version in self.versions.items())

@@ -1,4 +1,4 @@
-"""What the pages share: the template, numbers in a cell, values as JSON has them."""
+"""Rendering of pages, formatting of numbers, and conversion of values to JSON."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from impc.reporting.document import Report
 
 _HERE = Path(__file__).parent
-#: The library that draws curves; `vendor` holds its licence.
+#: Plotting library; its licence is in `vendor`.
 _LIBRARY = "vendor/uPlot.iife.min.js", "vendor/uPlot.min.css"
 _NOTICE = "/* uPlot 1.6.31, (c) 2022 Leon Sorokin, MIT licence */"
-# Between a number and its unit, and within a unit, no line ends.
+# No line break between a number and its unit, or within a unit.
 _UNIT = r"(\d) (%|N m|N\b|s\b|m\b|kg\b|ms\b|deg\b|Hz\b|°)"
 _KEPT = re.compile(rf"{_UNIT}|(N) (m)\b|(p) (=|<)|(=|<) (\d)")
 _ICONS = {
@@ -34,7 +34,7 @@ _ICONS = {
 
 
 def render_page(report: Report, charts: bool) -> str:
-    """The page of a report; all texts that enter it are escaped."""
+    """Render the page of a report; all texts are escaped."""
     environment = Environment(
         loader=FileSystemLoader(_HERE),
         autoescape=True,
@@ -56,14 +56,14 @@ def render_page(report: Report, charts: bool) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    """The text with spaces that are not broken where a number and its unit stand."""
+    """Escaped text with non-breaking spaces between numbers and units."""
     parts = re.split(r"(<[^>]*>)", str(escape(text)))
     kept = [part if part.startswith("<") else _KEPT.sub(_joined, part) for part in parts]
-    return Markup("".join(kept))  # of escaped text: nothing but spaces is another
+    return Markup("".join(kept))  # already escaped: only spaces were replaced
 
 
 def _name(text: str) -> Markup:
-    """What a row of a table is called; names as programs write them stand as code."""
+    """First cell of a table row; names with underscores are set as code."""
     coded = re.fullmatch(r"[A-Za-z]\w*_[\w.]+", text)
     return Markup("<code>{}</code>").format(text) if coded else _unbroken(text)
 
@@ -79,24 +79,24 @@ def _read(name: str) -> str:
 
 @functools.cache
 def _script(name: str) -> dict[str, str]:
-    """A script of ours, and the hash by which the policy of a page lets it run."""
+    """One of our scripts with its hash for the content security policy of the page."""
     return _sealed(_read(name))
 
 
 @functools.cache
 def _library() -> dict[str, str]:
-    """The library without its first line, which holds an address: a page has none."""
+    """The library without its first line, which contains a URL: pages must contain none."""
     _, _, text = _read(_LIBRARY[0]).partition("\n")
     return _sealed(f"{_NOTICE}\n{text}")
 
 
 def _sealed(text: str) -> dict[str, str]:
     seal = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-    return {"text": Markup(text), "sha256": seal}  # our own files: nothing of a user's is in them
+    return {"text": Markup(text), "sha256": seal}  # safe: no user input in our own files
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A `value` for a table cell, to so many significant `digits`; words where there is none."""
+    """Format a `value` for a table cell to `digits` significant digits."""
     if np.isnan(value):
         return "-"
     if np.isinf(value):
@@ -108,12 +108,12 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def probability(value: float) -> str:
-    """A p-value as it is printed."""
+    """Format a p-value."""
     return "p < 0.001" if value < 1e-3 else f"p = {number(value, 2)}"
 
 
 def fixed(value: float, digits: int = 3) -> str:
-    """As `number`, and zeros at the end stay: 13.0 beside 15.6."""
+    """Format as `number` does, but keep trailing zeros (13.0)."""
     text = number(value, digits)
     if not np.isfinite(value) or "e" in text:
         return text
@@ -122,10 +122,9 @@ def fixed(value: float, digits: int = 3) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A `value` with its arrays and numpy numbers as lists and numbers, at every depth.
+    """Convert arrays and NumPy numbers to lists and numbers for JSON, at every depth.
 
-    JSON knows neither NaN nor infinity: both become null. Bytes of a file's name that are not UTF-8
-    are escaped.
+    NaN and infinity become None (JSON null); bytes of file names that are not UTF-8 are escaped.
     """
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
@@ -141,5 +140,5 @@ def plain(value: Any) -> Any:
 
 
 def _encodable(text: str) -> str:
-    """The text in UTF-8: Python keeps bytes of a name that are none as halves of characters."""
+    """Escape surrogates, by which Python represents bytes of file names that are not UTF-8."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")

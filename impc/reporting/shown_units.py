@@ -1,7 +1,6 @@
-"""How a signal is shown: its name in words, and angles in degrees or radians.
+"""Names and units of signals on pages and figures; angles in degrees or radians.
 
-Every page and figure asks here; a command says once, with `angles_in`, what [report] angles asks
-for (docs/units.md).
+Commands set the unit of angles once with `angles_in`, from [report] angles.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _DEGREES = {"rad": "°", "rad/s": "°/s", "rad/s^2": "°/s²"}
-# Of plants that say no units, angles are identified by their names.
+# If the plant states no unit, angles are recognised by these prefixes of their names.
 _ANGLES = ("theta", "angle", "yaw", "pitch", "roll")
 _CHOSEN: ContextVar[str] = ContextVar("angles", default="degrees")
 
 
 @contextmanager
 def angles_in(choice: str) -> Iterator[None]:
-    """Inside the block angles are shown in the unit of this `choice`, "degrees" or "radians"."""
+    """Show angles in the unit `choice`, "degrees" or "radians", inside the block."""
     token = _CHOSEN.set(choice)
     try:
         yield
@@ -36,12 +35,12 @@ def angles_in(choice: str) -> Iterator[None]:
 
 
 def shown_angle() -> tuple[float, str]:
-    """Factor from radians, and the unit in which angles are shown."""
+    """Factor from radians to the shown unit of angles, and that unit."""
     return (math.degrees(1.0), "°") if _CHOSEN.get() == "degrees" else (1.0, "rad")
 
 
 def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
-    """Factor from the plant's unit of a signal, and the unit that is shown."""
+    """Factor from the plant's unit of a signal to the shown unit, and that unit."""
     unit = plant.unit(name)
     if unit == UNKNOWN and name.lower().startswith(_ANGLES):
         unit = "rad/s" if name.endswith("_rate") else "rad"
@@ -49,19 +48,19 @@ def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
 
 
 def shown_as(unit: str) -> tuple[float, str]:
-    """Factor from a `unit` to the one that is shown, and that one."""
+    """Factor from `unit` to the shown unit, and that unit."""
     if unit in _DEGREES and _CHOSEN.get() == "degrees":
         return math.degrees(1.0), _DEGREES[unit]
     return 1.0, "-" if unit == "1" else unit
 
 
 def signal_name(plant: Plant, name: str) -> str:
-    """What a signal is called for readers: its words, or its name without underscores."""
+    """Name of a signal on pages: the plant's words for it, or its name without underscores."""
     return plant.word(name) or name.replace("_", " ")
 
 
 def words_of(plant: Plant, feature: str) -> str:
-    """A feature with its signals in words: "trunk tilt - 0.5 seat tilt"."""
+    """A feature with its signals in words, for example "trunk tilt - 0.5 seat tilt"."""
     signals = (*plant.states, *plant.controls)
 
     def word(found: re.Match[str]) -> str:
@@ -71,16 +70,16 @@ def words_of(plant: Plant, feature: str) -> str:
 
 
 def axis_label(plant: Plant, name: str) -> str:
-    """A signal with the unit in which it is shown: "Seat tilt (°)"."""
+    """Label of a signal with its shown unit, for example "Seat tilt (°)"."""
     words = signal_name(plant, name)
     return f"{words[:1].upper()}{words[1:]} ({shown_unit(plant, name)[1]})"
 
 
 def body_sentence(plant: Plant) -> str:
-    """Which body every simulation of a page moved, that of a `plant` or its matrices."""
+    """State which equations of motion the simulations of a page use."""
     if plant.body is None:
-        return "What moves is the linear plant, by which the controller predicts too."
+        return "All simulations use the linear plant, with which the controller predicts too."
     return (
-        "What moves are the plant's own equations, which are not linear; the controller predicts "
-        "by their linearisation at rest."
+        "All simulations use the plant's nonlinear equations of motion; the controller predicts "
+        "with their linearisation at rest."
     )

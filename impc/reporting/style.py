@@ -1,7 +1,7 @@
-"""How figures look, and a figure as SVG that follows light, dark and print.
+"""Style of figures, and conversion to SVG for light mode, dark mode and print.
 
-Every colour of the light palette stands once in the style sheet too: in the SVG of a page it is
-replaced by its variable, so that one drawing serves all grounds. No colour carries a meaning alone.
+In the SVG of a page each colour is replaced by the CSS variable of the same colour in style.css. No
+meaning depends on colour alone.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.ticker import Formatter
 
-#: Text and axes; what is less important; lines of a grid; areas that nothing is drawn in.
+#: Colours of text and axes; of secondary items; of grid lines; of the background.
 INK, MUTED, RULE, PAPER = "#1b2229", "#566270", "#d9dfe5", "#ffffff"
-#: The model; what is at or beyond a limit, and the area there; what was recorded.
+#: Colours of the model; of samples at a limit; of the area beyond it; of recordings.
 BLUE, VERMILLION, FORBIDDEN, RECORDED = "#0a5ca8", "#a84300", "#f3e6dc", "#b4bec9"
-#: A third curve.
+#: Colour of a third curve.
 GREEN = "#0f6130"
 _VARIABLES = {
     INK: "ink",
@@ -44,10 +44,10 @@ _VARIABLES = {
     GREEN: "ok",
 }
 
-#: Inches of a drawing over the whole page, beside a text, and on a phone.
+#: Width in inches of a figure over the whole page, next to text, and on a phone.
 WIDE, HALF, PHONE = 11.0, 7.2, 4.0
 
-# Any: matplotlib types its keys one by one, and each version has others.
+# Any: the types of the keys differ between versions of matplotlib.
 _RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 11.0,
@@ -69,13 +69,13 @@ _RC: dict[Any, Any] = {
     "lines.markersize": 5.0,
     "legend.frameon": False,
     "legend.handlelength": 1.6,
-    "svg.fonttype": "none",  # the page's own fonts, and text that can be found and read aloud
-    "pdf.fonttype": 42,  # journals ask for TrueType, so that text stays text
+    "svg.fonttype": "none",  # text in the fonts of the page, searchable and readable aloud
+    "pdf.fonttype": 42,  # journals require TrueType fonts
     "path.simplify_threshold": 0.3,
     "figure.facecolor": "none",
     "axes.facecolor": "none",
     "savefig.facecolor": "none",
-    # A figure without an engine stays as it is laid out, whatever the user's own settings.
+    # Override the user's settings for figures without a layout engine.
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
 }
@@ -83,34 +83,34 @@ _RC: dict[Any, Any] = {
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Apply the style inside the block; matplotlib's settings are as before after it."""
+    """Apply the style inside the block and restore matplotlib's settings afterwards."""
     with mpl.rc_context():
-        mpl.rcdefaults()  # not the user's own: text.usetex alone ends a figure where TeX is missing
+        mpl.rcdefaults()  # drop the user's settings: text.usetex fails if TeX is missing
         mpl.rcParams.update(_RC)
         yield
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return a figure that belongs to no window and to no list; width and height in inches."""
+    """Return a figure outside pyplot; width and height in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def strip(ax: Axes, title: str) -> None:
-    """Name a panel above itself, with its unit, and draw its zero."""
+    """Set the title of a panel and draw its zero line."""
     ax.set_title(title, pad=5)
     ax.axhline(0, color=RULE, linewidth=0.8, zorder=0)
 
 
 def written(draw: Callable[[bool], Figure], kind: str) -> bytes:
-    """The wide drawing as a file of its own, "svg" or "pdf", without date or program name."""
+    """Bytes of the wide figure as a "svg" or "pdf" file, without date or program name."""
     with page_style():
         return render(draw(False), kind)
 
 
 def inline(draw: Callable[[bool], Figure], name: str, title: str, *, phone: bool) -> Markup:
-    """The drawing within a page; where a `phone` has one of its own, both, and the page chooses."""
+    """Inline SVG of a figure; with `phone` also a narrow version, between which CSS chooses."""
     name = re.sub(r"\W+", "-", name)  # in ids of the page
     with page_style():
         parts = [_svg(draw(False), f"{name}-w", title, "w" if phone else "")]
@@ -143,7 +143,7 @@ def _font(found: re.Match[str]) -> str:
 
 
 def render(figure: Figure, kind: str, ground: str = PAPER) -> bytes:
-    """The bytes of a figure as "svg", "pdf" or "png": the same figure gives the same."""
+    """Bytes of a figure as "svg", "pdf" or "png"; reproducible for the same figure."""
     _set_literally(figure)
     metadata = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
     stream = BytesIO()
@@ -153,7 +153,7 @@ def render(figure: Figure, kind: str, ground: str = PAPER) -> bytes:
 
 
 def _set_literally(figure: Figure) -> None:
-    """Let no text be read as mathematics, but the numbers that matplotlib itself writes."""
+    """Disable mathematical markup in all texts except matplotlib's own tick labels."""
     numbers: set[Text] = set()
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):

@@ -1,4 +1,4 @@
-"""What a result allows to be said: one value, for page, terminal and result.json."""
+"""Verdict of a report: conclusion, warnings, and statements that may be reported or not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from impc.reporting.finding import Level
 
-#: Columns of a terminal.
+#: Width of the text in a terminal, in characters.
 WIDTH = 100
 _BADGES = {
     Level.GREEN: "Ready to report",
@@ -21,44 +21,44 @@ _BADGES = {
 
 @dataclass(frozen=True)
 class Claim:
-    """What may, or may not, be reported."""
+    """Statement that may, or may not, be reported."""
 
-    text: str  # A sentence
-    why: str = ""  # With its numbers, or why not
+    text: str
+    why: str = ""  # Supporting numbers, or the reason why it may not be reported
 
 
 @dataclass(frozen=True)
 class Key:
-    """A number that stands first on the page."""
+    """Key number at the top of the page."""
 
     value: str
-    unit: str  # Behind it, small
-    label: str  # What it is
-    detail: str = ""  # Interval, or what it is about
+    unit: str
+    label: str
+    detail: str = ""  # For example its interval
 
 
 @dataclass(frozen=True)
 class Alert:
-    """Something that was found, which restricts what may be reported."""
+    """Warning: a finding, its consequence, and what to do."""
 
     level: Level
     title: str
     found: str
     means: str
-    todo: Sequence[str]  # Steps, in their order
+    todo: Sequence[str]  # Steps, in order
 
     def data(self) -> dict[str, Any]:
-        """For result.json."""
+        """Entry in result.json."""
         named = {name: getattr(self, name) for name in ("title", "found", "means")}
         return {"level": self.level.value, **named, "todo": list(self.todo)}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer of a page, how far it may be trusted, and what may be made of it.
+    """Conclusion of a page, warnings, and statements that may or may not be reported.
 
-    Green: all standard statements may be reported; amber: some, and an alert says which; red:
-    nothing about how the subject controls the movement. A note has no badge.
+    Green: all standard statements may be reported. Amber: some; an alert says which. Red: none
+    about how the person controls the movement. A note has no badge.
     """
 
     level: Level
@@ -67,15 +67,15 @@ class Verdict:
     alerts: Sequence[Alert] = ()
     may: Sequence[Claim] = ()
     may_not: Sequence[Claim] = ()
-    badge: str = ""  # In place of the usual words
+    badge: str = ""  # Replaces the usual words of the badge
 
     @property
     def words(self) -> str:
-        """The words of the badge."""
+        """Words of the badge."""
         return self.badge or _BADGES[self.level]
 
     def data(self) -> dict[str, Any]:
-        """For result.json."""
+        """Entry in result.json."""
         return {
             "level": self.level.value,
             "headline": self.headline,
@@ -86,7 +86,7 @@ class Verdict:
         }
 
     def text(self) -> str:
-        """For a terminal."""
+        """Text for a terminal."""
         badge = f"[{self.words}] " if self.level is not Level.NOTE else ""
         parts = [fill(badge + self.headline, WIDTH), fill(self.sentence, WIDTH)]
         for alert in self.alerts:

@@ -1,9 +1,9 @@
-"""Write a set of files whole or not at all, into a folder that one command owns.
+"""Atomic writing of a set of files into a folder that belongs to one command.
 
-A command holds its folder with `owned`: no second run enters it meanwhile, and no other command
-afterwards. What it writes with `write_files` is listed in `.impc`, and replaces what the same
-command wrote there before, so that a folder never shows files of two runs. If a run is killed while
-it replaces them, the folder says so in `INCOMPLETE.txt`, and the next run replaces all.
+`owned` locks the folder during a run and reserves it for the same command afterwards. The files of
+`write_files` are listed in `.impc` and replace those of the previous run, so that a folder never
+contains files of two runs. If a run is killed while it replaces files, `INCOMPLETE.txt` says so and
+the next run replaces all files.
 """
 
 from __future__ import annotations
@@ -31,32 +31,34 @@ except ImportError:  # Windows
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-_REMEDY = "give another folder"
-# List, lock, and where files are written before they are moved to their places.
+_REMEDY = "choose another folder"
+# List of files, lock, and folder in which files are written before they are moved.
 _LIST, _LOCK, _STAGING = ".impc", ".impc-lock", ".impc-new"
 _NOTICE = "INCOMPLETE.txt"
-_SAID = b"A run was stopped while it wrote these files: they may be of two runs. Run it again.\n"
-# Files by which results are known that have no list: of an older version, or not of this program.
+_SAID = (
+    b"A run was stopped while it wrote these files; they may come from two runs. Run it again.\n"
+)
+# Files that mark a folder of results without a list, from an older version or another program.
 _TELLING = ("report.html", "result.json", "study.toml", "truth.json")
 
 
 @dataclass
 class _Run:
-    """What a run that owns its folder has written so far, and what was there of the last one."""
+    """Files that the run has written so far, and files of the previous run."""
 
     folder: Path
     command: str
-    before: Mapping[str, str]  # SHA-256 by name
+    before: Mapping[str, str]  # SHA-256 by name, files of the previous run
     written: dict[str, str] = field(default_factory=dict)
 
     def begin(self, new: Mapping[str, bytes]) -> None:
-        """List files before they are written, so that a killed run leaves none unlisted."""
+        """List files before they are written: a killed run leaves no unlisted files."""
         for name in new:
             known = name in self.before or name in self.written
             if not known and os.path.lexists(self.folder / name):
                 raise OutputError(
-                    f"file {self.folder / name}", "is not of an earlier run of this command",
-                    "move it, or give another folder",
+                    f"file {self.folder / name}", "was not written by this command",
+                    "move it, or choose another folder",
                 )  # fmt: skip
         if not self.written and self.before:
             write_whole(self.folder / _NOTICE, _SAID)
@@ -64,21 +66,21 @@ class _Run:
         self.list({**self.before, **self.written})
 
     def list(self, files: Mapping[str, str]) -> None:
-        """Write the list: the command, and a line for each file."""
+        """Write the list: the command, and one line per file."""
         lines = [self.command, *(json.dumps(item) for item in files.items())]
         write_whole(self.folder / _LIST, ("\n".join(lines) + "\n").encode())
 
     def undo(self, names: Iterable[str]) -> None:
-        """These files were put back as they were."""
+        """Remove restored files from the list."""
         for name in names:
             self.written.pop(name, None)
         if not self.written:
             (self.folder / _NOTICE).unlink(missing_ok=True)
 
     def finish(self) -> None:
-        """Remove what the last run wrote and this one did not."""
+        """Remove files of the previous run that this run did not write."""
         for name in self.before.keys() - self.written.keys():
-            # What somebody has changed since, or a damaged list names by mistake, is not ours.
+            # Keep files that have changed since: the user's, or listed by mistake.
             if _has(self.folder / name, self.before[name]):
                 (self.folder / name).unlink()
                 for parent in Path(name).parents[:-1]:
@@ -93,10 +95,7 @@ _RUN: ContextVar[_Run | None] = ContextVar("run", default=None)
 
 @contextmanager
 def owned(folder: Path, command: str) -> Iterator[None]:
-    """Hold a `folder` for one run of a `command`; what `write_files` writes meanwhile replaces.
-
-    Nothing is left of a folder that is made here and in which nothing was written.
-    """
+    """Lock a `folder` for one run of a `command`; a new folder without files is removed."""
     require_writable(folder)
     with ExitStack() as undo:
         try:
@@ -106,7 +105,7 @@ def owned(folder: Path, command: str) -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
             undo.enter_context(_locked(folder))
             run = _Run(folder, command, _listed(folder, command))
-            shutil.rmtree(folder / _STAGING, ignore_errors=True)  # of a run that was killed
+            shutil.rmtree(folder / _STAGING, ignore_errors=True)  # left by a killed run
             if not (folder / _LIST).exists():
                 there = set(os.listdir(folder))
                 run.list({})
@@ -126,18 +125,18 @@ def owned(folder: Path, command: str) -> Iterator[None]:
 
 
 def _unlist(folder: Path, before: set[str]) -> None:
-    """Take the list away again when nothing was written, and no work is kept."""
+    """Remove the list if nothing was written and no intermediate results are kept."""
     if set(os.listdir(folder)) == before | {_LIST}:
         (folder / _LIST).unlink()
 
 
 def _missing(folder: Path) -> list[Path]:
-    """The folder and those above it that are not there yet."""
+    """The folder and its parents that do not exist yet."""
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def _listed(folder: Path, command: str) -> dict[str, str]:
-    """What a run of the `command` wrote to the folder before: SHA-256 by name."""
+    """Files that an earlier run of the `command` wrote to the folder: SHA-256 by name."""
     try:
         require_ordinary(folder / _LIST)
         owner, *lines = (folder / _LIST).read_text(encoding="utf-8").splitlines()
@@ -146,13 +145,13 @@ def _listed(folder: Path, command: str) -> dict[str, str]:
         telling = [name for name in _TELLING if (folder / name).exists()]
         if telling:
             raise OutputError(
-                f"folder {folder}", f"holds {telling[0]} of another version or of your own", _REMEDY
+                f"folder {folder}", f"contains {telling[0]}, not written by this version", _REMEDY
             ) from None
         return {}
     except (OSError, ValueError, RecursionError):
         raise OutputError(f"folder {folder}", f"its list {_LIST} is damaged", _REMEDY) from None
     if owner != command:
-        raise OutputError(f"folder {folder}", f"holds results of impc {owner}", _REMEDY)
+        raise OutputError(f"folder {folder}", f"contains results of impc {owner}", _REMEDY)
     return {name: seal for name, seal in found.items() if _is_inside(Path(name))}
 
 
@@ -161,15 +160,12 @@ def _is_inside(name: Path) -> bool:
 
 
 def _has(path: Path, seal: str) -> bool:
-    """Whether the content of a file has that SHA-256."""
+    """Whether the file has the SHA-256 `seal`."""
     return path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == seal
 
 
 def require_writable(folder: Path) -> None:
-    """Check, before a long computation, that files can be written to a folder or it can be made.
-
-    Nothing is created. What happens later (a full disk) is left to `write_files`.
-    """
+    """Raise OutputError if files cannot be written to the folder; creates nothing."""
     try:
         existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     except (OSError, ValueError) as error:
@@ -177,20 +173,20 @@ def require_writable(folder: Path) -> None:
     if not existing.is_dir():
         raise OutputError(f"folder {folder}", f"{existing} is a file", _REMEDY)
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise OutputError(f"folder {folder}", f"{existing} may not be written to", _REMEDY)
+        raise OutputError(f"folder {folder}", f"{existing} is not writable", _REMEDY)
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
-    """Write files by name into a folder, which is made when it is missing.
+    """Write files by name into a folder, which is created if it does not exist.
 
-    They are written into a folder of their own first and moved from there one by one. When anything
-    fails, files that were there before are put back and what was made is removed.
+    Files are first written to a staging folder and then moved one by one. If anything fails,
+    existing files are restored and new ones removed.
     """
     require_writable(folder)
     run = _RUN.get()
     if run is not None and not folder.is_relative_to(run.folder):
         run = None
-    # In the folder that is owned: the next run finds there what a killed one left.
+    # Inside the owned folder, so that the next run can remove what a killed one left.
     staging = (folder if run is None else run.folder) / _STAGING
     try:
         with ExitStack() as undo, ExitStack() as always:
@@ -218,7 +214,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
 
 
 def _move(source: Path, target: Path, undo: ExitStack) -> None:
-    """Put source in the place of target in one step, and note how to undo it."""
+    """Replace target by source in one step, and register the undo."""
     target.parent.mkdir(parents=True, exist_ok=True)
     require_ordinary(target)
     if target.exists():
@@ -230,13 +226,13 @@ def _move(source: Path, target: Path, undo: ExitStack) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold an existing `folder` while the block lasts; the system lets go when the process dies."""
+    """Lock an existing `folder` during the block; the system unlocks it if the process dies."""
     path = folder / _LOCK
     stream = _lock_of(path)
     try:
         yield
     finally:
-        # Taken away while it is still held: whoever opened it before finds that it is gone.
+        # Removed while still locked: a process that has opened it finds that it is gone.
         if os.name == "posix":
             path.unlink(missing_ok=True)
         stream.close()
@@ -256,11 +252,11 @@ def _lock_of(path: Path) -> IO[bytes]:
             raise OutputError(
                 f"folder {path.parent}",
                 "another run is writing to it",
-                "wait, or give another folder",
+                "wait for it, or choose another folder",
             ) from None
         if _is_there(path, stream):
             return stream
-        stream.close()  # its holder took it away in between: once more
+        stream.close()  # its holder removed it in between: try again
 
 
 def _take(stream: IO[bytes]) -> None:

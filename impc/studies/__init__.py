@@ -1,1 +1,1 @@
-"""Studies are compositions: methods and assessments on recordings, with their pages."""
+"""Studies: methods and assessments applied to recordings, with their reports."""

@@ -1,10 +1,9 @@
-"""Results in a folder, one JSON file each, computed once: who is interrupted goes on from there.
+"""Store of intermediate results (JSON files), from which interrupted commands continue.
 
     {"sha256": ..., "content": ..., "digest": ..., "name": ...}
 
-`name` says which result it is, `digest` of which recordings, plant, settings and versions
-(`impc.files.digests`), and `sha256` is that of all that follows it. What was damaged, edited,
-renamed or copied, or belongs to another digest, is not used: it is computed again.
+`digest` identifies recordings, plant, settings and versions (`impc.files.digests`); `sha256` covers
+everything after it. Files that are damaged, edited, renamed or of another digest are ignored.
 """
 
 from __future__ import annotations
@@ -33,49 +32,49 @@ _SEALED = len(_SEAL % (b"0" * 64))
 
 
 def to_json(value: Any) -> Any:
-    """A dataclass, or a mapping, as its fields; arrays as lists."""
+    """Convert a dataclass or mapping to built-in types; arrays to lists."""
     return msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
 
 
 def from_json(content: Any, kind: type[T]) -> T:
-    """The dataclass of that `kind`, from what `to_json` made of it."""
+    """Convert the output of `to_json` back to a dataclass of this `kind`."""
     return msgspec.convert(content, kind, dec_hook=lambda _, array: frozen(array))
 
 
 @dataclass(frozen=True)
 class Cache:
-    """Results by name, in a folder."""
+    """Results by name in a folder."""
 
-    folder: Path  # Made when the first result is kept
+    folder: Path  # Created with the first result
 
     def path(self, name: str) -> Path:
-        """The file of the result `name`; a slash in it makes a folder."""
+        """File of the result `name`; a slash in the name makes a subfolder."""
         return Path(f"{self.folder}/{_UNSAFE.sub('-', name)}.json")
 
     def find(self, name: str, digest: str) -> Any:
-        """The content kept under that `name` and `digest`; None where there is none to use."""
+        """Content stored under this `name` and `digest`; None if there is none."""
         found = _unsealed(self.path(name))
         if found is None or (found["name"], found["digest"]) != (name, digest):
             return None
         return found["content"]
 
     def keep(self, name: str, digest: str, content: Any) -> None:
-        """Write a result down: its `name`, its `content`, the `digest` of its origin."""
+        """Store the `content` of a result under its `name` and the `digest` of its inputs."""
         body = {"content": content, "digest": digest, "name": name}
         text = json.dumps(body).encode()[1:] + b"\n"
         seal = hashlib.sha256(text).hexdigest().encode()
-        # Cut short by a power failure it is computed again; a flush takes a disk 1 to 20 ms.
+        # No flush (1 to 20 ms): a file cut short by a power failure is detected and recomputed.
         write_whole(self.path(name), _SEAL % seal + text, flush=False)
 
     def discard(self, name: str) -> None:
-        """Remove the result of that `name`, if there is one."""
+        """Remove the result `name`, if there is one."""
         try:
             self.path(name).unlink(missing_ok=True)
         except OSError as error:
             raise _unremovable(f"file {self.path(name)}", error) from None
 
     def forget(self) -> None:
-        """Remove what was kept: the final results have been written. Files of others stay."""
+        """Remove all stored results and keep other files."""
         try:
             for path in self.folder.rglob("*.json"):
                 found = _unsealed(path)
@@ -87,9 +86,9 @@ class Cache:
 
 
 def _unsealed(path: Path) -> dict[str, Any] | None:
-    """What a sealed file holds; None where there is none, or its seal is broken."""
+    """Content of a sealed file; None if it does not exist or its checksum is wrong."""
     try:
-        if not path.is_file():  # a pipe would be waited for
+        if not path.is_file():  # reading a pipe would block
             return None
         text = path.read_bytes()
     except OSError:
@@ -107,12 +106,12 @@ def _unremovable(subject: str, error: OSError) -> OutputError:
 
 @dataclass(frozen=True)
 class Steps:
-    """Results of a command that come one after the other, all with one digest."""
+    """Results of the consecutive steps of a command, all with one digest."""
 
     cache: Cache
     digest: str
-    done: Callable[[str], None] = lambda _: None  # Told the name of each result when it is there
-    names: list[str] = field(default_factory=list)  # Of those that are there
+    done: Callable[[str], None] = lambda _: None  # Called with the name of each available result
+    names: list[str] = field(default_factory=list)  # Names of the available results
 
     def get(
         self,
@@ -121,7 +120,7 @@ class Steps:
         decode: Callable[[Any], T],
         encode: Callable[[T], Any] = to_json,
     ) -> T:
-        """The result `name`, from the folder or computed now and then written down."""
+        """Return the stored result `name`, or compute and store it."""
         content = self.cache.find(name, self.digest)
         if content is None:
             found = compute()
@@ -133,8 +132,8 @@ class Steps:
         return found
 
     def kept(self) -> str:
-        """The message for a user who interrupts the command."""
+        """Message after an interruption."""
         if not self.names:
-            return "nothing was done yet"
+            return "no step was finished"
         done = ", ".join(self.names)
-        return f"kept in {self.cache.folder}: {done}; the same command goes on from there"
+        return f"kept in {self.cache.folder}: {done}; the same command continues from there"

@@ -1,10 +1,10 @@
-"""Trajectories as numbers, for the part of a page in which a reader explores them.
+"""Data of the interactive curves on a page.
 
-    curves   label, colour (a variable of the style sheet) and dash of each; the first is recorded
-    trials   label, step (s) and panels of each; a panel is a signal: label, limits, and the values
-             of every curve (null: none)
+    curves   label, colour (CSS variable) and dash pattern of each; the first is the recording
+    trials   label, step (s) and panels of each; a panel is one signal: label, limits, and the
+             values of every curve (null: no value)
 
-Long trials are thinned (docs/results.md).
+Long trials are thinned.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
     from impc.inverse.problem import Problem
 
-# Numbers of a page: 25,000 are 0.15 MB.
+# Largest number of values on a page: 25,000 are 0.15 MB.
 _MOST = 25_000
 _COLOURS = ("--accent", "--limit", "--ok", "--bad", "--warn", "--muted")
 _DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [8, 2, 2, 2])
@@ -33,7 +33,7 @@ _DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [8, 2, 2, 2])
 def trajectories(
     problem: Problem, fits: Sequence[MethodFit], trials: Mapping[int, str]
 ) -> dict[str, Any]:
-    """Recorded, and simulated by each method, in `trials`, which are named."""
+    """Curves of recording and methods in the `trials` (index -> label)."""
     drawn, plant = [fit for fit in fits if fit.runs], problem.plant
     curves: list[dict[str, Any]] = [{"label": "recorded", "color": "--rec", "dash": []}]
     for k, fit in enumerate(drawn):
@@ -83,5 +83,5 @@ def _panels(
 
 
 def _short(values: Array) -> list[float | None]:
-    """Five digits: a screen has four."""
+    """Round to five digits; not finite values become None."""
     return [float(f"{one:.5g}") if np.isfinite(one) else None for one in values]

@@ -1,10 +1,9 @@
-"""What a command will take, said before it is begun: seconds and memory, by orders of magnitude.
+"""Order of magnitude of the run time and memory of a command.
 
-The largest arrays are the rows of the constraints, r = 2 N m for bounded inputs, and their
-derivatives along p directions, r x N m x p; and those of the states, samples x n x p
-(`impc.control.constraint_rows`, `impc.control.closed_loop`). Seconds are those of
-docs/benchmarks/results.md: 5.4 ms for a simulation of 3000 samples with ten states, N = 20 and ten
-directions, and as many simulations as a fit, a replicate and a profile took there.
+The largest arrays are the rows of the constraints, r = 2 N m for bounded inputs, their derivatives
+along p directions, r x N m x p, and those of the states, samples x n x p
+(`impc.control.constraint_rows`, `impc.control.closed_loop`). Run times are from
+experiments/benchmarks/results.md.
 """
 
 from __future__ import annotations
@@ -25,40 +24,39 @@ if TYPE_CHECKING:
     from impc.studies.selection.model import ParametricModel, Trial
     from impc.studies.selection.settings import SelectSettings
 
-#: Seconds for each sample, state and sample of the horizon.
+#: Seconds per sample, state and sample of the horizon: 5.4 ms for 3000 samples, n = 10, N = 20.
 SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)
-# For each number of the derivatives of the rows, which are built again for each simulation.
+# Seconds per number of the derivatives of the rows, which are rebuilt for each simulation.
 _A_NUMBER = 1e-8
-# Times of a simulation with other solvers over the compiled one, docs/benchmarks/results.md.
+# Run time of a simulation relative to the compiled solver (experiments/benchmarks/results.md).
 _SLOWER = {"compiled": 1.0, "daqp": 18.0, "qpoases": 24.0, "ipopt": 225.0}
-# What a simulation takes however short the trial is: the calls around the compiled loop.
+# Seconds per simulation outside the compiled loop.
 _A_TRIAL = 1e-3
-# Simulations of all trials: of a fit (4 s of three trials of 15 ms), of a replicate (0.6 s of it),
-# of a profile, which fits again at each of its points.
+# Number of simulations of all trials in a fit, a bootstrap replicate and a profile.
 _FIT, _REPLICATE, _PROFILE = 300, 40, 1000
-# Evaluations with derivatives of a fit from a start far off, of one from its neighbourhood, of a
-# LASSO with its refit, and of Table C.1 (of the outputs alone: a few thousand a solve). Counted on
-# the drug: 7, 5, 74; on the head, whose twelve parameters are hardly said: 200, 17, 23.
+# Evaluations with derivatives of a fit from a distant start, of a fit from a close start, of a
+# LASSO with refit, and of Table C.1. Counts on the drug: 7, 5, 74; on the head, whose twelve
+# parameters are poorly determined: 200, 17, 23.
 _START, _REFIT, _LASSO, _TABLE = 30, 9, 100, 4000
-# Arrays of the size of the derivative that a fit holds, and fits at a time in a bootstrap.
+# Arrays of the size of the derivative in a fit; parallel fits in a bootstrap.
 _COPIES, _THREADS = 6, 2
 
 
 @dataclass(frozen=True)
 class Effort:
-    """An estimate of what a request takes."""
+    """Estimated run time and memory of a request."""
 
-    seconds: float  # s, on one core of an ordinary machine
-    gigabytes: float  # Of the arrays that are alive at a time
+    seconds: float  # Run time on one core, s
+    gigabytes: float  # Memory of the arrays in use at the same time, GB
 
     def shared(self, parts: float, threads: int) -> Effort:
-        """Of so many such `parts`, as many at a time as there are `threads`."""
+        """Effort of several such `parts`, run in parallel on `threads`."""
         at_once = min(float(threads), parts)
         return Effort(self.seconds * parts / max(at_once, 1.0), self.gigabytes * at_once)
 
 
 def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
-    """What `impc.studies.fit.subject` will take; nothing of its size is made."""
+    """Effort of `impc.studies.fit.subject`; allocates no large arrays."""
     plant, trials = problem.plant, problem.recordings
     n, m = plant.n, plant.m
     along = m * n + m**2 + n + len(problem.logarithms)
@@ -81,24 +79,24 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
 
 
 def select_evaluations(settings: SelectSettings) -> int:
-    """Of the model with its derivative, for one subject of `impc select`."""
+    """Evaluations of the model with derivative for one subject of `impc select`."""
     table = _TABLE if settings.nelder_mead else 0
     return _START * (settings.starts + 1) + _REFIT * settings.replicates + _LASSO + table
 
 
 def key_evaluations(settings: SelectSettings, most: int = 20) -> int:
-    """Of the model with its derivative, for one subject and visit of `impc key-parameters`."""
+    """Evaluations of the model with derivative per subject and visit of `impc key-parameters`."""
     return _START * (settings.starts + most)
 
 
 def selection_effort(
     model: ParametricModel, recorded: Iterable[Sequence[Trial]], evaluations: int
 ) -> Effort:
-    """What one subject takes, on average; the model is called three times."""
+    """Mean effort for one subject; calls the model three times to measure its run time."""
     subjects = [tuple(trials) for trials in recorded]
     samples = [sum(len(trial.input) for trial in trials) for trials in subjects]
     first = subjects[0][0]
-    # The first call compiles, or loads, what the model needs: it took 300 times as long.
+    # The first call may include compilation.
     times = []
     for _ in range(3):
         begun = time.perf_counter()

@@ -1,8 +1,4 @@
-"""The page of one estimate, from Python: what `impc.report` writes.
-
-`impc fit` adds what a subject needs (intervals, trials left out, intent, docs/fitting.md); this is
-the answer of one method, whatever the method, beside its recordings.
-"""
+"""Report of a single estimate from Python (`impc.report`)."""
 
 from __future__ import annotations
 
@@ -30,14 +26,14 @@ if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
 
 _OURS = "inverse_mpc"
-_CALLER = "of the program that called impc.report"
+_CALLER = "given by the program that called impc.report"
 
 
 class OwnPage(Protocol):
-    """An estimate with a page of its own, such as that of an optimal control problem."""
+    """An estimate that makes its own report, such as that of an optimal control problem."""
 
     def page(self, provenance: Provenance) -> Report:
-        """The page, its tables and its figures."""
+        """The report with its tables and figures."""
 
 
 _PICTURE = Picture(
@@ -51,29 +47,29 @@ _PICTURE = Picture(
 def report(
     estimate: Estimate | OwnPage, folder: str | Path, settings: FitSettings | None = None
 ) -> tuple[Path, ...]:
-    """Write the page of an estimate, its figures, tables and result.json into a folder.
+    """Write the report of an estimate, with figures, tables and result.json, into a folder.
 
     Parameters
     ----------
     estimate : Estimate or OptimalControlEstimate
-        Of `impc.fit`, or of `fit_optimal_control`.
+        Result of `impc.fit`, `impc.estimate` or `fit_optimal_control`.
     folder : str or Path
-        Made when it is missing; an earlier report in it is replaced.
+        Output folder. It is created if necessary; an earlier report in it is replaced.
     settings : FitSettings, optional
-        Of an estimate of inverse MPC: the page is that of `impc fit` with these settings, with
-        intervals, other methods and trials left out. It takes as long as that.
+        Only for an estimate by inverse MPC: write the report of `impc fit` with these settings,
+        including intervals, other methods and left-out trials. Takes as long as `impc fit`.
 
     Returns
     -------
     tuple of Path
-        What was written.
+        Paths of the written files.
 
     Raises
     ------
     InputError
-        When the method ended without a gain: there is nothing to show.
+        If the estimate has no gain.
     OutputError
-        When the folder cannot be written, or holds other results.
+        If the folder is not writable or contains other results.
 
     Examples
     --------
@@ -94,9 +90,11 @@ def report(
         with owned(place, "report"):
             return write_files(place, estimate.page(Provenance(_CALLER)).files())
     if settings is not None and estimate.method != _OURS:
-        raise InputError("settings", f"are of {_OURS}, not {estimate.method}", "leave them out")
+        raise InputError(
+            "settings", f"need an estimate by {_OURS}, got {estimate.method}", "leave settings out"
+        )
     if estimate.K is None:
-        raise InputError("estimate", f"has no gain: {estimate.reason}", "try another method")
+        raise InputError("estimate", f"has no gain: {estimate.reason}", "use another method")
     if settings is None:
         document = _document(evaluate_method(estimate, estimate.problem.bounds))
     else:
@@ -108,7 +106,7 @@ def report(
 
 
 def _document(fit: MethodFit) -> Report:
-    """The page of a comparison of this method with none, which shows a trial first."""
+    """The report of a comparison with a single method, headed by the first trial."""
     problem, label = fit.estimate.problem, method_label(fit.name)
     page = compare_report(problem, [fit], Provenance(_CALLER))
     page = replace(page, window=f"impc: {label}", kind="estimate of one method")
@@ -120,8 +118,8 @@ def _document(fit: MethodFit) -> Report:
     alert = Alert(
         Level.AMBER,
         "Intervals and left-out trials are missing",
-        "This page shows the answer of one method to the trials that it was fitted to.",
-        "How far gain and cost weights are identified is not known.",
+        "This page shows the result of one method on the trials that it was fitted to.",
+        "The uncertainty of gain and cost weights is unknown.",
         [todo],
     )
     drawn: Any = SimpleNamespace(fitted=fit.estimate, inverse_mpc=fit, given=problem)

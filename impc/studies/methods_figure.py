@@ -1,4 +1,4 @@
-"""Methods beside each other: what they leave unexplained, and the largest command they need."""
+"""Figure that compares methods: unexplained variance and largest command."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
 
-# Percent that exact recordings leave, and less.
+# Smallest unexplained variance that is drawn, %.
 _ROUNDING = 1e-6
 _MARKERS = ("o", "s", "^", "D", "v")
 
 
 def explained(fit: MethodFit) -> Array:
-    """VAF of each output on left-out trials, of all where none was (p,), %."""
+    """VAF of each output in left-out trials, or in all trials if none was left out (p,), %."""
     return ASSESSMENTS["held_out_vaf"].find(fit) if len(fit.held_out) else fit.vaf
 
 
 def unexplained(fit: MethodFit) -> float:
-    """Variance that it leaves, mean over the outputs, %."""
+    """Unexplained variance, mean over the outputs, %."""
     return max(100.0 - float(np.mean(explained(fit))), 1e-9)
 
 
 def first_fall(fit: MethodFit) -> float | None:
-    """When the simulation of a method first leaves every reasonable range, s."""
+    """Earliest time in s at which a simulation stops (divergence or no admissible input)."""
     return min((time for time in fit.fell if time is not None), default=None)
 
 
 def by_score(fits: Sequence[MethodFit]) -> list[MethodFit]:
-    """Methods with a gain, that which explains most first; those that fall are last."""
+    """Methods with a gain, highest VAF first; methods whose simulations stop early are last."""
 
     def rank(fit: MethodFit) -> tuple[bool, float, bool]:
         left = float(np.mean(100 - explained(fit)))
@@ -63,7 +63,7 @@ def by_score(fits: Sequence[MethodFit]) -> list[MethodFit]:
 
 
 def largest_commands(fit: MethodFit) -> tuple[float, float, str]:
-    """Largest command, its limit (infinite: none) and its label; of several, shares of limits."""
+    """Largest command, its limit (or infinity) and axis label; several inputs: % of limits."""
     plant, bounds = fit.estimate.problem.plant, fit.bounds
     limits = np.maximum(np.abs(bounds.u_min), np.abs(bounds.u_max))
     limited = np.isfinite(limits)
@@ -76,7 +76,7 @@ def largest_commands(fit: MethodFit) -> tuple[float, float, str]:
 
 
 def methods_figure(fits: Sequence[MethodFit], narrow: bool, width: float = WIDE) -> Figure:
-    """A dot an output on a log axis, and bars whose area beyond the limit is shaded."""
+    """Unexplained variance of each output (dots, log axis) and largest command (bars)."""
     shown = by_score(fits)
     height = 0.9 + (0.55 if narrow else 0.42) * len(shown)
     figure = new_figure(PHONE if narrow else width, 2 * height if narrow else height)
@@ -114,7 +114,7 @@ def _unexplained(ax: Axes, fits: Sequence[MethodFit]) -> None:
     for row, fit in enumerate(fits):
         fell = first_fall(fit)
         missing = "no prediction" if np.any(np.isnan(left[row])) else ""
-        text = missing if fell is None else f"fell at {fell:.1f} s"
+        text = missing if fell is None else f"stops at {fell:.1f} s"
         ax.text(0.02, row, text, transform=ax.get_yaxis_transform(), va="center", color=MUTED)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.xaxis.set_minor_locator(NullLocator())

@@ -1,6 +1,6 @@
-"""Methods beside each other: a table, and result.json.
+"""Comparison of methods: table, entries of result.json, and trajectories.
 
-The columns are those of `impc.assess.assessments`, whichever command asks (docs/results.md).
+The columns are the `ASSESSMENTS` of `impc.assess.assessments` in all commands.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ if TYPE_CHECKING:
     from impc.model.weights import Weights
     from impc.reporting.provenance import Provenance
 
-# Heads for readers, by the names of assessments; others are their names in words.
+# Column headings by assessment; default: the name with spaces.
 _HEADS = {
     "vaf": "VAF, {} (%)",
     "held_out_vaf": "VAF, {} (%)",
     "largest_input": "Largest command ({})",
-    "first_fall": "Fell at (s)",
+    "first_fall": "Stops at (s)",
 }
-_AFTER_A_FALL = ("largest_input", "beyond_bound")  # Say nothing of a method that falls
+_AFTER_A_FALL = ("largest_input", "beyond_bound")  # Not shown if a simulation stops early
 
 
 def method_label(name: str) -> str:
-    """The label of a method, as a row or a term begins with it."""
+    """Label of a method with a capital first letter."""
     label = METHODS[name].label
     return label[:1].upper() + label[1:]
 
 
 def methods_fold(names: Iterable[str]) -> Fold:
-    """What each method does."""
+    """Folded section that explains the methods."""
     terms = [(method_label(name), METHODS[name].sentence) for name in names]
     return Fold("What each method does", [Terms(terms)])
 
 
 def provenance_section(problem: Problem, provenance: Provenance) -> Section:
-    """Where the page comes from, which body was simulated, and what solved its programs."""
+    """Section on provenance, simulated body and solver."""
     solver = f"Solved by {described(problem.solver)}."
     own = [("Body", body_sentence(problem.plant)), ("Quadratic programs", solver)]
     return Section("Provenance", [Terms([*provenance.terms, *own])])
 
 
 def methods_finding(fits: Sequence[MethodFit]) -> Finding:
-    """What methods reach on the same recordings; no column without a number."""
+    """Table of all methods on the same recordings, without empty columns."""
     plant, rows = fits[0].estimate.problem.plant, []
     labels, hidden = {}, ["beyond_bound", "condition_number", "seconds", "name", "note"]
     held = all(len(fit.held_out) for fit in fits if fit.estimate.K is not None)
@@ -89,12 +89,12 @@ def methods_finding(fits: Sequence[MethodFit]) -> Finding:
 
 
 def methods_data(fits: Sequence[MethodFit]) -> dict[str, Any]:
-    """`methods` of result.json (docs/results.md)."""
+    """`methods` in result.json (docs/ref/results.md)."""
     return {fit.name: _data(fit) for fit in fits}
 
 
 def problem_data(problem: Problem, fits: Sequence[MethodFit]) -> dict[str, Any]:
-    """The same with the problem that they were fitted to."""
+    """`methods` and the fitted problem in result.json."""
     plant = problem.plant
     return {
         "methods": methods_data(fits),
@@ -121,7 +121,7 @@ def _data(fit: MethodFit) -> dict[str, Any]:
 
 
 def controller_findings(fits: Sequence[MethodFit]) -> list[Finding]:
-    """Gain and cost weights of every method, in units of the plant."""
+    """Tables of gain and cost weights of all methods, in units of the plant."""
     plant = fits[0].estimate.problem.plant
     hidden = ["number", *(["method"] if len(fits) == 1 else [])]
     gains = [
@@ -137,8 +137,8 @@ def controller_findings(fits: Sequence[MethodFit]) -> list[Finding]:
         for entry in weight_entries(plant, fit.estimate.weights)
     ]
     heads = ["gain_on", "number", "unit", "method", "value"]
-    gain = "Gain: command against one unit of each state, in units of the plant, without intervals."
-    cost = "Cost weights, with one for the first command, without intervals."
+    gain = "Gain: opposing command per unit of each state, in units of the plant, no intervals."
+    cost = "Cost weights, scaled to 1 for the first command, without intervals."
     tables = (
         pd.DataFrame(gains, columns=heads),
         pd.DataFrame(costs, columns=["matrix", "first", "second", "unit", "method", "value"]),
@@ -150,7 +150,7 @@ def controller_findings(fits: Sequence[MethodFit]) -> list[Finding]:
 
 
 def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, str, float]]:
-    """The lower triangles of Q and R, one row an entry: matrix, two names, unit, value."""
+    """Lower triangles of Q and R, one row per entry: matrix, two names, unit, value."""
     return [
         (which, one, other, weight_unit(plant, one, other), float(matrix[i, j]))
         for which, names, matrix in (
@@ -167,9 +167,9 @@ def trajectory_table(
     trials: Mapping[int, str],
     runs: Mapping[str, Sequence[Simulation]],
 ) -> pd.DataFrame:
-    """A row a sample of these trials, with their names: recorded, what drove, runs by name.
+    """Recorded outputs, disturbances and simulated `runs` of `trials`, one row per sample.
 
-    Angles are in the unit that is shown, which ends the names of their columns.
+    Angles are in the shown unit, which is appended to the column name.
     """
     plant, blocks = problem.plant, []
     for index in trials:
@@ -196,10 +196,7 @@ def trajectory_table(
 
 
 def until_its_end(plant: Plant, run: Simulation) -> tuple[Array, Array]:
-    """Outputs (steps + 1, p) and commands (steps + 1, m) of a run, NaN where it did not get.
-
-    The last sample has no command.
-    """
+    """Outputs and commands (steps + 1, p or m) of a run, NaN after it stops; no last command."""
     y, u = np.array(run.x @ plant.C.T), np.full((len(run.x), plant.m), np.nan)
     y[run.reached + 1 :] = np.nan
     u[: run.reached] = run.u[: run.reached]

@@ -1,10 +1,10 @@
-"""Tasks on workers, here or elsewhere: the one loop of all commands that have many.
+"""Run many tasks on workers, on this machine or a scheduler.
 
-    run(pool, queue, cache) -> results, in the order in which they are there
+    run(pool, queue, cache) -> results in the order of completion
 
-What the cache has is not computed again, and what is computed is kept before it is handed on.
-Where tasks are short several go together. A task whose worker dies is given to another one; one
-that fails is a result with its fault, and stops nothing else.
+Cached results are not computed again; new results are stored before they are returned. Short tasks
+are sent in batches. A task whose worker dies is sent to another worker; a task that fails returns
+its exception and does not stop the others.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
     from impc.studies.cache import Cache
 
-# Batches given out for each thread: one that runs, and two that wait for it.
+# Submitted batches per thread: one that runs and two that wait.
 _AHEAD = 3
-# A batch takes about so many seconds, and has at most so many tasks.
+# Target run time (s) and largest number of tasks of a batch.
 _SECONDS, _MOST = 0.2, 100
-# A batch that has lost so many workers is taken for the cause.
+# Number of workers that may die before a batch is given up.
 _DEATHS = 4
-# One thread a worker, for every library of linear algebra; and no module from the current folder
-# while Python starts (-P): only what the user names is imported from there.
+# One thread per worker in all libraries of linear algebra; PYTHONSAFEPATH: modules in the current
+# folder are imported only if the user names them.
 _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -52,49 +52,49 @@ _STARTING = threading.Lock()
 
 @dataclass(frozen=True)
 class Task:
-    """``work(*given)``, of importable code; what it returns is written down by `to_json`."""
+    """A call ``work(*given)`` of an importable function; `to_json` stores its result."""
 
-    name: str  # Of its result
-    digest: str  # Of all that the result depends on
+    name: str  # Name of the result
+    digest: str  # Digest of everything that the result depends on
     work: Callable[..., Any]
     given: tuple[Any, ...]
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a task."""
+    """Outcome of a task."""
 
     task: Task
-    content: Any  # What it returned, as JSON has it
-    fault: ImpcError | None  # Why it returned nothing
-    found: bool = False  # Whether an earlier run had kept it
+    content: Any  # Return value in JSON form
+    fault: ImpcError | None  # Exception, if it failed
+    found: bool = False  # Whether it comes from the cache
 
 
-#: What became of a task on its worker: content, fault, and seconds.
+#: Outcome of a task on its worker: content, exception, and run time in s.
 Answer = tuple[Any, ImpcError | None, float]
 
 
 class Pool(Protocol):
-    """Where tasks run: in processes on this machine, or on a scheduler."""
+    """Workers: processes on this machine, or a scheduler."""
 
     @property
     def threads(self) -> int:
-        """How many tasks run at a time."""
+        """Number of tasks that run in parallel."""
         ...
 
     def submit(self, number: int, batch: list[Task]) -> None:
-        """Give out a batch, by its number."""
+        """Submit a batch under its number."""
         ...
 
     def take(self) -> tuple[int, list[Answer] | str]:
-        """Wait for a batch that is out: its number and answers, or why there are none."""
+        """Wait for a batch; return its number and its answers, or the reason of a failure."""
         ...
 
 
 def run(pool: Pool, queue: deque[Task], cache: Cache) -> Iterator[Result]:
-    """Do all tasks of a queue; more may be added to it with each result that comes."""
+    """Run all tasks of a queue, to which the caller may add tasks after each result."""
     out: dict[int, list[Task]] = {}
-    seconds: dict[Callable[..., Any], float] = {}  # Of each work, lately
+    seconds: dict[Callable[..., Any], float] = {}  # Recent run time of each function
     numbers = itertools.count()
 
     def submit(batch: list[Task]) -> None:
@@ -119,12 +119,12 @@ def run(pool: Pool, queue: deque[Task], cache: Cache) -> Iterator[Result]:
             continue
         number, answers = pool.take()
         batch = out.pop(number)
-        if isinstance(answers, str) and len(batch) > 1:  # one of them is the cause: which?
+        if isinstance(answers, str) and len(batch) > 1:  # find the task that is the cause
             for task in batch:
                 submit([task])
             continue
         if isinstance(answers, str):
-            answers = [(None, SolverError("worker", answers, "see what its recording has"), 0.0)]
+            answers = [(None, SolverError("worker", answers, "check the task's recordings"), 0.0)]
         results = []
         for task, (content, fault, spent) in zip(batch, answers, strict=True):
             seconds[task.work] = (seconds.get(task.work, spent) + spent) / 2
@@ -135,14 +135,14 @@ def run(pool: Pool, queue: deque[Task], cache: Cache) -> Iterator[Result]:
 
 
 def _together(seconds: float | None, share: int) -> int:
-    """How many tasks of so many `seconds` go together; one where that is not known."""
+    """Number of tasks per batch for a run time of `seconds` each; 1 if unknown."""
     if seconds is None:
         return 1
     return max(1, min(int(_SECONDS / max(seconds, 1e-9)), share, _MOST))
 
 
 def answered(batch: list[Task]) -> list[Answer]:
-    """What a worker does: all tasks of a batch."""
+    """Run all tasks of a batch on a worker."""
     answers: list[Answer] = []
     for task in batch:
         begun, content, fault = time.perf_counter(), None, None
@@ -154,17 +154,16 @@ def answered(batch: list[Task]) -> list[Answer]:
             fault = SolverError(
                 f"task {task.name}",
                 f"{type(error).__name__}: {error}",
-                "see what its recording has",
+                "check the task's recordings",
             )
         answers.append((content, fault, time.perf_counter() - begun))
     return answers
 
 
 class Processes:
-    """Processes on this machine, each held by a thread and reached by a pipe alone.
+    """Worker processes on this machine, each controlled by a thread through a pipe.
 
-    No port is opened, so that nobody else on the machine can send them work: what a pool of
-    `dask.distributed` would need certificates for.
+    No port is opened: other users of the machine cannot send tasks to the workers.
     """
 
     def __init__(self, count: int) -> None:
@@ -214,8 +213,8 @@ class Processes:
                     break
             else:
                 how = f"signal {-code}" if code < 0 else f"status {code}"
-                answers = f"ended {_DEATHS} times, at last with {how}"
-        except Exception as error:  # what cannot be sent
+                answers = f"died {_DEATHS} times, last with {how}"
+        except Exception as error:  # the batch cannot be sent
             answers = f"{type(error).__name__}: {error}"
         self._idle.put(worker)
         self._ended.put((number, answers))
@@ -249,7 +248,7 @@ class _Worker:
 
 @contextmanager
 def processes(count: int | None) -> Iterator[Processes]:
-    """Workers while the block lasts; as many as there are processors by default."""
+    """Worker processes during the block; by default one per processor."""
     found = Processes(count or os.cpu_count() or 1)
     try:
         yield found
@@ -259,9 +258,9 @@ def processes(count: int | None) -> Iterator[Processes]:
 
 @contextmanager
 def threads(count: int) -> Iterator[ThreadPoolExecutor]:
-    """A few threads of this process: the compiled loop and the semidefinite solver let others run.
+    """Threads of this process; useful because compiled code and solvers release the GIL.
 
-    When the block is left early, by an error or from the keyboard, what is not begun is not begun.
+    If the block ends with an exception, pending work is cancelled.
     """
     pool = ThreadPoolExecutor(count)
     try:
@@ -271,8 +270,8 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def _serve(pipe: Connection) -> None:
-    """What a worker does all its life."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever presses Ctrl-C means the client
+    """Main loop of a worker process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the client
     ignore_settings_files("matplotlib", "numba")
     threading.Thread(target=_die_with_client, daemon=True).start()
     while True:
@@ -280,7 +279,7 @@ def _serve(pipe: Connection) -> None:
             batch = pipe.recv()
         except EOFError:
             return
-        except Exception as error:  # a module that is not there, or fails when it is imported
+        except Exception as error:  # a module is missing or fails on import
             pipe.send(f"{type(error).__name__}: {error}")
             continue
         pipe.send(answered(batch))

@@ -1,4 +1,4 @@
-"""Where tasks run: workers on this machine, or those of a Dask scheduler that somebody started."""
+"""Connection to workers: processes on this machine, or a running Dask scheduler."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from impc.studies.pool import Answer, Pool, Task
 
 _PATIENCE = "10s"
-# Seconds for which the number of threads holds: to ask takes a millisecond.
+# Seconds for which the number of threads is cached; a query takes a millisecond.
 _HOLDS = 5.0
 _OPTIONS = ("--tls-ca", "--tls-cert", "--tls-key")
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """Which workers to use."""
+    """Workers to use."""
 
-    scheduler: str | None = None  # Address of a running Dask scheduler; None for this machine
-    workers: int | None = None  # How many on this machine; None for as many as there are processors
-    # For an address tls://: certificate of the authority, one's own, and its private key
+    scheduler: str | None = None  # Address of a running Dask scheduler; None: this machine
+    workers: int | None = None  # Number of workers on this machine; None: one per processor
+    # For an address tls://: CA certificate, client certificate and its private key
     tls_ca: Path | None = None
     tls_cert: Path | None = None
     tls_key: Path | None = None
@@ -42,10 +42,10 @@ class Cluster:
 
 @contextmanager
 def connected(cluster: Cluster) -> Iterator[Pool]:
-    """The workers of a `cluster` while the block lasts."""
+    """Connect to the workers of a `cluster` during the block."""
     if cluster.scheduler is None:
         if any((cluster.tls_ca, cluster.tls_cert, cluster.tls_key)):
-            raise InputError("--tls-ca", "is given without --scheduler", "leave it out")
+            raise InputError("--tls-ca", "is given without --scheduler", "remove the --tls options")
         with processes(cluster.workers) as pool:
             yield pool
         return
@@ -56,7 +56,7 @@ def connected(cluster: Cluster) -> Iterator[Pool]:
 @contextmanager
 def _client(cluster: Cluster, address: str) -> Iterator[Client]:
     distributed = optional("distributed", f"scheduler {address}")
-    import dask  # noqa: PLC0415  # distributed needs it, and brings it
+    import dask  # noqa: PLC0415  # a dependency of distributed
 
     security = _security(cluster, address)
     patience = {"distributed.comm.timeouts.connect": _PATIENCE}
@@ -67,7 +67,7 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
             raise InputError(
                 f"scheduler {address}",
                 f"does not answer ({type(error).__name__})",
-                "start one with `dask scheduler`, and give its address and certificates",
+                "start one with `dask scheduler`, and pass its address and certificates",
             ) from None
         with client:
             yield client
@@ -75,7 +75,7 @@ def _client(cluster: Cluster, address: str) -> Iterator[Client]:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """What Dask would log (112 lines for a lost scheduler), errors say here in one line."""
+    """Silence Dask's log, for example 112 lines for a lost scheduler."""
     logging.disable(logging.CRITICAL)
     try:
         yield
@@ -89,16 +89,16 @@ def _security(cluster: Cluster, address: str) -> Any:
     if not address.startswith("tls://"):
         if len(missing) < len(files):
             raise InputError(
-                f"scheduler {address}", "takes no certificates", "give its address as tls://..."
+                f"scheduler {address}", "takes no certificates", "use an address tls://..."
             )
         return None
     if missing:
         raise InputError(
-            f"scheduler {address}", f"needs {', '.join(missing)}", "give the three files"
+            f"scheduler {address}", f"needs {', '.join(missing)}", "pass all three files"
         )
     for name, path in files.items():
         if path is None or not path.is_file():
-            raise InputError(f"{name} {path}", "is no file", "check the path")
+            raise InputError(f"{name} {path}", "is not a file", "check the path")
     distributed = optional("distributed", f"scheduler {address}")
     return distributed.Security(
         tls_ca_file=str(cluster.tls_ca),
@@ -110,7 +110,7 @@ def _security(cluster: Cluster, address: str) -> Any:
 
 @contextmanager
 def _reached(address: str) -> Iterator[None]:
-    """What Dask raises in the block for a scheduler that is gone, as one line."""
+    """Convert Dask's exceptions for a lost scheduler to OutputError."""
     closed = optional("distributed", f"scheduler {address}").client.ClosedClientError
     try:
         yield
@@ -120,25 +120,25 @@ def _reached(address: str) -> Iterator[None]:
 
 def _was_lost(address: str) -> OutputError:
     return OutputError(
-        f"scheduler {address}", "was lost while tasks were out",
-        "start it again: the same command goes on from what is kept",
+        f"scheduler {address}", "connection was lost while tasks were running",
+        "start it again; the same command continues from the stored results",
     )  # fmt: skip
 
 
 class _Scheduler:
-    """The workers of a scheduler, see `Pool`; OutputError from each when it is lost."""
+    """Workers of a scheduler (see `Pool`); methods raise OutputError if it is lost."""
 
     def __init__(self, client: Client, address: str) -> None:
         self._client, self._address = client, address
         self._numbers: dict[Any, int] = {}
         make = optional("distributed", f"scheduler {address}").as_completed
-        # With results: they are fetched while others are looked at.
+        # with_results: fetch results in the background.
         self._out = make(with_results=True, raise_errors=False)
         self._threads, self._asked = 1, -_HOLDS
 
     @property
     def threads(self) -> int:
-        """How many tasks run at a time."""
+        """Number of tasks that run in parallel."""
         if time.monotonic() - self._asked > _HOLDS:
             client: Any = self._client
             with _reached(self._address):
@@ -148,7 +148,7 @@ class _Scheduler:
 
     def submit(self, number: int, batch: list[Task]) -> None:
         """As `Pool.submit`."""
-        work = functools.partial(answered, batch)  # as one: Dask looks for its own in arguments
+        work = functools.partial(answered, batch)  # partial: Dask searches plain arguments for keys
         with _reached(self._address):
             future = self._client.submit(work, pure=False, retries=0)
         self._numbers[future] = number

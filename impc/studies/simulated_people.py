@@ -1,11 +1,9 @@
-"""A subject for everybody without data: a constrained controller that holds a nonlinear plant.
+"""Simulated subjects: the bounded controller (3.1) in closed loop with a nonlinear plant.
 
-The controller sees the true state, or what a person who senses with noise takes for it, at its own
-rate and holds its command until the next sample; the plant runs at the rate of the recording. Motor
-noise is added to the held command, white from one sample of the controller to the next; sensor
-noise to the recorded outputs, white from one recorded sample to the next. What is recorded is what
-a laboratory would have: clock, outputs, disturbance.
-The controller is that of (3.1); docs/fitting.md has what a fit makes of such subjects.
+At its own rate, the controller receives the true state, or the state estimate of an observer, and
+holds its command until the next sample; the plant runs at the rate of the recording. Motor noise is
+added to the held command, recording noise to the outputs; both are white at their rates. A trial
+contains clock, outputs and disturbance.
 """
 
 from __future__ import annotations
@@ -32,16 +30,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SubjectTrial(Frozen):
-    """One simulated trial at the recording's rate."""
+    """One simulated trial at the rate of the recording."""
 
     time: Array  # s (samples,)
-    outputs: Array  # With sensor noise (samples, p), in the plant's units
+    outputs: Array  # With recording noise (samples, p), in the plant's units
     disturbance: Array  # (samples, d)
     states: Array  # True states (samples, n)
-    commands: Array  # What the controller asked for, without motor noise, (samples, m)
-    saturated: float  # Share of the controller's samples at which its command stands on a bound
-    # Time in s at which no command kept the bounds or an output went beyond `largest`; what follows
-    # repeats the last state
+    commands: Array  # Commands without motor noise (samples, m)
+    saturated: float  # Share of the controller's samples at which its command is at its bound
+    # Time in s at which no command kept the bounds or an output exceeded `largest`; all later
+    # samples repeat the last state
     fell: float | None
 
 
@@ -57,11 +55,11 @@ def simulate_subject(
     largest: float = 1e3,
     seed: int | np.random.SeedSequence = 0,
 ) -> SubjectTrial:
-    """A trial from rest; `disturbance` (samples, d), `rate` per s, `motor` (m,), `sensor` (p,)."""
+    """Simulate from rest; `disturbance` (samples, d), `rate` in Hz, SDs `motor`, `sensor`."""
     plant, dt = controller.plant, controller.plant.dt
-    within = round(rate * dt)  # Samples of the recording in one of the controller's
+    within = round(rate * dt)  # Recorded samples per sample of the controller
     if within < 1 or abs(within / (rate * dt) - 1) > 1e-9:
-        raise InputError("rate", f"got {rate:g} per s", f"give a multiple of {1 / dt:g} per s")
+        raise InputError("rate", f"got {rate:g} per s", f"pass a multiple of {1 / dt:g} per s")
     columns = np.asarray(disturbance, dtype=np.float64)
     d = finite_array(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (None, plant.E.shape[1])
@@ -83,14 +81,14 @@ def simulate_subject(
 
 
 class _Senses:
-    """What a person takes for the state, the state itself or an estimate; noise of the motor."""
+    """State that the controller receives (true or estimated), and motor noise."""
 
     def __init__(
         self, plant: Plant, person: Observer | None, rng: np.random.Generator, motor: Array
     ) -> None:
         self.plant, self.person, self.rng, self.motor = plant, person, rng, motor
         if person is not None and np.any(person.process):
-            raise InputError("process", "cannot be simulated here", "leave it at 0")
+            raise InputError("process", "process noise cannot be simulated", "set process=0")
         self.estimating = person is not None and person.estimates
         if person is not None and self.estimating:
             from impc.output_feedback.observer import (  # noqa: PLC0415  # optional
@@ -103,18 +101,18 @@ class _Senses:
             self.found = np.zeros(len(self.F))
 
     def of(self, state: Array) -> Array:
-        """Estimate (n,) at a `state` (n,)."""
+        """State estimate (n,) at a true `state` (n,)."""
         return np.asarray(self.found[: self.plant.n]) if self.estimating else state
 
     def noise(self, command: Array) -> Array:
-        """Motor noise beside a command (m,)."""
+        """Motor noise that is added to a command (m,)."""
         deviation, person = self.motor, self.person
         if person is not None:
             deviation = np.hypot(person.motor, person.share * command)
         return np.asarray(deviation * self.rng.standard_normal(len(command)))
 
     def look(self, state: Array, command: Array, d: Array) -> None:
-        """Sense a state (n,); a command (m,), and a known perturbation d (d,), have acted."""
+        """Update the estimate with a noisy observation of `state` (n,), then predict one sample."""
         if self.person is None or not self.estimating:
             return
         noise = self.person.sensory * self.rng.standard_normal(len(self.C))
@@ -128,7 +126,7 @@ class _Senses:
 def _moved(
     controller: Controller, several: Any, d: Array, within: int, senses: _Senses, largest: float
 ) -> tuple[Array, Array, int | None]:
-    """States (samples, n), commands (samples, m), and the sample of a fall, from rest."""
+    """States (samples, n) and commands (samples, m) from rest; sample of a fall or None."""
     plant, samples = controller.plant, len(d)
     prepared = prepare_loop(controller, directions(controller, 0))
     still = np.zeros((1, plant.E.shape[1]))

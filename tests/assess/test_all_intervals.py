@@ -1,4 +1,4 @@
-"""All that a fit can be asked about its own certainty, on the cart; alternatives against truth."""
+"""All analyses of uncertainty on the cart; comparison of alternatives with the truth."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def result() -> FitResult:
 
 @pytest.mark.full
 def test_every_interval_holds_the_truth(result: FitResult) -> None:
-    """Seeds 11 and 12, chosen before the run; 95 % intervals of two entries and the limit."""
+    """Seeds 11 and 12, fixed before the run; 95 % intervals of two entries and the limit."""
     truth = dict(zip(("K.force.x[0]", "K.force.x[1]"), true_controller().K[0], strict=True))
     truth["u_max.force"] = 1.0
     methods = {item.method for item in result.uncertainty.intervals}
@@ -67,7 +67,7 @@ def test_the_set_of_weights_is_described(result: FitResult) -> None:
 
 @pytest.mark.full
 def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -> None:
-    """The truth has a limit of 1 and N = 10: no limit is ruled out, N = 20 is not distinguished."""
+    """True limit 1 and N = 10: "no limit" is ruled out, N = 20 is not distinguished."""
     by_name = {item.name: item for item in result.uncertainty.alternatives}
     assert list(by_name) == ["as fitted", "no limit", "horizon 1", "horizon 20"]
     first = by_name["as fitted"]
@@ -79,14 +79,14 @@ def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -
 def test_verdicts() -> None:
     one = Alternative("as fitted", 10, 1.0, 0.0, 90.0, "")
     assert "do not distinguish" in verdict(one, replace(one, name="b", aic=1.9))
-    assert "speak weakly against b" in verdict(one, replace(one, name="b", aic=5.0))
+    assert "give weak evidence against b" in verdict(one, replace(one, name="b", aic=5.0))
     assert "rule out b" in verdict(one, replace(one, name="b", aic=50.0))
     assert "rule out as fitted" in verdict(replace(one, aic=50.0), replace(one, name="b"))
     assert "no controller (why)" in verdict(one, replace(one, name="b", reason="why"))
 
 
 def test_aic_is_that_of_the_innovations() -> None:
-    """White residuals of one output: T log of the mean square, up to the common constant."""
+    """White residuals of one output: T log of the mean square, up to a common constant."""
     trial = noisy_trial(SEEDS[0], 0.0)
     problem = fit_problem(cart(), [trial], EXTRAS)
     fitted = fit_controller(problem)
@@ -94,7 +94,7 @@ def test_aic_is_that_of_the_innovations() -> None:
     misfits = np.array([item.misfit for item in found])
     expected = trial.samples * np.log(misfits**2)
     differences = np.array([item.aic for item in found]) - (expected - np.min(expected))
-    # The root of white residuals is not quite zero: a few units of hundreds.
+    # The estimated coefficient of white residuals is not exactly zero.
     assert np.max(np.abs(differences)) < 0.05 * np.max(expected - np.min(expected)) + 1.0
     assert all(np.isnan(item.held_out) for item in found)
 
@@ -115,9 +115,9 @@ def test_settings_are_checked(table: dict[str, object], match: str) -> None:
 
 
 def test_profiles_of_two_inputs_end_where_deviations_say() -> None:
-    """At a VAF of 99.9 % the problem is all but linear: ends at 1.96 deviations of white noise.
+    """At a VAF of 99.9 % the problem is almost linear: ends at 1.96 standard errors.
 
-    The ends found are 2.6 and 1.0 % from there; both sides are within 0.5 % of each other.
+    The ends differ from that by 2.6 and 1.0 %, and from each other by at most 0.5 %.
     """
     controller = regulator(carts(2))
     estimate = gain_estimate(fit(controller, noisy_recording(controller, 0, 99.9, 0.0)))

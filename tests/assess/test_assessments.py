@@ -1,4 +1,4 @@
-"""What is said of every estimate, against numbers computed by hand."""
+"""Measures of every estimate against values computed by hand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impc.studies.fit.subject import fit_problem
 
 @pytest.fixture(scope="module")
 def fit() -> MethodFit:
-    """A gain that exceeds the bound of the cart."""
+    """Gain that exceeds the bound of the cart."""
     settings = FitSettings(horizon=10, u_max=1.0)
     problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], settings)
     return evaluate_method(methods.fit(problem, "feedback_gain"), problem.bounds)

@@ -1,4 +1,4 @@
-"""All weights with a gain: members behave alike, ranges are met and never passed."""
+"""Sets of equivalent weights: equal trajectories, ranges attained and never exceeded."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def set_of(work: Workload, ratio: float = 10.0) -> WeightsSet:
 
 
 def random_members(found: WeightsSet, count: int) -> list[Array]:
-    """Points along random rays from the least conditioned member to the edge of the set."""
+    """Points along random rays from the least-condition member to the edge of the set."""
     rng = np.random.default_rng(SEED)
     centre = found.least.weights.block
     m = found.fibre.plant.m
@@ -50,7 +50,7 @@ def _inside(found: WeightsSet, X: Array) -> bool:
 
 @pytest.mark.parametrize("make", [example, lambda: seat(1, 10.0)], ids=["example", "seat"])
 def test_members_give_the_same_trajectories(make) -> None:  # type: ignore[no-untyped-def]
-    """Sampled weights, made into controllers from scratch, through bounds and all: 1e-9."""
+    """Sampled weights, rebuilt as controllers with bounds, give equal trajectories to 1e-9."""
     work = make()
     found = set_of(work)
     truth = simulate(work.controller, work.drives[0])
@@ -70,7 +70,7 @@ def test_members_give_the_same_trajectories(make) -> None:  # type: ignore[no-un
 
 
 def test_ranges_are_those_of_random_search_with_two_states() -> None:
-    """Never passed, and met to 1 % of their width: 4000 rays."""
+    """Ranges never exceeded, and attained to 1 % of their width, by 4000 random rays."""
     found = set_of(example())
     sampled = np.array(random_members(found, 4000))
     for (i, j), ends in entry_ranges(found).items():
@@ -82,7 +82,7 @@ def test_ranges_are_those_of_random_search_with_two_states() -> None:
 
 
 def test_ranges_of_several_inputs_are_never_passed() -> None:
-    """Ten states, one of the chain's workloads; the ends themselves are members."""
+    """Ten states, as in the seat workloads; the end points are members."""
     work = chain_of_masses(6, 100)
     found = set_of(work)
     sampled = np.array(random_members(found, 100))
@@ -147,7 +147,7 @@ def test_a_ratio_must_leave_room() -> None:
 
 
 def test_fibre_members_span_the_set() -> None:
-    """Every member of the set is in the fibre: the levels are combinations of its basis."""
+    """Every member is a combination of the basis of the space."""
     found = set_of(seat(1, 1.0))
     basis = pair_blocks(found.fibre.Q, found.fibre.R)
     scaled = np.array([found.inverse @ X @ found.inverse.T for X in basis]).reshape(len(basis), -1)

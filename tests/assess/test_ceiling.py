@@ -1,4 +1,4 @@
-"""The part of a movement that repeats, on outputs whose noise is known."""
+"""Noise ceiling of the VAF, on outputs with known noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impc.inverse.problem import Problem
 
 
 def problem(pushes: list[Array], noise: float, seed: int = 0) -> tuple[Problem, float]:
-    """Carts that answer pushes, with white noise; and the share of it in the outputs, %."""
+    """Pushed carts with white noise, and the noise share of the outputs, %."""
     rng, plant = np.random.default_rng(seed), cart()
     bounds = impc.Bounds(plant, u_min=-5, u_max=5)
     law = impc.Controller(plant, impc.Weights(np.diag([4.0, 1.0]), 1), bounds, 10)
@@ -33,7 +33,7 @@ def push(seed: int, samples: int = 600) -> Array:
 
 
 def test_trials_with_the_same_perturbation() -> None:
-    """Four of them; the interval holds the true share, and its width is that of 20 draws."""
+    """Four trials; the interval covers the true share, and has the width of 20 draws."""
     posed, truth = problem([push(1)] * 4, 0.03)
     found = ceiling(posed, 0.0)
     assert found is not None
@@ -50,7 +50,7 @@ def test_trials_with_the_same_perturbation() -> None:
 
 
 def test_a_periodic_perturbation_in_one_trial() -> None:
-    """The second half of the recording is compared with the last; the first period settles."""
+    """Five periods: the first is excluded, four repetitions remain."""
     posed, truth = problem([np.tile(push(2, 150), 5)], 0.03)
     found = ceiling(posed, 7.5)
     assert found is not None
@@ -64,7 +64,7 @@ def test_what_does_not_repeat_has_none() -> None:
 
 
 def test_targets_count_as_what_drives() -> None:
-    """The same push towards two other targets is no repetition; towards the same one it is."""
+    """The same push towards two targets is no repetition; towards one target it is."""
     plant, rng = cart(), np.random.default_rng(3)
     bounds, force = impc.Bounds(plant, u_min=-5, u_max=5), push(1)
     paths = [np.repeat(rng.standard_normal(40), 15) for _ in range(2)]

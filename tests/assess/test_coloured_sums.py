@@ -1,4 +1,4 @@
-"""Sums over nearby lags against the whole matrix of the noise's covariances."""
+"""Sums over lags against the full covariance matrix of the noise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from impc.assess.long_run_covariance import _coloured
 
 @pytest.mark.parametrize(("samples", "lags"), [(9, 1), (9, 4), (3, 5)])
 def test_sums_are_those_of_the_whole_covariance_matrix(samples: int, lags: int) -> None:
-    """Two outputs, whose covariances are not the same forth and back; more lags than samples."""
+    """Two outputs with asymmetric cross-covariances; more lags than samples."""
     rng = np.random.default_rng(samples + lags)
     columns = rng.standard_normal((samples, 2, 3))
     gammas = rng.standard_normal((lags, 2, 2))

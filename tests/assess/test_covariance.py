@@ -1,4 +1,4 @@
-"""What is printed beside a gain is that gain's interval, and every unknown counts."""
+"""Intervals of the reported gain, with all other unknowns fitted too."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STEP = 1e-6
 
 
 def differences(problem: Problem, K: Array, S: Array) -> Array:
-    """Derivative of the residual by central differences: K, S up to scale, x0; (r, q), to 1e-8."""
+    """Derivative (r, q) by central differences: K, S without scale, x0; to 1e-8."""
     (trial,) = problem.recordings
     m, n = K.shape
     rows, columns = (part[1:] for part in np.tril_indices(m))
@@ -52,7 +52,7 @@ def differences(problem: Problem, K: Array, S: Array) -> Array:
 
 
 def test_deviations_of_two_inputs_count_the_metric_as_unknown() -> None:
-    """Unit white noise: (J'J)^-1 over K, S and x0, J by differences; S known takes a tenth off."""
+    """Unit white noise: (J'J)^-1 over K, S, x0; with S known errors are a tenth smaller."""
     controller = regulator(carts(2))
     problem = fit_problem(controller.plant, [noisy_recording(controller, 2, 90, 0)], SETTINGS)
     K, S = np.array(controller.K), np.array(controller.S)
@@ -71,7 +71,7 @@ def test_deviations_of_two_inputs_count_the_metric_as_unknown() -> None:
 
 
 def stronger(plant: Plant) -> PlantFamily:
-    """Its first input, and what moves its first state, by one factor."""
+    """Plant with its first input and the drive of its first state scaled by one factor."""
 
     def make(values: Array) -> Plant:
         A, B = np.array(plant.A), np.array(plant.B)
@@ -86,7 +86,7 @@ def stronger(plant: Plant) -> PlantFamily:
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 6), (3, 2)])
 def test_deviations_where_a_parameter_is_fitted(m: int, seed: int) -> None:
-    """Unit white noise: (J'J)^-1 over K, S and the parameter, J by differences of simulations."""
+    """Unit white noise: (J'J)^-1 over K, S and the parameter, J by differences."""
     rng = np.random.default_rng([14, m, seed])
     _, controller, problem = saturated_problem(rng, 2 + seed % 5, m)
     n, K, S = problem.plant.n, np.array(controller.K), np.array(controller.S)
@@ -108,7 +108,7 @@ def test_deviations_where_a_parameter_is_fitted(m: int, seed: int) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("seed", [52])
 def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> None:
-    """A random plant on which the free gain drifts, and takes its identified directions along."""
+    """Plant on which a free gain drifts and biases its identified directions."""
     controller, trial = random_recording(seed, 1, 90.0)
     fitted = fit(controller, trial)
     truth = controller.K
@@ -117,14 +117,14 @@ def test_a_direction_that_is_told_is_told_where_others_are_not(seed: int) -> Non
     off = np.abs(found.along(estimate.K - truth) / found.deviations)
     assert np.max(off[found.identified]) < 3.5
     assert not np.all(found.identified)
-    # What is not identified stays where the weights are.
+    # Unidentified directions stay at the weights.
     step = found.along(estimate.K - fitted.gain)
     assert np.max(np.abs(step[~found.identified])) < 0.2
 
 
 @pytest.mark.full
 def test_told_directions_count_what_is_not_told_to_second_order() -> None:
-    """Three inputs and one output: to first order the best direction is 2.4 deviations off."""
+    """Three inputs, one output: first order puts the best direction 2.4 standard errors off."""
     controller, trial = random_recording(1, 3, 90.0)
     estimate = gain_estimate(fit(controller, trial))
     found, error = estimate.covariance, estimate.K - controller.K
@@ -143,11 +143,10 @@ def test_told_directions_count_what_is_not_told_to_second_order() -> None:
     ],
 )
 def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -> None:
-    """Seeds from 0; all identified entries and directions together, first-order noise (0.8).
+    """All identified entries and directions, first-order noise (0.8), seeds from 0.
 
-    With the 95 % that they say, fewer than 86 % of 50 or of 64 fall inside once in a hundred, of 32
-    once in forty; the scores have unit variance within their own spread.
-    `experiments.printed_intervals` has 200.
+    At true 95 % coverage fewer than 86 % of 50 or of 64 occur once in a hundred, of 32 once in
+    forty; scores have unit variance within sampling error (experiments/printed_intervals has 200).
     """
     found = [score_carts(seed, inputs, vaf, 0.8) for seed in range(count)]
     for scores in ([item.entries for item in found], [item.directions for item in found]):
@@ -161,12 +160,12 @@ def test_printed_intervals_hold_the_truth(inputs: int, vaf: float, count: int) -
 @pytest.mark.parametrize("inputs", [1, 2, 3])
 @pytest.mark.parametrize("vaf", [90.0, 70.0])
 def test_two_hundred_recordings(inputs: int, vaf: float) -> None:
-    """White noise: every entry and direction that is identified in 50 and more, 92 to 98 %."""
+    """White noise: 92 to 98 % coverage of all that is identified at least 50 times."""
     found = [score_carts(seed, inputs, vaf, 0.0) for seed in range(200)]
     for scores in ([item.entries for item in found], [item.directions for item in found]):
         table = np.array(scores)
         often = np.count_nonzero(np.isfinite(table), axis=0) >= 50
         share = shares(table[:, often])
         assert np.mean(share) == pytest.approx(0.95, abs=0.02)
-        # A share of 200 has a deviation of 1.5 %.
+        # A share of 200 has a standard error of 1.5 %.
         assert np.all((share >= 0.90) & (share <= 0.995))

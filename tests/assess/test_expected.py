@@ -1,4 +1,4 @@
-"""What recordings would say: against derivatives by differences and dense covariances."""
+"""Expected intervals against finite differences and dense covariances."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ SAMPLES = 160
 
 
 def cart() -> tuple[Plant, Structure, Array]:
-    """A cart, cost weights of its position and speed, and a push that takes it to its limit."""
+    """Cart with cost weights of position and speed, and a push up to its limit."""
     plant = carts(1)
     push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 1)), 10, axis=0)
     return plant, Structure(plant, "diagonal"), push
 
 
 def outputs(cost_weights: Array, x0: Array, limit: float) -> Array:
-    """Recorded positions (samples,), by the controller."""
+    """Simulated positions (samples,)."""
     plant, structure, push = cart()
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
     law = Controller(plant, structure.weights(cost_weights), bounds, 8, terminal_set=False)
@@ -59,8 +59,8 @@ def differences(points: list[tuple[Array, Array, float]], step: float) -> Array:
 
 
 def columns() -> tuple[Array, Array, Array]:
-    """Derivatives with respect to logarithms of weights, initial state, logarithm of the limit."""
-    # At 1e-4 a sample comes to its limit in between.
+    """Derivatives by log weights, initial state and log limit."""
+    # At steps of 1e-4 a sample reaches its limit in between.
     h, still = 1e-5, np.zeros(2)
     ways = (1.0, -1.0, 2.0, -2.0)
     on_cost_weights = [
@@ -86,7 +86,7 @@ def test_deviations_are_those_of_least_squares(root: float) -> None:
     both = np.hstack([on_cost_weights, on_start])
     back = np.linalg.pinv(both)
     truth = np.sqrt(np.diag(back @ dense(root) @ back.T))[:2]
-    # The package's own noise reaches 250 samples back, and differences are good to 1e-7.
+    # The package's noise model reaches 250 samples back; differences are accurate to 1e-7.
     np.testing.assert_allclose(found.deviations, truth, rtol=2e-5)
     assert found.mean_variance == pytest.approx(np.mean(truth**2), rel=1e-4)
     block = (back @ dense(root) @ back.T)[:2, :2]
@@ -118,7 +118,7 @@ def test_a_limit_that_is_never_met_is_not_told() -> None:
 
 
 def test_small_noise_makes_intervals_of_deviations() -> None:
-    """1.96 deviations to either side; and ten times the noise, ten times as wide."""
+    """Normal intervals of 1.96 standard errors; ten times the noise, ten times as wide."""
 
     def ends(found: Expectation) -> Array:
         return np.array(
@@ -132,7 +132,7 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
 
 
 def known_to(uncertainty: dict[str, float | str]) -> Expectation:
-    """The cart whose force for a command, and its rate of falling, are known so well."""
+    """Cart with stated uncertainties of force per command and rate of falling."""
 
     def made(values: Array) -> Plant:
         force, fall = values
@@ -169,19 +169,19 @@ def test_an_exact_body_and_one_that_is_measured_are_those_of_their_own_problems(
         assert measured == pytest.approx(other.deviations, rel=1e-6)
         fall = 1 - other.deviations / found.deviations
         assert found.narrower(found.body.measured)[list(STATED).index(name)] == pytest.approx(fall)
-    # What recordings say of the limit leaves out what is stated of it.
+    # The stated uncertainty of the limit is excluded from its expected precision.
     assert found.limits == pytest.approx(known_to(STATED | {"u_max": 0.0}).limits, rel=1e-6)
 
 
 def test_no_number_of_trials_tells_a_weak_force_from_a_weak_person() -> None:
-    """Half the force, commands, and limits doubled, and a quarter of both cost weights: the same.
+    """Scaling force, commands, limits and cost weights together leaves the outputs unchanged.
 
-    So they are known to 2 sqrt(1 / (1 / .05^2 + 1 / .05^2)) and no better.
+    The best known precision is therefore 2 sqrt(1 / (1 / .05^2 + 1 / .05^2)).
     """
     body = known_to(STATED).body
     assert body is not None
     assert body.floor == pytest.approx(np.full(2, 2 * 0.05 / np.sqrt(2)), rel=0.01)
-    # By the limit, which is known here, the recordings tell the force.
+    # The known limit identifies the force.
     other = known_to({"force": "5 %"})
     assert other.body is not None
     assert np.all(other.body.floor < 0.05 * other.deviations)

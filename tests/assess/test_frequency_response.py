@@ -1,4 +1,4 @@
-"""Frequency responses of recordings against the transfer function that made them."""
+"""Frequency responses against the transfer function of the simulation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ GAIN = np.array([[2.5, 2.2]])
 
 
 def problem(noise: float, seed: int = 0, trials: int = 3) -> tuple[Problem, list[impc.Simulation]]:
-    """A cart under a linear feedback, pushed at random; and the runs of that feedback."""
+    """Cart under linear feedback with random pushes, and its simulations."""
     plant, rng = cart(), np.random.default_rng(seed)
     bounds = impc.Bounds(plant, u_min=-1e3, u_max=1e3)
     law = impc.Controller.from_gain(plant, GAIN, bounds, 5, terminal_set=False)
@@ -28,7 +28,7 @@ def problem(noise: float, seed: int = 0, trials: int = 3) -> tuple[Problem, list
 
 
 def test_the_response_is_the_transfer_function() -> None:
-    """Magnitude and phase of the closed loop, where the coherence says that they are known."""
+    """Magnitude and phase of the closed loop at coherent frequencies."""
     posed, runs = problem(0.0)
     found = frequency_response(posed, runs)
     assert found is not None
@@ -47,7 +47,7 @@ def test_the_response_is_the_transfer_function() -> None:
 
 
 def test_errors_hold_what_noise_does() -> None:
-    """Against the response without noise, 95 % intervals hold in about 95 of 100."""
+    """95 % intervals cover the noise-free response in about 95 of 100."""
     clean = frequency_response(*problem(0.0))
     assert clean is not None
     held: list[bool] = []

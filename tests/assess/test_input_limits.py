@@ -1,4 +1,4 @@
-"""The input limit is found where it shows, and said not to show where it does not."""
+"""The input limit is found if it is active, and reported as unidentified if not."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.simulated_subjects import noisy_recordings
+from impc.assess import input_limits
 from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
 from impc.control.closed_loop import simulate
 from impc.control.simulation import scenario
@@ -26,7 +27,7 @@ def fitted_cart(trial: Recording, limit: float | None) -> Estimate:
 
 
 def gentle_trial() -> Recording:
-    """Pushed so little that the limit of 1 is never met; noise of a fifth."""
+    """Pushes too small to reach the limit of 1; noise 20 %."""
     rng, controller = np.random.default_rng(SEED), true_controller()
     push = np.repeat(rng.choice([-0.1, 0.0, 0.1], 150), 10)
     run = simulate(controller, scenario(controller.plant, np.zeros(2), disturbance=push))
@@ -39,7 +40,7 @@ def gentle_trial() -> Recording:
 @pytest.mark.full
 @pytest.mark.parametrize("assumed", [None, 1.4])
 def test_a_limit_that_is_met_is_found(assumed: float | None) -> None:
-    """Seed 3: within 2 %, the truth inside the interval, whatever was assumed before."""
+    """Seed 3: within 2 % and covered by the interval, from any assumed limit."""
     found = input_limit(fitted_cart(noisy_trial(SEED, 0.0), assumed))
     assert found.value == pytest.approx(1.0, rel=0.02)
     assert found.low < 1.0 < found.high
@@ -53,15 +54,22 @@ def test_a_limit_that_is_never_met_is_not_determined() -> None:
     assert found.value is None
     assert found.high == np.inf
     assert found.against_none <= found.quantile
-    assert "no limit explains the recordings as well as any" in found.reason
+    assert "the fit without a limit is not significantly worse" in found.reason
+
+
+def test_the_search_starts_at_the_given_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The unlimited regulator of a seat commands 20 times the limit: a grid below it misses it."""
+    monkeypatch.setattr(input_limits, "_typical_peak", lambda *_: 1e3)
+    found = input_limit(fitted_cart(noisy_trial(SEED, 0.0), 1.2))
+    assert found.value == pytest.approx(1.0, rel=0.02)
 
 
 @pytest.mark.slow
 def test_limits_of_noisy_subjects() -> None:
-    """The seat at 6 Nm, an eighth of its samples saturated, seeds 0 to 4; at 70 Nm: not identified.
+    """Seat at 6 Nm, 12.5 % of samples saturated, seeds 0 to 4; at 70 Nm not identified.
 
-    With noise that leaves a VAF of 90 % the limit itself has a deviation of 1 %: of five subjects
-    the median must be within 2 % and no interval may miss by more than its own half.
+    At a VAF of 90 % the limit has a standard error of 1 %: the median of five subjects must be
+    within 2 %, and no interval may miss by more than half its width.
     """
     plant = seat(1, 1.0).problem.plant
 

@@ -1,4 +1,4 @@
-"""Gains that recordings allow: their spread, and statements on intent that survive it or do not."""
+"""Drawn gains, and statements on intent that hold for all of them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def fitted() -> tuple[Estimate, GainCovariance]:
 def test_drawn_gains_spread_as_their_covariance(
     fitted: tuple[Estimate, GainCovariance],
 ) -> None:
-    """300 gains: centre to 0.2 deviations, deviations along both directions to 15 %."""
+    """300 draws: centre to 0.2 standard errors, standard errors along both directions to 15 %."""
     found, covariance = fitted
     drawn = drawn_gains(cart(), found.stage_weights, found.gain, covariance, 300)
     off = np.array([covariance.along(one.K - found.gain) for one in drawn])
@@ -48,7 +48,7 @@ def test_drawn_gains_spread_as_their_covariance(
 def test_a_statement_is_made_only_when_other_gains_agree(
     fitted: tuple[Estimate, GainCovariance],
 ) -> None:
-    """The same gain and the same weights: identified to its deviations, and all but unknown."""
+    """Same gain and weights: well identified, and almost unidentified."""
     found, covariance = fitted
     K, metrics = np.array(found.gain), np.array(found.metrics)
     bare = summarise_weights(cart(), K, metrics, SIZES)
@@ -88,7 +88,7 @@ def test_a_parameter_that_stays_where_it_began_is_not_determined() -> None:
 
 
 def test_the_ratio_of_prices_has_an_interval() -> None:
-    """It falls only where all resampled fits say so."""
+    """A fall is reported only if all resampled fits agree."""
     one = ConditionResult(
         11.0, 9, 0.1, 0.08, True, False, [], [], [], [], [1.0, 1.0], 3, 1e6, 1e6, 1e6,
         [5e5, 2e6], [1.0, 2.0], "", [], [], [],
@@ -97,4 +97,4 @@ def test_the_ratio_of_prices_has_an_interval() -> None:
     assert "falls by a factor of 1e+03 (33 %: 200 to 5e+03)" in weight_ratio([one, other])
     crossing = replace(other, resampled_weight=[1e2, 1e7])
     assert "is not distinguished from constant" in weight_ratio([one, crossing])
-    assert "nothing is said" in weight_ratio([replace(one, resampled_weight=[]), other])
+    assert "is unknown" in weight_ratio([replace(one, resampled_weight=[]), other])

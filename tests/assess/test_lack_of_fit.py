@@ -1,4 +1,4 @@
-"""The test of the model, on carts whose error is known; its columns against differences."""
+"""Test of the model on carts with known errors; columns against finite differences."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def result_of(seed: int, error: str, root: float = 0.0) -> LackOfFit:
 
 
 def problem_and_gain() -> tuple[Problem, Array, Array]:
-    """A cart at its limit for part of the time, at its true gain."""
+    """Cart at its limit for part of the time, at its true gain."""
     person = cart_person(1, 99, 0.0)
     assert person is not None
     problem, K, _ = person
@@ -51,7 +51,7 @@ def column(name: str) -> Array:
 
 @pytest.mark.parametrize(("seed", "root"), [(0, 0.0), (1, 0.0), (0, 0.9), (1, 0.9)])
 def test_noise_of_the_recorder_gives_no_alarm(seed: int, root: float) -> None:
-    """A body drawn from its uncertainty; docs/fitting.md has the rate over 200."""
+    """Body drawn from its stated uncertainty."""
     assert not result_of(seed, "none", root).alarm
 
 
@@ -74,13 +74,13 @@ def test_a_lean_is_an_error_of_a_constant() -> None:
 
 
 def test_the_column_of_a_delay_is_a_derivative() -> None:
-    """Of a plant whose commands are part of a sample late, at none, the gain on the last one 0."""
+    """Plant with a fractional command delay, at zero delay and zero gain on the last command."""
     problem, K, S = problem_and_gain()
     wider = with_delay_unknown(problem)
     assert wider is not None
     K = np.hstack([K, np.zeros((1, 1))])
     expected = evaluate(wider, K, S).dparameters[:, 0]
-    # The plan knows of the delay that the forcing does not: the columns differ at the limit.
+    # The planned commands include the delay, the forcing does not: columns differ at the limit.
     error = np.linalg.norm(column(DELAY)[:, 0] - expected) / np.linalg.norm(expected)
     assert error < 0.05
 
@@ -96,7 +96,7 @@ def test_columns_are_derivatives(name: str, wider: object) -> None:
 
 
 def test_the_column_of_a_lean_is_a_difference() -> None:
-    """Of a constant push in the first trial."""
+    """Constant push in the first trial."""
     problem, K, S = problem_and_gain()
     first, step, ends = problem.recordings[0], 1e-5, []
     for push in (step, -step):
@@ -108,7 +108,7 @@ def test_the_column_of_a_lean_is_a_difference() -> None:
 
 
 def test_what_is_named_is_fitted_too() -> None:
-    """One sample of delay, seed 1: the second fit has it, and its intervals hold the gain."""
+    """One sample of delay, seed 1: the second fit includes it and covers the gain."""
     person = cart_person(1, 99, 0.0, "delay")
     assert person is not None
     problem, truth, _ = person
@@ -133,7 +133,7 @@ def test_offsets_are_no_error_where_they_are_fitted() -> None:
 
 
 def test_too_little_is_not_tested() -> None:
-    """An exact fit, and a plant whose delay is in it already."""
+    """Exact fit, and a plant whose delay is already modelled."""
     plant = cart()
     law = impc.Controller(
         plant, impc.Weights(np.diag([4.0, 1.0]), 1), impc.Bounds(plant, u_min=-1, u_max=1), 10,
@@ -157,7 +157,7 @@ def test_of_many_trials_some_are_tested() -> None:
     [("recorder", (0, 2)), ("coloured", (0, 2)), ("default", (9, 10)), ("motor", (9, 10))],
 )
 def test_ten_subjects_on_the_seat(name: str, alarms: tuple[int, int]) -> None:
-    """Noise of the recorder, a nonlinear body, motor noise at the limit: seeds 0 to 9."""
+    """Recording noise, nonlinear body, and motor noise at the limit: seeds 0 to 9."""
     found = [diagnosed(seed, name, order=1, horizon=4) for seed in range(10)]
     count = sum(item is not None and item.alarm for item in found)
     assert alarms[0] <= count <= alarms[1]

@@ -1,4 +1,4 @@
-"""What a lasting tilt ends up with, against a simulation that waits."""
+"""Steady opposing command against a long simulation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_states_of_nerves_and_muscles_are_found() -> None:
 
 
 def test_the_command_settles_at_it() -> None:
-    """With the body held at a tilt of one, delay and muscle driven until nothing changes."""
+    """Tilt held at one while delay and muscle settle."""
     A = [[1.0, 0.1, 0.0], [0.2, 0.9, 0.1], [0.0, 0.0, 0.7]]
     system = control.ss(
         A, [[0, 0], [0, 0.1], [0.4, 0]], [[1, 0, 0]], 0, 0.1,
@@ -44,7 +44,7 @@ def test_the_command_settles_at_it() -> None:
         u = -K[0] - K[2] * muscle
         muscle = 0.7 * muscle + 0.4 * u
     np.testing.assert_allclose(found.value, -u, rtol=1e-9)
-    # The interval is that of the linearised value.
+    # Interval of the linearised value.
     slopes = []
     for k in range(3):
         ends = []

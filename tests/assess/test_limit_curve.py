@@ -1,4 +1,4 @@
-"""The curve of limits, against fits of its own."""
+"""The limit curve against separate fits."""
 
 from __future__ import annotations
 

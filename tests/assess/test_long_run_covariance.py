@@ -1,4 +1,4 @@
-"""The colour of residuals, and what a fit takes of it, against Toeplitz matrices."""
+"""Autocorrelation of residuals and its correction for the fit, against Toeplitz matrices."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _noise(rng: np.random.Generator, root: float) -> Array:
 
 
 def test_colour_of_a_first_order_process() -> None:
-    """Seed 5: the spread of a plain sum is N times the spectral density at zero, 1/(1 - a)^2."""
+    """Seed 5: the variance of a sum is N times the spectral density at zero, 1/(1 - a)^2."""
     rng = np.random.default_rng(5)
     noise = rng.standard_normal((40000, 1))
     for a in (0.0, 0.5, 0.9):
@@ -47,7 +47,7 @@ def test_colour_of_a_first_order_process() -> None:
 
 
 def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
-    """Known colour, two outputs: against the full covariance matrix of the noise."""
+    """Known autocorrelation, two outputs: against the full covariance matrix of the noise."""
     a, rng = np.array([0.6, -0.3]), np.random.default_rng(8)
     mixing = np.array([[1.0, 0.4], [0.0, 0.8]])
     found = ResidualNoise(a, (mixing @ mixing.T)[None])
@@ -63,9 +63,9 @@ def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
 
 @pytest.mark.parametrize(("root", "short"), [(0.0, 0.99), (0.5, 0.98), (0.9, 0.85)])
 def test_deviations_of_a_regression_are_those_of_the_noise(root: float, short: float) -> None:
-    """60 draws: the mean variance of ten coefficients is that of theory, not for bare residuals.
+    """60 draws: mean variance of ten coefficients equals theory only with the correction.
 
-    Theory is the Toeplitz covariance of first-order noise. The mean of 60 draws has a deviation of
+    Theory: Toeplitz covariance of first-order noise. The mean of 60 draws has a standard error of
     about 1 % (.5) to 3 % (.9).
     """
     slow, own = _regression()

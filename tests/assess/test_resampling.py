@@ -1,4 +1,4 @@
-"""Bootstrap and profile likelihood beside the covariance, on the cart and on known noise."""
+"""Bootstrap and profile likelihood against the covariance, and on known noise."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def fitted(request: pytest.FixtureRequest) -> Estimate:
 
 
 def test_replicates_draw_what_is_known_of_the_body_again() -> None:
-    """A mass known to 10 % makes a gain on force as uncertain; without noise nothing else does."""
+    """A mass known to 10 % makes a gain on force equally uncertain; there is no other noise."""
     plant = cart()
     family = impc.PlantFamily(
         lambda mass: replace(plant, B=plant.B / mass[0]), ["mass"], [1.0], {"mass": "10 %"}
@@ -85,7 +85,7 @@ def drawn(fitted: Estimate, index: int, seed: int) -> Replicate:
 
 
 def white_covariance(estimate: GainEstimate) -> GainCovariance:
-    """As if the residuals were white."""
+    """Covariance for white residuals."""
     at = estimate.problem, np.array(estimate.K), np.array(estimate.S)
     return gain_covariance(*at, white_noise, curvature=True)
 
@@ -112,7 +112,7 @@ def test_bootstrap_agrees_with_the_sandwich(fitted: Estimate) -> None:
 
 @pytest.mark.full
 def test_profile_agrees_with_the_sandwich(fitted: Estimate) -> None:
-    """Nearly quadratic, so nearly the same ends."""
+    """Nearly quadratic, so nearly equal ends."""
     estimate = gain_estimate(fitted)
     for item in covariance_intervals(estimate, estimate.covariance, "sandwich"):
         found = profile_likelihood(estimate, item.name).interval
@@ -133,7 +133,7 @@ def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
 
 @pytest.mark.full
 def test_profile_against_brute_force(fitted: Estimate) -> None:
-    """D at one value against a dense search over the only other entry, initial state refitted."""
+    """D at one value against a grid search over the other entry, initial state refitted."""
     problem = replace(fitted.problem, unknown_start=False)
     known = gain_estimate(replace(fitted, problem=problem))
     name = entry_names(problem.plant)[0]
@@ -155,7 +155,7 @@ def test_profile_against_brute_force(fitted: Estimate) -> None:
 
 
 def test_what_is_not_determined_has_no_end() -> None:
-    """A third state that nothing reaches: its entry of the gain shows nowhere."""
+    """A third state that nothing excites: its gain entry is not identified."""
     base = cart()
     A, B = (
         scipy.linalg.block_diag(base.A, np.array([[0.5]])),
@@ -174,7 +174,7 @@ def test_what_is_not_determined_has_no_end() -> None:
 
 
 def test_an_unknown_name_is_told(fitted: Estimate) -> None:
-    with pytest.raises(InputError, match=r"known: K\.force"):
+    with pytest.raises(InputError, match=r"choose from: K\.force"):
         profile_likelihood(gain_estimate(fitted), "mass")
 
 
@@ -188,9 +188,9 @@ def test_a_replicate_depends_on_seed_and_number_only(fitted: Estimate) -> None:
 def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
     fitted: Estimate, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Weights first, then the gain that is identified: within a hundredth of its deviation.
+    """Against a full fit (weights, then identified gain): within 0.01 standard errors.
 
-    The whole fit is given the recordings that the replicate has drawn.
+    The full fit uses the recordings drawn by the replicate.
     """
     at = gain_estimate(fitted)
     kept: list[list[Array]] = []
@@ -215,7 +215,7 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
 
 @pytest.mark.parametrize("root", [0.0, 0.9])
 def test_drawn_residuals_have_the_colour_of_the_given(root: float) -> None:
-    """Variance, correlation of the outputs and of neighbours; 40 draws of 2 x 2000 samples."""
+    """Variance, cross-correlation and autocorrelation; 40 draws of 2 x 2000 samples."""
     given = [first_order(root, 2000, SEED), first_order(root, 1500, SEED + 1)]
     rng = np.random.default_rng(SEED)
     drawn = [block_residuals(given, rng) for _ in range(40)]
@@ -231,7 +231,7 @@ def test_drawn_residuals_have_the_colour_of_the_given(root: float) -> None:
 
 
 def test_block_length_of_first_order_noise() -> None:
-    """The closed form of Politis and White at the estimated root."""
+    """Closed form of Politis and White at the estimated coefficient."""
     given = [first_order(0.9, 4000, SEED)]
     assert block_length(given) == pytest.approx(
         np.cbrt(6 * 0.81 / (1 - 0.81) ** 2 * 4000), rel=0.15

@@ -11,7 +11,7 @@ SEED = 5
 
 
 def test_correction_for_several_tests_is_statsmodels() -> None:
-    """Bit by bit, ties and values that end at 1 too; NaN is no test."""
+    """Equal to the last bit, including ties, values capped at 1, and NaN."""
     rng = np.random.default_rng(SEED)
     for count in (0, 1, 2, 7):
         given = rng.uniform(0, 0.3, count).round(1)

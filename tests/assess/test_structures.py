@@ -1,4 +1,4 @@
-"""What recordings identify of a structure: rank, deviations, intervals, and whether it holds."""
+"""Structured fits: rank, standard errors, intervals and the score test."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CARTS = np.log([4.0, 5.0, 1.0, 1.0, 1.0])
 
 
 def seat_tangent(kind: str) -> Tangent:
-    """The seat without noise, at the true weights of a structure that holds them."""
+    """Noise-free seat at the true weights of a structure that contains them."""
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, kind, over=BODY)
     cost_weights = SEAT if kind == "diagonal" else np.concatenate([SEAT / 2, np.zeros(6)])
@@ -57,26 +57,26 @@ def test_the_seat_tells_four_prices_of_four() -> None:
 
 
 def test_of_ten_prices_and_products_the_seat_tells_four() -> None:
-    """The controller predicts over the delay, so the gain has four numbers (docs/structures.md)."""
+    """The controller predicts over the delay, so the gain has four degrees of freedom."""
     found = weight_covariance(seat_tangent("full"))
     assert found.rank == 4
     sizes = np.array(found.singular_values)
-    assert sizes[3] / sizes[0] > 1e-2  # 1.5e-2, and 1e-7 after it
+    assert sizes[3] / sizes[0] > 1e-2  # 1.5e-2, then 1e-7
     assert sizes[4] / sizes[0] < 1e-6
-    # No unknown is individually identified: each cost weight can be made up for by others.
+    # No unknown is individually identified: the others compensate for each cost weight.
     assert np.all(np.isinf(found.each))
 
 
 @functools.cache
 def fitted(seed: int = 0, cross: float = 0.0) -> Tangent:
-    """Two carts at a VAF of 90 %, initial state unknown, from the truth."""
+    """Two carts at a VAF of 90 %, initial state unknown, started at the truth."""
     person = cart_person(seed, 90.0, 0.0, cross)
     end = search_from(person.problem, person.structure, person.cost_weights)
     return tangent(person.structure, end.problem, np.array(end.cost_weights))
 
 
 def test_deviations_are_those_of_the_whole_normal_matrix() -> None:
-    """White: against s^2 times the inverse of H with all columns, by differences."""
+    """White noise: s^2 times the inverse of H with all columns, by differences."""
     at = fitted()
     structure, problem = at.structure, at.problem
     starts = np.asarray(problem.starts)
@@ -94,13 +94,13 @@ def test_deviations_are_those_of_the_whole_normal_matrix() -> None:
     s2 = float(at.residual @ at.residual) / (len(at.residual) - size)
     whole = s2 * np.linalg.inv(columns.T @ columns)[: structure.count, : structure.count]
     found = weight_covariance(at)
-    # White noise is estimated for each output, so their noise differs by a few per cent.
+    # The noise is estimated per output and differs by a few per cent.
     white = np.sqrt(np.diag(found.white))
     np.testing.assert_allclose(white, np.sqrt(np.diag(whole)), rtol=0.03)
 
 
 def test_an_interval_ends_where_the_misfit_has_grown() -> None:
-    """Against searches of the recordings themselves with the cost weight held at the end."""
+    """Against searches of the recordings with the cost weight fixed at the end."""
     at = fitted()
     covariance = weight_covariance(at)
     structure, cost_weights = at.structure, np.array(at.cost_weights)
@@ -111,15 +111,15 @@ def test_an_interval_ends_where_the_misfit_has_grown() -> None:
     )  # without the weak prior on the initial states
     for end in (found.low, found.high):
         grown = len(at.residual) * (_held(at, cost_weights, end) / best - 1)
-        # The bisection ends within a fiftieth of a deviation, 2 % of D.
+        # The bisection ends within 1/50 of a standard error, 2 % of D.
         assert grown == pytest.approx(3.84 * wider**2, rel=0.05)
 
 
 @pytest.mark.full
 def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -> None:
-    """One trial of a subject whose weights are known to within a factor of ten: far from linear.
+    """One trial of a subject whose weights are known to within a factor of ten.
 
-    The quadratic form of the gain at the fit ends 1.3 of a logarithm short of here.
+    The quadratic form at the fit alone would end 1.3 (log cost weight) short.
     """
     person = seat_person(4, 99.0, 0.0)
     one = replace(person.problem, recordings=person.problem.recordings[:1])
@@ -136,9 +136,9 @@ def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -
 
 
 def test_an_interval_ends_where_the_body_all_but_falls() -> None:
-    """An unstable plant near its limit, so noisy that a line sees no cost weight that is too low.
+    """Unstable plant near its limit, with so much noise that linearisation has no lower end.
 
-    Its misfit grows without end towards the cost weight at which it falls.
+    The misfit diverges towards the cost weight at which the plant does.
     """
     system = control.ss(
         [[1.2]], [[1, 1]], [[1]], 0, 1, inputs=["u", "d"], states=["x"], outputs=["x"]
@@ -172,7 +172,7 @@ def test_an_interval_ends_where_the_body_all_but_falls() -> None:
 
 
 def _least(at: Tangent, index: int, value: float) -> float:
-    """Least squares over the other weights by the recordings, any initial state being allowed."""
+    """Least squares over the other weights, initial states free, on the recordings."""
     free = np.delete(np.arange(at.structure.count), index)
 
     def place(others: np.ndarray) -> Tangent:
@@ -195,7 +195,7 @@ def _least(at: Tangent, index: int, value: float) -> float:
 
 
 def _held(at: Tangent, cost_weights: np.ndarray, end: float) -> float:
-    """Least squares with the first cost weight held at `end`, by Gauss-Newton on the recordings."""
+    """Gauss-Newton on the recordings with the first cost weight fixed at `end`."""
     structure, problem, free = at.structure, at.problem, np.arange(1, at.structure.count)
     here = cost_weights.copy()
     here[0] = end
@@ -211,7 +211,7 @@ def _held(at: Tangent, cost_weights: np.ndarray, end: float) -> float:
 
 
 def _start_columns(place: Tangent) -> np.ndarray:
-    """Derivative with respect to every trial's initial state, zero outside of the trial."""
+    """Derivative by the initial state of every trial, zero outside the trial."""
     sizes = [trial.outputs.size for trial in place.problem.recordings]
     parts = np.split(np.asarray(place.found.own), np.cumsum(sizes)[:-1])
     whole = np.zeros((sum(sizes), sum(part.shape[1] for part in parts)))
@@ -225,7 +225,7 @@ def _start_columns(place: Tangent) -> np.ndarray:
 def test_a_price_of_zero_has_an_upper_end() -> None:
     at = fitted()
     cost_weights = np.array(at.cost_weights)
-    cost_weights[3] = -np.inf  # the cost weight of a speed is left out, whatever the recordings say
+    cost_weights[3] = -np.inf  # zero cost weight of a speed, for any recordings
     bare = search_from(at.problem, at.structure, cost_weights)
     assert bare.cost_weights[3] == -np.inf
     place = tangent(at.structure, bare.problem, np.array(bare.cost_weights))
@@ -244,11 +244,11 @@ def test_the_structure_that_holds_is_not_refused_and_a_cross_term_is() -> None:
     assert not holds.refused
     assert crossed.refused
     first = next(item for item in holds.powers if (item.first, item.second) == ("x[0]", "x[1]"))
-    assert first.power > 0.99  # and it is refused: in 5 of 5 subjects of the study
+    assert first.power > 0.99  # and it is rejected in 5 of 5 subjects of the study
 
 
 def test_the_statistic_is_the_one_step_fall_of_the_misfit() -> None:
-    """For white residuals T is the fall to the free gain, to first order, over s^2: (U'e)^2 / s^2.
+    """For white residuals T is (U'e)^2 / s^2, the one-step decrease towards the free gain.
 
     Against least squares with all columns of the gain.
     """
@@ -268,12 +268,12 @@ def test_the_statistic_is_the_one_step_fall_of_the_misfit() -> None:
     )
     s2 = float(e @ e) / len(e)
     assert metric.shape[1] >= 1
-    # The window of the sandwich, and outputs of unequal noise: a tenth.
+    # The window of the sandwich and unequal noise of the outputs: 10 %.
     assert tested.statistic == pytest.approx(fall / s2, rel=0.15)
 
 
 def test_nothing_to_test_where_prices_make_every_gain() -> None:
-    """One cart: two cost weights, a gain of two numbers."""
+    """One cart: two cost weights and a gain of two entries."""
     plant = carts(1)
     structure = Structure(plant)
     truth = Controller(
@@ -290,7 +290,7 @@ def test_nothing_to_test_where_prices_make_every_gain() -> None:
 
 
 def test_near_a_fit_the_misfit_is_that_of_the_recordings() -> None:
-    """A few deviations away, against a simulation with the initial states fitted again."""
+    """A few standard errors away, against a simulation with refitted initial states."""
     at = fitted()
     near = NearFit(at)
     moved = np.array(at.cost_weights) + 0.3 * np.array(weight_covariance(at).each) * [

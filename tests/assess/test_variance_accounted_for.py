@@ -14,7 +14,7 @@ def test_variance_accounted_for_by_hand() -> None:
     recorded = np.array([[3.0, 1.0], [4.0, 1.0]])
     simulated = np.array([[3.0, 0.0], [3.0, 1.0]])
     np.testing.assert_allclose(vaf(recorded, simulated), [100 * (1 - 1 / 25), 50.0])
-    # The second output does not vary: there is no variance to account for.
+    # The second output is constant zero: VAF is undefined.
     np.testing.assert_allclose(centred_vaf(recorded, simulated), [0.0, np.nan])
 
 
@@ -29,7 +29,7 @@ def test_a_shift_counts_in_vaf_and_not_in_the_centred_one() -> None:
 
 
 def test_whiteness_is_ljung_and_box() -> None:
-    """By statsmodels; seed 1."""
+    """Against statsmodels; seed 1."""
     noise = np.random.default_rng(1).standard_normal(500) + 0.3
     expected = acorr_ljungbox(noise, lags=[20])["lb_pvalue"].iloc[0]
     assert whiteness(noise[:, None], 20)[0] == pytest.approx(expected, rel=1e-9)

@@ -1,4 +1,4 @@
-"""Whether cost weights explain a gain: optimal regulators do, and one that delays no."""
+"""Test whether cost weights explain a gain: optimal regulators, and delayed ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def compared(problem: Problem) -> WeightsTest:
 
 
 def noisy_problem(seed: int, K: np.ndarray | None = None) -> Problem:
-    """A random optimal regulator of one to three states, or a given gain, with 2 % of noise."""
+    """Random optimal regulator of one to three states, or a given gain, with 2 % noise."""
     rng = np.random.default_rng([470, seed])
     n = 1 + seed % 3
     plant = random_plant(rng, n, 1, rng.uniform(0.8, 1.1), d=1)
@@ -45,7 +45,7 @@ def test_an_optimal_regulator_has_weights(wanted: int) -> None:
 
 
 def test_the_inequality_of_the_readme_holds_and_is_the_linear_matrix_inequality() -> None:
-    """0.1754 >= 0.1572; and of other gains, of the stick, it says what the program says."""
+    """0.1754 >= 0.1572; for other gains of the stick it agrees with the program."""
     example = impc.Plant(yalmip_example())
     found = return_difference(example, impc.solve_lqr(example, impc.Weights(np.eye(2), 1)).K)
     assert found is not None
@@ -68,7 +68,7 @@ def test_the_inequality_of_the_readme_holds_and_is_the_linear_matrix_inequality(
 
 
 def test_a_gain_without_weights_is_said_to_have_none() -> None:
-    """A stick balanced by a gain that no weights have, recorded well."""
+    """Stick balanced by a gain that no weights have, well recorded."""
     plant = impc.Plant(stick(), ["finger"])
     K, rng = np.array([[-60.0, -4.0]]), np.random.default_rng(2)
     assert np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ K))) < 1

@@ -1,4 +1,4 @@
-"""`impc cohort`: the same table whatever runs it and whatever dies, and what fails is said."""
+"""`impc cohort`: same tables for all kinds of workers, after crashes, and with failures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 
 def run_here(study: Path, out: Path, *more: str) -> Result:
-    """The same in this process, which has loaded its libraries; its workers are others."""
+    """Run the command in this process; its workers are separate processes."""
     return CliRunner().invoke(main, command(study, out, *more)[3:])
 
 
@@ -55,7 +55,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """By one worker; those that are killed are two."""
+    """Reference result with one worker."""
     out = tmp_path_factory.mktemp("undisturbed")
     with pytest.MonkeyPatch.context() as patch:
         leave_blank(patch)
@@ -85,7 +85,7 @@ def test_the_tables_are_whole(undisturbed: Path) -> None:
 
 
 def workers_of(process: psutil.Process) -> list[psutil.Process]:
-    """Processes that compute: those with no child of their own."""
+    """Worker processes: those without children."""
     children = process.children(recursive=True)
     names = [" ".join(item.cmdline()) for item in children if item.is_running()]
     return [
@@ -156,7 +156,7 @@ def test_going_on_repeats_nothing(study: Path, undisturbed: Path) -> None:
 
 @contextmanager
 def scheduler_and_workers(folder: Path, workers: int, *tls: str) -> Iterator[tuple[Any, str]]:
-    """Started apart, with certificates of Dask's options `tls`; the scheduler and its address."""
+    """Start a scheduler process with Dask's options `tls`; yield it and its address."""
     place = folder / "scheduler.json"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     quiet: Any = {
@@ -187,7 +187,7 @@ def scheduler_and_workers(folder: Path, workers: int, *tls: str) -> Iterator[tup
 def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
     secure: bool, study: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
-    """Killed in the middle, with certificates too; then what was kept is used on this machine."""
+    """Kill the scheduler during the run; then continue on this machine from stored results."""
     out, given, tls = tmp_path / "out", list[str](), list[str]()
     if secure:
         ca, cert, key = map(str, certificates(tmp_path))
@@ -210,7 +210,7 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
     assert client.returncode == 2, said
     assert said[0] == ""
     assert len(said[1].splitlines()) == 1
-    assert "was lost while tasks were out" in said[1]
+    assert "connection was lost while tasks were running" in said[1]
     assert len(list((out / "units").rglob("replicate-*.json"))) >= 3
     done = run(study, out, "--workers", "1")
     assert done.returncode == 0, done.stderr
@@ -228,7 +228,7 @@ def test_a_killed_scheduler_is_one_line_and_the_run_goes_on(
 def test_damaged_recordings_stop_nobody_else(
     tmp_path: Path, subjects: int, damaged: tuple[int, ...]
 ) -> None:
-    """Three of them: results of the others, three reasons, status 1; mended, the rest follows."""
+    """Three failing units: results of the others, three reasons, status 1; then repaired."""
     study = write_study(tmp_path, subjects)
     names = [tmp_path / f"sub-{number:02d}" / "cart_1.csv" for number in damaged]
     whole = {path: path.read_bytes() for path in names}
@@ -244,7 +244,7 @@ def test_damaged_recordings_stop_nobody_else(
     assert len(pd.read_csv(out / "units.csv")) == subjects - 3
     reasons = [line for line in done.stderr.splitlines() if line.startswith("sub-")]
     assert len(reasons) == 3
-    assert f"{subjects - 3} of {subjects} fits made" in done.stdout
+    assert f"{subjects - 3} of {subjects} fits done" in done.stdout
     for path, content in whole.items():
         path.write_bytes(content)
     again = run_here(study, out, "--workers", "1")

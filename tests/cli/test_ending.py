@@ -1,4 +1,4 @@
-"""However a command ends: one line, a status that says what, nothing half-written."""
+"""Endings of commands: one line on stderr, exit status, no incomplete files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RECORDING = "t,x\n" + "".join(f"{k},{k % 7}\n" for k in range(50))
 
 
 class OddError(Exception):
-    """An exception that cannot be written."""
+    """An exception whose text cannot be formatted."""
 
     def __str__(self) -> str:
         raise RuntimeError
@@ -100,7 +100,7 @@ def test_a_full_disk_is_no_defect(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     done = failing(monkeypatch, OSError(errno.ENOSPC, "No space left on device", "out/x.json"))
     assert done.exit_code == 2
-    assert done.stderr == "impc: error: out/x.json: No space left on device; make room\n"
+    assert done.stderr == "impc: error: out/x.json: No space left on device; free disk space\n"
 
 
 def test_warnings_of_libraries_go_to_the_log_only(
@@ -143,7 +143,7 @@ def test_messages_are_one_line_whatever_is_in_them() -> None:
 def command(
     *words: str, folder: Path, stdout: Any = subprocess.PIPE
 ) -> subprocess.CompletedProcess[str]:
-    """`python -m impc` in a folder, as a process of its own."""
+    """Run `python -m impc` in a folder as a separate process."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run(
         [sys.executable, "-m", "impc", *words],
@@ -161,11 +161,11 @@ def twice():
     except KeyboardInterrupt:
         interrupt()
 def late():
-    atexit.register(interrupt)  # while Python waits for what is still at work
+    atexit.register(interrupt)  # while Python waits for running threads
     interrupt()
 class Last:
     def __del__(self, kill=os.kill, me=os.getpid(), number=signal.SIGINT):
-        kill(me, number)  # while Python takes its modules apart
+        kill(me, number)  # while Python deletes its modules
 def last():
     global kept
     kept = Last()
@@ -189,7 +189,7 @@ def test_output_that_nobody_takes(tmp_path: Path) -> None:
     with open("/dev/full", "w") as full:
         done = command("--help", folder=tmp_path, stdout=full)
     assert done.returncode == 2
-    assert done.stderr == "impc: error: output: No space left on device; make room\n"
+    assert done.stderr == "impc: error: output: No space left on device; free disk space\n"
     reading, writing = os.pipe()
     os.close(reading)
     try:
@@ -201,7 +201,7 @@ def test_output_that_nobody_takes(tmp_path: Path) -> None:
 
 
 def test_statuses_are_distinct_and_documented() -> None:
-    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "ref" / "cli.md").read_text(encoding="utf-8")
     stated = {int(value) for value in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
     assert stated == {status.value for status in ExitStatus}
     assert len(ExitStatus) == 6

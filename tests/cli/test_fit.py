@@ -1,4 +1,4 @@
-"""`impc simulate` and `impc fit` from files to files, as their users type them."""
+"""`impc simulate` and `impc fit` from files to files."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def quick(subject: Path) -> Path:
-    """The subject's TOML for a fit in a twentieth: fewer states, a shorter horizon, no draws."""
+    """Settings for a fit in 5 % of the time: fewer states, shorter horizon, no draws."""
     text = easier_seat((subject / "subject.toml").read_text(encoding="utf-8"))
     path = subject / "quick.toml"
     path.write_text(text.replace("[fit]", "[fit]\nintent_draws = false"), encoding="utf-8")
@@ -112,7 +112,7 @@ def test_a_person_who_senses_with_noise_is_simulated_and_asked_for(tmp_path: Pat
 
 @pytest.mark.full
 def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path, quick: Path) -> None:
-    """Against a fit of the same files without command and report."""
+    """Compare with a fit of the same files in Python."""
     found = json.loads((fitted[1] / "result.json").read_text())
     configuration = read_configuration(quick)
     source = plant_source("plants:seated_balance_for", configuration.plant)
@@ -165,7 +165,7 @@ def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None
 
 
 def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> None:
-    """As pandas reads them, and as MATLAB does."""
+    """Tables are readable by pandas and MATLAB."""
     found = json.loads((fitted[1] / "result.json").read_text())
     names = ("gain", "weights", "methods", "trajectories")
     tables = {name: pd.read_csv(fitted[1] / f"{name}.csv") for name in names}
@@ -188,7 +188,7 @@ def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> Non
     assert share == pytest.approx(found["trials"][1]["vaf"][0])
     assert abs(sway.command_simulated).max() <= 6 * (1 + 1e-9)
     for name, table in tables.items():
-        for head in table.columns:  # read.csv of R would change others, readtable of MATLAB too
+        for head in table.columns:  # R and MATLAB would change other names
             assert re.fullmatch(r"(?!\d|_)[A-Za-z][A-Za-z0-9._]{0,62}", head), head
         text = (fitted[1] / f"{name}.csv").read_text(encoding="utf-8").splitlines()
         assert {line.count(",") for line in text if '"' not in line} == {len(table.columns) - 1}
@@ -206,7 +206,7 @@ def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> Non
 
 @pytest.mark.full
 def test_a_plant_and_a_file_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A semicolon file with decimal commas; a plant beside it; names to stumble over."""
+    """A semicolon file with decimal commas, a local plant, and unusual names."""
     monkeypatch.chdir(tmp_path)
     Path("mine_to_fit.py").write_text(OWN_PLANT)
     rng = np.random.default_rng(0)
@@ -287,7 +287,7 @@ def test_an_interrupted_command_says_what_it_kept(
         stopped = run(*arguments)
     assert stopped.exit_code == 130
     assert "fit" in stopped.stderr
-    assert "the same command goes on from there" in stopped.stderr
+    assert "the same command continues" in stopped.stderr
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".impc", "fit-in-progress"}
     done = run(*arguments)
     assert done.exit_code == 0, done.stderr

@@ -1,4 +1,4 @@
-"""A command holds and owns its folder: no second run, no other command, no files of two runs."""
+"""Ownership of output folders: no second run, no other command, no mixed files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_run_replaces_the_one_before_whole(tmp_path: Path) -> None:
     with owned(folder, "fit"):
         write_files(folder, PAGE | {"old.png": b"", "deep/er/old.csv": b""})
     (folder / "notes.txt").write_text("mine")
-    for left in (".impc-new/0", ".impc-notes/thesis.txt"):  # of a killed run, and of the user
+    for left in (".impc-new/0", ".impc-notes/thesis.txt"):  # left by a killed run; by the user
         (folder / left).parent.mkdir(parents=True, exist_ok=True)
         (folder / left).write_text("left")
     with owned(folder, "fit"):
@@ -57,20 +57,23 @@ def test_another_command_and_files_of_ones_own_are_refused(tmp_path: Path) -> No
     with owned(tmp_path / "a", "fit"):
         write_files(tmp_path / "a", PAGE)
     with (
-        pytest.raises(OutputError, match="holds results of impc fit"),
+        pytest.raises(OutputError, match="contains results of impc fit"),
         owned(tmp_path / "a", "compare"),
     ):
         pytest.fail("entered")
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "report.html").write_text("mine")
     with (
-        pytest.raises(OutputError, match=r"holds report.html of another version"),
+        pytest.raises(OutputError, match=r"contains report.html, not written by this version"),
         owned(tmp_path / "b", "fit"),
     ):
         pytest.fail("entered")
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "gain.png").write_text("mine")
-    with pytest.raises(OutputError, match="is not of an earlier run"), owned(tmp_path / "c", "fit"):
+    with (
+        pytest.raises(OutputError, match="was not written by this command"),
+        owned(tmp_path / "c", "fit"),
+    ):
         write_files(tmp_path / "c", PAGE | {"gain.png": b""})
     assert names(tmp_path / "c") == {"gain.png"}
     assert names(tmp_path / "b") == {"report.html"}
@@ -110,7 +113,7 @@ def test_a_damaged_list_removes_nothing_else(text: str, tmp_path: Path) -> None:
 
 
 def test_the_lock_goes_with_its_holder(tmp_path: Path) -> None:
-    """Held by another process: refused. Killed: free at once."""
+    """Refused while another process holds the folder; free once it is killed."""
     code = (
         "import sys, time; from pathlib import Path; from impc.reporting.writer import owned\n"
         "with owned(Path(sys.argv[1]), 'fit'):\n    print('held', flush=True); time.sleep(60)\n"
@@ -134,7 +137,7 @@ def test_the_lock_goes_with_its_holder(tmp_path: Path) -> None:
 
 
 def test_every_command_with_out_holds_its_folder(tmp_path: Path) -> None:
-    """Through click: the second run into one folder ends with a message, whatever the command."""
+    """A second run of any command into the same folder ends with a message."""
 
     @click.group()
     def main() -> None: ...
@@ -146,7 +149,7 @@ def test_every_command_with_out_holds_its_folder(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="another run is writing"), owned(out, "make"):
             pytest.fail("entered")
 
-    # `impc` and `python -m impc` are one program.
+    # `impc` and `python -m impc` are the same program.
     for program in ("main", "python -m main"):
         words = ["make", "--out", str(tmp_path / "out")]
         done = CliRunner().invoke(main, words, prog_name=program)

@@ -97,13 +97,13 @@ def test_bad_arguments_get_one_line(arguments: tuple[str, ...], names: str) -> N
 @pytest.mark.full
 @pytest.mark.parametrize("solver", [solver for solver in SOLVERS if solver != "daqp"])
 def test_any_solver_finds_the_weights_of_the_example(solver: str, example_plant: Plant) -> None:
-    """Case A, at the bound for three samples; case B is solved by daqp above."""
+    """Case A is at the bound for three samples; case B is solved by daqp above."""
     found = run_case(example_plant, "A", solver=solver)
     assert found.controller.solver == solver
     for name in ("inverse_mpc", "inverse_mpc_reduced"):
         residual = found.method(name).residual
         assert residual is not None
-        assert residual <= 1e-6  # measured: 1e-14
+        assert residual <= 1e-6  # typically 1e-14
 
 
 @pytest.mark.parametrize("below", ["file", "file/below", "file/far/below"])

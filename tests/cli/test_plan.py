@@ -1,4 +1,4 @@
-"""`impc plan` from its file to its page, as its users type it."""
+"""`impc plan` from configuration to report."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
     errors = table["theta1_standard_error"]
     kept = found["findings"]["experiments"]["table"]["theta1_standard_error"]
     assert kept == pytest.approx(list(errors))
-    # Twice the torque halves what noise adds, and not what is uncertain of the body.
+    # Twice the torque halves the error by noise, not the error by the uncertain body.
     assert errors[0] / 2 < errors[1] < errors[0]
     weights = pd.read_csv(folder / "out" / "cost_weights.csv")
     assert np.all(weights["with_an_exact_body"] < weights["standard_error_of_the_logarithm"])
@@ -101,7 +101,7 @@ def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Taken as exact" in page
-    # Twice the torque in a body that nothing stops: half the standard error.
+    # Twice the torque without any bound: half the standard error.
     errors = pd.read_csv(tmp_path / "out" / "experiments.csv")["theta1_standard_error"]
     assert errors[1] == pytest.approx(errors[0] / 2, rel=1e-6)
     assert not (tmp_path / "out" / "body.csv").exists()
@@ -110,7 +110,7 @@ def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
 def test_an_interval_without_an_upper_end_is_infinite_not_a_large_number(tmp_path: Path) -> None:
     done = planned(tmp_path, PLAN.replace("0.05 deg", "100000 deg").replace("[2, 4]", "[2]"))
     assert done.exit_code == 0, done.output
-    assert "Seat tilt: not at all" in " ".join(done.output.split())
+    assert "Seat tilt: not determined" in " ".join(done.output.split())
     found = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["findings"]
     (row,) = pd.read_csv(tmp_path / "out" / "experiments.csv").to_dict("records")
     assert found["experiments"]["table"]["theta1_high"] == [None]
@@ -141,7 +141,7 @@ def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
     ("change", "message"),
     [
         (('perturbed = ["perturbation"]', ""), "[plan] perturbed: names no input of the plant"),
-        (("amplitude = [2, 4]", "amplitude = [90]"), "falls in 100 % of the trials or more"),
+        (("amplitude = [2, 4]", "amplitude = [90]"), "falls in at least 100 % of the trials"),
         (('"0.05 deg", theta2', '"0.05 kg", theta2'), "noise theta1: is in kg"),
         (('"0.05 deg", theta2', '"deg", theta2'), "noise theta1: got deg"),
         (("theta1 = 6e3, ", ""), "[plan] cost_weights: lacks 'theta1'"),
@@ -209,7 +209,7 @@ def test_a_person_like_the_one_of_a_fit(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"findings": {}}, "has no cost weights of named features"),
-        ({"trials": 1}, "is no result of a fit"),
+        ({"trials": 1}, "is not a result of impc fit"),
         ({"plant": {"name": "os:getcwd", "arguments": {}}}, "names code that would be run"),
     ],
 )

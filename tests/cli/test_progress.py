@@ -1,4 +1,4 @@
-"""The bar of all commands: what is said when it is interrupted, also where no bar is drawn."""
+"""Progress bar: messages after interruptions and lines without a bar."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impc.cli.console import progress
 
 @pytest.fixture(autouse=True)
 def said(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other tests are quiet."""
+    """Enable the progress output, which other tests disable."""
     monkeypatch.delenv("IMPC_QUIET")
 
 
@@ -31,7 +31,7 @@ def test_an_interruption_says_how_much_is_kept() -> None:
 def test_lines_stand_in_a_pipe_every_ten_seconds(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The clock is made: a step takes four seconds; what was found says nothing of the others."""
+    """Simulated clock, 4 s per step; cached steps do not enter the estimate of the time left."""
 
     def clock() -> Iterator[float]:
         yield from range(0, 1000, 4)

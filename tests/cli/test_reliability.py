@@ -46,7 +46,7 @@ def analysed(study: Path) -> tuple[Result, Path]:
 
 
 def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path]) -> None:
-    """RMS of every trial from the files, without the command."""
+    """RMS of every trial computed directly from the files."""
     found = json.loads((analysed[1] / "result.json").read_text())
     read = read_study(study / "study.toml")
     plant = make_plant(plant_source("plants:seated_balance_for", {}), ("perturbation",))
@@ -67,7 +67,7 @@ def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path
     changed = pd.DataFrame(found["findings"]["conditions"]["table"])
     assert set(changed["against"]) == {"EC"}
     assert set(changed["condition"]) == {"EO", "VIB"}
-    # The error of a single visit, not of the mean over visits that ICC(A,k) is of.
+    # The error of a single visit, not of the mean over visits as in ICC(A,k).
     complete = table[np.all(np.isfinite(table), axis=1)]
     within = np.rad2deg(1) * np.sqrt(np.mean(np.var(complete, axis=1, ddof=1)))
     assert stated["sem"] == pytest.approx(within)
@@ -78,7 +78,7 @@ def test_icc_is_that_of_the_recordings(study: Path, analysed: tuple[Result, Path
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_result_names_the_recordings_that_count(study: Path, tmp_path: Path) -> None:
-    """With --last 1 the second of two trials; a byte in its middle makes another result."""
+    """--last 1 uses the second of two trials; a changed byte in it changes the result."""
     folder = copy(study, tmp_path / "s")
     for number in range(3, 6):
         remove(folder, f"sub-{number:02d}_*")
@@ -93,7 +93,9 @@ def test_a_result_names_the_recordings_that_count(study: Path, tmp_path: Path) -
         if name == "before":
             assert found[name]["recordings"]["sub-01_ses-1_task-EC"] == [whole]
             content = path.read_bytes()
-            row = content.index(b"\n", len(content) // 2)  # its last number: not the clock
+            row = content.index(
+                b"\n", len(content) // 2
+            )  # the last number of the row, not the clock
             place = content.rindex(b".", row + 1, content.index(b"\n", row + 1)) + 1
             digit = b"3" if content[place : place + 1] != b"3" else b"4"
             path.write_bytes(content[:place] + digit + content[place + 1 :])
@@ -116,11 +118,11 @@ def remove(folder: Path, pattern: str) -> None:
 @pytest.mark.parametrize(
     ("removed", "says"),
     [
-        (["*_ses-2_*"], ["of 1 occasion"]),
+        (["*_ses-2_*"], ["got 1 occasion"]),
         ([f"sub-{number:02d}_*" for number in range(2, 6)], ["complete for 1 subject"]),
-        # One subject lacks a visit, another a trial: left out of the one, cut alike in the other.
+        # One subject lacks a visit (left out), another a trial (cut to equal numbers).
         (["sub-02_ses-2_task-EO_*", "sub-03_ses-1_task-EC_run-2_*"],
-         ["1 subjects lack a visit", "give two or more subjects, visits and trials"]),
+         ["1 subjects lack a visit", "give at least 2 subjects, visits and trials"]),
         (["*_ses-2_task-VIB_*"], []),
     ],
     ids=["one visit", "one subject", "unequal cells", "no trials of a condition"],
@@ -135,7 +137,7 @@ def test_what_is_missing_is_said(
     assert done.exit_code == 0, done.stderr
     table = (tmp_path / "o" / "icc-rms.csv").read_text()
     assert all(words in table for words in says)
-    if not says:  # of a condition that one visit lacks for everybody there is no number
+    if not says:  # no numbers if a visit lacks the condition in all subjects
         found = json.loads((tmp_path / "o" / "result.json").read_text())
         shown = pd.DataFrame(found["findings"]["icc-rms"]["table"])
         assert set(shown.dropna(subset=["icc"])["condition"]) == {"EO", "EC"}

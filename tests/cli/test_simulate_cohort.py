@@ -1,4 +1,4 @@
-"""`impc simulate cohort`: what is recorded is what moved the body, and what a fit assumes."""
+"""`impc simulate cohort`: recordings agree with the simulated plant and with the fit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_truth_moved_by_what_is_recorded_leaves_the_noise_of_the_recorder(
 
 
 def test_falls_are_said_and_their_trials_left_out(tmp_path: Path) -> None:
-    """A torque of 1.8 N m is too little for a subject: the other trial of the unit stays."""
+    """A limit of 1.8 N m makes a subject fall in one trial; the other trial is kept."""
     given = ("--subjects", "2", "--trials", "2", "--duration", "8", "--replicates", "0")
     more = ("--torque-limit", "1.8", "--seed", "1", "--out", str(tmp_path))
     done = CliRunner().invoke(main, ["simulate", "cohort", *given, *more])

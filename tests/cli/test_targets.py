@@ -68,7 +68,7 @@ def cart() -> impc.Plant:
 
 
 def columns(law: impc.Controller, start: list[float]) -> dict[str, Array]:
-    """A trial as a recorder has it: cm, noise, an offset, and an empty cell now and then."""
+    """A recorded trial in cm with noise, an offset and empty cells."""
     rng, wind = np.random.default_rng(1), 0.3 + 0.1 * np.sin(np.arange(SAMPLES) / 7)
     goal = 0.3 * np.cumsum((rng.random(SAMPLES) < 0.1) * rng.normal(size=SAMPLES))
     run = law.simulate(start, disturbance=wind[:-1], target={"x": goal})
@@ -124,7 +124,8 @@ def test_a_tracked_target_with_all_of_it(
     assert found["findings"]["offsets"]["table"]["unit"] == ["m"]
     assert found["trials"][0]["missing"] == 17
     page = Path("out/report.html").read_text().replace("\u00a0", " ")
-    assert "regulates to the target of x; it takes the wind for lasting and learns it at 1." in page
+    assert "regulates to the target of x; it assumes that the wind persists and learns it" in page
+    assert "at a rate of 1." in page
     assert "(fitted, 95 %: 1." in page
     assert "the x has an offset in each trial, 0.0" in page
     assert "recorded commands (push) are fitted in addition to the outputs." in page
@@ -171,19 +172,23 @@ def test_targets_are_held_and_gaps_stay_at_another_rate(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('column = "gust"', 'column = "gust"\ntarget = 1.0', "wind.target: is for outputs alone"),
+        (
+            'column = "gust"',
+            'column = "gust"\ntarget = 1.0',
+            "wind.target: is allowed for outputs only",
+        ),
         ('"goal"', '"gaol"', "signals.x.target may be"),
         ('"goal"', '"pos"', "at an end|samples are missing"),
-        ("keep_gaps = true", "", "or write recording.keep_gaps = true"),
+        ("keep_gaps = true", "", "or set recording.keep_gaps = true"),
         ('column = "pos"', 'column = "half"', "at most half of a signal may be missing"),
-        ('target = "goal"', "", "preview: has no target to be known ahead"),
-        ("rate = 0.8", "rate = { gust = 1 }", "observer_rate.gust: is of no disturbance"),
+        ('target = "goal"', "", "preview: needs an output with a target"),
+        ("rate = 0.8", "rate = { gust = 1 }", "observer_rate.gust: is not a disturbance"),
         ("observer_rate = 0.8", "", "free observer_rate: has no nominal value"),
         ("rate = 0.8", "rate = -1.0", "observer_rate: got -1.0; give at least 0"),
-        ('["x"]', '["y"]', "there is no output 'y'; choose of x, v"),
-        ('["x"]', '["x", "x"]', "offsets: names x twice"),
-        ("[fit]", "[fit]\nrates = { pull = 1.0 }", "rates pull: is no command"),
-        ('[signals.wind]\ncolumn = "gust"\nunit = "N"\n', "", "has no disturbance to learn"),
+        ('["x"]', '["y"]', "no output is named 'y'; choose from: x, v"),
+        ('["x"]', '["x", "x"]', "offsets: contains x twice"),
+        ("[fit]", "[fit]\nrates = { pull = 1.0 }", "rates pull: is not a command"),
+        ('[signals.wind]\ncolumn = "gust"\nunit = "N"\n', "", "needs a recorded disturbance"),
     ],
 )
 def test_what_cannot_be(
@@ -211,5 +216,5 @@ def test_gaps_and_settings_are_refused_where_nothing_knows_them() -> None:
     with pytest.raises(impc.InputError, match="impc reliability needs every sample"):
         require_whole([trial], "reliability")
     for settings in (FitSettings(rates=True), FitSettings(preview=2), FitSettings(observer_rate=1)):
-        with pytest.raises(impc.InputError, match="is set, and the plant is without"):
+        with pytest.raises(impc.InputError, match="is set, but the plant was made without it"):
             fit_problem(plant, [trial], settings)

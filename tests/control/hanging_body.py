@@ -1,4 +1,4 @@
-"""A pushed pendulum that stands: a small plant with a body of its own, for tests."""
+"""An inverted pendulum with a nonlinear body, for tests."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ DT = 0.1
 
 
 def rate(x: ca.SX, w: ca.SX, stiffness: float, damping: float) -> ca.SX:
-    """Rate of angle and angular rate under a torque and a push; the body falls as sin(angle)."""
+    """Rates of angle and angular rate under torque and push; gravity acts as sin(angle)."""
     return ca.vertcat(
         x[1], stiffness * ca.sin(x[0]) - damping * x[1] * (1 + x[1] ** 2) + w[0] + w[1]
     )
 
 
 def pendulum(stiffness: float = 2.0, damping: float = 0.3) -> Plant:
-    """By one Euler step a sample: its linearisation is a matter of reading it off."""
+    """Plant of one Euler step per sample, whose linearisation is known exactly."""
     x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
     A = np.array([[1.0, DT], [DT * stiffness, 1 - DT * damping]])
     B = np.array([[0.0, 0.0], [DT, DT]])
@@ -43,7 +43,7 @@ def pendulum_family() -> PlantFamily:
 
 
 def linear_body(plant: Plant) -> Plant:
-    """The same linear plant, which offers its own matrices as a body."""
+    """The same linear plant, with its matrices as a body."""
     n, m, d = plant.n, plant.m, plant.E.shape[1]
     x, w = ca.SX.sym("x", n), ca.SX.sym("w", m + d)
     both = np.hstack([plant.B, plant.E])

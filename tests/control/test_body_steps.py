@@ -1,4 +1,4 @@
-"""The loop with a body that is not linear: its trajectory, its derivatives, its code."""
+"""Closed loop with a nonlinear body: trajectory, derivatives, machine code."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def drive(plant: Plant) -> Scenario:
 
 @pytest.mark.full
 def test_every_operation_is_casadis_and_its_slopes_are_differences() -> None:
-    """Each where it is smooth, at 50 points, in a body that adds them up; 2e-8 was found."""
+    """Each at 50 points where it is smooth; the largest difference found was 2e-8."""
     x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
     a, b = x[0] + 0.3, x[1] * w[0] + 0.2
     terms = [
@@ -60,7 +60,7 @@ def test_every_operation_is_casadis_and_its_slopes_are_differences() -> None:
     ]  # fmt: skip
     weights = np.cos(np.arange(len(terms)))
     total = sum(weight * term for weight, term in zip(weights, terms, strict=True))
-    # No slopes and no value at rest, so that it is a body; products of squares leave all in place.
+    # Zero value and slopes at rest, so that it is a valid body: products of squares.
     ahead = ca.vertcat(0.5 * x[0] + w[0], w[1] + total * x[0] ** 2)
     inputs = ["u", "d"]
     system = control.ss([[0.5, 0], [0, 0]], np.eye(2), np.eye(2), 0, 0.1, inputs=inputs)
@@ -82,7 +82,7 @@ def test_every_operation_is_casadis_and_its_slopes_are_differences() -> None:
 
 
 def test_what_a_condition_leaves_out_may_be_infinite() -> None:
-    """A body that begins at rest, where the branch that is not taken divides by zero."""
+    """The body starts at rest, where the unused branch divides by zero."""
     x, w = ca.SX.sym("x"), ca.SX.sym("w")
     wave = ca.if_else(x == 0, 1, ca.sin(x) / x)
     system = control.ss([[0.5]], [[1.0]], [[1.0]], 0, 0.1, inputs=["u"])
@@ -108,7 +108,7 @@ def test_derivatives_equal_central_differences_with_active_bounds(rate: float) -
     run, moved = simulate_and_differentiate(controller, drive(plant), along)
     assert run.complete
     assert 0.2 < np.mean(run.status > Status.FREE) < 0.9
-    # Without a bound on it the rate comes to 0.55; with one at 0.4 the push takes it to 0.50.
+    # Without a bound the rate reaches 0.55; with a bound of 0.4 the push takes it to 0.50.
     assert (np.max(np.abs(run.x[1:, 1])) < 0.5) == np.isfinite(rate)
 
     def at(step: Array) -> Array:
@@ -129,7 +129,7 @@ def _on_inputs(controller: Controller) -> Array:
 
 
 def test_parameters_move_the_body_as_differences_say() -> None:
-    """Stiffness and damping are in the matrices and in the body; 1e-10 of the largest was found."""
+    """Stiffness and damping affect matrices and body; difference found: 1e-10 of the largest."""
     family = pendulum_family()
     plant = pendulum()
     controller = law(plant)
@@ -149,7 +149,7 @@ def test_parameters_move_the_body_as_differences_say() -> None:
 
 @pytest.mark.parametrize("limit", [0.7, pytest.param(1e3, marks=pytest.mark.full)])
 def test_a_linear_body_is_the_linear_plant(limit: float) -> None:
-    """Trajectory and derivatives, and what a fit finds; saturated and not."""
+    """Trajectory, derivatives and fit, with and without saturation."""
     plant = pendulum().linear()
     twin = linear_body(plant)
     mild = PUSH / 2
@@ -173,9 +173,11 @@ def test_a_linear_body_is_the_linear_plant(limit: float) -> None:
 
 
 def test_a_sample_of_the_seat_is_that_of_another_integrator() -> None:
-    """The closed loop at up to 10 degrees: each step by DOP853 from the state before it.
+    """The closed loop at up to 10 degrees: each step by DOP853 from the previous state.
 
-    Largest difference found: 1e-8 rad, 7e-7 rad/s, where the linear plant is off by 7e-3 rad/s.
+    Largest difference found: 1e-8 rad, 7e-7 rad
+    s, where the linear plant is off by 7e-3 rad
+    s.
     """
     controller = seat_controller({}, 40.0)
     plant = controller.plant
@@ -213,7 +215,7 @@ def test_other_solvers_and_casadis_controller_move_the_same_body() -> None:
 
 
 def test_the_loop_function_differentiates_through_the_body() -> None:
-    """By the gain, the start and the push, forward and in reverse."""
+    """By gain, initial state and push, in forward and reverse mode."""
     plant = pendulum()
     controller = law(plant)
     loop = closed_loop_function(controller, STEPS)
@@ -243,7 +245,7 @@ def test_the_loop_function_differentiates_through_the_body() -> None:
 
 
 def test_bodies_that_differ_by_parameters_share_their_code() -> None:
-    """A family of plants is translated once; the constants are those of each."""
+    """A family of plants is compiled once; each member has its own constants."""
     one, other = pendulum(2.1), pendulum(2.2)
     assert one.body is not None
     assert other.body is not None
@@ -254,7 +256,7 @@ def test_bodies_that_differ_by_parameters_share_their_code() -> None:
 
 
 def test_the_same_states_with_derivatives_and_without() -> None:
-    """To the last digit, and without them nothing behind the states is written."""
+    """Identical to the last digit; without derivatives nothing behind the states is written."""
     body = pendulum().body
     x, rest = np.random.default_rng(0).standard_normal((30, 2)), np.zeros((30, 1))
     found = []

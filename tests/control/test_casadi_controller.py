@@ -1,4 +1,4 @@
-"""The program at every sample, and what a controller refuses; test_solvers.py compares them."""
+"""The program at every sample, and rejected arguments; test_solvers.py compares solutions."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def test_a_solver_says_what_happened(example_plant: Plant, example_bounds: Bound
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_solver_that_fails_proves_nothing(name: str) -> None:
-    """Nothing but the input is bounded, so every program has plans; each was called infeasible.
+    """Only the input is bounded, so every program is feasible, but solvers called each infeasible.
 
-    The rows lose their digits as the plant runs away: DAQP finds nothing, and qpOASES and IPOPT
-    say that there is nothing.
+    The rows lose their digits on an unstable plant: DAQP finds nothing, and qpOASES and IPOPT
+    report infeasibility.
     """
     A = [[2, 1, 0], [0, 2, 0.5], [0, 0, 0.8]]
     plant = Plant(control.ss(A, [[0], [0.1], [1]], np.eye(3), 0, True))
@@ -60,7 +60,7 @@ def test_a_solver_that_fails_proves_nothing(name: str) -> None:
 
 @pytest.mark.parametrize("block", range(3))
 def test_infeasible_is_said_where_linear_programming_finds_no_plan(block: int) -> None:
-    """Starts inside, at and outside of what a random plant can keep, each with another solver."""
+    """Starts inside, at and outside the feasible set of random plants, by several solvers."""
     said = set()
     for seed in range(15):
         rng = np.random.default_rng([17, block, seed])
@@ -94,7 +94,7 @@ def test_an_infeasible_start_names_the_bound_and_the_step(
 
 
 def test_the_loop_stays_feasible_from_every_feasible_start() -> None:
-    """Recursive feasibility: the property that the terminal set is for."""
+    """Recursive feasibility, the property that the terminal set guarantees."""
     seed = 11
     print("seed", seed)
     rng = np.random.default_rng(seed)
@@ -117,7 +117,7 @@ def test_the_loop_stays_feasible_from_every_feasible_start() -> None:
 
 
 def test_units_1e200_apart_do_not_decide_what_an_input_reaches() -> None:
-    """The same plant in other units; scipy's balancing cast its scales to integers and warned."""
+    """The same plant in other units; scipy's balancing casts its scales to integers and warns."""
     units = np.diag([1e-100, 1e100])
     for link, reached in ((0.4, True), (0.0, False)):
         A = np.array([[1.2, link], [2.6, 0.5]])

@@ -1,4 +1,4 @@
-"""Exact sensitivities against central differences, and what the closed loop does not depend on."""
+"""Exact sensitivities against central differences, and invariances of the closed loop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def moved(
 
 
 def with_bound(controller: Controller, row: int, step: float) -> Controller:
-    """One bound moved by a step, the cost weight of its excess kept."""
+    """One bound changed by a step, with the penalty of its excess unchanged."""
     rows = bound_rows(controller.bounds, controller.plant)
     names = ("x_min", "x_max", "u_min", "u_max")
     sides = {name: np.array(getattr(controller.bounds, name)) for name in names}
@@ -55,12 +55,12 @@ def with_bound(controller: Controller, row: int, step: float) -> Controller:
     changed = replace(controller, bounds=replace(controller.bounds, **sides))
     if controller.softening is None:
         return changed
-    # The penalty is a number of its own, not one of the directions.
+    # The penalty is a separate number, not one of the directions.
     return replace(changed, softening=controller.softening * controller.penalty / changed.penalty)
 
 
 def entries(controller: Controller) -> list[tuple[str, tuple[int, ...]]]:
-    """Every number that the closed loop can be differentiated with respect to."""
+    """Every number with respect to which the closed loop can be differentiated."""
     plant = controller.plant
     shapes = {
         "K": controller.K.shape,
@@ -92,7 +92,7 @@ def unit_directions(
 
 
 def problem(seed: int, softening: float | None) -> tuple[Controller, Scenario, Simulation]:
-    """A random loop with input bounds, and mostly state bounds and a terminal set, at work."""
+    """A random loop with input bounds, and mostly state bounds and a terminal set, some active."""
     n, m = 2 + seed % 3, 1 + seed % 3
     x_max = 1.5 if seed % 2 else np.inf
     for attempt in range(10):
@@ -131,13 +131,13 @@ def test_jacobian_of_the_example_equals_central_differences(
 
 
 def check_jacobian(controller: Controller, drive: Scenario, *without: str) -> None:
-    """Compare every derivative, without some parts, with differences of fourth order, to 1e-6."""
+    """Compare every derivative, except some parts, with fourth-order differences, to 1e-6."""
     wanted = [(part, index) for part, index in entries(controller) if part not in without]
     _, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
     for column, (part, index) in enumerate(wanted):
         errors = []
-        # The longer differences may reach across a change of the active set, the shorter ones have
-        # more rounding: one of them must agree.
+        # Longer differences may cross a change of the active set, shorter ones have more
+        # rounding: one of them must agree.
         for step in (1e-5, 1e-4, 1e-6, 1e-7):
             near, far = (
                 [moved(controller, drive, part, index, sign * s) for sign in (1, -1)]
@@ -182,7 +182,7 @@ def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
     step = 1e-7
     for column, (part, index) in enumerate(wanted):
         up, down = (
-            # The set is computed anew for the changed gain or bound.
+            # The set is recomputed for the changed gain or bound.
             simulate(
                 Controller.from_gain(
                     example_plant,
@@ -208,7 +208,7 @@ def _unit(part: str, index: tuple[int, ...]) -> np.ndarray:
 def test_weights_with_the_same_gain_give_the_same_trajectories(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    """The two Q of the reference that have the gain of Q = I, R = 1 to its printed digits."""
+    """The two Q of the reference that have the gain of Q = I, R = 1 to the printed digits."""
     drive = scenario(example_plant, [2, 3], 20)
     true = simulate(Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3), drive)
     for Q in ([[1.3, 0.06], [0.06, 0.712]], [[0.5, -0.1], [-0.1, 1.48]]):
@@ -229,7 +229,7 @@ def test_samples_at_a_change_of_the_active_set_are_counted(
 
 
 def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
-    """Against scipy's linear programming, which decides feasibility by another method."""
+    """Against scipy's linear programming, an independent test of feasibility."""
     seed = 4
     print("seed", seed)
     rng = np.random.default_rng(seed)
@@ -255,7 +255,7 @@ def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
 
 @pytest.mark.parametrize("cost_weight", [np.inf, 0.5])
 def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(cost_weight: float) -> None:
-    """Rows at their limits are given up at some samples and kept at the next."""
+    """Warm starts: rows at their limits are relaxed at some samples and kept at the next."""
     rng, begun, limited = np.random.default_rng(8), 0, 0
     for _ in range(40):
         rows, width = int(rng.integers(3, 16)), int(rng.integers(4, 9))

@@ -1,4 +1,4 @@
-"""Set points and costs of changes against do-mpc, where it is installed; it is no dependency."""
+"""Set points and costs of changes against do-mpc, if it is installed (not a dependency)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STEPS, HORIZON = 12, 8
 def closed_loop(
     plant: impc.Plant, cost: Any, last: Any, change: Array, limit: float, x0: Array
 ) -> Array:
-    """Inputs (STEPS, m) of do-mpc: stage cost, terminal cost and the cost of changes."""
+    """Inputs (STEPS, m) of do-mpc with stage cost, terminal cost and cost of changes."""
     model = do_mpc.model.Model("discrete")
     x = model.set_variable("_x", "x", shape=(plant.n, 1))
     u = model.set_variable("_u", "u", shape=(plant.m, 1))
@@ -65,7 +65,7 @@ def test_a_set_point(limit: float) -> None:
 
 @pytest.mark.parametrize("limit", [0.3, 50.0])
 def test_the_cost_of_changes(limit: float) -> None:
-    """The terminal weight of changes has that of the last command in it."""
+    """The terminal weight of changes includes the last command."""
     plant = random_plant(np.random.default_rng(3), 2, 1, 0.8)
     rates = impc.with_rates(plant)
     Q, r, v = np.diag([2.0, 1.0]), 0.1, 0.7

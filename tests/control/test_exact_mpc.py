@@ -1,4 +1,4 @@
-"""The reference of the hard plants, against other solvers, and what its proofs refuse."""
+"""The reference for the hard plants, against other solvers, and solutions that it rejects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support import random_plant, random_weights
 
 @pytest.mark.parametrize("seed", range(8))
 def test_any_guess_ends_at_the_answer_of_clarabel(seed: int) -> None:
-    """Starts inside and outside of what can be kept: there is an answer where HiGHS has a plan."""
+    """Starts inside and outside the feasible set: a solution exists where HiGHS finds a plan."""
     rng = np.random.default_rng([18, seed])
     n, m, N = 2 + seed % 3, 1 + seed % 2, 5
     plant = random_plant(rng, n, m, 1.2)
@@ -59,7 +59,7 @@ def test_what_is_no_answer_is_not_proved() -> None:
 
 
 def test_a_wrong_simulation_is_noticed() -> None:
-    """Ended at its first program, by an input that is 2e-7 of the bound off, or by a wrong word."""
+    """Stopped at its first program, an input off by 2e-7 of the bound, or a wrong status."""
     case = hard_case(10002)
     plant, bounds = case.controller.plant, case.controller.bounds
     run = simulate(case.controller, case.drive)

@@ -1,6 +1,7 @@
-"""Controllers at and beyond the edge of what they can keep: right, or a status that says no.
+"""Controllers at and beyond the limit of feasibility: correct, or a status of failure.
 
-The reference is `tests/exact_mpc.py`: the program in u from (Q, R, P), proved in a hundred digits.
+The reference is `tests
+exact_mpc.py`: the program in u from (Q, R, P), proved in 100 digits.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def runaway(pole: float, horizon: int) -> HardCase:
 
 @pytest.mark.parametrize(("pole", "horizon"), [(2, 20), (2, 30), (2, 60), (1.6, 40), (1.4, 40)])
 def test_a_plant_that_runs_away_is_right_or_refused(pole: float, horizon: int) -> None:
-    """The inputs were 5.9, 26.5, none, 5e6 and 1.00003 where the bound is 1."""
+    """Regression: the inputs were 5.9, 26.5, none, 5e6 and 1.00003 at a bound of 1."""
     case = runaway(pole, horizon)
     run = simulate(case.controller, case.drive)
     assert run.complete or run.status[run.reached] in (Status.DIVERGED, Status.UNSOLVED)
@@ -40,7 +41,7 @@ def test_a_plant_that_runs_away_is_right_or_refused(pole: float, horizon: int) -
 
 
 def test_soft_rows_on_a_plant_that_runs_away_are_refused_by_name() -> None:
-    """Nothing is applied that is not determined."""
+    """No undetermined input is applied."""
     case = runaway(2, 30)
     bounds = Bounds(case.controller.plant, u_min=-1, u_max=1, x_min=-1, x_max=1)
     controller = replace(case.controller, bounds=bounds, softening=50.0)
@@ -52,13 +53,13 @@ def test_soft_rows_on_a_plant_that_runs_away_are_refused_by_name() -> None:
 
 
 def test_random_plants_are_right_or_say_no() -> None:
-    """Sixty small ones of the same kind as the two thousand below."""
+    """Sixty small plants of the same kind as the two thousand below."""
     check(range(60), largest=16, samples=1)
 
 
 @pytest.mark.parametrize("seed", [10115, 10461, 10622, 10994])
 def test_seeds_that_were_wrong_once(seed: int) -> None:
-    """No reference; no terminal set; a search of 44 s; a state that rounding left outside."""
+    """Regressions: no reference, no terminal set, a search of 44 s, a state outside by rounding."""
     check(range(seed, seed + 1), largest=60, samples=2)
 
 
@@ -69,7 +70,7 @@ def test_two_thousand_random_plants_are_right_or_say_no(block: int) -> None:
 
 
 def check(seeds: range, largest: int, samples: int) -> None:
-    """No fault in any; what is not identified in double precision is a small part."""
+    """No plant may fail; only a small part may be undetermined in double precision."""
     wrong, unidentified = {}, 0
     for seed in seeds:
         case = hard_case(seed, largest)

@@ -28,14 +28,14 @@ from tests.support import extrapolated_slope, random_weights
 
 
 def columns(values: np.ndarray) -> np.ndarray:
-    """Derivatives (samples, n, p) as CasADi lays them out, (n samples, p)."""
+    """Derivatives (samples, n, p) in CasADi's layout, (n samples, p)."""
     return np.moveaxis(values, 1, 0).reshape(-1, values.shape[2])
 
 
 def scale_free(S: np.ndarray) -> np.ndarray:
-    """Directions of S (m, m, m * m), column after column, as the controller's scaled metric has it.
+    """Derivatives of the scaled metric by the entries of S, in column order (m, m, m * m).
 
-    Written out: the controller takes m S / tr S, and of S the symmetric part.
+    The controller takes m S / tr S, and of S the symmetric part.
     """
     m, found = len(S), []
     for column in range(m):
@@ -87,7 +87,7 @@ def test_jacobian_and_reverse_are_those_of_the_loop(block: int, softening: float
 
 
 def test_the_disturbance_moves_the_loop_as_differences_say() -> None:
-    """The compiled loop has no such derivative; 1 to 3 inputs at their bounds."""
+    """Against differences, as the compiled loop has no such derivative; 1 to 3 inputs at bounds."""
     for seed in (3, 4, 5):
         controller, drive, _ = problem(seed, None)
         loop = closed_loop_function(controller, drive.steps)
@@ -144,7 +144,7 @@ def test_weights_move_the_loop_as_differences_say() -> None:
 
 
 def test_a_given_disturbance_is_no_input() -> None:
-    """The same states and gradients as where it is one."""
+    """The same states and gradients as with the disturbance as an input."""
     controller, drive, _ = problem(5, None)
     open_one = closed_loop_function(controller, drive.steps)
     given = closed_loop_function(controller, disturbance=drive.disturbance)
@@ -157,7 +157,7 @@ def test_a_given_disturbance_is_no_input() -> None:
         slopes.append(ca.Function("slope", [K, S], parts)(controller.K, controller.S))
     for one, other in zip(*slopes, strict=True):
         np.testing.assert_array_equal(one.full(), other.full())
-    with pytest.raises(DataError, match=r"^steps: got None without a disturbance"):
+    with pytest.raises(DataError, match=r"^steps: is missing, without a disturbance"):
         closed_loop_function(controller)
 
 
@@ -177,22 +177,22 @@ def test_what_is_no_controller_is_nan(example_plant: Plant) -> None:
     assert np.isnan(weights(-np.eye(2), 1, [1, 3], still)[0].full()).all()
     slope = weights.jacobian()(-np.eye(2), 1, [1, 3], still, 0, 0)[0].full()
     assert np.isnan(slope.reshape(2, 6, 4)[:, 1:]).all()  # the first state is x0 all the same
-    with pytest.raises(InputError, match=r"^of: got 'price'; choose gain or weights$"):
+    with pytest.raises(InputError, match=r"^of: got 'price'; choose .gain. or .weights.$"):
         closed_loop_function(law, 5, of="price")
 
 
 def test_a_bilevel_program_of_ones_own_finds_the_weights(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The tutorial, whose answer is that of the dissertation's example: Q = I."""
-    runpy.run_path(str(ROOT / "docs/tutorials/tutorial_08_casadi.py"))
+    """The example of the dissertation, whose solution is Q = I."""
+    runpy.run_path(str(ROOT / "docs/examples/loop_in_casadi.py"))
     printed = capsys.readouterr().out
     assert "Q = [[1.0, 0.0], [0.0, 1.0]]\n" in printed
     assert "residual (3.10) below 1e-6: True" in printed
 
 
 def test_one_step_is_the_controllers_and_so_are_its_slopes(tmp_path: Path) -> None:
-    """From states of random loops, as it is made and as it is loaded from its file."""
+    """From states of random loops, for the new function and after saving and loading."""
     for seed in (1, 2, 6):
         controller, drive, run = problem(seed, None)
         step = mpc_function(controller)

@@ -1,4 +1,4 @@
-"""A solver by its name in the closed loop: the same inputs and derivatives, not a word of it."""
+"""Named solvers in the closed loop: the same inputs and derivatives, and no output."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ ROOT = Path(__file__).parents[2]
 
 
 def check_against_compiled(solver: str, seed: int, softening: float | None) -> None:
-    """Trajectory, every derivative, and what happened at each sample."""
+    """Compare trajectory, every derivative, and the status of each sample."""
     controller, drive, _ = problem(seed, softening)
     along = unit_directions(controller, entries(controller))
     ours, derivative = simulate_and_differentiate(controller, drive, along)
     run, found = simulate_and_differentiate(replace(controller, solver=solver), drive, along)
     np.testing.assert_array_equal(run.status, ours.status)
     assert run.weakly_active == ours.weakly_active
-    # Measured: 7e-12 of the states, 1e-13 of the derivatives; at a cost weight of 1e6, whose
+    # Measured: 7e-12 of the states, 1e-13 of the derivatives; with a penalty of 1e6, whose
     # multipliers have lost as many digits, 9e-9 and 3e-9.
     tolerance = 1e-7 if softening == 1e6 else 1e-10
     assert np.max(np.abs(run.x - ours.x)) <= tolerance * np.max(np.abs(ours.x))
@@ -53,7 +53,7 @@ def check_against_compiled(solver: str, seed: int, softening: float | None) -> N
         assert np.max(np.abs(one - other)) <= tolerance * np.max(np.abs(derivative.x))
 
 
-# Input bounds throughout, terminal sets, one to three inputs; odd seeds have state bounds too.
+# Input bounds always, terminal sets, one to three inputs; odd seeds have state bounds too.
 @pytest.mark.parametrize("softening", [None, 50.0, 1e6])
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
 def test_loops_are_those_of_the_compiled_method(solver: str, softening: float | None) -> None:
@@ -69,7 +69,7 @@ def test_loops_of_ipopt_are_those_of_the_compiled_method(softening: float | None
 
 @pytest.mark.parametrize("solver", ["daqp", pytest.param("qpoases", marks=pytest.mark.slow)])
 def test_fits_with_other_solvers_end_at_the_same_gain(solver: str) -> None:
-    """Exact recordings of two inputs at their bounds; W2 is compared in the benchmarks."""
+    """Noise-free recordings of two inputs at their bounds; W2 is compared in the benchmarks."""
     _, truth, posed = saturated_problem(np.random.default_rng(3), 2, 2)
     found = [inverse_mpc_reduced(replace(posed, solver=name)) for name in (COMPILED, solver)]
     for fit in found:
@@ -89,7 +89,7 @@ def test_what_no_input_keeps_is_proved(solver: str, example_plant: Plant) -> Non
 
 
 def test_tight_rows_that_depend_on_each_other_are_told_apart() -> None:
-    """One state that sums its inputs: what bounds the state at one stage bounds it at others."""
+    """One state that sums its inputs: its bound at one stage implies those at others."""
     plant = Plant(control.ss([[1.0]], [[1.0]], [[1.0]], 0, True))
     bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-1, x_max=1)
     controller = Controller(plant, Weights(0.1, 1e-3), bounds, 2, terminal_set=False)
@@ -105,7 +105,7 @@ def test_tight_rows_that_depend_on_each_other_are_told_apart() -> None:
 def test_a_wrong_answer_is_not_believed(
     example_plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A solver that ends too early: its multipliers and its input do not belong to each other."""
+    """A solver that stops too early: its multipliers and its input do not match."""
     bounds = Bounds(example_plant, u_min=-1, u_max=1)
     controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3, solver="daqp")
     rows = build_rows(controller)
@@ -142,7 +142,7 @@ def test_an_unknown_solver_is_one_line(name: str, example_plant: Plant) -> None:
 
 def test_a_solver_that_casadi_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ca, "has_conic", lambda name: name != "daqp")
-    with pytest.raises(InputError, match="'daqp' is not part of the CasADi that is installed"):
+    with pytest.raises(InputError, match="'daqp' is not part of the installed CasADi"):
         require_solver("daqp")
     assert require_solver("qpoases") == "qpoases"
     assert described(COMPILED) == "the package's own"
@@ -172,7 +172,7 @@ print("done")
 
 
 def test_solvers_are_silent() -> None:
-    """In a process of its own: what a library in C writes passes Python by."""
+    """In a separate process: C libraries write past Python's standard output."""
     done = subprocess.run(
         [sys.executable, "-c", _EVERY_SOLVER], cwd=ROOT, capture_output=True, text=True, check=True
     )

@@ -1,4 +1,4 @@
-"""The seated subject (W2 of experiments/benchmarks): every path agrees, and the whole fit."""
+"""The seated subject (W2 of experiments/benchmarks): all solvers agree, and the complete fit."""
 
 from __future__ import annotations
 

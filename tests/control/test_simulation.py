@@ -1,4 +1,4 @@
-"""What drives a simulation, what comes of it, and what is said where it did not end."""
+"""Scenarios, simulations and the reports of incomplete ones."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_simulation_ends_at_the_first_sample_without_an_input(example_plant: P
 
 @pytest.mark.parametrize("status", list(Status))
 def test_every_status_is_said_in_words(status: Status, example_plant: Plant) -> None:
-    """The statuses with an input are no failure; a failure's words are in the error."""
+    """Statuses with an input are not failures; a failure's description is in the error."""
     assert len(status.sentence) > 10
     controller = Controller(
         example_plant, Weights(np.eye(2), 1), Bounds(example_plant, u_max=1, u_min=-1), 3
@@ -72,10 +72,10 @@ def test_a_scenario_says_what_is_missing(example_plant: Plant) -> None:
 
 
 def test_a_start_beyond_feasibility_is_nan_and_no_recording() -> None:
-    """It was a frozen state with u = 0, from which weights were inferred without a word."""
+    """Regression: the state was frozen with u = 0, and weights were inferred without a warning."""
     plant = Plant(control.ss([[2.0]], [[1]], [[1]], 0, 1))
     law = Controller(plant, Weights(1, 1), Bounds(plant, u_min=-1, u_max=1), 3)
-    with pytest.warns(UserWarning, match="sample 0: .*; what follows is NaN"):
+    with pytest.warns(UserWarning, match="sample 0: .*; later samples are NaN"):
         run = law.simulate([2.0], steps=5)
     assert run.status[0] == Status.INFEASIBLE
     assert run.x[0] == 2.0

@@ -1,7 +1,7 @@
-"""One table: problems whose bounds are at work, by whoever solves the program at every sample.
+"""Problems with active bounds, solved at every sample by several solvers.
 
-The compiled loop against qpOASES, DAQP and IPOPT, which are given the formulation of the package,
-and against a dense program in u with (Q, R, P), condensed with the plant itself, by Clarabel.
+The compiled loop against qpOASES, DAQP and IPOPT in the package's formulation, and against Clarabel
+in a dense program in u with (Q, R, P), condensed with the plant itself.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LEFT_OUT = {("seat", "ipopt")}
 
 @dataclass(frozen=True)
 class Case:
-    """A loop with its weights and what the compiled code makes of it."""
+    """A loop with its weights and its compiled simulation."""
 
     controller: Controller
     weights: Weights
@@ -58,7 +58,7 @@ def case(name: str) -> Case:
 
 
 def soft() -> Case:
-    """State bounds that a disturbance breaks."""
+    """State bounds that a disturbance violates."""
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1, 1.1, d=1)
     weights = Weights(np.eye(3), 1)
@@ -79,7 +79,7 @@ def random_case(seed: int) -> Case:
     bounds = Bounds(plant, u_min=-0.5, u_max=0.5, x_min=-x_max, x_max=x_max)
     controller = Controller(plant, weights, bounds, 5)
     assert controller.terminal is not None
-    # As far out as the program is feasible, so that bounds are active.
+    # As far from the origin as is feasible, so that bounds are active.
     for size in 30.0 * 0.8 ** np.arange(30):
         drive = scenario(plant, size * np.ones(n) / np.sqrt(n), 12)
         fast = simulate(controller, drive)
@@ -111,7 +111,7 @@ def test_a_program_at_every_sample_is_the_compiled_kernel(name: str, solver: str
 
 @pytest.mark.parametrize("name", [name for name in PROBLEMS if name != "soft"])
 def test_inputs_are_those_of_an_independent_program(name: str) -> None:
-    """At every sample; of the seat's 3000 at each tenth that saturates, and at each hundredth."""
+    """At every sample; for the seat's 3000 at every tenth saturated one, and every hundredth."""
     one = case(name)
     plant, bounds, terminal = one.controller.plant, one.controller.bounds, one.controller.terminal
     samples = np.arange(len(one.fast.u))

@@ -1,4 +1,4 @@
-"""Targets, preview and lasting disturbances against programs and differences that share no code."""
+"""Targets, preview and lasting disturbances, against independent programs and differences."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STEPS = 25
 
 
 def a_loop(seed: int, *, ahead: int = 0, rate: float = 0.0) -> tuple[Any, ...]:
-    """A random plant with targets that change, its weights, and its controller with limits."""
+    """A random plant with changing targets, its weights, and its controller with limits."""
     rng = np.random.default_rng(seed)
     n, m = 2 + seed % 3, 1 + seed % 2
     plant = random_plant(rng, n, m, 1.05, d=1)
@@ -39,7 +39,7 @@ def a_loop(seed: int, *, ahead: int = 0, rate: float = 0.0) -> tuple[Any, ...]:
 
 
 def rest_of(plant: Plant, values: Array, push: float, limit: float) -> tuple[Array, Array]:
-    """The nearest rest to targets of the first states, by a general solver where bounds hold."""
+    """Steady state nearest to targets of the first states, by a general solver within bounds."""
     n, m, q = plant.n, plant.m, len(values)
     still, moved = np.hstack([plant.A - np.eye(n), plant.B]), -plant.E[:, 0] * push
     z = np.linalg.lstsq(np.vstack([still, np.eye(n + m)[:q]]), np.r_[moved, values])[0]
@@ -61,7 +61,7 @@ def rest_of(plant: Plant, values: Array, push: float, limit: float) -> tuple[Arr
 @pytest.mark.parametrize("rate", [0.0, 0.5, np.inf])
 @pytest.mark.parametrize("seed", range(6))
 def test_inputs_are_those_of_a_program_about_the_target(seed: int, ahead: int, rate: float) -> None:
-    """The target stays, or comes as it is known; a disturbance stays as it is believed to be."""
+    """The target stays or is known in advance; a disturbance stays at its estimate."""
     plant, (Q, R), known, weights, target, push = a_loop(seed, ahead=ahead, rate=rate)
     horizon, limit = 5, 0.6
     bounds = impc.Bounds(known, u_min=-limit, u_max=limit)
@@ -77,7 +77,7 @@ def test_inputs_are_those_of_a_program_about_the_target(seed: int, ahead: int, r
         ]
         believed += (1 - np.exp(-rate * plant.dt)) * (push[t] - believed) if rate else 0.0
         clipped = any(np.any(np.abs(u) > limit * (1 - 1e-6)) for _, u in rests)
-        if clipped and ahead:  # targets to come are planned for as if no bound met them
+        if clipped and ahead:  # Coming targets are planned for as if no bound were reached.
             continue
         X, U = (np.array(part) for part in zip(*rests, strict=True))
         drift = plant.E[:, 0] * expected if rate else np.zeros(plant.n)
@@ -95,9 +95,9 @@ def test_inputs_are_those_of_a_program_about_the_target(seed: int, ahead: int, r
 @pytest.mark.parametrize("named", [True, False])
 @pytest.mark.parametrize("seed", range(4))
 def test_slopes_of_targets_are_differences(seed: int, named: bool) -> None:
-    """Along plant, gain and observer's rate, with saturated samples; also where no signal is named.
+    """Along plant, gain and observer rate, with saturated samples; also without target signals.
 
-    Then the rest is the smallest, and what it may move along turns with the plant.
+    Then the steady state has minimum norm, and its null space depends on the plant.
     """
     plant, _, known, weights, target, push = a_loop(seed, rate=0.7)
     target = target if named else {}
@@ -138,7 +138,7 @@ def test_slopes_of_targets_are_differences(seed: int, named: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_slopes_where_every_target_is_beyond_reach(seed: int) -> None:
-    """Along the plant's B, at rests whose commands are all at their bounds."""
+    """Along the plant's B, at steady states with all commands at their bounds."""
     plant, _, _, weights, target, _ = a_loop(seed)
     bounds = impc.Bounds(plant, u_min=-1e-3, u_max=1e-3)
     law = impc.Controller(plant, weights, bounds, 4, terminal_set=False)
@@ -166,7 +166,7 @@ def test_preview_moves_before_the_target_does() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_preview_identifies_more_of_q(seed: int) -> None:
-    """Gains on increments to come, and the rank of all gains in Q: docs/theory.md, section 7."""
+    """Gains on coming changes, and the rank of all gains in Q: docs/why/theory.md, section 7."""
     rng = np.random.default_rng(seed)
     plant = random_plant(rng, 3, 1, 1.05)
     Q = random_weights(rng, 3)
@@ -209,9 +209,9 @@ def test_what_has_no_target_is_refused() -> None:
     law = impc.Controller(known, weights, impc.Bounds(known), 3, terminal_set=False)
     with pytest.raises(DataError, match="no signal 'elsewhere'"):
         law.simulate(np.zeros(plant.n), disturbance=push, target={"elsewhere": 1.0})
-    with pytest.raises(PlantError, match="has none of"):
+    with pytest.raises(PlantError, match="lacks"):
         law.simulate(np.zeros(plant.n), disturbance=push)
-    with pytest.raises(DataError, match="give a number or 26"):
+    with pytest.raises(DataError, match="give one number, or 26"):
         law.simulate(np.zeros(plant.n), disturbance=push, target={plant.states[0]: [1.0, 2.0]})
     ended = impc.Controller(
         plant, impc.Weights(np.eye(plant.n), 1), impc.Bounds(plant, u_min=-1, u_max=1), 3

@@ -1,4 +1,4 @@
-"""A terminal weight and a terminal set of the user's own, against a program written out in u."""
+"""User-supplied terminal weight and terminal set, against a program written out in u."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_inputs_are_those_of_the_program_written_out(
 
 
 def moved(law: impc.Controller, name: str, change: np.ndarray) -> impc.Controller:
-    """The controller made anew with one weight changed."""
+    """The controller made again with one weight changed."""
     stages = law.stages
     assert stages is not None
     given = {"Q": stages.weights.Q, "R": stages.weights.R, "P": stages.P[-1]}
@@ -116,7 +116,7 @@ def test_casadi_and_named_solvers_agree(softening: float | None) -> None:
 
 
 def test_the_riccati_weight_given_is_the_default() -> None:
-    """And the Riccati gain's invariant set as a set of one's own is the maximal invariant set."""
+    """The Riccati gain's invariant set, supplied by the user, is the maximal invariant set."""
     law, drive, _, parts = own_loop(0, "set", None)
     weights = impc.Weights(parts["Q"], parts["R"])
     solution = impc.solve_lqr(law.plant, weights)
@@ -154,7 +154,7 @@ def test_gaps_offsets_and_commands_of_a_finite_horizon() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_weights_behind_a_finite_horizon(seed: int, tmp_path: Path) -> None:
-    """Of exact recordings; the rank is that of central differences."""
+    """From noise-free recordings; the rank is that of central differences."""
     rng = np.random.default_rng(seed)
     plant, P = random_plant(rng, 2, 1, 1.05, d=1), 3 * random_weights(rng, 2) * (seed % 2)
     structure = impc.Structure(plant, "diagonal") if seed > 1 else None
@@ -179,7 +179,7 @@ def test_weights_behind_a_finite_horizon(seed: int, tmp_path: Path) -> None:
     assert found.fit.rank == np.count_nonzero(values > 1e-5 * values[0])
     if seed != 1:  # there one direction stays unidentified
         assert impc.weight_error(found.stage_weights, truth) < 1e-6
-    assert "terminal weight of your own" in found.summary()
+    assert "terminal weight is fixed" in found.summary()
     again: Any = impc.load(found.save(tmp_path / "found.json"))
     assert np.array_equal(again.controller().gains, found.controller().gains)
     for refused in (
@@ -189,11 +189,11 @@ def test_weights_behind_a_finite_horizon(seed: int, tmp_path: Path) -> None:
         lambda: impc.fit(problem, "inverse_lqr_lmi"),
         lambda: impc.fit_output_feedback(found, impc.Observer(plant, motor=0.1, sensory=0.1)),
     ):
-        with pytest.raises(impc.InputError, match="terminal_weight: of your own gives each stage"):
+        with pytest.raises(impc.InputError, match="terminal_weight: gives every stage its own"):
             refused()
-    with pytest.raises(impc.InputError, match="start: has no use beside a terminal_weight"):
+    with pytest.raises(impc.InputError, match="start: cannot be combined with terminal_weight"):
         impc.fit(problem, start=found)
-    with pytest.raises(impc.InputError, match="neither with terminal_set=True nor with a family"):
+    with pytest.raises(impc.InputError, match="cannot be combined with terminal_set"):
         impc.Problem(plant, bounds, 4, trials, terminal_set=True, **given)
 
 
@@ -210,7 +210,7 @@ def test_what_cannot_be_is_refused_in_one_line() -> None:
         (lambda: make(terminal_set=(np.eye(3), np.ones(3))), r"terminal_set: H: expected shape"),
         (lambda: make(terminal_set=(np.eye(2), np.zeros(2))), "give H x <= h with h > 0"),
         (lambda: impc.directions(law, 1, K=np.ones(2)), "K: is no part of a direction"),
-        (lambda: impc.replace(law, horizon=5), "its stage gains are of another plant"),
+        (lambda: impc.replace(law, horizon=5), "its stage gains belong to another plant"),
         (lambda: impc.closed_loop_function(law, 3), "has a terminal weight of its own"),
     ):
         with pytest.raises(impc.ImpcError, match=message):

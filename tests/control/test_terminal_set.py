@@ -40,7 +40,7 @@ def regulator(plant: Plant) -> Array:
 
 
 def example() -> Case:
-    """Primary example: input bound only."""
+    """Primary example with an input bound only."""
     plant = sampled([[2, -1], [1, 0.2]], [[1], [0]])
     return plant, regulator(plant), Bounds(plant, u_min=-1, u_max=1)
 
@@ -76,7 +76,7 @@ def seat() -> Case:
 
 
 def plain_support(direction: Array, H: Array, h: Array) -> float:
-    """The same question by the primal program, unscaled, one at a time; at most 1e3.
+    """Support by the primal program, unscaled, one at a time; at most 1e3.
 
     The cap keeps the program bounded: HiGHS may call an unbounded one infeasible.
     """
@@ -123,7 +123,7 @@ def test_scalar_set_with_one_bound_is_an_interval() -> None:
 
 
 def test_a_set_of_fewer_rows_than_states_has_supports_and_no_corner() -> None:
-    """Six states and four rows: the hints had the wrong size, and the terminal set ended in it."""
+    """Regression: with six states and four rows the warm start had the wrong size."""
     Z = np.eye(4, 6)
     targets = np.array([[0.5, -0.25, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 0.1]])
     mirrored = np.concatenate([Z, -Z])
@@ -402,7 +402,7 @@ def test_errors_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
         maximal_invariant_set(plant, K, bounds, tolerance=-1.0)
     with pytest.raises(InputError, match="max_steps"):
         maximal_invariant_set(plant, K, bounds, max_steps=0)
-    with pytest.raises(InputError, match="has 10 states, what stands before it 2"):
+    with pytest.raises(InputError, match="has 10 states, but an earlier argument has 2"):
         maximal_invariant_set(plant, K, slow_rotations()[2])
     with pytest.raises(SolverError, match="max_steps = 3"):
         maximal_invariant_set(*cannon(), max_steps=3)
@@ -417,5 +417,5 @@ def test_errors_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
         return linprog(*arguments, **{**options, "options": {"maxiter": 0, "presolve": False}})
 
     monkeypatch.setattr("impc.control.halfspaces.linprog", fail)
-    with pytest.raises(SolverError, match="HiGHS ended"):
+    with pytest.raises(SolverError, match="HiGHS failed"):
         maximal_invariant_set(plant, K, bounds)

@@ -1,6 +1,6 @@
-"""Damaged recordings, what they say they are not, and settings that cannot be right.
+"""Damaged recordings and invalid settings, with the error that each must give.
 
-`DAMAGED[name]` has a phrase of the one line in which it must end, and a function of a folder that
+`DAMAGED[name]` has a phrase of the expected one-line message, and a function of a folder that
 writes the file and returns its path and the text of a configuration for `PLANT`.
 """
 
@@ -22,11 +22,11 @@ from tests.files.samples import csv_text, hdf5_mat, opaque_variable, pushed_seat
 
 __all__ = ["DAMAGED", "PLANT", "written", "written_by_impc"]
 
-#: The plant that the configurations are for, as the command line takes it.
+#: Plant of the configurations, as given on the command line.
 PLANT = "plants:seated_balance_plant"
 Make = Callable[[Path], tuple[Path, str]]
 Change = tuple[str, str]
-#: TDMS and C3D say their rate: the clock is taken out of the configuration.
+#: TDMS and C3D state their rate: the configuration has no clock.
 OWN_RATE = ('time = "time"', "")
 SEAT = pushed_seat()
 TEXT = csv_text(SEAT)
@@ -49,7 +49,7 @@ def written_by_impc(folder: Path, name: str) -> Path:
 
 
 def made(fill: Callable[[Path], object], name: str = "trial.csv", *changes: Change) -> Make:
-    """What `fill` writes to a path, and settings with these changes."""
+    """File that `fill` writes, and settings with these changes."""
 
     def make(folder: Path) -> tuple[Path, str]:
         fill(folder / name)
@@ -63,24 +63,24 @@ def text(content: bytes | str, name: str = "trial.csv", *changes: Change) -> Mak
 
 
 def lines(changed: dict[int, str]) -> Make:
-    """The sound text with some of its lines exchanged."""
+    """The valid text with some lines replaced."""
     return text("\n".join((dict(enumerate(LINES)) | changed).values()))
 
 
 def seat(*changes: Change, **columns: Any) -> Make:
-    """The sound text with other columns and settings."""
+    """The valid text with other columns and settings."""
     return text(csv_text({**SEAT, **columns}), "trial.csv", *changes)
 
 
 def changed(name: str, where: slice | int, value: Any) -> Any:
-    """A column with other samples."""
+    """A column with some samples replaced."""
     column = SEAT[name].copy()
     column[where] = value
     return column
 
 
 def cut(make: Make) -> Make:
-    """Six tenths of a file."""
+    """The first 60 % of a file."""
     return broken(make, lambda content: content[: int(0.6 * len(content))])
 
 
@@ -99,12 +99,12 @@ def mat(values: dict[str, Any], name: str = "trial.mat", **options: Any) -> Make
 
 
 def mat73(values: dict[str, Any], classes: dict[str, str] | None = None) -> Make:
-    """One of version 7.3 by h5py."""
+    """A .mat file of version 7.3 by h5py."""
     return made(lambda path: hdf5_mat(path, values, classes), "trial.mat")
 
 
 def linked(add: Callable[[Path, Any], object]) -> Make:
-    """One of version 7.3 whose seat lies in another file."""
+    """A .mat file of version 7.3 whose seat is a link to another file."""
 
     def fill(path: Path) -> None:
         hdf5_mat(path.with_name("other.mat"), SEAT)
@@ -189,10 +189,10 @@ DAMAGED: dict[str, tuple[str, Make]] = {
     "header alone": ("no rows of numbers", text("time,seat,trunk,push\n")),
     "zero bytes": ("a zero byte in line 4", lines({3: "\0" * 20})),
     "truncated csv": ("ends in the middle of a row", text(TEXT[: TEXT.rindex(",") - 3])),
-    "wrong delimiter": ("is divided by bars", text(csv_text(SEAT, "|"))),
-    "tsv with commas": ("is divided by commas", text(TEXT, "trial.tsv")),
+    "wrong delimiter": ("is separated by bars", text(csv_text(SEAT, "|"))),
+    "tsv with commas": ("is separated by commas", text(TEXT, "trial.tsv")),
     "decimal commas between commas": (
-        "names 4 columns, and the rows below have 8 values", text(csv_text(SHIFTED, ",", ","))
+        "names 4 columns, but the rows below have 8 values", text(csv_text(SHIFTED, ",", ","))
     ),
     "words in a column": (
         "column 'seat' has text in 2 of 600 rows, the first 'overload' in line 12", lines(OVERLOAD)
@@ -216,11 +216,11 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         broken(mat(SEAT, do_compression=True), lambda c: c[:2000] + bytes(100) + c[2100:]),
     ),
     "7.3 called 5": (
-        "says that it is version 5 and holds version 7.3",
+        "states version 5, but contains version 7.3",
         broken(mat73(SEAT), lambda content: HEAD_5 + content[128:]),
     ),
     "5 called 7.3": (
-        "says that it is version 7.3 and holds version 5",
+        "states version 7.3, but contains version 5",
         broken(mat(SEAT), lambda content: HEAD_73 + content[128:]),
     ),
     "table object": (
@@ -230,11 +230,11 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         "T is a MATLAB table", mat73({"T": np.arange(6, dtype=np.uint32)}, {"T": "table"})
     ),
     "cell array": ("is a cell array", mat({"data": CELLS})),
-    "text and one number": ("holds no column of numbers", mat({"subject": "S01", "fs": 100.0})),
+    "text and one number": ("has no column of numbers", mat({"subject": "S01", "fs": 100.0})),
     "complex signal": ("is complex", mat({"seat": np.exp(1j * np.arange(600))})),
     "three dimensions": ("has 3 dimensions", mat({"data": np.zeros((5, 6, 7))})),
     "link to another file": (
-        "seat points elsewhere",
+        "seat is a link",
         linked(lambda _, file: file.update(seat=h5py.ExternalLink("other.mat", "seat"))),
     ),
     "data in another file": ("seat lies in another file", linked(outside)),
@@ -244,9 +244,9 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         "has channels of 100 and 200 samples per second",
         tdms(*((name, SEAT[name], {"wf_increment": 1 / rate}) for name, rate in RATES)),
     ),
-    "tdms of text": ("holds no column of numbers", tdms(("notes", ["a", "b"]))),
+    "tdms of text": ("has no column of numbers", tdms(("notes", ["a", "b"]))),
     "rate that contradicts the file": (
-        "says 100 samples per second and recording.rate 500",
+        "states 100 samples per second, but recording.rate is 500",
         own("trial.tdms", (OWN_RATE[0], "rate = 500.0")),
     ),
     "truncated c3d": ("of 600 frames", cut(own("trial.c3d"))),
@@ -271,19 +271,19 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         "has 1 gaps, the first at 2 s, the longest of 0.51 s",
         seat(time=changed("time", slice(201, 600), SEAT["time"][201:] + 0.5)),
     ),
-    "uneven clock": ("is uneven", seat(time=UNEVEN)),
+    "uneven clock": ("is not uniform", seat(time=UNEVEN)),
     "absent clock": ("column 'clock': is not in the file", seat(('"time"', '"clock"'))),
-    "unknown rate": ("gives no clock and no rate", seat(OWN_RATE)),
-    "clock in degrees": ("is no time", seat(('"time"', '"time"\ntime_unit = "deg"'))),
+    "unknown rate": ("has neither a time column nor a sampling rate", seat(OWN_RATE)),
+    "clock in degrees": ("is not a unit of time", seat(('"time"', '"time"\ntime_unit = "deg"'))),
     "cut behind the end": (
-        "does not reach recording.stop = 60 s", seat(('"time"', '"time"\nstop = 60.0'))
+        "recording.stop = 60 s lies outside the recording", seat(('"time"', '"time"\nstop = 60.0'))
     ),
     # Channels
     "absent column": (
         "column 'seat angle': is not in the file", seat(('"seat"', '"seat angle"'))
     ),
     "unit against the file": (
-        "is in 'rad' by the configuration and in 'deg' by the file",
+        "has the unit 'rad' in the configuration and 'deg' in the file",
         text(
             TEXT.replace("seat", "seat (deg)", 1),
             "trial.csv",
@@ -291,9 +291,9 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         ),
     ),
     "degrees called radians": (
-        "degrees taken for radians", seat(('unit = "deg"\nlimit = 12.0', 'unit = "rad"'))
+        "may hold degrees instead of radians", seat(('unit = "deg"\nlimit = 12.0', 'unit = "rad"'))
     ),
-    "radians called degrees": ("radians taken for degrees", seat(seat=np.deg2rad(SEAT["seat"]))),
+    "radians called degrees": ("if the column holds radians", seat(seat=np.deg2rad(SEAT["seat"]))),
     "missing samples": (
         "10 of 600 samples are missing or not finite, the first sample 51",
         seat(seat=changed("seat", slice(50, 60), np.nan)),
@@ -311,7 +311,7 @@ DAMAGED: dict[str, tuple[str, Make]] = {
     "constant channel": ("is constant at 0 deg in all 600 samples", seat(seat=np.zeros(600))),
     "push that never acts": ("is constant at 0 Nm", seat(push=np.zeros(600))),
     "angle beyond the stop": (
-        "is beyond its stop of 12 deg", seat(seat=changed("seat", 70, 13.0))
+        "exceeds its mechanical stop of 12 deg", seat(seat=changed("seat", 70, 13.0))
     ),
     "clipped channel": ("is clipped at 2 deg", seat(seat=np.clip(SEAT["seat"], -2.0, 2.0))),
     "too few samples": (
@@ -339,6 +339,6 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         "does not match recording.pattern", seat(('subject = "S01"', PATTERN))
     ),
     "no regular expression": (
-        "is no regular expression", seat(('subject = "S01"', "pattern = '(?P<subject>'"))
+        "is not a regular expression", seat(('subject = "S01"', "pattern = '(?P<subject>'"))
     ),
 }  # fmt: skip

@@ -1,6 +1,6 @@
-"""Small files that take gigabytes, hours or the process of whoever believes what they say.
+"""Small files that need gigabytes, hours or a crash if their headers are trusted.
 
-`HOSTILE[name]` has what must be said of it, and a function of a folder that writes it.
+`HOSTILE[name]` has a phrase of the expected message, and a function of a folder that writes it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Make = Callable[[Path], Path]
 
 
 def hdf5(fill: Callable[[Any], object]) -> Make:
-    """A .mat file of version 7.3 whose content `fill` writes."""
+    """A .mat file of version 7.3 with content written by `fill`."""
 
     def make(folder: Path) -> Path:
         path = folder / "trial.mat"
@@ -40,7 +40,7 @@ def hdf5(fill: Callable[[Any], object]) -> Make:
 
 
 def dataset(*given: Any, begin: float | None = None, **more: Any) -> Make:
-    """One of its datasets, x, whose first ten values are perhaps written."""
+    """Add a dataset x, whose first ten values may be written."""
 
     def fill(file: Any) -> None:
         made = file.create_dataset("x", *given, **more)
@@ -61,7 +61,7 @@ def chunk(packed: bytes, size: int) -> Make:
 
 
 def zeros(count: int) -> bytes:
-    """So many times ten million zero bytes, packed."""
+    """Compressed zeros, `times` ten million bytes."""
     packer = zlib.compressobj(1)
     return b"".join(packer.compress(bytes(10_000_000)) for _ in range(count)) + packer.flush()
 
@@ -131,7 +131,7 @@ def cells_within_cells() -> bytes:
 
 
 def with_bytes(name: str, old: bytes, new: bytes, times: int = 1) -> Make:
-    """A file of impc with some bytes exchanged, which are there so often at least."""
+    """A file of impc with some bytes replaced, which must occur at least so often."""
 
     def make(folder: Path) -> Path:
         path = written_by_impc(folder, name)
@@ -151,7 +151,7 @@ def last_frame(folder: Path) -> Path:
 
 
 def repacked(path: Path, **exchanged: Callable[[bytes], bytes]) -> Path:
-    """A zip archive with the files whose names end so exchanged."""
+    """A zip archive in which files with these endings are replaced."""
     with zipfile.ZipFile(path) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -214,7 +214,7 @@ def cells_repeated(folder: Path) -> Path:
 
 
 def later(make: Callable[[], Make]) -> Make:
-    """Packing takes seconds: not before it is asked for."""
+    """Create the file on demand: compression takes seconds."""
 
     def run(folder: Path) -> Path:
         return make()(folder)
@@ -233,7 +233,7 @@ HOSTILE: dict[str, tuple[str, Make]] = {
     # HDF5. One value of 1.6 GB: its type is an array.
     "array type": ("is not numeric", dataset((4,), np.dtype(("<f8", (200_000_000,))))),
     "fill values": (
-        "has no values, only one to fill it with",
+        "has no stored values, only a fill value",
         dataset((100_000_000,), "f8", chunks=(1000,), fillvalue=1.5),
     ),
     "fill values around one chunk": (
@@ -253,8 +253,8 @@ HOSTILE: dict[str, tuple[str, Make]] = {
     "long strings": ("is not numeric", dataset((4,), "S1000000000")),
     "variable lengths": ("is not numeric", hdf5(variable_lengths)),
     "attribute of gigabytes": ("the attribute MATLAB_class is too long", hdf5(long_attribute)),
-    "cycle of links": ("is another name of what stands before it", hdf5(cycle)),
-    "hard links at every level": ("is another name of what stands before it", hdf5(hard_links)),
+    "cycle of links": ("is a link to an earlier variable", hdf5(cycle)),
+    "hard links at every level": ("is a link to an earlier variable", hdf5(hard_links)),
     "one dataset by many names": ("holds more than 10000 names", hdf5(many_names)),
     "groups within groups": (
         "is nested too deep", hdf5(lambda file: file.create_group("/".join("g" * 500)))
@@ -289,14 +289,14 @@ HOSTILE: dict[str, tuple[str, Make]] = {
         "x is a cell array",
         mat5(mat5_array(1, (300_000, 1), "x", mat5_element(14, b"") * 300_000)),
     ),
-    "cells within cells": ("holds no column of numbers", mat5(cells_within_cells())),
+    "cells within cells": ("has no column of numbers", mat5(cells_within_cells())),
     # TDMS and C3D
     "tdms of 1e12 values": (
         "is damaged and cannot be read",
         with_bytes("trial.tdms", struct.pack("<Q", 600), struct.pack("<Q", 10**12), 3),
     ),
     "tdms of an infinite rate": (
-        "says inf samples per second",
+        "states a rate of inf samples per second",
         with_bytes("trial.tdms", struct.pack("<d", 0.01), struct.pack("<d", 5e-324)),
     ),
     "c3d of an infinite rate": (
@@ -319,7 +319,7 @@ HOSTILE: dict[str, tuple[str, Make]] = {
     # Text
     "columns without end": ("line 1 has 399999 characters", text(f"{MANY}\n{MANY}\n")),
     "headings without end": (
-        "holds no column of numbers (a0 has 1 values)",
+        "has no column of numbers (a0 has 1 values)",
         text(MANY_HEADS + "\n" + ",".join(["1"] * 9_000) + "\n"),
     ),
     "digits without end": ("no rows of numbers", text("x\n" + "1" * 49_000 + "x\n")),

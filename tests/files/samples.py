@@ -1,4 +1,4 @@
-"""A recording to begin with: a seat that is pushed, and files of it by other means than impc's."""
+"""Sample recording of a pushed seat, and files of it written by other means than impc."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ unit = "Nm"
 
 
 def settings(*changes: tuple[str, str]) -> str:
-    """`CONFIGURATION` with pieces replaced; each must be there."""
+    """`CONFIGURATION` with pieces replaced; each must occur."""
     text = CONFIGURATION
     for old, new in changes:
         assert old in text
@@ -62,7 +62,7 @@ def settings(*changes: tuple[str, str]) -> str:
 
 
 def pushed_seat(samples: int = 600, rate: float = 100.0, seed: int = 1) -> dict[str, Array]:
-    """Clock in s, two angles in deg that follow a push of two levels in Nm; one random seed."""
+    """Clock in s, and two angles in deg that follow a two-level push in Nm; fixed random seed."""
     rng = np.random.default_rng(seed)
     hold = max(1, round(0.2 * rate))
     push = np.repeat(rng.choice([-10.0, 10.0], samples // hold + 1), hold)[:samples]
@@ -107,7 +107,7 @@ def hdf5_mat(
 
 
 def opaque_variable(name: bytes, kind: bytes) -> bytes:
-    """A variable of a v5 file that is an object of a class of MATLAB's, such as table.
+    """A variable of a v5 file that is an object of a MATLAB class, such as table.
 
     Class 17 (opaque), then name, kind of object, class, and a reference.
     """
@@ -123,20 +123,20 @@ def mat5_file(*elements: bytes) -> bytes:
 
 
 def mat5_array(kind: int, sizes: tuple[int, ...], name: str, content: bytes) -> bytes:
-    """The element of an array of a class, such as 6 (double), before whose `content` all stands."""
+    """Element of an array of a class such as 6 (double), with its dimensions and name."""
     flags = mat5_element(6, struct.pack("<II", kind, 0))
     shape = mat5_element(5, struct.pack(f"<{len(sizes)}i", *sizes))
     return mat5_element(14, flags + shape + mat5_element(1, name.encode()) + content)
 
 
 def mat5_element(kind: int, content: bytes, padded: bool = True) -> bytes:
-    """One element of a v5 file: its type, its length, its bytes, filled up to eight."""
+    """An element of a v5 file: type, length and bytes, padded to eight."""
     end = bytes(-len(content) % 8) if padded else b""
     return struct.pack("<II", kind, len(content)) + content + end
 
 
 def ods_file(path: Path, sheets: Mapping[str, Iterable[Sequence[float | str]]]) -> None:
-    """A workbook of OpenDocument 1.3, as LibreOffice packs it: the type first, unpacked."""
+    """An OpenDocument 1.3 workbook as LibreOffice packs it: mimetype first, uncompressed."""
     kind = "application/vnd.oasis.opendocument.spreadsheet"
     names = " ".join(
         f'xmlns:{short}="urn:oasis:names:tc:opendocument:xmlns:{short}:1.0"'

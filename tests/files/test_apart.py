@@ -1,4 +1,4 @@
-"""The process that reads: limits, its end, and what the one that asks gets to know of it."""
+"""The reader process: limits, failures, and what its parent reports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from impc.files.table import Table
 from tests.files.samples import hdf5_mat, pushed_seat
 
 SEAT = pushed_seat(60)
-# Nothing but the reading of a line, and then an end of some kind.
+# One line is read, and then the process ends in some way.
 BEGIN = "import os, signal, sys, time; sys.stdin.buffer.readline(); "
 
 
@@ -36,7 +36,7 @@ def sound(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def fresh() -> Iterator[None]:
-    """No process at the beginning, and none of the test's at the end."""
+    """No reader process before the test, and none of the test's after it."""
     apart._ended()
     yield
     apart._ended()
@@ -79,7 +79,7 @@ def test_a_name_in_a_reason_is_of_one_line(tmp_path: Path) -> None:
     hdf5_mat(tmp_path / "t.mat", SEAT)
     with h5py.File(tmp_path / "t.mat", "r+") as file:
         file["a\n\x1b[2J"] = h5py.SoftLink("seat")
-    assert refusal(tmp_path / "t.mat") == r"a\n\x1b[2J points elsewhere"
+    assert refusal(tmp_path / "t.mat") == r"a\n\x1b[2J is a link"
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_too_much_memory(
 def test_a_reader_that_is_watched(
     sound: Path, fresh: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Where the system bounds no address space.
+    # As on systems that cannot limit the address space.
     monkeypatch.setattr(apart, "_BOUNDED", False)
     require_sound(read_table(sound))
     apart._ended()
@@ -229,7 +229,7 @@ def test_an_interrupt_leaves_no_reader_behind(sound: Path) -> None:
     text = (
         "import os, signal, sys, threading\nfrom pathlib import Path\n"
         "from impc.files import apart\nfrom impc.files.formats import read_table\n"
-        # Whatever starts in the background of a shell ignores interrupts.
+        # Background processes of a shell ignore interrupts.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"read_table(Path({sound.name!r}))\n"
         "pid = apart._children[os.getpid()].pid\n"
@@ -259,7 +259,7 @@ def test_a_reader_ends_with_whoever_started_it(sound: Path) -> None:
     done = in_a_script(sound.parent, text)
     assert done.returncode == -signal.SIGKILL
     pid = int(done.stdout)
-    # communicate() above ended because nobody holds the pipes: the reader is gone, or about to be.
+    # communicate() above returned because no process holds the pipes: the reader has ended or will.
     for _ in range(1000):
         try:
             os.kill(pid, 0)

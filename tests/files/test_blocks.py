@@ -45,7 +45,7 @@ TRC = [
     "50.00\t50.00\t40\tmm", "time\ttilt\ttap", "\t\t\t", "",
 ]  # fmt: skip
 OTHER = [f"{k / 1000},{k}" for k in range(300)]
-# Ending, lines: each is read as the columns time, tilt and tap.
+# Ending and lines: each file is read as the columns time, tilt and tap.
 EVENTS = rows(end=",")
 SHAPES: dict[str, tuple[str, list[str]]] = {
     "settings of LabVIEW": (".lvm", [*LVM, "time\ttilt\ttap\tComment", *rows("\t")]),
@@ -106,7 +106,9 @@ def test_what_is_not_read_is_named(tmp_path: Path) -> None:
     path.write_text("\n".join([*EXCEL, *lines]) + "\n")
     table = read_table(path)
     assert table.skipped == {"Event": "is text, such as 'fell' in line 46"}
-    assert table.notes == ("line 47 and those below are not read: they begin with 'Mean,0.1,0.2,'",)
+    assert table.notes == (
+        "line 47 and the lines below are not read; they begin with 'Mean,0.1,0.2,'",
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,8 +121,8 @@ def test_what_is_not_read_is_named(tmp_path: Path) -> None:
         ({1: "0.0,ERR,0"}, "has text in 1 of 40 rows, the first 'ERR' in line 2"),
         ({40: "0.78,0."}, "line 41 has 2 values where the first row has 3: the file ends"),
         ({40: "0.78,0.1,-"}, "has text in 1 of 40 rows, the first '-' in line 41"),
-        ({0: "time,tilt"}, "the header names 2 columns, and the rows below have 3 values"),
-        ({0: "time,tilt,tap,lean"}, "the header names 4 columns, and the rows below have 3"),
+        ({0: "time,tilt"}, "the header names 2 columns, but the rows below have 3 values"),
+        ({0: "time,tilt,tap,lean"}, "the header names 4 columns, but the rows below have 3"),
     ],
 )
 def test_a_damaged_row_is_no_end(tmp_path: Path, changed: dict[int, str], says: str) -> None:
@@ -205,8 +207,8 @@ def test_a_sheet_may_be_asked_for(tmp_path: Path) -> None:
     second: list[Sequence[object]] = [["t", "x"], *([k, 2 * k] for k in range(9))]
     path = book(tmp_path / "a.xlsx", one=DATA, two=second)
     assert list(read_table(path, sheet="two").columns) == ["t", "x"]
-    assert read_table(path).notes == ("sheet 'one' is read, and others have rows of numbers too",)
-    with pytest.raises(DataError, match=r"has no sheet 'three'; recording.sheet may be one, two"):
+    assert read_table(path).notes == ("sheet 'one' is read; other sheets have rows of numbers too",)
+    with pytest.raises(DataError, match=r"has no sheet 'three'; set recording.sheet to one, two"):
         read_table(path, sheet="three")
     (tmp_path / "a.csv").write_text("t\n1\n2\n")
     with pytest.raises(DataError, match="has no sheets"):
@@ -217,12 +219,12 @@ def test_settings_and_statistics_in_a_sheet(tmp_path: Path) -> None:
     cells = [*INFO, [], *DATA, [], ["Mean", 0.1, 0.2], ["SD", 0.3, 0.4]]
     table = read_table(book(tmp_path / "a.xlsx", Sheet=cells))
     np.testing.assert_array_equal(table.columns["time"], TIME)
-    assert table.notes == ("row A48 and those below are not read: they begin with 'Mean'",)
+    assert table.notes == ("row A48 and the rows below are not read; they begin with 'Mean'",)
 
 
 @pytest.mark.parametrize("line", [b"1\n", b"1,2\n", b"1;2;3;4\n"])
 def test_short_lines_take_little_memory(tmp_path: Path, line: bytes) -> None:
-    """It was 60 to 90 bytes for each byte of the file, in the process of the command."""
+    """Regression: the command's process needed 60 to 90 bytes per byte of the file."""
     path, size = tmp_path / "a.csv", 4_000_000
     path.write_bytes(line * (size // len(line)))
     code = (

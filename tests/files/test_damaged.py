@@ -1,4 +1,4 @@
-"""Damaged recordings end in one line and exit status 2, and nothing is returned or written."""
+"""Damaged recordings give one line and exit status 2; nothing is returned or written."""
 
 from __future__ import annotations
 

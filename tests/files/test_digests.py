@@ -1,4 +1,4 @@
-"""A digest differs whenever anything differs that a result depends on."""
+"""A digest changes whenever any input of a result changes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_values_that_differ_in_anything_differ() -> None:
 
 
 def test_a_file_is_read_from_end_to_end(tmp_path: Path) -> None:
-    """A recording of 300 kB, one byte changed in its middle, its size and time stamps as before."""
+    """One byte changed in the middle of 300 kB, with the same size and time stamps."""
     path = tmp_path / "a.csv"
     path.write_bytes(bytes(300_000))
     before, stamp = content_digest(path), path.stat()
@@ -69,7 +69,7 @@ def test_a_file_is_read_from_end_to_end(tmp_path: Path) -> None:
 def test_code_of_a_plant_and_of_what_it_imports(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """1.0 to 1.6 in the module itself, in those it imports, and in one that cannot be read."""
+    """1.0 to 1.6 in the module, in modules that it imports, and in one that cannot be parsed."""
     texts = {
         "plant": "LENGTH = 1.0\nfrom body import MASS\ndef make():\n    from deep.inner import G\n",
         "body": "MASS = 1.0\n",

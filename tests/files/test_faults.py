@@ -1,7 +1,7 @@
-"""Faults injected into everything that writes: no space at each write, a kill at each rename.
+"""Fault injection in everything that writes: no space at each write, a kill at each rename.
 
-Afterwards a folder holds the files of one run, or says that it does not; what is kept reads as it
-was written, or is done again; and the next run ends as if nothing had happened.
+Afterwards a folder holds the files of one run, or reports that it does not; stored stages are read
+as they were written or computed again; and the next run succeeds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STAGES = {"fit": {"K": [[1.5]]}, "without trial 1": {"K": [[2.5]]}}
 
 
 def work(folder: Path, files: dict[str, bytes]) -> None:
-    """What a command does: stages one by one, then its files, and the stages go."""
+    """Like a command: store stages one by one, write files, remove the stages."""
     with owned(folder, "fit"):
         kept = Cache(folder / "fit-in-progress")
         for name, content in STAGES.items():
@@ -37,14 +37,14 @@ def work(folder: Path, files: dict[str, bytes]) -> None:
 
 
 def found_in(folder: Path) -> dict[str, Any]:
-    """The stages that a folder keeps."""
+    """Stages that a folder stores."""
     kept = Cache(folder / "fit-in-progress")
     found = {name: kept.find(name, "digest") for name in STAGES}
     return {name: content for name, content in found.items() if content is not None}
 
 
 def shown(folder: Path) -> dict[str, bytes]:
-    """All files that somebody sees."""
+    """Files that are visible to the user."""
     found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
     return {
         name.as_posix(): path.read_bytes()
@@ -54,7 +54,7 @@ def shown(folder: Path) -> dict[str, bytes]:
 
 
 def test_no_space_at_each_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk fills at the first, second, ... flush or rename; the old run's files stay whole."""
+    """The disk fills at each flush or rename; the old run's files stay complete."""
     work(tmp_path, OLD)
     failures = 0
     while True:
@@ -73,7 +73,7 @@ def test_no_space_at_each_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         found = shown(tmp_path)
         assert found in (OLD, NEW) or "INCOMPLETE.txt" in found
         assert not list(tmp_path.rglob("*.part"))
-    # Each stage, file, notice and list has a flush and a rename; what is kept is not kept again.
+    # Each stage, file, notice and list has a flush and a rename; stored stages are not repeated.
     assert failures >= 10
     assert shown(tmp_path) == NEW
 
@@ -142,7 +142,7 @@ MINE = {"notes.txt": b"mine", "sub/ole.csv": b"mine"}  # one bit from a name of 
 def test_a_flipped_byte_in_what_a_folder_keeps(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Anywhere: the run is refused in one line, or its files are those of an undisturbed one."""
+    """The run is rejected in one line, or its files are those of an undisturbed one."""
     monkeypatch.setattr(os, "fsync", lambda _: None)  # thousands of them take minutes
     refused = right = 0
     folder = _interrupted(tmp_path / "0")
@@ -167,7 +167,7 @@ def test_a_flipped_byte_in_what_a_folder_keeps(
 
 
 def _interrupted(folder: Path) -> Path:
-    """A folder with the files of a run, what another one had done, and files of somebody's own."""
+    """A folder with the files of a run, stages of another one, and files of the user."""
     work(folder, OLD)
     with owned(folder, "fit"):
         Cache(folder / "fit-in-progress").keep("fit", "digest", STAGES["fit"])
@@ -179,7 +179,7 @@ def _interrupted(folder: Path) -> Path:
 @pytest.mark.skipif(os.name != "posix", reason="pipes with a name")
 @pytest.mark.parametrize("name", [".impc", ".impc-lock", "fit-in-progress/fit.json"])
 def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(name: str, tmp_path: Path) -> None:
-    """In a process of its own: who opens it waits for ever."""
+    """In a separate process: opening the pipe would block."""
     folder = _interrupted(tmp_path)
     (folder / name).unlink(missing_ok=True)
     os.mkfifo(folder / name)

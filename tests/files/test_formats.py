@@ -1,4 +1,4 @@
-"""Every format, written by other means than impc's and read back; and written by impc."""
+"""Every format, written by other means than impc and read, and written by impc."""
 
 from __future__ import annotations
 
@@ -108,10 +108,13 @@ def test_headings() -> None:
         (["0,5;999", "1,5;1.000"], "text in 1 of 2 rows, the first '1.000' in line 3"),
         (["0,5;999,5", "1,5;1.000,5"], "text in 1 of 2 rows, the first '1.000,5' in line 3"),
         # Nothing says which sign is the decimal one.
-        (["0;999", "1;1.000"], "has whole numbers and '1.000' in line 3, which may be a thousand"),
-        (["0;999", "1;-1,000"], "has whole numbers and '-1,000' in line 3"),
-        (["0;999", "1;12.345", "2;998"], "has whole numbers and '12.345' in line 3"),
-        (['0;"999"', '1;"1.000"'], "has whole numbers and '1.000' in line 3"),
+        (
+            ["0;999", "1;1.000"],
+            "has whole numbers, and '1.000' in line 3 can be a decimal or thousands",
+        ),
+        (["0;999", "1;-1,000"], "has whole numbers, and '-1,000' in line 3"),
+        (["0;999", "1;12.345", "2;998"], "has whole numbers, and '12.345' in line 3"),
+        (['0;"999"', '1;"1.000"'], "has whole numbers, and '1.000' in line 3"),
         (["0;1.234.567", "1;999"], "text in 1 of 2 rows"),
     ],
 )
@@ -183,7 +186,7 @@ def test_version_73_by_h5py(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["seat", "s.seat"])
 @pytest.mark.parametrize("version", ["5", "7.3", "7.3, whole numbers"])
 def test_no_imaginary_part_is_dropped(name: str, version: str, tmp_path: Path) -> None:
-    """At the top and in a field of a struct: no column, and said why."""
+    """At the top level and in a field of a struct: no column, with a reason."""
     path = tmp_path / "trial.mat"
     numbers = np.exp(1j * np.arange(200.0))
     if version == "5":
@@ -199,7 +202,7 @@ def test_no_imaginary_part_is_dropped(name: str, version: str, tmp_path: Path) -
 
 
 def matlab_file(name: str) -> Path:
-    """A file that MATLAB wrote, from the tests of scipy."""
+    """A file written by MATLAB, from the tests of scipy."""
     spec = importlib.util.find_spec("scipy.io.matlab")
     assert spec is not None
     assert spec.origin is not None
@@ -238,7 +241,7 @@ def test_files_that_matlab_wrote_and_cannot_be_read(name: str, phrase: str) -> N
 
 def test_the_names_of_columns_in_matlab(tmp_path: Path) -> None:
     table = make_table("trial", {"seat angle": np.arange(5.0)})
-    with pytest.raises(OutputError, match="cannot be the name of a variable"):
+    with pytest.raises(OutputError, match="is not a valid MATLAB variable"):
         write_table(tmp_path / "trial.mat", table)
     assert list(tmp_path.iterdir()) == []
 
@@ -299,7 +302,7 @@ def test_a_tdms_scale_that_nobody_applies(tmp_path: Path, kind: str) -> None:
         ("seat", np.arange(99, dtype=np.int16), scale),
     )
     table = read_table(path)
-    assert table.skipped == {"seat": f"has a scale of the unknown kind {kind!r}: raw counts"}
+    assert table.skipped == {"seat": f"has unscaled counts (unknown scaling {kind!r})"}
     assert "seat" not in table.columns
 
 
@@ -360,7 +363,7 @@ def test_what_others_read_in_what_impc_writes(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "trial.c3d"
     path.write_bytes(b"old")
-    with pytest.raises(OutputError, match="needs the rate"):
+    with pytest.raises(OutputError, match="needs a sampling rate"):
         write_table(path, make_table("trial", SEAT))
     with pytest.raises(OutputError, match="cannot be written"):
         write_table(tmp_path / "none" / "trial.csv", make_table("trial", SEAT))
@@ -371,7 +374,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> Non
 
 
 def read_or_reason(path: Path) -> Table | str:
-    """What is read; or the one line of why not."""
+    """The table, or the one-line reason why it is rejected."""
     try:
         return read_table(path)
     except DataError as error:

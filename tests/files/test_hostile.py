@@ -1,4 +1,4 @@
-"""Files that mean harm: names, links, and what would take all memory, all time or the process."""
+"""Malicious files: names, links, and attempts to exhaust memory or time or to crash the process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.files.samples import hdf5_mat
 def test_one_line_and_little_memory(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A reader that took the memory would be said so, and not the reason that its header gives.
+    # If the memory were used up, that would be reported instead of the expected reason.
     monkeypatch.setattr(apart, "_ROOM", 250_000_000)
     phrase, make = HOSTILE[name]
     path = make(tmp_path)
@@ -39,7 +39,7 @@ def test_one_line_and_little_memory(
     assert phrase in message
     assert "\n" not in message
     assert len(message) - len(str(path)) < 300
-    # Of the process that asks; the largest of the files is 8 MB.
+    # Memory of the parent process; the largest file has 8 MB.
     assert peak < 200_000_000
 
 
@@ -60,10 +60,10 @@ def test_a_sparse_file_of_two_gigabytes_is_refused_unread(tmp_path: Path, ending
 def test_a_limit_of_ones_own_a_pipe_and_a_name_that_no_file_can_have(tmp_path: Path) -> None:
     write_table(tmp_path / "trial.csv", make_table("trial", {"x": np.arange(100.0)}))
     assert read_table(tmp_path / "trial.csv").samples == 100
-    with pytest.raises(DataError, match="is the most that is read"):
+    with pytest.raises(DataError, match=r"; at most .* are read"):
         read_table(tmp_path / "trial.csv", largest=100)
     os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(DataError, match="is no ordinary file"):
+    with pytest.raises(DataError, match="is not a regular file"):
         read_table(tmp_path / "pipe.csv")
     with pytest.raises(DataError, match="cannot be opened"):
         read_table(tmp_path / ("x" * 300 + ".csv"))
@@ -81,7 +81,7 @@ def test_names_of_columns_cannot_write_toml(tmp_path: Path) -> None:
 
 
 def test_a_million_references_are_not_followed(tmp_path: Path) -> None:
-    """A cell of 8 MB whose million entries are one and the same dataset: 8 GB, were it read."""
+    """A cell of 8 MB whose 1e6 entries are the same dataset: 8 GB if they were read."""
     path = tmp_path / "trial.mat"
     hdf5_mat(path, {"big": np.arange(1000.0)})
     with h5py.File(path, "r+") as file:

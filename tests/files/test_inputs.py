@@ -1,6 +1,6 @@
-"""A result names what it was made of, and an interrupted study uses nothing that was made of other.
+"""Results record digests of their inputs, and an interrupted study reuses only matching results.
 
-Work is done in this process, and its third task is interrupted; then something is changed.
+Work is done in this process and interrupted at its third task; then something is changed.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from tests.support import ThisProcess
 
 COMMANDS = ("select", "key-parameters")
 MODEL = "my_model:blood_model"
-# Taken out of a result before two are compared: times of the machine.
+# Removed from results before they are compared: run times.
 _TIMES = ("made", "seconds")
 
 
 @pytest.fixture
 def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Two subjects and visits, and a model in a file of its own."""
+    """Two subjects and visits, and a model in its own file."""
     source = (Path(__file__).parents[2] / "tests/studies/selection/dosing.py").read_text()
     (tmp_path / "my_model.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -46,7 +46,7 @@ def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def here(monkeypatch: pytest.MonkeyPatch, stop: int = -1) -> list[str]:
-    """Work in this process, interrupted before task number `stop`; names of what is done."""
+    """Work in this process, interrupted before task `stop`; names of finished tasks."""
     done: list[str] = []
 
     class Interrupted(ThisProcess):
@@ -66,7 +66,7 @@ def here(monkeypatch: pytest.MonkeyPatch, stop: int = -1) -> list[str]:
 
 
 def run(command: str, study: Path, out: str = "out") -> Result:
-    """A command as if it were typed in a new process."""
+    """Run a command as in a new process."""
     sys.modules.pop("my_model", None)
     importlib.invalidate_caches()
     words = [command, str(study), "--model", MODEL, "--out", str(study.parent / out)]
@@ -107,7 +107,7 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 def recording(study: Path) -> None:
-    """One digit in its middle: neither its size nor either end changes."""
+    """Change one digit in the middle: neither size nor ends change."""
     path = study.parent / "p1_v1.csv"
     lines = path.read_text().splitlines()
     number = lines[100].split(",")[-1]

@@ -1,4 +1,4 @@
-"""`impc inspect`: what it prints, and that what it writes can be read."""
+"""`impc inspect`: what it prints, and that its draft can be read."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_units_of_other_languages_are_to_be_filled_in(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("Zeit (Sek);theta1 (Grad);push (Ellen)\n0;1;2\n0,1;2;3\n")
     text = inspect(path).stdout
-    assert re.search(r'unit = "\?" +# the file says .Grad., which is not known', text)
+    assert re.search(r'unit = "\?" +# the file states .Grad., which is not known', text)
     assert '[signals."push (Ellen)"]' in text  # no unit that is known
 
 
@@ -99,11 +99,11 @@ def test_from_a_file_never_seen_to_a_recording(tmp_path: Path) -> None:
     (found,) = read_recordings([path], read_configuration(out), plant)
     np.testing.assert_allclose(found.outputs[:, 0], np.deg2rad(columns["seat"]), atol=1e-10)
     result = inspect(path, "--config", out, "--plant", PLANT)
-    assert result.stdout == "trial: 600 samples at 100 per second\nNothing was found.\n"
+    assert result.stdout == "trial: 600 samples at 100 per second\nThe checks found no problems.\n"
 
 
 def test_a_column_is_not_taken_for_a_signal_of_another_kind(tmp_path: Path) -> None:
-    """EMG in mV stands where an angle would: it is named, and the angle is still to be found."""
+    """EMG in mV is the first column: the draft names it, and does not use it for an angle."""
     path, out = tmp_path / "trial.csv", tmp_path / "new.toml"
     columns = pushed_seat(600)
     units = {"emg (mV)": "seat", "lean (deg)": "trunk", "push (N*m)": "push"}
@@ -120,8 +120,8 @@ def test_a_column_is_not_taken_for_a_signal_of_another_kind(tmp_path: Path) -> N
     assert found["theta2"].column == FILL_IN
     text = out.read_text()
     assert '# Columns that are not used: "emg" (mV)' in text
-    assert "A GUESS, by its unit: check it" in text
-    assert "no column is left that fits: name it" in text
+    assert "A GUESS from its unit: check it" in text
+    assert "no remaining column fits: enter its name" in text
     plant = Plant(seated_balance_plant(), ["command"])
     with pytest.raises(InputError, match=r"theta2.column: is still '\?'; fill in its name"):
         read_recordings([path], read_configuration(out), plant)
@@ -144,7 +144,7 @@ def test_counters_constants_and_second_clocks_are_no_guesses(tmp_path: Path) -> 
     assert [found.signals[name].column for name in ("theta1", "theta2", "perturbation")] == [
         *("SeatAngle", "lean_deg", "shove")
     ]
-    assert re.search(r'unit = "deg" +# a guess: by its name', text)
+    assert re.search(r'unit = "deg" +# a guess from its name', text)
     assert (
         '# Columns that are not used: "Frame" (a clock or counter), '
         '"EMG time" (a clock or counter), "gain" (constant)'
@@ -170,7 +170,7 @@ def test_day_numbers_of_excel_are_a_clock(tmp_path: Path) -> None:
 
 
 def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: Path) -> None:
-    """The subject's own numbers, and what has no default, are refused until given."""
+    """The subject's own numbers, and arguments without default, are rejected until filled in."""
     out = tmp_path / "new.toml"
     done = inspect(trial, "--out", out, "--plant", "seated-balance")
     assert done.exit_code == 0
@@ -178,14 +178,15 @@ def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: 
     with pytest.raises(InputError, match=r"\[plant\] mass: is still '\?'; fill it in"):
         make_plant(find_plant("seated-balance", read_configuration(out).plant), ())
     text = out.read_text()
-    assert 'mass = "?"                # the subject\'s own; without this line it is 79.7' in text
+    assert 'mass = "?"                # the subject\'s own; without this line' in text
+    assert "without this line the plant's 79.7 is used" in text
     assert 'height = "?"' in text
     assert '# sex = "male"' in text
     assert "command in N m" in text
     assert "0.2 s" in text
     table = read_configuration(out).fit
     assert table == {"horizon": 20, "u_max": FILL_IN}
-    with pytest.raises(InputError, match=r"\[fit\] u_max: is still '\?'; fill it in, or take"):
+    with pytest.raises(InputError, match=r"\[fit\] u_max: is still '\?'; fill it in, or remove"):
         fit_settings(table)
     assert fit_settings({"horizon": 20, "u_max": 60.0}).u_max == 60.0
 
@@ -205,7 +206,7 @@ def test_names_that_toml_must_quote_and_units_nobody_knows(tmp_path: Path) -> No
     write_table(path, make_table("trial", columns, {"a.b": "furlongs!", "# no": "mV"}, 250.0))
     result = inspect(path, "--out", out)
     assert result.exit_code == 0
-    assert "The file says 250 samples per second." in result.stdout
+    assert "The file states a rate of 250 samples per second." in result.stdout
     configuration = read_configuration(out)
     assert configuration.recording.rate is None
     assert list(configuration.signals) == names
@@ -219,7 +220,7 @@ def test_it_writes_over_nothing(trial: Path, tmp_path: Path) -> None:
     out.write_text("old")
     result = inspect(trial, "--out", out)
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "exists already" in result.stderr
+    assert "already exists" in result.stderr
     assert out.read_text() == "old"
     assert "cannot be written" in inspect(trial, "--out", tmp_path / "none" / "x.toml").stderr
 

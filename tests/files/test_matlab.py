@@ -1,4 +1,4 @@
-"""Files of MATLAB's versions 5 to 7: sound ones are read, damaged ones end no process."""
+"""MATLAB files of versions 5 to 7: valid ones are read, damaged ones do not crash the process."""
 
 from __future__ import annotations
 

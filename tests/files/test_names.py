@@ -1,4 +1,4 @@
-"""Names of signals, subjects and files are text, wherever they are written."""
+"""Names of signals, subjects and files are treated as text everywhere."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOSTILE = (
 
 
 def test_no_name_is_mathematics_on_a_figure() -> None:
-    """Each name as title, label, note, in the legend and at a tick, beside powers of ten."""
+    """Each name as title, label, note, legend entry and tick, next to powers of ten."""
     with page_style():
         figure = new_figure(8, 6)
         left, right = figure.subplots(1, 2)
@@ -76,5 +76,5 @@ def test_no_cell_of_a_table_is_a_formula_and_numbers_stay_numbers() -> None:
 
 
 def test_json_takes_names_that_are_not_utf_8() -> None:
-    """Pages do too: tests/cli/test_fit.py has a file of such a name."""
+    """Pages accept them too: tests/cli/test_fit.py has a file with such a name."""
     assert plain({"file": ["m\udcff"]}) == {"file": [r"m\udcff"]}

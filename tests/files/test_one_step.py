@@ -1,4 +1,4 @@
-"""Offsets, drifts, shifts, stretches and falls, in recordings of a stick that is balanced."""
+"""Offsets, drifts, shifts, frozen sensors and falls, in simulated stick balancing."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def balanced(seed: int) -> tuple[Array, Array]:
 
 
 def seeds(count: int) -> list[int]:
-    """Of trials in which the stick does not fall."""
+    """Seeds of trials in which the stick does not fall."""
     return [seed for seed in range(1, 100) if np.ptp(balanced(seed)[0]) < 15][:count]
 
 
@@ -87,7 +87,7 @@ def test_an_offset_is_found_and_taken_away_where_the_user_says_so(tmp_path: Path
     assert times >= 12
     angle, push = balanced(1)
     (finding,) = read(tmp_path, angle + 1, push)[1]
-    said = float(finding.rpartition("write signals.angle.offset = ")[2])
+    said = float(finding.rpartition("set signals.angle.offset = ")[2])
     assert said == pytest.approx(1, abs=0.15)
     cured = read(tmp_path, angle + 1, push, ("# offset = 0.0", f"offset = {said}"))
     assert cured[1] == ()
@@ -107,7 +107,7 @@ def test_a_sensor_that_stands_still_is_found(tmp_path: Path) -> None:
         angle = angle.copy()
         angle[200:350] = angle[200]
         findings = read(tmp_path, angle, push)[1]
-        assert "stands still 1 time, 150 samples in all" in findings[0]
+        assert "is constant in 1 stretch, 150 samples in total" in findings[0]
         assert "sample 201 (4 s)" in findings[0]
 
 
@@ -122,7 +122,7 @@ def test_samples_that_were_lost_and_written_as_a_number_are_found(tmp_path: Path
         assert "in 12 samples" in finding
     lost = angle.copy()
     lost[100:120] = lost[300:315] = 0
-    assert "stands still 2 times, 35 samples in all" in read(tmp_path, lost, push)[1][0]
+    assert "is constant in 2 stretches, 35 samples in total" in read(tmp_path, lost, push)[1][0]
 
 
 @pytest.mark.parametrize("late", [-2, -1, 1, 2])
@@ -149,21 +149,23 @@ def test_a_shift_of_a_part_of_a_sample_and_one_too_far(tmp_path: Path) -> None:
     trial, _ = read(tmp_path, angle, push, ("# shift = 0", "shift = 0.005"))
     means = 0.75 * push[1:] + 0.25 * push[:-1]
     np.testing.assert_allclose(trial.disturbance[:, 0], means, atol=1e-9)
-    with pytest.raises(DataError, match=r"signals.push.shift: moves it by 301 of 600 samples"):
+    with pytest.raises(
+        DataError, match=r"signals.push.shift: moves the signal by 301 of 600 samples"
+    ):
         read(tmp_path, angle, push, ("# shift = 0", "shift = 301"))
     with pytest.raises(InputError, match=r"signals.push.shift: got inf"):
         read(tmp_path, angle, push, ("# shift = 0", "shift = inf"))
 
 
 def fallen(angle: Array, second: float) -> Array:
-    """The stick falls from there on, and lies at 80 degrees."""
+    """The stick falls from there on, and comes to rest at 80 degrees."""
     time = np.arange(len(angle)) * 0.02
     return np.minimum(angle + np.where(time > second, np.expm1(4 * (time - second)), 0), 80)
 
 
 @pytest.mark.parametrize("limit", ["# limit = 20.0", "limit = 20.0"])
 def test_a_fall_is_called_a_fall(tmp_path: Path, limit: str) -> None:
-    """The sensor ends at 80 degrees, or the stop is at 20."""
+    """The sensor saturates at 80 degrees, or the stop is at 20."""
     angle, push = balanced(1)
     with pytest.raises(
         FallError, match=r"the subject fell at 8.\d+ s; leave the trial out"
@@ -177,7 +179,7 @@ def test_a_fall_is_called_a_fall(tmp_path: Path, limit: str) -> None:
 
 def test_what_comes_back_is_no_fall(tmp_path: Path) -> None:
     angle, push = balanced(1)
-    with pytest.raises(DataError, match="is beyond its stop of 20 deg") as caught:
+    with pytest.raises(DataError, match="exceeds its mechanical stop of 20 deg") as caught:
         read(tmp_path, 20 * angle, push, ("# limit = 20.0", "limit = 20.0"))
     assert not isinstance(caught.value, FallError)
 

@@ -1,4 +1,4 @@
-"""Plants by import path and from files, and what is said of those that cannot be used."""
+"""Plants by import path and from files, and the errors of invalid ones."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_module_beside_the_recordings(tmp_path: Path, monkeypatch: pytest.Monk
 def test_the_working_folder_is_last_and_not_left_on_the_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A user's module finds its neighbours, and nothing installed is replaced by one of them."""
+    """A user's module finds its neighbours, and replaces no installed module."""
     (tmp_path / "mine_of_two.py").write_text(
         "import neighbour_of_mine, statsmodels\nmake = neighbour_of_mine.make\n"
     )
@@ -73,7 +73,7 @@ def test_the_working_folder_is_last_and_not_left_on_the_path(
 
 
 class OwnInterrupt(KeyboardInterrupt):
-    """Not from the keyboard."""
+    """A KeyboardInterrupt that does not come from the keyboard."""
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_whatever_a_plant_raises_is_one_line_that_names_it(error: BaseException)
     def make() -> object:
         raise error
 
-    with pytest.raises(InputError, match=rf"^plant mine:make: ends in {type(error).__name__}") as e:
+    with pytest.raises(InputError, match=rf"^plant mine:make: raised {type(error).__name__}") as e:
         make_plant(PlantSource("mine:make", make, {}), ())
     assert str(e.value).isprintable()
 
@@ -106,9 +106,9 @@ def test_a_module_that_ends_the_program(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "ending_plant.py").write_text("import sys\nsys.exit(0)\n")
     (tmp_path / "broken_plant.py").write_text("def cart(:\n")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="plant ending_plant:x: ends in SystemExit"):
+    with pytest.raises(InputError, match="plant ending_plant:x: raised SystemExit"):
         plant_source("ending_plant:x", {})
-    with pytest.raises(InputError, match="plant broken_plant:x: ends in SyntaxError"):
+    with pytest.raises(InputError, match="plant broken_plant:x: raised SyntaxError"):
         plant_source("broken_plant:x", {})
 
 
@@ -132,7 +132,7 @@ def test_a_saved_state_space(tmp_path: Path, suffix: str) -> None:
 
 
 def saved(**changed: object) -> Callable[[Path], str]:
-    """A file of JSON with these entries changed."""
+    """A JSON file with these entries changed."""
     content = json.dumps({"A": A, "B": B, "C": C, "dt": 0.1, **changed}).encode()
     return written("plant.json", content)
 
@@ -174,7 +174,7 @@ NO_PLANT: list[tuple[str | Callable[[Path], str], str]] = [
     ("nowhere.mat", "does not exist"),
     ("nowhere.json", "does not exist"),
     (written("plant.json", b'{"A": [[1]], "B": [[1]], "C": [[1]]}'), "lacks dt"),
-    (written("plant.json", b"[1, 2]"), "holds no names"),
+    (written("plant.json", b"[1, 2]"), "has no named entries"),
     (written("plant.json", b"{"), "cannot be read"),
     (written("deep.json", b"[" * 100_000), "nested too deep"),
     (written("digits.json", b'{"A": ' + b"1" * 5000 + b"}"), "cannot be read"),
@@ -183,19 +183,19 @@ NO_PLANT: list[tuple[str | Callable[[Path], str], str]] = [
     (written("cut.npz", b"PK\x03\x04" + bytes(200)), "cannot be read"),
     (written("crash.mat", CRASH), "ends the process"),
     (arrays("bomb.npz", A=np.zeros(10_000_000)), "too large once it is unpacked"),
-    (pipe, "is no ordinary file"),
+    (pipe, "is not a regular file"),
     (arrays("objects.npz", A=np.array([{"a": 1}], dtype=object)), "cannot be read"),
-    (saved(A=[["x"]]), "not made of numbers in rows"),
+    (saved(A=[["x"]]), "not a matrix of numbers"),
     (saved(B=[[1, 2]], C=[[1, 2]]), "plant"),
-    (saved(states=["x", "v", "a"]), "names 3 states and has 2"),
-    (saved(states=["x"]), "names 1 states and has 2"),
-    (saved(inputs=["force"]), "names 1 inputs and has 2"),
-    (saved(outputs=["x", "y"]), "names 2 outputs and has 1"),
+    (saved(states=["x", "v", "a"]), "names 3 states, but has 2"),
+    (saved(states=["x"]), "names 1 states, but has 2"),
+    (saved(inputs=["force"]), "names 1 inputs, but has 2"),
+    (saved(outputs=["x", "y"]), "names 2 outputs, but has 1"),
     (saved(states=["x", "x"]), "names two states 'x'"),
     (saved(states={"x": 1}), "that are not names"),
     (saved(states=[["x"], []]), "names 1 states"),
     (saved(states=["x", None]), "that are not names"),
-    (saved(**{"state\x1bs": ["x", "v"]}), r"does not know state\\x1bs"),
+    (saved(**{"state\x1bs": ["x", "v"]}), r"has an unknown entry state\\x1bs"),
     *(
         (arrays(f"plant.{ending}", **changed), says)
         for ending in ("mat", "npz")
@@ -206,8 +206,8 @@ NO_PLANT: list[tuple[str | Callable[[Path], str], str]] = [
             ({"dt": np.inf}, r"beyond 1e\+70 in dt"),
             ({"A": 1e200 * np.array(A)}, r"beyond 1e\+70 in A"),
             ({"dt": [0.1, 0.2]}, "dt that is not one number"),
-            ({"C": np.array([["1", "0"]])}, "not made of numbers in rows"),
-            ({"A": np.array([A, A])}, "not made of numbers in rows"),
+            ({"C": np.array([["1", "0"]])}, "not a matrix of numbers"),
+            ({"A": np.array([A, A])}, "not a matrix of numbers"),
         )
     ),
 ]

@@ -50,22 +50,22 @@ def test_values_in_si_units_with_offset_and_sign(tmp_path: Path, seat: Plant) ->
     np.testing.assert_allclose(trial.outputs[:, 1], -np.deg2rad(columns["trunk"] - 2), atol=1e-10)
     np.testing.assert_allclose(trial.disturbance[:, 0], columns["push"] / 100, rtol=1e-12)
     np.testing.assert_array_equal(trial.x0, np.zeros(seat.n))
-    # An offset that the sensor does not have is one that is left.
+    # Removing an offset that the sensor does not have introduces one.
     assert "theta2 is off by about -2 deg" in trial.findings[0]
-    assert trial.findings[0].endswith("write signals.theta2.offset = 0")
+    assert trial.findings[0].endswith("set signals.theta2.offset = 0")
 
 
 def test_a_unit_of_the_file_is_overruled_in_so_many_words(tmp_path: Path, seat: Plant) -> None:
     columns = seated()
     radians = csv_text(columns).replace(",trunk", ",trunk (rad)", 1)
-    with pytest.raises(DataError, match=r"write signals.theta2.overrule_unit = true if the file"):
+    with pytest.raises(DataError, match=r"set signals.theta2.overrule_unit = true if the file"):
         read(tmp_path, seat, radians)
     column = 'column = "trunk"\nunit = "deg"'
     trial = read(tmp_path, seat, radians, (column, f"{column}\noverrule_unit = true"))
     np.testing.assert_allclose(trial.outputs[:, 1], np.deg2rad(columns["trunk"]), atol=1e-10)
-    assert "taken in 'deg' by signals.theta2, where the file says 'rad'" in trial.findings[0]
+    assert "read in 'deg' as signals.theta2 says; the file states 'rad'" in trial.findings[0]
     none = read(tmp_path, seat, csv_text(columns).replace(",trunk", ",trunk (1)", 1))
-    assert "where the file says '1'" in none.findings[0]
+    assert "the file states '1'" in none.findings[0]
     assert (
         read(tmp_path, seat, csv_text(columns).replace(",trunk", ",trunk (Grad)", 1)).findings == ()
     )
@@ -101,7 +101,7 @@ def test_a_recording_at_1_khz_comes_to_the_rate_of_the_plant(tmp_path: Path, sea
     exact = np.deg2rad(3 * np.sin(2 * np.pi * 0.7 * 0.01 * np.arange(1000)))
     assert trial.samples == 1000
     assert np.abs(trial.outputs[inside, 0] - exact[inside]).max() < 1e-3 * np.deg2rad(3)
-    # Held for 0.2 s and jumping within a millisecond: means but for the sample of each jump.
+    # Held for 0.2 s and jumping within a millisecond: exact means except at the jumps.
     assert np.mean(np.abs(trial.disturbance[:, 0] - push[::10]) < 1e-9) > 0.94
     assert trial.disturbance.sum() * 0.01 == pytest.approx(push.sum() * 0.001, abs=0.01)
 
@@ -109,7 +109,7 @@ def test_a_recording_at_1_khz_comes_to_the_rate_of_the_plant(tmp_path: Path, sea
 def test_a_slower_recording_says_what_it_cannot_know(tmp_path: Path, seat: Plant) -> None:
     trial = read(tmp_path, seat, csv_text(seated(50.0)))
     assert trial.samples == 2999
-    assert any("nothing above 25 Hz is known" in finding for finding in trial.findings)
+    assert any("nothing above 25 Hz" in finding for finding in trial.findings)
 
 
 def test_gaps_are_filled_only_where_allowed_and_reported(tmp_path: Path, seat: Plant) -> None:
@@ -177,11 +177,11 @@ def test_trials_of_unequal_length_in_the_order_given(tmp_path: Path, seat: Plant
     trials = read_recordings(paths, configured(tmp_path), seat)
     assert [trial.label.trial for trial in trials] == ["b", "a"]
     assert trials[0].findings == ()
-    assert "2500 samples where the longest has 3000" in trials[1].findings[0]
+    assert "2500 samples, the longest has 3000" in trials[1].findings[0]
     with pytest.raises(InputError, match="is given twice"):
         read_recordings([paths[0], tmp_path / "." / "b.csv"], configured(tmp_path), seat)
     (tmp_path / "link.csv").symlink_to(paths[0])
-    with pytest.raises(InputError, match=r"link.csv: is given twice, as .*b.csv too"):
+    with pytest.raises(InputError, match=r"link.csv: is given twice, also as .*b.csv"):
         read_recordings([paths[0], tmp_path / "link.csv"], configured(tmp_path), seat)
     (tmp_path / "copy.csv").write_bytes(paths[0].read_bytes())
     with pytest.raises(InputError, match=r"copy.csv: is a copy of .*b.csv, byte for byte"):
@@ -201,7 +201,7 @@ def test_a_plant_without_recorded_disturbance(tmp_path: Path) -> None:
 
 
 def balanced(plant: Plant, seed: int) -> tuple[Array, Array]:
-    """Torque and seat angle of a person who is a regulator and moves besides; 30 s."""
+    """Torque and seat angle of a simulated subject (LQR) with further movement; 30 s."""
     rng = np.random.default_rng(seed)
     gain, _, _ = control.dlqr(plant.A, plant.B, np.eye(plant.n), np.eye(plant.m))
     torque = ternary_torque(seed=seed)
@@ -219,15 +219,15 @@ def test_a_balancing_loop_is_aligned_and_a_shifted_one_is_not(seat: Plant) -> No
         torque, angles = balanced(seat, seed)
         for lead in found:
             reason = misaligned(torque[: 3000 - lead], angles[lead:], 0.01)
-            found[lead] += "comes before" in reason
-            assert "nothing in common" not in reason
+            found[lead] += "precedes the disturbance" in reason
+            assert "is not correlated" not in reason
     assert found == {0: 0, 40: 10, 100: 10}
 
 
 def test_the_response_of_another_trial_has_nothing_in_common() -> None:
     for seed in range(20):  # seeds 0 to 19
         push, other = pushed_seat(3000, seed=seed)["push"], pushed_seat(3000, seed=seed + 100)
-        assert "nothing in common" in misaligned(push, other["seat"], 0.01)
+        assert "is not correlated" in misaligned(push, other["seat"], 0.01)
 
 
 def test_of_a_sinusoid_nothing_is_said() -> None:
@@ -255,7 +255,7 @@ def test_a_unit_of_another_kind_is_refused(
 
 
 def test_a_plant_in_degrees_is_refused(tmp_path: Path) -> None:
-    """Recordings are turned into SI units: they would be too small by a factor of 57."""
+    """Recordings are converted to SI units: they would be too small by a factor of 57."""
     plant = Plant(seated_balance_plant(), ["command"], units={"theta1": "deg"})
     with pytest.raises(InputError, match="make the plant in SI units"):
         read(tmp_path, plant, csv_text(seated()))

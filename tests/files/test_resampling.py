@@ -1,4 +1,4 @@
-"""Resampling against signals whose values and means are known."""
+"""Resampling of signals whose values and means are known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def lower_nyquist(rate: float) -> float:
 
 
 def edge(rate: float) -> float:
-    """What the filter sees beyond each end, s: the w of docs/recordings.md."""
+    """Half-width of the filter in s, beyond each end."""
     return (70 - 7.95) / (2.285 * 2 * np.pi * 0.2 * lower_nyquist(rate)) / 2
 
 

@@ -1,4 +1,4 @@
-"""Results are read again by their schema, and refused in one line when they are not of it."""
+"""Results are read by their schema, and rejected in one line if it differs."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ def test_what_a_report_writes_is_read(tmp_path: Path) -> None:
         ("{}", "another version of impc (schema 1, not 7)"),
         (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 7"),
         (json.dumps(HEAD | {"schema": 99}), "schema 99, not 7"),
-        (json.dumps(HEAD | {"versions": 3}), "is no result"),
-        (json.dumps({"schema": SCHEMA}), "is no result"),
+        (json.dumps(HEAD | {"versions": 3}), "is not a result file"),
+        (json.dumps({"schema": SCHEMA}), "is not a result file"),
         (json.dumps(HEAD | {"methods": {"a": {"seconds": "x"}}}), "$.methods[...].seconds"),
-        ("", "is no result"),
-        ("[]", "is no result"),
-        ("null", "is no result"),
-        ('{"schema"', "is no result"),
-        ("[" * 100_000, "is no result"),
-        ('{"a":' * 100_000, "is no result"),
+        ("", "is not a result file"),
+        ("[]", "is not a result file"),
+        ("null", "is not a result file"),
+        ('{"schema"', "is not a result file"),
+        ("[" * 100_000, "is not a result file"),
+        ('{"a":' * 100_000, "is not a result file"),
     ],
 )
 def test_what_is_not_a_result(content: str, words: str, tmp_path: Path) -> None:
@@ -56,8 +56,8 @@ def test_what_is_not_a_result(content: str, words: str, tmp_path: Path) -> None:
 
 
 def test_what_is_no_file(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="is no result"):
+    with pytest.raises(DataError, match="is not a result file"):
         read_result(tmp_path)
     os.mkfifo(tmp_path / "result.json")
-    with pytest.raises(DataError, match="no ordinary file"):
+    with pytest.raises(DataError, match="not a regular file"):
         read_result(tmp_path)

@@ -1,4 +1,4 @@
-"""Units as people write them, against their definitions."""
+"""Units in common spellings, against their definitions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REFUSED = [
     ("is not known; write it as in", ["wibble", "Sekunden", "m**999999999", "(2)**9", "m" * 41,
                                       "9**9**9", "__import__('os')"]),
     ("has an offset", ["degC"]),
-    ("can be read in two ways", ["g", "a.u.", "px"]),
+    ("is ambiguous", ["g", "a.u.", "px"]),
     ("write deg for degrees", ["Grad", "grad", "GRAD/s", "grad/s^2", "Grade"]),
     ("write rad", ["rads"]),
     ("write rpm", ["U/min"]),

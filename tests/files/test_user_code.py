@@ -1,4 +1,4 @@
-"""Code that a study file names: not without consent."""
+"""Code that a study file names does not run without consent."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_what_the_package_has_needs_none(name: str) -> None:
 
 
 def test_the_users_own_needs_it() -> None:
-    with pytest.raises(InputError, match=f"--plant {OWN}, or --allow-plant"):
+    with pytest.raises(InputError, match=f"--plant {OWN} or --allow-plant"):
         consent(OWN)
     assert consent(OWN, allowed=True) == OWN
     assert consent("os:system", given=OWN) == OWN

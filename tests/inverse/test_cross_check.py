@@ -1,4 +1,4 @@
-"""An answer that another method beats in its own model is searched again, or says so."""
+"""Solutions that another method beats in their own model are searched again or reported."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impc.inverse.problem import Problem, controller_for, misfit, scenarios
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    """A noisy cart at its limit."""
+    """Noisy cart at its limit."""
     system = control.ss(
         [[1, 0.1], [0, 1]], [[0.005, 0], [0.1, 0.1]], np.eye(2), 0, 0.1, inputs=["u", "push"]
     )
@@ -41,7 +41,7 @@ def fitted(problem: Problem, names: list[str]) -> dict[str, impc.Estimate]:
 
 
 def test_a_method_that_loses_begins_again(problem: Problem) -> None:
-    """Inverse MPC and the search of weights without bounds, both put at poor weights."""
+    """Poor starting weights for inverse MPC and for the search without bounds."""
     names = ["feedback_gain", "inverse_lqr_output", "inverse_mpc"]
     found = fitted(problem, names)
     poor = impc.solve_lqr(problem.plant, impc.Weights(np.eye(2) * 50, 1))
@@ -62,7 +62,7 @@ def test_a_method_that_loses_begins_again(problem: Problem) -> None:
 
 
 def test_no_answer_is_beaten_and_nested_models_are_ordered(problem: Problem) -> None:
-    """A free gain leaves no more than weights without bounds; each is the least of its model."""
+    """The free gain fits no worse than weights without bounds; each is best in its model."""
     names = ["feedback_gain", "inverse_lqr_gradient", "inverse_lqr_output", "inverse_mpc"]
     found = cross_checked(problem, fitted(problem, names))
     assert found["feedback_gain"].misfit <= found["inverse_lqr_output"].misfit * (1 + 1e-3)

@@ -1,4 +1,4 @@
-"""The fibre of a gain and the weights chosen from it: `impc.inverse.equivalent_weights`."""
+"""Equivalent weights of a gain, and the choice among them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impc.arrays import Array
-from impc.errors import DataError, WeightsError
+from impc.errors import DataError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import (
     SLACK,
     EquivalentWeights,
     analytic_centre,
+    inverse_factor,
     least_condition_weights,
     other_weights,
     weights_margin,
@@ -94,7 +95,7 @@ def test_published_example_has_the_least_condition_number_of_the_reference() -> 
         [6.5105, 1.8088, 6.9223, -0.4818],
         [-1.7114, 3.5052, -0.4818, 6.5442],
     ]
-    # The reference ends anywhere within 1e-5 of the least; here it is the least norm of those.
+    # The reference is within 1e-5 of the least condition; here the least norm within 1e-5.
     np.testing.assert_allclose(scaled[:4, :4], Q, atol=15 * np.sqrt(SLACK))
     np.testing.assert_allclose(scaled[4:, 4:], R, atol=15 * np.sqrt(SLACK))
 
@@ -172,7 +173,7 @@ def test_a_metric_narrows_the_fibre_to_weights_with_that_metric(seed: int, dt: f
 
 @pytest.mark.parametrize(("n", "m"), [(3, 2), (4, 2), (5, 3), (6, 3)])
 def test_gain_and_metric_determine_m_minus_1_numbers_more_than_the_gain(n: int, m: int) -> None:
-    """S K A^-1 B = B'PB is symmetric: of the m(m+1)/2 numbers of S, the gain leaves m free."""
+    """S K A^-1 B = B'PB is symmetric: the gain leaves m of the m(m+1)/2 entries of S free."""
     plant, truth = random_case(1, n, m, 1.0)
     solution = solve_lqr(plant, truth)
     numbers = n * (n + 1) // 2 + m * (m + 1) // 2
@@ -186,7 +187,7 @@ def test_seat_plant() -> None:
     assert fibre.dimension == 46
     assert fibre.singular_values[-1] > 1e-3 * fibre.singular_values[0]
     found = least_condition_weights(fibre)
-    # The 1.69e7 of the reference belongs to another realisation of the delay.
+    # The reference's 1.69e7 belongs to another realisation of the delay.
     assert found.condition == pytest.approx(2.368523e7, rel=1e-4)
     assert found.gap is not None
     assert found.gap < 1e-6
@@ -261,7 +262,7 @@ def test_an_unbounded_fibre_has_a_least_condition_but_no_centre(A: object, B: ob
 
 @pytest.mark.parametrize("seed", [55, 107, 199, 209, 306])
 def test_a_fibre_with_members_is_never_called_empty(seed: int) -> None:
-    """Clarabel stopped at its first iterations on these while the trace was an equality."""
+    """With the trace as an equality Clarabel stopped at the first iterations on these."""
     size = {55: (8, 2, 1.0), 107: (6, 3, 1.0), 199: (8, 2, 1.0), 209: (8, 3, 1.0), 306: (8, 3, 0)}
     plant, truth = random_case(seed, *size[seed])
     found = weights_margin(gain_fibre(plant, solve_lqr(plant, truth).K))
@@ -296,10 +297,10 @@ def test_basis_is_orthonormal_in_natural_coordinates() -> None:
 
 
 def test_the_reported_weights_do_not_depend_on_rounding() -> None:
-    """Six states, two inputs: members of the same condition number differ by a half in Q.
+    """Six states, two inputs: members of equal condition number differ by a half in Q.
 
-    The least norm of them is one point. States are rotated, which changes neither norm nor
-    condition number, but every rounding, as another processor does.
+    Their least-norm member is unique. Rotated states keep norm and condition number and change the
+    rounding, as another processor does.
     """
     A = np.random.default_rng(3).normal(size=(6, 6)) / 2.2
     B = np.random.default_rng(4).normal(size=(6, 2))
@@ -313,3 +314,11 @@ def test_the_reported_weights_do_not_depend_on_rounding() -> None:
         size = 1e-4 * np.max(np.abs(first.Q))
         np.testing.assert_allclose(U @ found.Q @ U.T, first.Q, atol=size)
         np.testing.assert_allclose(found.R, first.R, atol=1e-4)
+
+
+def test_weights_on_the_border_of_the_set_are_refused() -> None:
+    """`_by_convention` then reports the weights of the search."""
+    plant = Plant(control.ss([[1.1, 0.1], [0, 0.9]], [[0], [1]], np.eye(2), 0, 1))
+    fibre = gain_fibre(plant, solve_lqr(plant, Weights(np.eye(2), 1)).K)
+    with pytest.raises(SolverError, match="singular to working precision"):
+        inverse_factor(fibre, Weights(np.diag([1.0, 0.0]), 1))

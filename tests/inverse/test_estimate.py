@@ -1,4 +1,4 @@
-"""An estimate as users work with it: text, table, figure, file."""
+"""Text, table, figure and file of an estimate."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_summary_repr_and_html_are_short_and_escaped(found: impc.Estimate) -> No
     text = found.summary()
     for part in ("horizon 10", "VAF", "K.", "Q =", found.status.sentence):
         assert part in text
-    for doubt in found.doubts:  # before the numbers that they are about
+    for doubt in found.doubts:  # qualifications precede the numbers
         assert text.index(doubt) < text.index("K.")
     assert len(repr(found)) < 100
     assert len(repr(found.problem)) < 1000
@@ -104,7 +104,7 @@ def test_a_search_goes_on_from_an_earlier_answer(found: impc.Estimate) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda text: text[:-40], "is no result"),
+        (lambda text: text[:-40], "is not a result file"),
         (lambda text: text.replace('"schema": 7', '"schema": 3'), "another version"),
         (lambda text: text.replace('"status": "settled"', '"status": "odd"'), "is damaged"),
         (lambda text: text.replace('"K": [[', '"K": [["x", '), "K: expected real numbers"),
@@ -135,7 +135,7 @@ def test_a_body_and_a_family_are_given_again(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="family"):
         impc.load(file)
     other_family = impc.PlantFamily(lambda v: plant_of(v * 1.1), ["a"], [0.9])
-    with pytest.raises(InputError, match="another A"):
+    with pytest.raises(InputError, match="plant: has a different A than saved"):
         impc.load(file, family=other_family)
     again = impc.load(file, family=family)
     assert isinstance(again, impc.Estimate)
@@ -163,7 +163,7 @@ def test_a_body_and_a_family_are_given_again(tmp_path: Path) -> None:
         impc.load(file)
     wrong = {"A": [[0.8]], "body": [[0.9]]}
     for what, A in wrong.items():
-        with pytest.raises(InputError, match=f"another {what}"):
+        with pytest.raises(InputError, match=f"a different {what} than saved"):
             impc.load(file, plant=impc.Plant(control.ss(A, [[1]], [[1]], 0, 1)))
     assert np.array_equal(impc.load(file, plant=moving).gain, other.gain)  # type: ignore[union-attr]
 
@@ -186,7 +186,7 @@ def test_the_log_is_silent_unless_asked(
 
 
 def test_what_drove_a_simulation_drives_its_recording() -> None:
-    """The last row is not used: a simulation of n steps has n + 1 states and n disturbances."""
+    """The last disturbance is unused: n steps have n + 1 states and n disturbances."""
     push = np.ones(20)
     x = impc.Controller(cart(), impc.Weights(np.eye(cart().n), 1), impc.Bounds(cart()), 3)
     run = x.simulate(np.zeros(cart().n), disturbance=push)

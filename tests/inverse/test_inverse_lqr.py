@@ -1,4 +1,4 @@
-"""Weights for a given gain, or for the nearest: `impc.inverse.inverse_lqr`."""
+"""Inverse LQR: weights for a given gain, or for the nearest one."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_lmi_of_a_gain_that_does_not_stabilise_is_infeasible() -> None:
 
 @pytest.mark.parametrize("samples", [1, 2, 3])
 def test_lmi_of_no_gain_on_a_delay_is_feasible(samples: int) -> None:
-    """What is delayed leaves by itself: any weights have the gain 0, to round-off."""
+    """A delay alone is stable: any weights have the gain 0, to rounding."""
     delay = Plant(control.ss(np.eye(samples, k=1), np.eye(samples)[:, -1:], np.eye(samples), 0, 1))
     found = inverse_lqr_lmi(delay, np.zeros((1, samples)))
     assert found.feasible
@@ -71,7 +71,7 @@ def test_lmi_branches_on_the_two_gains_of_the_example() -> None:
 def test_cross_term_of_the_published_example() -> None:
     found = inverse_lqr_cross_term(PRIESS, PRIESS_GAIN)
     assert found.norm == pytest.approx(39.5, abs=0.05)
-    # The minimum is flat: the reference's iterate and this one agree only so far.
+    # The minimum is flat: both iterates agree only this far.
     Q = [[2.8112, -6.8124, -48.058], [-6.8124, 296.92, 5.928], [-48.058, 5.928, 1553.76]]
     R = [[1.0076, -1.4953, 0.2777], [-1.4953, 380.39, -75.36], [0.2777, -75.36, 16.19]]
     np.testing.assert_allclose(found.Q, Q, rtol=0.03)
@@ -84,7 +84,7 @@ def test_cross_term_weights_have_exactly_the_gain(plant: Plant, gain: Array) -> 
     joint = np.block([[found.Q, found.S], [found.S.T, found.R]])
     assert np.linalg.eigvalsh(joint)[0] > -1e-7 * np.linalg.norm(joint)
     assert np.linalg.eigvalsh(found.R)[0] > 1 - 1e-6
-    # By scipy's Riccati solver with a cross term, which shares nothing with the program.
+    # Independent check by scipy's Riccati solver with a cross term.
     if plant.discrete:
         P = scipy.linalg.solve_discrete_are(plant.A, plant.B, found.Q, found.R, s=found.S)
         right, left = plant.B.T @ P @ plant.A + found.S.T, found.R + plant.B.T @ P @ plant.B
@@ -150,7 +150,7 @@ def test_gradient_on_the_seat_plant_comes_near_a_gain_that_no_weights_have() -> 
 @pytest.mark.parametrize(
     ("seed", "n", "m", "dt"),
     [
-        # A gain of 256 from a P of condition 1e5: a difference over 2e-5 errs by 2e-4 there.
+        # Gain 256 from a P of condition 1e5: differences over 2e-5 err by 2e-4.
         (1675, 3, 1, 0.0),
         (3, 4, 3, 1.0),
     ],
@@ -171,7 +171,7 @@ def test_gradient_agrees_with_finite_differences(seed: int, n: int, m: int, dt: 
 
 
 def require_gradient(seed: int, n: int, m: int, dt: float) -> None:
-    """The Jacobian of the gain against differences of gains, to 1e-6 of its largest entry."""
+    """Derivative of the gain against finite differences, to 1e-6 of its largest entry."""
     rng = np.random.default_rng(seed)
     plant = Plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
     space = _FactorSpace.around(plant, Weights(np.eye(n), np.eye(m)), 1e-3)

@@ -1,4 +1,4 @@
-"""Unknowns of single trials are eliminated: the same minimum as with all columns side by side."""
+"""Elimination of trial-specific unknowns gives the minimum of the full problem."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Curved:
 
 
 def problem(seed: int, *, exact: bool = False, bent: bool = False) -> tuple[Curved, Prior]:
-    """Noisy, or with a zero residual near the start."""
+    """Noisy, or with zero residual near the start."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((TRIALS, ROWS, SHARED))
     B = rng.standard_normal((TRIALS, ROWS, OWN))
@@ -63,7 +63,7 @@ def problem(seed: int, *, exact: bool = False, bent: bool = False) -> tuple[Curv
 @pytest.mark.parametrize("bent", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 5.0])
 def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: float) -> None:
-    """N log |r|^2 and the prior, by BFGS from where the search ends: no lower value."""
+    """BFGS from the solution finds no lower value of N log |r|^2 plus prior."""
     model, prior = problem(seed, bent=bent)
     prior = Prior(prior.u, prior.v, np.full(SHARED, weight), weight)
     u, v, _, converged = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 400))
@@ -82,7 +82,7 @@ def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: fl
 
 @pytest.mark.parametrize("bent", [False, True])
 def test_an_exact_problem_ends_at_rounding(bent: bool) -> None:
-    """However strong the prior: its weight falls with the residual."""
+    """Any prior loses its weight as the residual vanishes."""
     model, prior = problem(7, exact=True, bent=bent)
     prior = Prior(prior.u, prior.v, np.full(SHARED, 1.0), 1.0)
     u, v, _, _ = minimise(model, prior, (prior.u, prior.v), Stop(1e-6, 1e-24, 100))

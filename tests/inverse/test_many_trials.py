@@ -1,4 +1,4 @@
-"""Hundreds of trials: memory grows with their number; the page draws those explained least."""
+"""Memory is linear in the number of trials; figures show the worst-explained trials."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_of_500_those_that_are_explained_least() -> None:
 
 
 def starts_unknown(trials: int) -> Problem:
-    """Short trials of a cart from starts that nobody knows, with noise."""
+    """Short noisy trials of a cart with unknown initial states."""
     plant, rng = cart(), np.random.default_rng(1)
     bounds = Bounds(plant, u_min=-1, u_max=1)
     controller = Controller.from_gain(plant, GAIN, bounds, 5, terminal_set=False)
@@ -57,7 +57,7 @@ def starts_unknown(trials: int) -> Problem:
 
 
 def peak_of(work: Callable[[], object]) -> int:
-    """Most that numpy holds meanwhile, bytes."""
+    """Peak memory of numpy during a call, bytes."""
     tracemalloc.start()
     try:
         work()
@@ -75,7 +75,7 @@ WORK: dict[str, Callable[[Problem], object]] = {
 @pytest.mark.full
 @pytest.mark.parametrize("name", WORK)
 def test_memory_grows_as_the_trials_do(name: str) -> None:
-    """Thrice the trials: 3 times the memory; nine times when each had columns beside all others."""
+    """Three times the trials need about three times the memory, not nine times."""
     few, many = (starts_unknown(count) for count in (60, 180))
-    WORK[name](few)  # what is compiled and kept once does not count
+    WORK[name](few)  # warm-up: compiled code and caches do not count
     assert peak_of(lambda: WORK[name](many)) < 4.5 * peak_of(lambda: WORK[name](few))

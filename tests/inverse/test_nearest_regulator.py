@@ -1,4 +1,4 @@
-"""The auxiliary problem against a search without derivatives."""
+"""The auxiliary problem (3.7) against a derivative-free search."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
     found = auxiliary_weights(example_plant, gain, IDENTITY)
     best = auxiliary_objective(example_plant, gain, found.weights)
     assert found.objective == pytest.approx(best, rel=1e-9)
-    # The reference's Q_0 (section 3, case A), from Nelder-Mead on its own scaling of the weights.
+    # Q_0 of the reference (section 3, case A) by Nelder-Mead, in its own scaling of the weights.
     assert best <= auxiliary_objective(
         example_plant, gain, Weights([[0.1901, 0.0716], [0.0716, 0.2163]], 1)
     )
@@ -42,7 +42,7 @@ def test_auxiliary_problem_reaches_what_a_derivative_free_search_reaches(
 
 
 def test_a_metric_is_come_near_too() -> None:
-    """Without a penalty on conditioning, weights of a known pair are found again."""
+    """Without penalty on conditioning, known weights are recovered from gain and metric."""
     rng = np.random.default_rng(3)
     plant = random_plant(rng, 3, 2, 0.9)
     truth = solve_lqr(plant, Weights(random_weights(rng, 3), random_weights(rng, 2)))

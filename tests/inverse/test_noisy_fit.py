@@ -1,4 +1,4 @@
-"""Fits with unknown initial states and parameters, without noise and with it."""
+"""Fits with unknown initial states and parameters, with and without noise."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def clean_problem(limit: float, trials: int = 2) -> tuple[Workload, Problem]:
     return work, fit_problem(plant, recordings, FitSettings(u_max=limit))
 
 
-# At 4.5 Nm, where clipped LQR falls, a search takes ten times as long.
+# At 4.5 Nm clipped LQR diverges, and a search takes ten times as long.
 LIMITS = [6.0, *(pytest.param(one, marks=pytest.mark.full) for one in (70.0, 4.5))]
 
 
@@ -49,7 +49,7 @@ def clean(request: pytest.FixtureRequest) -> tuple[Workload, Estimate]:
 def test_without_noise_all_that_is_determined_comes_out(
     clean: tuple[Workload, Estimate],
 ) -> None:
-    """VAF above 99.999 %, and the gain to 1e-5 along every determined direction."""
+    """VAF above 99.999 %, and the gain to 1e-5 along every identified direction."""
     work, fitted = clean
     samples = sum(trial.outputs.size for trial in work.problem.recordings)
     assert fitted.explained
@@ -64,7 +64,7 @@ def test_without_noise_all_that_is_determined_comes_out(
 
 
 def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, Estimate]) -> None:
-    """It wins and keeps the limit where the subject saturates, and equals where none is active."""
+    """Inverse MPC fits better and keeps the limit if the subject saturates; else equal."""
     work, fitted = clean
     names = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr", OURS)
     bounds = fitted.problem.bounds
@@ -87,7 +87,7 @@ def test_inverse_mpc_against_inverse_lqr(clean: tuple[Workload, Estimate]) -> No
 @pytest.mark.full
 @pytest.mark.parametrize("count", [1, 3])
 def test_noisy_subjects_reach_the_ceiling_within_their_deviations(count: int) -> None:
-    """Seeds 0 to 2 at 6 Nm; `python -m experiments.simulated_subjects` has a hundred of each."""
+    """Seeds 0 to 2 at 6 Nm (experiments/simulated_subjects has a hundred)."""
     subjects = [simulated_subject(seed, 6.0) for seed in range(count)]
     assert max(item.below_ceiling for item in subjects) < 0.5
     inside = [np.abs(item.entries) <= 3 for item in subjects]
@@ -97,7 +97,7 @@ def test_noisy_subjects_reach_the_ceiling_within_their_deviations(count: int) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", [70.0, 6.0, 4.5])
 def test_a_hundred_noisy_subjects(limit: float) -> None:
-    """Seeds 0 to 99: within half a point of the ceiling, every entry inside for 97 of 100."""
+    """Seeds 0 to 99: within 0.5 points of the ceiling; all entries covered for 97 of 100."""
     subjects = [simulated_subject(seed, limit) for seed in range(100)]
     assert max(item.below_ceiling for item in subjects) < 0.5
     inside = np.array([np.abs(item.entries) <= 3 for item in subjects])
@@ -105,7 +105,7 @@ def test_a_hundred_noisy_subjects(limit: float) -> None:
 
 
 def test_initial_states_are_found() -> None:
-    """From rest as the first guess, with the true controller, to the rounding of a short trial."""
+    """True controller, initial guess at rest: found to the rounding of a short trial."""
     work, _ = clean_problem(6.0, 1)
     controller, plant = work.controller, work.problem.plant
     rng = np.random.default_rng(7)
@@ -124,7 +124,7 @@ def test_initial_states_are_found() -> None:
 
 
 def seat_family() -> tuple[Problem, Workload]:
-    """Unknown moment of inertia and muscle time constant, from nominal values 20 % off."""
+    """Unknown moment of inertia and muscle time constant, nominal values 20 % off."""
     work, problem = clean_problem(6.0, 2)
     truth = plants.SeatedBalanceParameters()
 
@@ -158,7 +158,7 @@ def test_every_column_of_the_search_equals_differences() -> None:
     space = Coordinates(problem, np.array(work.controller.K), np.eye(1))
     rng = np.random.default_rng(3)
     z = space.start + 0.02 * rng.standard_normal(len(space.start))
-    # The compressed residual turns with z; its norm does not: compare the gradient of its square.
+    # Compression rotates the residual and keeps its norm: compare gradients of its square.
     gradient = space.at(z).jacobian.T @ space.at(z).residual
     for index in [*rng.choice(len(z), 12, replace=False).tolist(), len(z) - 1, len(z) - 2]:
         step = np.zeros(len(z))
@@ -203,7 +203,7 @@ def test_moved_changes_starts_and_plant() -> None:
 
 @pytest.mark.full
 def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
-    """White noise, no bound: the sandwich is sigma^2 (J'J)^-1 of the full problem."""
+    """White noise, no bounds: the sandwich equals sigma^2 (J'J)^-1 of the full problem."""
     subject_noise = 1e-6
     work, problem = clean_problem(70.0, 1)
     rng = np.random.default_rng(11)

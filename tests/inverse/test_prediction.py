@@ -1,4 +1,4 @@
-"""Prediction errors, against the recursion of the filter written out, and its limits."""
+"""One-step-ahead predictions against the explicit filter recursion, and limiting cases."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impc.inverse.residuals import evaluate
 
 @pytest.mark.parametrize("ratio", [1.0, 10.0])
 def test_the_corrected_loop_is_the_recursion(ratio: float) -> None:
-    """A stick with its limit: predict, correct by the innovation, clip the command (horizon 1)."""
+    """Stick with a limit: predict, correct by the innovation, clip the command (horizon 1)."""
     known = next(one for one in map(stick_problem, range(50)) if one is not None)
     problem = replace(known.problem, horizon=1, terminal_set=False)
     plant, (trial,) = problem.plant, problem.recordings
@@ -32,7 +32,7 @@ def test_the_corrected_loop_is_the_recursion(ratio: float) -> None:
 
 
 def test_the_filter_is_steady_and_stable() -> None:
-    """Its gain solves the Riccati equation of the filter, by iterating the covariance."""
+    """The filter gain solves the Riccati equation (checked by iterating the covariance)."""
     known = random_problem(3, half=True)
     assert known is not None
     problem, plant = known.problem, known.problem.plant

@@ -1,4 +1,4 @@
-"""Random inverse problems with known answers, and none left out."""
+"""Random inverse problems with known solutions."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ def random_problem(seed: int) -> tuple[Weights, Controller, Problem]:
 
 
 def solved(seed: int) -> bool:
-    """Misfit below 1e-8; the true metric as far as it is identified; least condition to 1e-4.
+    """Misfit below 1e-8, the true metric as far as identified, least condition number to 1e-4.
 
-    The least condition number is that of the true gain, with a metric that the recording does not
-    say from the true one.
+    The latter is that of the true gain with a metric that the recording cannot distinguish.
     """
     weights, _, problem = random_problem(seed)
     found = inverse_mpc_reduced(problem)

@@ -1,4 +1,4 @@
-"""The span of the gains that weights of a structure have: behind a delay, and on the seat."""
+"""Linear span of the gains of a structure's weights, with a delay and on the seat."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LATE = 3
 
 
 def late_body() -> Plant:
-    """A body of two states that falls, under a command that comes three samples late."""
+    """Unstable body of two states; the command arrives three samples late."""
     A = np.zeros((2 + _LATE, 2 + _LATE))
     A[:2, :2], A[:2, 2], A[2:-1, 3:] = _BODY, [0.0, 0.1], np.eye(_LATE - 1)
     inputs = np.zeros((len(A), 2))
@@ -44,7 +44,7 @@ def late_body() -> Plant:
 
 
 def weighed(plant: Plant, rng: np.random.Generator) -> Array:
-    """Gain of random weights on the body, by another solver of the equation."""
+    """Gain of random weights on the body, by scipy's Riccati solver."""
     root = rng.normal(size=(2, 2))
     Q = scipy.linalg.block_diag(root @ root.T, np.zeros((_LATE, _LATE)))
     P = scipy.linalg.solve_discrete_are(plant.A, plant.B, Q, np.eye(1))
@@ -58,7 +58,7 @@ def spanned(plant: Plant, structure: Structure, gain: Array) -> Array:
 
 
 def outside(found: Array, gain: Array) -> float:
-    """What of a gain the span does not have, as a share of it."""
+    """Share of a gain outside the span."""
     rows = found.reshape(len(found), -1)
     row = np.ravel(gain)
     left = row - np.linalg.lstsq(rows.T, row, rcond=None)[0] @ rows
@@ -66,7 +66,7 @@ def outside(found: Array, gain: Array) -> float:
 
 
 def test_over_a_delay_the_controller_predicts() -> None:
-    """K = K_b (A^3, A^2 b, A b, b), whatever the body's cost weights are: two numbers of five."""
+    """K = K_b (A^3, A^2 b, A b, b) for all cost weights of the body: two dimensions of five."""
     plant, rng = late_body(), np.random.default_rng(0)
     found = spanned(plant, Structure(plant, "full", over=["p", "v"]), weighed(plant, rng))
     assert len(found) == 2
@@ -78,7 +78,7 @@ def test_over_a_delay_the_controller_predicts() -> None:
         on_body = np.linalg.lstsq(predicted.T, gain[0], rcond=None)[0]
         np.testing.assert_allclose(on_body @ predicted, gain[0], rtol=1e-9)
         assert outside(found, gain) < 1e-9
-    assert outside(found, np.eye(5)[4]) > 0.1  # a gain on the delay alone is not among them
+    assert outside(found, np.eye(5)[4]) > 0.1  # a gain on the delay alone is outside
 
 
 @pytest.mark.parametrize("features", ["diagonal", ["p", "v"], ["p", "v - p", "p + v"]])
@@ -92,7 +92,7 @@ def test_it_is_that_of_all_products_of_the_features(features: str | list[str]) -
 
 
 def test_on_the_seat_five_dimensions_hold_them_all() -> None:
-    """Weights over angles and rates, from a hundredth of the benchmark's to a hundred times."""
+    """Weights over angles and rates, from 0.01 to 100 times those of the benchmark."""
     work = seat(1, 2.0)
     plant, rng = work.controller.plant, np.random.default_rng(2)
     structure = Structure(plant, "full", over=plant.states[:4])
@@ -106,7 +106,7 @@ def test_on_the_seat_five_dimensions_hold_them_all() -> None:
         gain = Controller(plant, Weights(Q, 1), Bounds(plant), 1, terminal_set=False).K
         natural = found[:, 0] @ T
         row = np.array(gain)[0] @ T
-        # Measured: 1e-4; Padé's delay, sampled, is not quite all-pass.
+        # Measured: 1e-4; the sampled Padé delay is not exactly all-pass.
         assert np.linalg.norm(row - natural.T @ (natural @ row)) < 5e-4 * np.linalg.norm(row)
 
 
@@ -140,7 +140,7 @@ def test_a_structure_that_prices_every_state_keeps_no_gain_out() -> None:
 
 @pytest.mark.full
 def test_a_person_is_searched_within_the_span() -> None:
-    """Three numbers fewer, a gain that predicts, and derivatives that are those of differences."""
+    """Three unknowns fewer, a predicting gain, and derivatives equal to finite differences."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
     person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
     first = fit(problem)
@@ -152,7 +152,7 @@ def test_a_person_is_searched_within_the_span() -> None:
     ).K
     np.testing.assert_allclose(found.K, truth, rtol=0.3)
     closed = np.abs(np.linalg.eigvals(problem.plant.A - problem.plant.B @ found.K))
-    np.testing.assert_allclose(np.sort(closed)[:_LATE], 0, atol=1e-3)  # 1e-15's cube root
+    np.testing.assert_allclose(np.sort(closed)[:_LATE], 0, atol=1e-3)  # cube root of 1e-15
     step = np.random.default_rng(5).normal(size=len(found.theta))
 
     def moved(t: float) -> Array:

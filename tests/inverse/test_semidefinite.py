@@ -1,4 +1,4 @@
-"""Bounds of semidefinite programs are proofs, however early the solver stops."""
+"""Dual bounds of semidefinite programs hold at any solver accuracy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-4, 1e-6, 1e-9])
 def test_a_bound_is_never_above_the_largest_eigenvalue(tolerance: float) -> None:
-    """min s with s I >= M is the largest eigenvalue, which LAPACK knows."""
+    """min s with s I >= M is the largest eigenvalue."""
     rng = np.random.default_rng(4)
     for size in (1, 2, 5, 9):
         for scale in (1e-3, 1.0, 1e3):
@@ -36,7 +36,7 @@ def test_a_bound_is_never_above_the_largest_eigenvalue(tolerance: float) -> None
 
 
 def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
-    """min s with ||a + V'y|| <= s is the distance of a to a space, by least squares."""
+    """min s with ||a + V'y|| <= s is the distance of a to a subspace (least squares)."""
     rng = np.random.default_rng(5)
     for tolerance in (1e-1, 1e-4, 1e-8):
         V, a = rng.normal(size=(3, 8)), rng.normal(size=8)
@@ -51,7 +51,7 @@ def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
 
 
 def test_each_objective_over_the_same_cone_has_its_own_end() -> None:
-    """min c'y over the disc |y| <= 1 as a matrix inequality: -|c|, whatever came before."""
+    """min c'y over the disc |y| <= 1 is -|c| for each of several objectives."""
     rng = np.random.default_rng(6)
     basis = np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
     cone = matrix_inequality(np.eye(2), basis)
@@ -64,7 +64,7 @@ def test_each_objective_over_the_same_cone_has_its_own_end() -> None:
 
 
 def test_a_solver_that_breaks_off_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A panic of Rust is no Exception; whatever else is none, an interrupt, passes."""
+    """A Rust panic becomes a SolverError; other non-Exceptions, such as an interrupt, pass."""
 
     def broken(kind: type[BaseException]) -> Callable[..., None]:
         def solver(*_: object) -> None:

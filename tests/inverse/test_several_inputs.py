@@ -1,4 +1,4 @@
-"""Weights of two and three inputs: what is reported, simulated, is what was recorded."""
+"""Problems with two and three inputs: simulated weights reproduce the recordings."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from tests.support import extrapolated_slope, saturated_problem
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# What is asked of reported weights, of the recorded outputs.
+# Largest misfit of reported weights relative to the recorded outputs.
 REPRODUCED = 1e-7
 
 
@@ -49,7 +49,7 @@ def random_problem(seed: int, m: int) -> tuple[Controller, Problem]:
 
 
 def missed(problem: Problem, weights: Weights) -> float:
-    """Simulated minus recorded outputs over the recorded ones: by the controller, from weights."""
+    """Relative misfit of the controller built from the reported weights."""
     plant = problem.plant
     controller = Controller(
         plant, weights, problem.bounds, problem.horizon, terminal_set=bool(problem.terminal_set)
@@ -83,7 +83,7 @@ PATHS = {"fit": by_fit, "reduced": by_reduced, "direct": by_direct}
 def outcomes(
     path: Callable[[Problem], tuple[Weights, bool]], m: int, seeds: range
 ) -> dict[int, str]:
-    """Per problem that is not reproduced: "said so", or how far a silent answer missed."""
+    """For problems that are not reproduced: "said so", or the misfit without a warning."""
     found = {}
     for seed in seeds:
         _, problem = random_problem(seed, m)
@@ -101,7 +101,7 @@ def outcomes(
 @pytest.mark.parametrize("m", [2, pytest.param(3, marks=pytest.mark.full)])
 @pytest.mark.parametrize("path", ["fit", "reduced"])
 def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
-    """At seeds 0 to 4 the weights missed it by 0.1 to 60 %, and were called exact."""
+    """Regression: seeds 0 to 4 had a misfit of 0.1 to 60 % and were reported as exact."""
     assert outcomes(PATHS[path], m, range(5)) == {}
 
 
@@ -116,9 +116,9 @@ def test_reported_weights_reproduce_the_recording(path: str, m: int) -> None:
     ],
 )
 def test_direct_form_reproduces_the_recording(m: int, seed: int) -> None:
-    """At seeds 2 and 8 it ended with a misfit of 8e-5 and 3e-5, and called that converged.
+    """Regression: seeds 2 and 8 converged to misfits of 8e-5 and 3e-5.
 
-    At the last two its start had an eigenvalue of -1e-9, and it ended with a WeightsError.
+    The last two started at an eigenvalue of -1e-9 and raised a WeightsError.
     """
     assert outcomes(by_direct, m, range(seed, seed + 1)) == {}
 
@@ -135,7 +135,7 @@ def test_ninety_nine_in_a_hundred_are_reproduced_and_no_miss_is_silent(path: str
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 3), (3, 2)])
 def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
-    """The recording alone leaves more than one S; consistency with K says the rest of it."""
+    """The recording leaves more than one S; consistency with K determines the rest."""
     controller, problem = random_problem(seed, m)
     plant = problem.plant
     fit = refine_gain(problem, np.array(controller.K), np.array(controller.S))
@@ -159,12 +159,12 @@ def test_set_of_weights_has_the_metric_in_it() -> None:
     plant, K = problem.plant, np.array(fitted.gain)
     numbers = plant.n * (plant.n + 1) // 2 + plant.m * (plant.m + 1) // 2
     found = summarise_weights(plant, K, np.array(fitted.metrics), np.ones(plant.n))
-    # n m + m - 1 numbers are identified, and one is the scale.
+    # n m + m - 1 directions are identified; one further is the scale.
     assert found.dimension == numbers - (plant.n * plant.m + plant.m - 1) - 1
 
 
 def test_fibre_of_a_metric_in_a_span() -> None:
-    """Every member's R + B'PB is in the span, and the span of all metrics asks nothing."""
+    """R + B'PB of every member is in the span; the span of all metrics is no restriction."""
     controller, problem = random_problem(2, 3)
     plant = problem.plant
     metric = np.array(controller.S)
@@ -181,7 +181,7 @@ def test_fibre_of_a_metric_in_a_span() -> None:
 
 
 def test_a_step_at_which_the_solver_breaks_off_is_tried_shorter() -> None:
-    """Here Clarabel panics on eigenvalues that LAPACK does not find; the fit ended with it."""
+    """Regression: Clarabel panics here on eigenvalues that LAPACK does not find."""
     controller = regulator(carts(2))
     found = fit(controller, noisy_recording(controller, 111, 90.0, 0.0))
     assert found.converged
@@ -189,14 +189,14 @@ def test_a_step_at_which_the_solver_breaks_off_is_tried_shorter() -> None:
 
 
 def asymmetry(plant: Plant, gain: np.ndarray, metric: np.ndarray) -> float:
-    """Of S K A^-1 B, against its size: it is B'PB where the pair is that of weights."""
+    """Relative asymmetry of S K A^-1 B, which is B'PB for a pair of weights."""
     product = metric @ gain @ np.linalg.solve(plant.A, plant.B)
     return float(np.linalg.norm(product - product.T) / np.linalg.norm(product))
 
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 1), (2, 4), (3, 0), (3, 4), (3, 5)])
 def test_the_family_of_metrics_is_that_of_weights(m: int, seed: int) -> None:
-    """Every member is consistent with the gain, and so is that of the true weights a member.
+    """Every member is consistent with the gain, and the true metric is a member.
 
     At (3, 5) the inputs outnumber the states.
     """
@@ -220,7 +220,7 @@ def test_the_family_of_metrics_is_that_of_weights(m: int, seed: int) -> None:
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 4), (2, 12), (3, 5), (3, 40), (3, 67), (3, 89)])
 def test_inactive_samples_determine_the_gain(m: int, seed: int) -> None:
-    """Also where they are a third of all (2, 12), or the inputs outnumber the states (3, 5)."""
+    """Also if these are a third of all samples (2, 12) or inputs outnumber states (3, 5)."""
     controller, problem = random_problem(seed, m)
     found = pair_of_inactive_samples(problem)
     assert found is not None
@@ -230,7 +230,7 @@ def test_inactive_samples_determine_the_gain(m: int, seed: int) -> None:
 
 @pytest.mark.parametrize("B", [[[0, 0], [1, 2]], [[0, 0], [1, 1]]])
 def test_two_motors_that_do_the_same(B: list[list[float]]) -> None:
-    """Their split is a convention: each by its bound. The recordings are explained by weights."""
+    """The split between equal inputs is a convention; weights explain the recordings."""
     plant = Plant(control.ss([[1, 0.1], [0.2, 1]], B, np.eye(2), np.zeros((2, 2)), 1))
     bounds = Bounds(plant, u_min=-0.3, u_max=0.3)
     truth = Controller(plant, Weights(np.eye(2), np.eye(2)), bounds, 10)
@@ -262,7 +262,7 @@ def test_coordinates_know_how_gain_and_metric_change(m: int, seed: int) -> None:
 
 
 def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
-    """Their margin is below 1e-9: known members are found again, none is made up without one."""
+    """Margin below 1e-9: known members are recovered, none is invented without one."""
     _, problem = random_problem(2, 2)
     plant = problem.plant
     thin = Weights(np.diag([1e-11, 1.0, 1.0, 1.0]), np.eye(2))
@@ -274,7 +274,7 @@ def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
 
 @pytest.mark.full
 def test_a_noisy_fit_stays_where_it_ended() -> None:
-    """Begun at its own answer the gain moved by a fifth of its error along weak directions."""
+    """Regression: restarted at its own solution, the gain moved by a fifth of its error."""
     controller, clean = random_problem(1, 2)
     (trial,) = clean.recordings
     scale = np.asarray(clean.output_scale)
@@ -292,8 +292,8 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     assert found.converged
     assert not found.explained
     assert moved < 0.1 * error
-    # What is printed is at the minimum over the identified directions, which no weights hold back:
-    # a Gauss-Newton step along them would lower chi-squared by less than a tenth.
+    # The reported gain is at the minimum over the identified directions: a Gauss-Newton step along
+    # them would lower chi-squared by less than 0.1.
     printed = gain_estimate(found)
     here = evaluate(printed.problem, np.array(printed.K), np.array(printed.S))
     T, G = natural_coordinates(clean.plant, np.array(printed.K))
@@ -307,7 +307,7 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     "seed", [49, *(pytest.param(seed, marks=pytest.mark.full) for seed in (82, 89, 92))]
 )
 def test_a_start_at_the_edge_of_what_weights_can_have(seed: int) -> None:
-    """Two fits ended with an error of the start's program, two 4 and 7 % above the truth."""
+    """Regression: two fits failed at the start's program; two were 4 and 7 % above the truth."""
     assert short_of_truth(*random_recording(seed, 3, 90.0)) < 1
 
 
@@ -322,5 +322,5 @@ def test_a_start_at_the_edge_of_what_weights_can_have(seed: int) -> None:
     ],
 )
 def test_a_noisy_fit_leaves_the_local_minimum_of_its_start(m: int, seed: int) -> None:
-    """They left 3, 14 and 29 %, 4.7 and 1.4 % more than the truth."""
+    """Regression: these ended 1.4 to 29 % above the misfit of the truth."""
     assert short_of_truth(*random_recording(seed, m, 90.0)) < 1

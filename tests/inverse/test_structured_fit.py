@@ -1,4 +1,4 @@
-"""Cost weights of a structure behind recordings: exact ones, zeros, and the best there is."""
+"""Cost weights of a structure: exact recovery, zero cost weights, and noisy fits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def pushed(
     samples: int = 300,
     limit: float = 1.0,
 ) -> tuple[Controller, np.ndarray]:
-    """A controller of the structure, and a push that drives it to its limits."""
+    """Controller of the structure, and a push that drives it to its limits."""
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
     rng = np.random.default_rng(5)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (samples // 10, plant.E.shape[1])), 10, axis=0)
@@ -57,7 +57,7 @@ def posed(truth: Controller, trial: Recording, **given: object) -> Problem:
 
 @functools.cache
 def seat() -> tuple[Problem, Controller]:
-    """One trial of ten seconds of the seat without noise, and its controller."""
+    """One noise-free trial of ten seconds of the seat, and its controller."""
     plant = Plant(plants.seated_balance_plant(), ["command"])
     structure = Structure(plant, "diagonal", over=BODY)
     truth = Controller(plant, structure.weights(SEAT), Bounds(plant), 20, terminal_set=False)
@@ -72,7 +72,7 @@ def seat() -> tuple[Problem, Controller]:
 
 
 def test_the_prices_of_the_seat_without_noise() -> None:
-    """From a gain that is 5 % wrong; the search itself starts at Bryson's rule."""
+    """From a gain that is 5 % wrong; the search starts at Bryson's rule."""
     problem, truth = seat()
     structure = problem.structure
     assert structure is not None
@@ -83,7 +83,7 @@ def test_the_prices_of_the_seat_without_noise() -> None:
 
 @pytest.mark.parametrize("family", [False, True])
 def test_derivatives_through_the_riccati_equation(family: bool) -> None:
-    """Two inputs at their limits; with a family the plant moves the gain too."""
+    """Two inputs at their limits; with a family the plant changes the gain too."""
     plant = carts(2)
     structure = Structure(plant, ["x[0]", "x[1] - x[0]", "x[2]", "x[3]"], "full")
     cost_weights = np.concatenate([np.log([4.0, 5.0, 1.0, 1.0]), [0.1, 0.2]])
@@ -109,12 +109,12 @@ def test_derivatives_through_the_riccati_equation(family: bool) -> None:
             return np.array(np.sum(space.at(z + h * step).residual ** 2) / 2)
 
         slope = extrapolated_slope(half, 1e-4)
-        # Kinks where a limit begins to hold: 1e-6 of the gradient.
+        # Kinks where a limit becomes active: 1e-6 of the gradient.
         assert exact[index] == pytest.approx(float(slope), rel=1e-4, abs=1e-5 * abs(exact).max())
 
 
 def test_a_price_that_is_not_needed_is_zero() -> None:
-    """Truth without a cost weight of the second speed; noise decides that its estimate is zero."""
+    """The second speed has no cost weight; noise decides whether its estimate is zero."""
     plant = carts(2)
     structure = Structure(plant)
     cost_weights = np.concatenate([np.log([4.0, 5.0, 1.0]), [-np.inf, 0.0]])
@@ -125,14 +125,14 @@ def test_a_price_that_is_not_needed_is_zero() -> None:
         problem = posed(truth, trial)
         found = search_from(problem, structure, np.log([4.0, 5.0, 1.0, 0.3, 1.0]))
         zeros += int(found.cost_weights[3] == -np.inf)
-        if found.cost_weights[3] == -np.inf:  # no small cost weight is better
+        if found.cost_weights[3] == -np.inf:  # no small positive cost weight fits better
             for small in (1e-3, 1e-2):
                 tried = np.array(found.cost_weights)
                 tried[3] = np.log(small)
                 solution = solve_lqr(plant, structure.weights(tried))
                 size, _ = misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))
                 assert size > found.misfit
-    assert 1 <= zeros <= 3  # half of the time in the long run
+    assert 1 <= zeros <= 3  # half of the time in expectation
 
 
 def test_no_search_without_derivatives_does_better() -> None:
@@ -149,12 +149,12 @@ def test_no_search_without_derivatives_does_better() -> None:
         return misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))[0]
 
     best = min(nelder_mead(objective, start, 200) for start in (cost_weights, cost_weights + 1.0))
-    # The polish ends when the misfit falls by less than 1e-8 of itself.
+    # The refinement stops when the misfit decreases by less than 1e-8 of itself.
     assert found.misfit == pytest.approx(best, rel=1e-7)
 
 
 def test_the_method_of_the_registry() -> None:
-    """Through `impc.fit`, with an estimate that knows its cost weights."""
+    """Through `impc.fit`, with an estimate that has its cost weights."""
     plant = carts(1)
     structure = Structure(plant)
     truth, push = pushed(structure, plant, np.log([4.0, 1.0]))
@@ -167,23 +167,25 @@ def test_the_method_of_the_registry() -> None:
     np.testing.assert_allclose(found.stage_weights.Q, np.diag([4.0, 1.0]), rtol=1e-6)
     without = impc.fit(posed(truth, trial), "structured")
     assert without.K is None
-    assert "the problem names no structure" in without.reason
+    assert "the problem has no structure" in without.reason
 
 
 def test_a_structure_of_another_plant_is_refused() -> None:
     truth, push = pushed(Structure(carts(1)), carts(1), np.log([4.0, 1.0]))
     run = truth.simulate(np.zeros(2), disturbance=push)
     trial = Recording(truth.plant, (run.x @ truth.plant.C.T)[:-1], push)
-    with pytest.raises(InputError, match=r"^structure: has 4 states, what stands before it 2"):
+    with pytest.raises(
+        InputError, match=r"^structure: has 4 states, but an earlier argument has 2"
+    ):
         posed(truth, trial, structure=Structure(carts(2)))
 
 
 def test_no_regulator_that_can_be_simulated() -> None:
-    """A push that is far beyond the limit: whatever the cost weights, the plant runs away."""
+    """Push far beyond the limit: the plant diverges for all cost weights."""
     system = control.ss([[3.0]], [[1.0, 1.0]], [[1.0]], 0, 1, inputs=["u", "push"])
     plant = Plant(system, ["u"])
     structure = Structure(plant)
     truth = Controller(plant, structure.weights(np.zeros(1)), Bounds(plant, u_min=-1, u_max=1), 3)
     trial = Recording(plant, np.zeros((900, 1)), np.full(900, 50.0))
-    with pytest.raises(SolverError, match="none of its regulators can be simulated"):
+    with pytest.raises(SolverError, match="no controller of this structure can be simulated"):
         fit_structure(posed(truth, trial), structure, np.array(truth.K), np.array(truth.S))

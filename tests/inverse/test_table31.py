@@ -1,4 +1,4 @@
-"""Recovering the controller: the example of section 3.4, and problems with known answers."""
+"""Table 3.1: the example of section 3.4, and problems with known solutions."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_example_identifiability_shows_other_weights_that_explain_the_data(
 def test_what_is_determined_is_told_where_no_other_weights_can_be_found(
     example_plant: Plant, example_bounds: Bounds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At a condition number of 5e10 no program proves anything: a fit of hours once ended there."""
+    """At a condition number of 5e10 no program proves anything; the count must still be made."""
     problem = example(example_plant, example_bounds, "A")
     expected = identifiability(problem, IDENTITY)
 
@@ -116,7 +116,7 @@ def test_what_is_determined_is_told_where_no_other_weights_can_be_found(
 def test_singular_values_are_those_of_differences(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    """Of the simulated outputs along relative changes of Q and R: three directions and scale."""
+    """Derivative of the outputs by relative changes of Q and R: three directions, scale."""
     problem = example(example_plant, example_bounds, "A")
     columns = []
     for direction in block_basis(2, 1):
@@ -128,7 +128,7 @@ def test_singular_values_are_those_of_differences(
         columns.append((pair[0] - pair[1]) / 2e-5)
     expected = np.linalg.svd(np.column_stack(columns), compute_uv=False)
     found = identifiability(problem, IDENTITY).singular_values
-    # The differences end at 1e-10 of the largest.
+    # Finite differences are accurate to 1e-10 of the largest.
     np.testing.assert_allclose(found, expected, atol=1e-7 * float(expected[0]))
 
 
@@ -174,7 +174,7 @@ def test_direct_form_tends_to_the_reduced_one_with_noise(
 def test_squared_misfit_trades_and_the_norm_does_not(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    """With exact data and true weights away from the identity: docs/theory.md, section 6."""
+    """Exact data, true weights away from the identity (docs/why/theory.md)."""
     true = Weights([[4.0, 0.5], [0.5, 1.0]], 2.0)
     controller = Controller(example_plant, true, example_bounds, 3)
     run = require_complete(controller, simulate(controller, scenario(example_plant, [2, 3], 20)))
@@ -213,8 +213,8 @@ def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
     assert condition_number(found.stage_weights) == pytest.approx(best, rel=1e-4)
     counts = identifiability(problem, found.stage_weights)
     assert counts.free == 8
-    assert counts.rank == 3 * 2 + 2 - 1  # docs/theory.md, section 2: n m + m - 1
-    # Without an active bound the metric stays in the dark: only the gain is determined.
+    assert counts.rank == 3 * 2 + 2 - 1  # docs/why/theory.md: n m + m - 1
+    # Without an active bound the metric is not identified, only the gain.
     calm = simulate(controller, scenario(plant, [1e-3, 0, 0], 15))
     quiet = Problem(plant, bounds, 4, (Recording(plant, calm.x),))
     assert len(weights_behind(fit_gain(quiet)).metrics) > 1
@@ -222,7 +222,7 @@ def test_two_inputs_recover_gain_and_metric_while_bounds_are_active() -> None:
 
 @pytest.mark.parametrize("inputs", [1, 2])
 def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None:
-    """Terminal set, gain and metric all follow the weights; bounds are active."""
+    """Terminal set, gain and metric follow the weights; bounds are active."""
     rng = np.random.default_rng(inputs)
     plant = random_plant(rng, 3, inputs, 1.1)
     Q, R = random_weights(rng, 3), random_weights(rng, inputs)
@@ -256,7 +256,7 @@ def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None
 def test_a_gain_no_weights_have_is_said_and_the_direct_form_continues(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    """A recording made by a gain that is not a regulator's."""
+    """Recording made by a gain that no weights have."""
     gain = np.array([[1.21183, -0.71277]])
     controller = Controller.from_gain(example_plant, gain, example_bounds, 3)
     run = require_complete(
@@ -286,7 +286,7 @@ def test_a_search_steps_back_from_gains_that_do_not_stabilise(
 def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
     example_plant: Plant,
 ) -> None:
-    """A push beyond the bound: no hard controller passes it, the soft one explains it."""
+    """Push beyond the bound: infeasible for a hard controller, explained by the soft one."""
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1, 1.1, d=1)
     bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
@@ -304,7 +304,7 @@ def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so(
 def test_an_iterate_that_diverges_is_named_and_finite(
     example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    """A gain that gives the bounded input too little to do, from a start that needs it."""
+    """Gain that makes too little use of the bounded input for this initial state."""
     problem = example(example_plant, example_bounds, "A")
     outputs = np.vstack([2.5 * problem.recordings[0].outputs, np.zeros((200, 2))])
     far = Problem(

@@ -1,4 +1,4 @@
-"""Recordings with targets, lasting disturbances, commands, gaps and offsets: what made them."""
+"""Recordings with targets, disturbances, commands, gaps and offsets are recovered."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TRUE = np.diag([4.0, 0.3])
 
 
 def cart(**more: Any) -> Plant:
-    """A mass on a weak spring that is pushed, and pushed by the wind."""
+    """Mass on a weak spring with a push and wind as disturbances."""
     system = control.ss(
         [[1, 0.1], [-0.02, 0.97]], [[0, 0], [0.1, 0.1]], np.eye(2), 0, 0.1,
         states=["x", "v"], inputs=["push", "wind"], outputs=["x", "v"],
@@ -40,7 +40,7 @@ def recorded(
 
 
 def steps(seed: int) -> Array:
-    """A target that jumps now and then."""
+    """Target with occasional steps."""
     rng = np.random.default_rng(seed)
     return np.cumsum((rng.random(STEPS + 1) < 0.1) * rng.normal(size=STEPS + 1)) * 0.3
 
@@ -51,7 +51,7 @@ WIND = 0.3 + 0.1 * np.sin(np.arange(STEPS) / 7)
 @pytest.mark.parametrize("limit", [0.6, 9.0])
 @pytest.mark.parametrize("kind", ["target", "push", "known push", "preview"])
 def test_exact_recordings_give_gain_and_weights(kind: str, limit: float) -> None:
-    """The gain, the set of weights with the true ones in it, and weights of a structure."""
+    """Recovers the gain, a set of weights that contains the true ones, and structured weights."""
     plant = cart()
     if kind == "preview":
         plant = impc.with_preview(plant, ["x"], 3)
@@ -99,7 +99,7 @@ def test_the_rate_of_an_observer_is_a_parameter() -> None:
 
 @pytest.mark.parametrize("limit", [0.6, 9.0])
 def test_gaps_offsets_and_commands(limit: float) -> None:
-    """Half of the positions missing, an offset in each trial, commands recorded with gaps."""
+    """Half of the positions missing, one offset per trial, recorded commands with gaps."""
     plant = cart()
     weights, rng, trials = impc.Weights(TRUE, 1), np.random.default_rng(0), []
     for seed in (1, 2):
@@ -124,7 +124,7 @@ def test_gaps_offsets_and_commands(limit: float) -> None:
 @pytest.mark.parametrize("seen", ["x v", "x"])
 @pytest.mark.parametrize("limit", [0.6, 9.0])
 def test_commands_give_the_gain_by_regression(limit: float, seen: str) -> None:
-    """From recorded states, and from those of the plant that the commands drive."""
+    """From recorded states, and from the plant driven by the commands."""
     plant = impc.with_observer(cart(), 2.0)
     law, run = recorded(plant, limit, {"x": steps(1)}, WIND, impc.Weights(TRUE, 1))
     if seen == "x":
@@ -137,10 +137,10 @@ def test_commands_give_the_gain_by_regression(limit: float, seen: str) -> None:
     assert shown["regression"].to_numpy() == pytest.approx(np.ravel(law.K), abs=1e-6)
     regression = impc.fit(problem, "command_regression", start=found)
     assert regression.gain == pytest.approx(np.array(law.K), abs=1e-6)
-    if seen == "x v":  # recorded states are not driven
+    if seen == "x v":  # recorded states are used directly
         return
     wrong = replace(trial, commands=-3 * trial.commands)
-    with pytest.raises(SolverError, match="do not move the plant"):
+    with pytest.raises(SolverError, match="does not reproduce the recorded outputs"):
         impc.command_regression(replace(found, problem=replace(problem, recordings=(wrong,))))
 
 

@@ -1,4 +1,4 @@
-"""A standing person of two links: the answers are at the minimum of the misfit."""
+"""Two-link standing person: fits are at the minimum of the misfit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def least_misfit(problem: Problem, start: np.ndarray) -> float:
-    """Of plain feedback, by another simulator and another least squares."""
+    """Least misfit of linear feedback, by another simulator and optimiser."""
     plant, trial = problem.plant, problem.recordings[0]
     drive, scale = np.array(trial.disturbance), np.array(problem.output_scale)
 

@@ -1,4 +1,4 @@
-"""A body that is not exactly known: its prior in the fit, and in the intervals."""
+"""Plant with stated uncertainty: prior in the fit and in the intervals."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def family(**uncertainty: Any) -> PlantFamily:
 
 @functools.cache
 def saturated() -> tuple[Problem, Array]:
-    """Recordings at the limit for part of the time, of the family with all four unknowns."""
+    """Recordings partly at the limit, of the family with all four unknowns."""
     made = family()
     plant, rng = made.make(made.nominal), np.random.default_rng(3)
     bounds = impc.Bounds(plant, u_min=-0.42, u_max=0.42)
@@ -77,7 +77,7 @@ def test_values_of_delay_and_limit_are_in_their_units() -> None:
 
 
 def test_the_covariance_is_that_of_the_joint_curvature() -> None:
-    """White residuals: the inverse of J'J / s^2 + prior, all else written out; to 1e-6."""
+    """White residuals: inverse of J'J / s^2 + prior from all columns; to 1e-6."""
     found = gain_estimate(fitted())
     problem, K, S = found.problem, np.array(found.K), np.array(found.S)
     at = evaluate(problem, K, S)
@@ -99,7 +99,7 @@ def test_the_covariance_is_that_of_the_joint_curvature() -> None:
 
 
 def test_the_fit_is_the_mode_of_the_posterior() -> None:
-    """N log |r|^2 + |q / d|^2 is no smaller nearby, in 20 directions of gain and body."""
+    """N log |r|^2 + |q / d|^2 is no smaller nearby (20 directions of gain and body)."""
     found = gain_estimate(fitted())
     problem, K = found.problem, np.array(found.K)
     logs, count = np.array(problem.logarithms), problem.recorded_numbers
@@ -117,7 +117,7 @@ def test_the_fit_is_the_mode_of_the_posterior() -> None:
 
 
 def test_intervals_hold_where_they_do_not_for_an_exact_body() -> None:
-    """Both coefficients 3 % off, four carts: 8 of 8 entries, and 2 of 8 as if they were exact."""
+    """Both coefficients 3 % off, four carts: 8 of 8 entries covered, 2 of 8 if taken as exact."""
     held = {"stated": 0, "exact": 0}
     for seed in (0, 4, 5, 6):
         person = cart_person(seed, 99, 0.0, "plant")
@@ -131,7 +131,7 @@ def test_intervals_hold_where_they_do_not_for_an_exact_body() -> None:
 
 
 def test_an_uncertainty_of_zero_is_none() -> None:
-    """As without the family, to the last digit."""
+    """Identical to the fit without the family."""
     person = cart_person(1, 99, 0.0)
     assert person is not None
     nothing = family(fall=0, damp="0 %")
@@ -183,8 +183,8 @@ def test_what_a_file_states_replaces_the_plants_own() -> None:
         ({"J2": "much"}, "J2"),
         ({"J2": -1}, "J2"),
         ({"J2": True}, "J2"),
-        ({"u_max": 3.0}, "a share of the limit"),
-        ("no table", "is no table"),
+        ({"u_max": 3.0}, "a percentage of the limit"),
+        ("no table", "is not a table"),
     ],
 )
 def test_what_cannot_be_stated(stated: Any, said: str) -> None:
@@ -203,12 +203,12 @@ def test_a_delay_needs_a_plant_that_can_have_one() -> None:
     source = plant_source("plants:seated_balance_for", {"uncertainty": {"extra_delay": 0.01}})
     seat = plant_family_of(source, ["perturbation"], [])
     assert seat is not None
-    with pytest.raises(PlantError, match="write one into the body"):
+    with pytest.raises(PlantError, match="model the delay in the body"):
         seat.make(seat.nominal)
 
 
 def test_a_body_that_is_not_linear_follows_by_its_linear_part() -> None:
-    """Derivatives by parameters of the seat's nonlinear body against differences; at 4 Nm."""
+    """Derivatives by parameters of the seat's nonlinear body, against differences; at 4 Nm."""
     made = plant_family_of(plant_source("plants:seated_balance_for", {}), ["perturbation"], [])
     assert made is not None
     plant = made.make(made.nominal)

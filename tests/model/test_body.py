@@ -1,4 +1,4 @@
-"""A plant's own body: how it is read, and what is refused."""
+"""Nonlinear bodies: how they are read, and which are rejected."""
 
 from __future__ import annotations
 
@@ -29,10 +29,13 @@ def system(dt: float = 0.1) -> Any:
     [
         (3.0, "expected a casadi.Function"),
         (ca.Function("f", [X], [X]), r"make it \(states \(2, 1\), inputs \(2, 1\)\)"),
-        (ca.Function("f", [X, W], [LINEAR, W]), "takes"),
-        (ca.Function("f", [X, W], [LINEAR + 1e-6]), "another linearisation"),
-        (ca.Function("f", [X, W], [LINEAR + 0.01 * X[0]]), "another linearisation"),
-        (ca.Function("f", [X, W], [LINEAR + ca.erf(X[0]) * X[0]]), "has the operation ERF"),
+        (ca.Function("f", [X, W], [LINEAR, W]), "maps"),
+        (ca.Function("f", [X, W], [LINEAR + 1e-6]), "does not have the linearisation"),
+        (ca.Function("f", [X, W], [LINEAR + 0.01 * X[0]]), "does not have the linearisation"),
+        (
+            ca.Function("f", [X, W], [LINEAR + ca.erf(X[0]) * X[0]]),
+            "uses the unknown operation ERF",
+        ),
     ],
 )
 def test_what_is_no_body_is_refused(body: Any, words: str) -> None:
@@ -41,13 +44,13 @@ def test_what_is_no_body_is_refused(body: Any, words: str) -> None:
 
 
 def test_the_order_of_the_inputs_is_that_of_the_system() -> None:
-    """The push comes first there and last in the plant; exchanged, the linearisation is another."""
+    """The push is first in the body and last in the plant; exchanged, the slopes differ."""
     tilted = np.array([[0.0, 0.0], [0.1, 0.3]])
     given = control.ss(A, tilted, [[1.0, 0.0]], 0, 0.1, inputs=["push", "torque"])
     ahead = ca.DM(A) @ X + ca.DM(tilted) @ W
     assert Plant(given, ["torque"], body=ca.Function("f", [X, W], [ahead])).moves == "nonlinear"
     exchanged = ca.DM(A) @ X + ca.DM(tilted[:, ::-1]) @ W
-    with pytest.raises(PlantError, match="order of its states and inputs"):
+    with pytest.raises(PlantError, match="its order of states and inputs"):
         Plant(given, ["torque"], body=ca.Function("f", [X, W], [exchanged]))
 
 
@@ -62,12 +65,12 @@ def test_what_is_no_expression_is_refused() -> None:
     equation = {"x": z, "p": known, "g": z - ca.sin(known)}
     solved = ca.rootfinder("solved", "newton", equation)(p=given[0][0])["x"]
     ahead = ca.DM(A) @ given[0] + ca.DM(B) @ given[1] + solved**2
-    with pytest.raises(PlantError, match="has the operation CALL"):
+    with pytest.raises(PlantError, match="uses the unknown operation CALL"):
         Plant(system(), ["torque"], body=ca.Function("f", [*given], [ahead]))
 
 
 def test_a_body_is_a_value() -> None:
-    """It can be sent and compared; parameters count; without it the plant is linear."""
+    """It can be pickled and compared; parameters matter; without it the plant is linear."""
     plant = pendulum()
     sent = pickle.loads(pickle.dumps(plant))
     assert digest(sent) == digest(plant) != digest(pendulum(2.1)) != digest(plant.linear())

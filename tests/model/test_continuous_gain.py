@@ -1,4 +1,4 @@
-"""Gains of continuous feedback and of held commands, against the continuous loop integrated."""
+"""Continuous and held gains, against integration of the continuous loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from impc.model.continuous_gain import continuous_gain, held_gain
 def missed(
     system: control.StateSpace, plant: impc.Plant, gain: np.ndarray, start: list[float]
 ) -> list[float]:
-    """Share of the continuous motion that the loop of its held gain misses, and of it, held."""
+    """Relative error of the motion with the held gain, and with the continuous gain held."""
     m, n = gain.shape
 
     def loop(_: float, z: np.ndarray) -> np.ndarray:  # state, and integral of the command
@@ -59,7 +59,7 @@ def test_the_held_gain_of_the_seat_at_50_hz_is_18_percent_less() -> None:
 
 
 def test_an_estimate_has_its_continuous_gain_with_intervals() -> None:
-    """Of one state: K = G (1 - exp(F dt)) / (-F dt), and the interval is that of K through it."""
+    """One state: K = G (1 - exp(F dt)) / (-F dt), and the interval is that of K mapped by it."""
     system = control.ss([[0.5]], [[2]], [[1]], 0, 0)
     plant = impc.Plant(control.c2d(system, 0.1))
     law = impc.Controller.from_continuous_gain(plant, [[1.5]], impc.Bounds(plant), 5)
@@ -80,8 +80,8 @@ def test_an_estimate_has_its_continuous_gain_with_intervals() -> None:
 @pytest.mark.parametrize(
     ("A", "said"),
     [
-        ([[0, 1], [0, 0]], "forgets all within a sample, such as a delay in samples; model"),
-        ([[0.5, 0], [0, -0.5]], "changes sign at every sample, which nothing continuous has"),
+        ([[0, 1], [0, 0]], "singular A, for example because of a delay in samples; model"),
+        ([[0.5, 0], [0, -0.5]], "changes sign at every sample, which no continuous plant has"),
     ],
 )
 def test_a_plant_that_is_sampled_from_none_is_refused(A: list[list[float]], said: str) -> None:
@@ -89,11 +89,11 @@ def test_a_plant_that_is_sampled_from_none_is_refused(A: list[list[float]], said
     with pytest.raises(impc.PlantError, match=said):
         impc.Controller.from_continuous_gain(plant, [[0, 0]], impc.Bounds(plant), 5)
     rates = impc.with_rates(plant)
-    with pytest.raises(impc.PlantError, match="give the plant that with_rates was given"):
+    with pytest.raises(impc.PlantError, match="pass the plant before with_rates"):
         impc.Controller.from_continuous_gain(rates, [[0, 0, 0]], impc.Bounds(rates), 5)
 
 
 def test_a_held_gain_of_no_continuous_one_is_refused() -> None:
     plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 0.1))
-    with pytest.raises(impc.InputError, match="of no continuous feedback near it; sample"):
+    with pytest.raises(impc.InputError, match="has no continuous-time gain near it; sample"):
         continuous_gain(plant, np.array([[1.2]]))  # a loop that changes sign at every sample

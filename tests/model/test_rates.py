@@ -1,4 +1,4 @@
-"""Changes of commands as controls: against a program in u and du, and through the inverse."""
+"""Changes of commands as controls: against a program in u and du, and in the inverse problem."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ either = pytest.mark.parametrize("inputs", [1, 2])
 
 
 def plant_of(inputs: int) -> impc.Plant:
-    """Of three states and a disturbance; its loops meet limits at 5 to 37 of 60 samples."""
+    """Plant of three states and a disturbance; its loops reach limits in 5 to 37 of 60 samples."""
     return random_plant(np.random.default_rng({1: 38, 2: 100}[inputs]), 3, inputs, 1.0, d=1)
 
 
@@ -40,7 +40,7 @@ def costs(inputs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def controller_of(
     inputs: int, u: float = U, du: float = DU, weights: Any = None, **settings: Any
 ) -> impc.Controller:
-    """Whose commands are -0.8 u to u, their changes -du to 0.9 du."""
+    """Controller with commands in -0.8 u to u and changes in -du to 0.9 du."""
     rates = impc.with_rates(plant_of(inputs))
     low, high = dict.fromkeys(rates.commands, -0.8 * u), dict.fromkeys(rates.commands, u)
     bounds = impc.Bounds(rates, x_min=low, x_max=high, u_min=-du, u_max=0.9 * du)
@@ -51,7 +51,7 @@ def controller_of(
 
 
 def driven(law: impc.Controller, seed: int) -> tuple[Scenario, impc.Simulation]:
-    """From three states of size one, pushed for 60 samples."""
+    """Scenario from three states of size one, pushed for 60 samples."""
     rng = np.random.default_rng(seed)
     x0 = np.concatenate([rng.choice([-1.0, 1.0], 3), np.zeros(law.plant.m)])
     push = np.repeat(rng.choice([-0.2, 0.2], 12), 5)
@@ -134,7 +134,7 @@ def test_derivatives_are_central_differences(inputs: int) -> None:
 
 
 def posed(law: impc.Controller, **given: Any) -> impc.Problem:
-    """Two exact recordings of the plant's states, without the commands."""
+    """Problem with two noise-free recordings of the plant's states, without the commands."""
     trials = []
     for drive, run in (driven(law, 0), driven(law, 1)):
         assert 5 <= np.count_nonzero(run.status == Status.ACTIVE) <= 37
@@ -174,7 +174,7 @@ def test_cost_weights_of_a_structure_are_found(inputs: int) -> None:
 
 
 def test_limits_of_changes_are_not_those_of_commands() -> None:
-    """The limit of the one as a number of the other: each is moved, cut off or clipped alone."""
+    """Limits of commands and of changes are fitted, removed or clipped separately."""
     law = controller_of(1, 0.9 * DU / 0.8)
     problem, at = impc.replace(posed(controller_of(1)), bounds=law.bounds), (law.K, law.S)
 
@@ -212,7 +212,7 @@ def test_what_has_no_changes_of_commands_is_refused() -> None:
     tilt, torque = ca.SX.sym("tilt"), ca.SX.sym("torque")
     bent = ca.Function("body", [tilt, torque], [0.9 * ca.sin(tilt) + torque])
     system = control.ss([[0.9]], [[1]], [[1]], 0, 0.1, states=["torque"], inputs=["torque"])
-    with pytest.raises(impc.PlantError, match=r"body that is not linear; give plant.linear\(\)"):
+    with pytest.raises(impc.PlantError, match=r"nonlinear body; pass plant.linear\(\)"):
         impc.with_rates(impc.Plant(system, body=bent))
     with pytest.raises(impc.PlantError, match="two signals 'torque'"):
         impc.with_rates(impc.Plant(system))

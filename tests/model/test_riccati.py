@@ -42,7 +42,7 @@ def test_gain_equals_that_of_python_control(seed: int) -> None:
 
 
 def test_cost_of_any_inputs_is_distance_to_the_gain() -> None:
-    """The identity of docs/theory.md, section 2, on random inputs."""
+    """The identity of docs/why/theory.md, section 2, for random inputs."""
     rng = np.random.default_rng(1)
     plant = random_plant(rng, 3, 2, 1.3)
     weights = Weights(random_weights(rng, 3), random_weights(rng, 2))
@@ -93,7 +93,7 @@ def test_lyapunov_series_equals_scipy_up_to_slow_loops() -> None:
 
 def test_a_mode_without_weight_is_an_error() -> None:
     plant = Plant(control.ss(np.diag([1.0, 0.5]), [[1], [1]], np.eye(2), 0, True))
-    with pytest.raises(WeightsError, match="weigh every mode"):
+    with pytest.raises(WeightsError, match="penalise every mode"):
         solve_lqr(plant, Weights(np.diag([0.0, 1.0]), 1))
 
 

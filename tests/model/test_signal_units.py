@@ -1,4 +1,4 @@
-"""Units of gains and weights, against pint's; those that a plant carries, and that pages show."""
+"""Units of gains and weights, against pint; units of plants and in reports."""
 
 from __future__ import annotations
 

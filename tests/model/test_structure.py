@@ -1,4 +1,4 @@
-"""Structures of weights: features by name, what they make, and what is refused."""
+"""Cost structures: features by name, their weights, and rejected input."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = ("a", "a_rate", "b", "x[0]", "1st")
 
 @pytest.fixture(scope="module")
 def plant() -> Plant:
-    """Three states, of which p and v run away; two inputs, one output p - w."""
+    """Three states, of which p and v are unstable; two inputs, one output p - w."""
     A = [[1.1, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.5]]
     system = control.ss(
         A, np.eye(3, 2), [[1, 0, -1]], 0, 1, states=["p", "v", "w"], inputs=["f", "g"],
@@ -109,11 +109,11 @@ def test_changes_are_derivatives(plant: Plant, given: tuple[Any, ...]) -> None:
     [
         ({"Q": "diagonl"}, InputError, "Q: got 'diagonl'"),
         ({"Q": 3}, InputError, "Q: got 3"),
-        ({"Q": []}, InputError, "names no feature"),
-        ({"Q": ["p"], "over": ["v"]}, InputError, "over: goes with diagonal and full"),
-        ({"Q": "outputs", "over": ["v"]}, InputError, "over: goes with diagonal and full"),
-        ({"Q": ["p", "v", "p + v", "p - v"]}, InputError, "make the same weights; leave one out"),
-        ({"Q": "full", "over": ["p", "v", "p + v"]}, InputError, "make the same weights"),
+        ({"Q": []}, InputError, "is empty"),
+        ({"Q": ["p"], "over": ["v"]}, InputError, "over: needs diagonal or full"),
+        ({"Q": "outputs", "over": ["v"]}, InputError, "over: needs diagonal or full"),
+        ({"Q": ["p", "v", "p + v", "p - v"]}, InputError, "give the same weights; remove one"),
+        ({"Q": "full", "over": ["p", "v", "p + v"]}, InputError, "give the same weights"),
         ({"Q": ["v", "w"]}, WeightsError, "leaves the mode 1.1, which does not decay by itself"),
         ({"R": ["f"]}, WeightsError, "R: leaves a combination of the inputs without a cost weight"),
         ({"R": "outputs"}, InputError, "R: got 'outputs'"),
@@ -130,5 +130,5 @@ def test_what_cannot_be_a_structure_is_refused_in_a_line(
 
 
 def test_a_price_beyond_all_numbers_is_refused(plant: Plant) -> None:
-    with pytest.raises(WeightsError, match="beyond all numbers"):
+    with pytest.raises(WeightsError, match="overflows"):
         Structure(plant).weights(np.array([800.0, 0.0, 0.0, 0.0]))

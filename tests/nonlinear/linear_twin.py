@@ -15,7 +15,7 @@ __all__ = ["linear_twin"]
 def linear_twin(
     controller: Controller, weights: Weights
 ) -> tuple[OptimalControlProblem, dict[str, float]]:
-    """The same program; its parameters are the factors 1 of the diagonal of Q, and their values.
+    """The same program; its parameters are factors 1 of the diagonal of Q, with their values.
 
     The terminal weight is the Riccati solution as a function of them, by ten steps of the doubling
     algorithm (Chu, Fan and Lin 2005), which square the error.

@@ -38,7 +38,7 @@ class Case:
 
 
 def seat_case() -> Case:
-    """Tilted by four degrees: the torque is at its limit for a part of every plan."""
+    """Tilted by 4 degrees: the torque is at its limit in part of every plan."""
     plant = Plant(seated_balance_for(), ["command"])
     Q = np.zeros((plant.n, plant.n))
     Q[:4, :4] = TRUTH["line"] * np.outer(DIRECTION, DIRECTION)

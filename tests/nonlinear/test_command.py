@@ -1,4 +1,4 @@
-"""`impc fit` of an optimal control problem of the user's own, as its users type it."""
+"""`impc fit` of a user-defined optimal control problem, on the command line."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def write_trial(path: Path, place: Any, force: Any, push: Any) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Two recordings of a closed loop in which the speed was not measured, one with a hole."""
+    """Two recordings of a closed loop without the speed, one with a gap."""
     folder = tmp_path_factory.mktemp("optimal")
     (folder / "own_point.py").write_text(MODULE, encoding="utf-8")
     (folder / "point.toml").write_text(CONFIG, encoding="utf-8")
@@ -169,7 +169,7 @@ def test_page_tables_terminal_and_numbers_say_the_same(folder: Path, done: Resul
     for sentence in (verdict["headline"], verdict["alerts"][0]["found"]):
         assert sentence in page
         assert sentence in done.stdout.replace("\n  ", " ")
-    assert "far is not identified: near its value nothing that was measured depends on it." in page
+    assert "far is not identified: near its value it affects nothing that was measured." in page
     table = pd.read_csv(out / "parameters.csv").set_index("parameter")
     kept = found.table("parameters").set_index("parameter")
     np.testing.assert_array_equal(table["value"], kept["value"])
@@ -192,7 +192,7 @@ def test_the_trajectories_are_those_of_the_files(folder: Path, done: Result) -> 
 
 
 def test_one_plan_by_another_solver(folder: Path, done: Result) -> None:
-    """The same page from one optimum as a whole; the command line names the solver."""
+    """The same report from a single plan; the command line names the solver."""
     problem = own_problem().with_horizon(25)
     plan = problem.plan(TRUTH, [1.0, 0.5])
     write_trial(folder / "plan.csv", plan.x[:, 0], plan.u, np.zeros(25))
@@ -231,7 +231,7 @@ def fault(name: str) -> tuple[str, str]:
 
 WRONG: dict[str, tuple[tuple[str, str], str]] = {
     "a function that fails": (
-        fault("raises"), "plant own_point:point: ends in RuntimeError (the sensor is\\nbroken)"
+        fault("raises"), "plant own_point:point: raised RuntimeError (the sensor is\\nbroken)"
     ),
     "no such solver": (
         ('recorded = "loop"', 'solver = "snopt"'), "solver: got 'snopt'; choose one of ipopt, "
@@ -262,22 +262,22 @@ WRONG: dict[str, tuple[tuple[str, str], str]] = {
     "both": (
         ("start = 0.5", "start = 0.5, known = 0.5"), "drag: has both start and known; write { start"
     ),
-    "no number": (("start = 0.5", 'unit = "kg/m"'), "drag: has no number; write { start ="),
+    "no number": (("start = 0.5", 'unit = "kg/m"'), "drag: needs start or known; write { start ="),
     "a bare number": (
         ("{ start = 0.5 }", "0.5"), "drag: Expected 'object', got 'float'; write {"
     ),
     "a misspelt key": (("start = 0.5", "begin = 0.5"), "drag begin: is not a setting; write {"),
     "not filled in": (("start = 0.5", 'start = "?"'), "drag start: Expected 'float | null'"),
     "another kind of unit": (
-        ('"gram"', '"cm"'), "mass.unit: is 'cm', and the problem has kg; correct the unit"
+        ('"gram"', '"cm"'), "mass.unit: is 'cm', but the problem has kg; correct the unit"
     ),
     "all are known": (
         (CONFIG[CONFIG.index("drag =") :],
          "".join(f"{name} = {{ known = 1.0 }}\n" for name in ("drag", "price", "limit", "far"))),
-        "parameters: are all known; leave one to be searched",
+        "parameters: are all known; leave at least one to be estimated",
     ),
     "no initial state": (
-        ("speed = 0.5", ""), "[fit.x0] speed: is missing, and was not recorded; give it, or a guess"
+        ("speed = 0.5", ""), "[fit.x0] speed: is missing, and was not recorded; set it; a guess"
     ),
     "an initial state of nothing": (
         ("speed = 0.5", "pace = 0.5"), "[fit.x0] pace: is no state of the problem; it has pl"
@@ -287,11 +287,11 @@ WRONG: dict[str, tuple[tuple[str, str], str]] = {
         "signals.forse: is no signal of the problem; did you mean force?",
     ),
     "a signal in another kind of unit": (
-        ('unit = "cm"', 'unit = "deg"'), "signals.place.unit: is 'deg', and the plant has place in"
+        ('unit = "cm"', 'unit = "deg"'), "signals.place.unit: is 'deg', but the plant has place in"
     ),
     "no disturbance": (
         ('[signals.push]\ncolumn = "wind"\nunit = "N"', ""),
-        "signals.push: is missing; a disturbance has to be recorded",
+        "signals.push: is missing; record every disturbance",
     ),
 }  # fmt: skip
 
@@ -321,4 +321,4 @@ def test_commands_for_linear_plants_say_that_they_are(folder: Path) -> None:
     given = ("trial_1.csv", "--plant", "own_point:point", "--config", "compare.toml")
     done = run("compare", *given, "--out", "wrong")
     assert done.exit_code == 2
-    assert "plant own_point:point: is an optimal control problem; impc fit takes one" in done.stderr
+    assert "plant own_point:point: is an optimal control problem; use `impc fit`" in done.stderr

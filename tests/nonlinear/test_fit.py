@@ -1,4 +1,4 @@
-"""Parameters behind plans and closed loops: known truths, the linear route, noise, refusals."""
+"""Parameters behind plans and closed loops: known values, the linear case, noise, errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from impc.nonlinear.problem import OptimalControlProblem
 from tests.nonlinear.linear_twin import linear_twin
 from tests.support import random_plant
 
-#: System -> sentences of what is not identified; by the mechanics, see docs/nonlinear.md.
+#: System -> sentences on unidentified combinations, from the mechanics (docs/howto/nonlinear.md).
 UNIDENTIFIED = {
     "cart-pole": [],
     "robot arm": [{"max_q": 1.0}, {"l1": 1.0, "m1": -2.0, "l2": 1.0, "m2": -2.0}],
@@ -53,7 +53,7 @@ def test_a_demonstration_gives_back_what_it_tells(name: str) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("limit", [0.6, 50.0], ids=["saturated", "not saturated"])
 def test_a_linear_loop_has_the_weights_of_the_linear_route(limit: float) -> None:
-    """Two states, one input: the gain's two numbers are what the diagonal of Q says."""
+    """Two states, one input: the two entries of the gain determine the diagonal of Q."""
     plant = random_plant(np.random.default_rng(11), 2, 1, 1.05)
     weights = Weights(np.diag([2.0, 0.5]), 1)
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
@@ -72,7 +72,7 @@ def test_a_linear_loop_has_the_weights_of_the_linear_route(limit: float) -> None
 
 
 def point(disturbed: bool = False) -> OptimalControlProblem:
-    """A point with drag, its force limited."""
+    """A point with drag and limited force."""
     x, u, d = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("d")
     drag, price, limit = ca.SX.sym("drag"), ca.SX.sym("price"), ca.SX.sym("limit")
     force = u + d if disturbed else u
@@ -119,7 +119,7 @@ def test_an_unknown_initial_state_is_found_with_the_parameters() -> None:
 
 @pytest.mark.full
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
-    """Thirty noisy plans, three parameters each: 95 % of ninety, within three deviations."""
+    """Thirty noisy plans, three parameters each: 95 % of 90, within three standard errors."""
     problem = point()
     plan = problem.plan(TRUTH, [1.0, 0.5])
     rng = np.random.default_rng(2)
@@ -151,9 +151,9 @@ def test_what_cannot_be_fitted_is_refused_in_a_line() -> None:
     problem = point()
     plan = problem.plan(TRUTH, [1.0, 0.5])
     recording = problem.recorded_plan(plan.x, plan.u)
-    with pytest.raises(DataError, match="recordings: there are none; give at least one"):
+    with pytest.raises(DataError, match="recordings: is empty; give at least one"):
         fit_optimal_control(problem, [], START)
-    with pytest.raises(InputError, match="recordings: are of another problem"):
+    with pytest.raises(InputError, match="recordings: belong to another problem"):
         fit_optimal_control(point(), [recording], START)
     with pytest.raises(InputError, match="solver: got 'knitro'; choose one of"):
         fit_optimal_control(problem, [recording], START, solver="knitro")
@@ -173,7 +173,7 @@ def test_an_infeasible_start_names_the_constraint_and_the_sample() -> None:
 
 @pytest.mark.full
 def test_another_start_is_tried_where_the_first_has_no_plan() -> None:
-    """The angle's first limit is below where the arm begins to be stopped; the second is not."""
+    """The first start's limit is below the angle at which the arm begins; the second's is not."""
     arm = SYSTEMS["robot arm"]()
     plan = arm.problem.plan(arm.truth, arm.x0, mu=1e-12)
     recording = arm.problem.recorded_plan(plan.x, plan.u)
@@ -186,7 +186,7 @@ def test_another_start_is_tried_where_the_first_has_no_plan() -> None:
 
 
 def test_the_size_of_the_cost_does_not_matter() -> None:
-    """Everything in the cost times 1e-3: the same answer, from a mu that is smaller too."""
+    """The cost times 1e-3 gives the same result, with a smaller mu."""
     u = ca.SX.sym("u")
     x, price, limit = ca.SX.sym("x", 2), ca.SX.sym("price"), ca.SX.sym("limit")
     problem = OptimalControlProblem(
@@ -212,7 +212,7 @@ def test_a_search_that_is_stopped_says_so() -> None:
 
 
 def turned(bend: float) -> tuple[OptimalControlProblem, dict[str, float]]:
-    """A point whose motion has a force of f (1 + bend f) over its mass: a scaling without bend."""
+    """A point with force f (1 + bend f) and a mass: a scaling if bend is zero."""
     x, u = ca.SX.sym("x", 1), ca.SX.sym("u")
     force, mass, price = ca.SX.sym("force"), ca.SX.sym("mass"), ca.SX.sym("price")
     problem = OptimalControlProblem(
@@ -225,7 +225,7 @@ def turned(bend: float) -> tuple[OptimalControlProblem, dict[str, float]]:
 
 @pytest.mark.parametrize("bend", [0.0, 0.5])
 def test_a_scaling_is_one_where_it_holds_far_from_the_estimate(bend: float) -> None:
-    """Force and mass stay in one ratio; with a bend the ratio is no power, but a tangent."""
+    """Force and mass keep their ratio; with a bend the direction is only a tangent."""
     problem, truth = turned(bend)
     loop = problem.closed_loop(truth, [1.0], 12)
     recording = problem.recorded_loop(loop.x, loop.u)

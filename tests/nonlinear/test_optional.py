@@ -1,4 +1,4 @@
-"""Without its folder the rest works, and asking for it is one line."""
+"""Without the subpackage everything else works; its use gives one line."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from docs.rooms import imports, room
+from docs.layers import imports, subpackage
 from tests.documents.blocks import ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-# No finder of the interpreter finds the folder, nor that of an editable installation.
+# Neither the interpreter's finders nor those of an editable installation find the folder.
 HIDDEN = """
 import sys
 class Without:
@@ -49,7 +49,7 @@ def test_of_the_core_only_the_door_the_commands_and_the_studies_name_it() -> Non
     named = {
         name
         for name, others in imports().items()
-        if room(name) != "nonlinear" and any(room(other) == "nonlinear" for other in others)
+        if subpackage(name) != "nonlinear" and "nonlinear" in map(subpackage, others)
     }
     assert named <= {"__init__", "cli.fit"}
 
@@ -73,7 +73,7 @@ def test_the_rest_works_without_the_folder(tmp_path: Path) -> None:
 
     done = run(EXAMPLE)
     assert done.returncode == 0, done.stderr
-    line = "impc.OptimalControlProblem: needs impc.nonlinear, which is not there; install all"
+    line = "impc.OptimalControlProblem: needs impc.nonlinear, which is not installed; install"
     status, identified = done.stdout.strip().splitlines()
     assert status == "explained"
     assert line in identified

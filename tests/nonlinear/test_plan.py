@@ -1,4 +1,4 @@
-"""Plans against other routes to the same answer, and their derivatives against differences."""
+"""Plans against independent solutions, and their derivatives against differences."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plan(system: PeerSystem) -> Plan:
     return system.problem.plan(system.truth, system.x0)
 
 
-#: Constraint -> samples at which it is active in the demonstration, as the peer's have it.
+#: Constraint -> samples at which it is active in the demonstration, as in Safe-PDP.
 ACTIVE = {
     "cart-pole": {"force": 6, "position": 2},
     "robot arm": {"torque": 13},
@@ -113,7 +113,7 @@ def test_a_weakly_active_row_is_named_and_has_a_slope_between_its_sides() -> Non
 
 
 def test_dependent_rows_do_no_harm() -> None:
-    """A cap that is written twice: the plan is identified, each multiplier is not."""
+    """A limit that is written twice: the plan is determined, the single multipliers are not."""
     u, p = ca.SX.sym("u"), ca.SX.sym("p")
     plan = one_step({"cap": u - 1, "again": 2 * u - 2}, u, p).plan({"p": 2.0}, [0.0])
     assert plan.u[0, 0] == pytest.approx(1)
@@ -122,7 +122,7 @@ def test_dependent_rows_do_no_harm() -> None:
 
 
 def test_a_row_at_the_end_is_kept_and_differentiated() -> None:
-    """A point that must have left: x_N >= p, the least effort is p / N at every sample."""
+    """A final position x_N >= p: the least effort is p / N at every sample."""
     x, u, p = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p")
     problem = OptimalControlProblem(
         x, u, {"p": p}, next_state=x + u, stage_cost=u**2, horizon=5,

@@ -1,4 +1,4 @@
-"""The problem as a value: what it takes, and what it refuses in one line."""
+"""The problem as a value: accepted arguments, and one-line errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRUTH = {"mass": 1.5, "price": 10.0, "limit": 1.0}
 
 
 def made(kind: Any = ca.SX, **changes: Any) -> OptimalControlProblem:
-    """A point with a limited force, one entry of it changed."""
+    """A point with limited force, with one argument changed."""
     x, u = kind.sym("x", 2), kind.sym("force")
     p = {name: kind.sym(name) for name in TRUTH}
     given: dict[str, Any] = {
@@ -74,22 +74,22 @@ def test_a_controller_does_not_reckon_with_disturbances() -> None:
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "a free symbol": (
         {"stage_cost": lambda x, u, p: ca.sumsqr(x) + u**2 * ca.SX.sym("w") * p["price"]},
-        "stage_cost: has the symbol w; which is neither a state",
+        "stage_cost: has the unknown symbol w; make it a state",
     ),
     "a system of python-control": (
         {"next_state": lambda x, u, p: control.nlsys(lambda t, x, u, params: x, states=2)},
-        "next_state: is a system of python-control; call its function with the symbols, as docs/",
+        "next_state: is a system of python-control; call its function with the symbols: docs/",
     ),
     "a wrong size": (
         {"next_state": lambda x, u, p: x[0] + u}, r"next_state: has shape \(1, 1\); give \(2, 1\)"
     ),
     "no expression": ({"stage_cost": "u^2"}, "stage_cost: got str; give an expression of SX"),
     "no symbols": ({"states": 3.0}, "states: got float, not symbols"),
-    "no inputs": ({"inputs": []}, "inputs: there are none"),
-    "two kinds": ({"inputs": ca.MX.sym("u")}, "symbols: are of SX and of MX"),
+    "no inputs": ({"inputs": []}, "inputs: is empty"),
+    "two kinds": ({"inputs": ca.MX.sym("u")}, "symbols: mix SX and MX"),
     "a parameter that is in nothing": (
         {"parameters": lambda x, u, p: p | {"colour": ca.SX.sym("colour")}},
-        "parameter colour: is in no expression; take it out",
+        "parameter colour: occurs in no expression; remove it",
     ),
     "a vector as a parameter": (
         {"parameters": lambda x, u, p: p | {"price": ca.SX.sym("w", 2)}},
@@ -102,7 +102,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no horizon": ({"horizon": 0}, "horizon: got 0; give a whole number"),
     "a comparison": (
         {"constraints": lambda x, u, p: {"force": ca.vertcat(u, -u) <= p["limit"]}},
-        "constraint force: is a comparison; write what must not exceed 0: u - 1 for u <= 1",
+        "constraint force: is a comparison; write the expression that must be <= 0: u - 1 for",
     ),
     "constraints without names": (
         {"terminal_constraints": lambda x, u, p: x <= 1}, "give a dictionary"
@@ -174,14 +174,14 @@ def test_what_is_not_finite_at_the_start_is_named_with_its_sample() -> None:
 
 
 def test_an_infeasible_problem_names_the_constraint_and_the_sample() -> None:
-    """A force of 1 stops a mass of 1.5 at a speed of 1 within 0.75 m; it may go 0.3 m.
+    """A force of 1 stops a mass of 1.5 at a speed of 1 within 0.75 m; 0.3 m are allowed.
 
-    The least total excess is that of a harder brake at once.
+    The least total excess needs a harder brake at once.
     """
     problem = made(constraints=lambda x, u, p: {
         "force": ca.vertcat(u - p["limit"], -u - p["limit"]), "place": x[0] - 0.3})  # fmt: skip
     with pytest.raises(
-        InfeasibleError, match=r"constraint force\[1\]: no plan .* keeps it at sample 0: the"
+        InfeasibleError, match=r"constraint force\[1\]: no plan .* satisfies it at sample 0: the"
     ):
         problem.plan(TRUTH, [0.0, 1.0])
     problem.plan(TRUTH | {"limit": 5.0}, [0.0, 1.0])
@@ -209,7 +209,7 @@ def test_recordings_are_checked() -> None:
         (lambda: problem.recorded_plan("x"), "states: expected real numbers"),
         (
             lambda: problem.recorded_plan(x * np.nan, x0=[0, 0]),
-            "recording: has nothing that was measured",
+            "recording: has missing values only",
         ),
     ]
     for make, words in refused:

@@ -1,4 +1,4 @@
-"""Covariances of a person at the largest likelihood: two ways, and against repeated people."""
+"""Covariances of output-feedback fits: two kinds, and against repeated simulations."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def fitted() -> OutputFeedbackFit:
 
 def test_both_agree_where_the_model_is_true(fitted: OutputFeedbackFit) -> None:
     expected, sandwich = (person_covariance(fitted, kind) for kind in ("expected", "sandwich"))
-    # 1600 samples: a deviation is itself identified to a tenth or two.
+    # 1600 samples: a standard error is itself known to 10 or 20 %.
     np.testing.assert_allclose(sandwich.entries, expected.entries, rtol=0.4)
     np.testing.assert_allclose(sandwich.levels, expected.levels, rtol=0.4)
 
 
 def test_the_step_that_is_least_told_apart(fitted: OutputFeedbackFit) -> None:
-    """Moved along it together, gain and levels cost less than each of them alone."""
+    """Moved along it together, gain and noise SDs cost less likelihood than each alone."""
     found = confusion(fitted)
     assert 0 < found.correlation < 1
     covariance = np.array(person_covariance(fitted, "expected").covariance)
@@ -49,9 +49,9 @@ def test_an_unknown_kind_is_refused(fitted: OutputFeedbackFit) -> None:
 
 
 def test_a_direction_that_nothing_tells_leaves_the_others_as_they_are() -> None:
-    """Two inputs and no limit: the metric of the inputs moves no command, nor any likelihood.
+    """Two inputs without limit: the metric of the inputs affects neither command nor likelihood.
 
-    Deviations by the sandwich had been none along four directions of seven.
+    Regression: four of seven directions had no sandwich standard error.
     """
     who = subject("pair", 0, "motor", 90.0, 5.0)
     found = fit_output_feedback(fit(recorded(who, 0).problem), blind(who))

@@ -1,4 +1,4 @@
-"""Fits by maximum likelihood: the limit of no noise, derivatives, a known person, cost weights."""
+"""Maximum likelihood fits: noise-free limit, derivatives, a known subject, cost weights."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def fitted(noisy: tuple[Observer, Estimate]) -> OutputFeedbackFit:
 
 
 def test_the_gradient_is_that_of_the_likelihood(noisy: tuple[Observer, Estimate]) -> None:
-    """Along gain, initial states of both trials, and levels together."""
+    """Along gain, initial states of both trials, and noise SDs together."""
     space = fit_output_feedback(noisy[1], noisy[0], max_evaluations=1).space
     identified = space.identified(space.start)
     assert identified.value == pytest.approx(space.value(space.start), rel=1e-12)
@@ -105,7 +105,7 @@ def test_a_person_is_found_and_told_better_than_without_the_noise(
     np.testing.assert_allclose(fitted.observer.motor, person.motor, rtol=0.2)
     np.testing.assert_allclose(fitted.recorder, 0.01, rtol=0.1)
     np.testing.assert_allclose(fitted.K, truth, rtol=0.15)
-    # With the prior, and what scores do not have, its gradient is none, to a tenth of a deviation.
+    # With prior and REML term, the gradient is zero to 0.1 standard errors.
     slope, bend = fitted.prior.slopes(np.array(fitted.theta))
     unseen = unseen_slope(fitted.prior, fitted.prior.at(np.array(fitted.theta)))
     gradient = fitted.identified.gradient + slope + unseen
@@ -122,15 +122,15 @@ def test_the_barrier_is_how_far_noise_drives_the_loop(noisy: tuple[Observer, Est
     for _ in range(3000):  # the slowest mode has 0.9
         total += float(np.sum(np.linalg.solve(T, column) ** 2))
         column = closed @ column
-    value, gradient = space.wandering(theta)
+    value, gradient = space.noise_growth(theta)
     assert value == pytest.approx(np.log(total / plant.n), rel=1e-9)
     for step in np.random.default_rng(1).normal(size=(2, len(theta))):
 
         def moved(t: float, step: Array = step) -> Array:
-            return np.array([space.wandering(theta + t * step)[0]])
+            return np.array([space.noise_growth(theta + t * step)[0]])
 
         assert gradient @ step == pytest.approx(extrapolated_slope(moved, 1e-3)[0], rel=1e-6)
-    assert space.wandering(space.start - 100 * (np.arange(len(theta)) < 2))[0] == np.inf
+    assert space.noise_growth(space.start - 100 * (np.arange(len(theta)) < 2))[0] == np.inf
 
 
 def test_a_level_of_zero_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
@@ -146,14 +146,14 @@ def test_a_level_that_is_known_is_not_searched(noisy: tuple[Observer, Estimate])
     assert held.space.names == ["motor u", "recorder x"]
     free = fit_output_feedback(noisy[1], noisy[0])
     assert free.count == held.count + 1
-    assert 0 <= free.log_likelihood - held.log_likelihood < 4  # chi-squared's, of one number
+    assert 0 <= free.log_likelihood - held.log_likelihood < 4  # chi-squared with 1 d.o.f.
     with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
         fit_output_feedback(noisy[1], noisy[0], held=["noise"])
 
 
 def test_a_trial_of_which_nothing_is_told_is_refused(noisy: tuple[Observer, Estimate]) -> None:
-    """Everything would be given, and the prior taken for what was found."""
-    with pytest.raises(InputError, match="counted: got 400, and the shortest trial has 400"):
+    """All samples would be conditioned on, and the fit would be the prior."""
+    with pytest.raises(InputError, match="counted: got 400, but the shortest trial has 400"):
         fit_output_feedback(noisy[1], noisy[0], counted=400)
 
 
@@ -161,17 +161,17 @@ def test_a_trial_of_which_nothing_is_told_is_refused(noisy: tuple[Observer, Esti
 def test_a_level_that_cannot_be_squared_has_no_likelihood(
     fitted: OutputFeedbackFit, logarithm: float
 ) -> None:
-    """A profile came there along its ridge, and numpy's warning to the screen."""
+    """Regression: a profile reached such an SD along its ridge, with a warning of numpy."""
     space = fitted.space
     theta = space.start.copy()
     theta[space.own] = logarithm
     for said in (space.identified, space.value):
-        with pytest.raises(SolverError, match="level of noise: has no square"):
+        with pytest.raises(SolverError, match="noise SD: is out of range"):
             said(theta)
 
 
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
-    """W, V -> 0: the same gain to 1e-6, where neither has a prior."""
+    """W, V -> 0: the same gain to 1e-6, if neither has a prior."""
     problem = posed(Observer(cart()), 0.01, 0.9)
     found = fit(problem)
     least = refine_gain(found.problem, np.array(found.gain), np.array(found.metric))
@@ -188,7 +188,7 @@ def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
 def test_a_gain_that_cannot_be_the_persons_is_left_behind(
     noisy: tuple[Observer, Estimate], fitted: OutputFeedbackFit, along: int, units: float
 ) -> None:
-    """From three natural units away a search had ended at ten times the gain, from five in none."""
+    """Regression: started 3 whitened units away, a search ended at 10 times the gain."""
     far = np.array(noisy[1].gain) + units * fitted.space.space.gains[along]
     found = fit_output_feedback(replaced(noisy[1], K=far), noisy[0])
     assert found.converged

@@ -1,4 +1,4 @@
-"""Somebody of whom one number is held: it stays, and all else is at its best."""
+"""Profile points: the fixed coordinate stays, and all others are optimal."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_all_else_is_at_its_best(fitted: OutputFeedbackFit) -> None:
 
 
 def test_where_there_is_nobody_there_is_none(fitted: OutputFeedbackFit) -> None:
-    """A level whose square double precision does not have."""
+    """A noise SD whose square overflows."""
     prior, here = fitted.prior, fitted.prior.placed(np.array(fitted.theta), fitted.identified)
     level = np.eye(len(fitted.theta))[fitted.space.own]
     assert held_person(prior, here, level, 1e3, np.array(fitted.unseen), 10) is None

@@ -20,7 +20,7 @@ def test_it_is_the_riccati_solution_of_scipy(radius: float) -> None:
         C, Q, R = rng.normal(size=(p, n)), random_weights(rng, n), random_weights(rng, p)
         found = stationary_filter(F, C, Q, R)
         expected = scipy.linalg.solve_discrete_are(F.T, C.T, Q, R)
-        # Both are off by their rounding: 1e-12 at most on these.
+        # Both are off by rounding: at most 1e-12 here.
         np.testing.assert_allclose(found.P, expected, rtol=0, atol=1e-10 * np.max(expected))
         np.testing.assert_allclose(found.S, C @ found.P @ C.T + R, rtol=1e-12)
 
@@ -57,15 +57,15 @@ def test_derivatives_equal_differences() -> None:
 
 def test_what_is_not_seen_and_does_not_decay_has_no_filter() -> None:
     F = np.diag([1.2, 0.5])
-    with pytest.raises(SolverError, match="no stationary gain"):
+    with pytest.raises(SolverError, match="no stationary Kalman filter"):
         stationary_filter(F, np.array([[0.0, 1.0]]), np.eye(2), np.eye(1))
-    # Seen, but never disturbed: the filter that forgets nothing is not stationary.
-    with pytest.raises(SolverError, match="no stationary gain"):
+    # Observed but without process noise: the filter that never forgets is not stable.
+    with pytest.raises(SolverError, match="no stationary Kalman filter"):
         stationary_filter(F, np.eye(2), np.zeros((2, 2)), np.eye(2))
 
 
 def test_senses_that_cannot_be_told_apart_have_no_filter() -> None:
-    """Two all but equal signals, all but without noise: the covariance of both is singular."""
+    """Two almost equal signals with almost no noise: their covariance is singular."""
     F, C = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[1.0, 0.0], [1.0, 1e-12]])
-    with pytest.raises(SolverError, match="no stationary gain"):
+    with pytest.raises(SolverError, match="no stationary Kalman filter"):
         stationary_filter(F, C, np.eye(2), 1e-40 * np.eye(2))

@@ -1,4 +1,4 @@
-"""A person that was written down is the one that was fitted, to the last digit."""
+"""A stored fit equals the original one to the last digit."""
 
 from __future__ import annotations
 

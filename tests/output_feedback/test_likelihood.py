@@ -1,4 +1,4 @@
-"""The likelihood of a person who senses with noise: other filters, differences, particles."""
+"""Likelihood of output-feedback MPC against other filters, differences and particles."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.full
 
 
 class Someone(NamedTuple):
-    """A person on a cart, by numbers that can be moved."""
+    """A subject on a cart, described by numbers that can be changed."""
 
     gain: tuple[float, float] = (8.0, 4.0)
     motor: float = 0.3
@@ -71,7 +71,7 @@ class Someone(NamedTuple):
         )  # fmt: skip
 
     def moved(self, step: Array) -> Someone:
-        """The person a step away: gain, logarithms of the levels, first state."""
+        """The subject a step away: gain, log noise SDs, initial state."""
         factor = np.exp(step[2:])
         return self._replace(
             gain=(self.gain[0] + step[0], self.gain[1] + step[1]),
@@ -110,7 +110,7 @@ def trial_of(who: Someone, outputs: Array) -> Recording:
 
 
 def filter_of(who: Someone, *, slopes: bool = False, steady: bool = True) -> PreparedFilter:
-    """Along gain (2), levels in their order, the recorder's, and the first state: `moved`."""
+    """Filter along gain (2), noise SDs, recording noise and initial state, as in `moved`."""
     person, q = who.observer(), 11 if slopes else 0
     levels = np.concatenate([person.levels, [who.recorder]])
     gain, start = np.zeros((1, 2, q)), np.zeros((2, q))
@@ -172,7 +172,7 @@ def test_without_bounds_it_is_that_of_statsmodels(who: Someone) -> None:
 
 
 SATURATING = Someone(limit=0.6)
-#: Knows so well where the cart is that no bound is near until one is met, after 95 samples.
+#: Knows the position of the cart so well that no bound is near until sample 95.
 QUIET = Someone(limit=0.8, motor=0.01, process=0.001, sensory=(0.001, 0.002), recorder=0.001)
 PEOPLE = [
     Someone(),
@@ -199,13 +199,13 @@ def test_derivatives_equal_differences(who: Someone) -> None:
 
         slope = extrapolated_slope(moved, 1e-3)
         exact = found.score.sum(axis=0) @ step
-        # Differences of a sum of size 300 carry 1e-9 of rounding at these steps.
+        # Differences of a sum of size 300 have rounding of 1e-9 at these steps.
         assert exact == pytest.approx(slope[0], rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("who", [QUIET, QUIET._replace(share=0.3), SATURATING, Someone()])
 def test_recordings_together_tell_what_each_tells(who: Someone) -> None:
-    """Of other lengths and noise, met by bounds at other samples, or by none."""
+    """Trials of other lengths and noise, reaching bounds at other samples, or never."""
     lengths = {1: 120, 2: 30, 3: 80, 4: 120}
     trials = [
         trial_of(who, recorded(who, length, seed).outputs) for seed, length in lengths.items()
@@ -227,7 +227,7 @@ def test_recordings_together_tell_what_each_tells(who: Someone) -> None:
 
 
 def test_a_stationary_covariance_says_what_that_of_every_sample_does() -> None:
-    """With noise that is a share of the command, however small, so it is from the first sample."""
+    """Signal-dependent noise, however small, prevents the stationary covariance from the start."""
     outputs = recorded(QUIET, 130).outputs
     own = likelihood(QUIET._replace(share=1e-12), outputs, slopes=True)
     found = likelihood(QUIET, outputs, slopes=True)
@@ -239,7 +239,7 @@ def test_a_stationary_covariance_says_what_that_of_every_sample_does() -> None:
 
 
 def test_a_perturbation_that_does_not_persist_is_noise_to_the_person() -> None:
-    """The person's gain is that of process noise E walk^2 E', and nothing is expected of it."""
+    """The subject's filter has process noise E walk^2 E' and predicts no disturbance."""
     fades = Someone(process=0.0, walk=0.2, persistence=0.0)
     plant = fades.plant()
     moved = Observer(plant, ["x", "v"], motor=np.hypot(0.3, 0.2), sensory=[0.02, 0.05])
@@ -262,7 +262,7 @@ def test_the_stationary_covariance_changes_nothing() -> None:
 
 @pytest.mark.parametrize("limit", [0.8, 50.0])
 def test_samples_that_are_given_are_not_told(limit: float) -> None:
-    """What is left is the likelihood of all samples less that of the given ones."""
+    """The rest is the likelihood of all samples minus that of the conditioned ones."""
     who = Someone(limit=limit)
     outputs = recorded(who, 120).outputs
     every, first = (likelihood(who, each, slopes=True) for each in (outputs, outputs[:40]))
@@ -277,7 +277,7 @@ def test_samples_that_are_given_are_not_told(limit: float) -> None:
 
 
 def test_scores_have_the_covariance_that_is_expected() -> None:
-    """Without bounds the outer products of the scores are Fisher's information on average."""
+    """Without bounds the mean outer product of the scores is the Fisher information."""
     who = Someone(sensory=(0.02, 0.05), start=(0.0, 0.0))
     runs = [likelihood(who, recorded(who, 100, seed).outputs, slopes=True) for seed in range(100)]
     kept = [0, 1, 2, 5, 6, 8]  # what this person has, the first state left aside
@@ -300,7 +300,7 @@ def test_the_limit_of_no_noise_is_the_simulation() -> None:
 
 
 def test_who_does_what_is_believed_errs_as_the_filter_says() -> None:
-    """Simulated errors of the estimate have the stationary covariance of the person's filter."""
+    """Simulated estimation errors have the stationary covariance of the subject's filter."""
     who = Someone(sensory=(0.02, 0.05))
     found = recorded(who, 20000)
     joint = joint_loop(who.plant(), who.observer(), np.array([who.recorder]))
@@ -315,12 +315,12 @@ def test_an_expectation_without_a_command_is_an_error() -> None:
                                terminal_set=False)  # fmt: skip
     nothing = NoiseDirections(np.zeros((1, 1, 0)), np.zeros((4, 0)), 0)
     prepared = prepare_filter(law, Observer(plant), np.array([1.0]), directions(law, 0), nothing)
-    with pytest.raises(SolverError, match="as the filter expects it"):
+    with pytest.raises(SolverError, match="in the prediction of the filter"):
         joint_likelihoods(prepared, [Recording(plant, np.zeros((60, 1)), x0=[3.0])])
 
 
 def particles(who: Someone, outputs: Array, count: int, seed: int) -> float:
-    """Log-likelihood by a bootstrap filter; with one sample ahead the law is a clipped gain."""
+    """Log-likelihood by a bootstrap filter; with horizon 1 the law is a clipped gain."""
     rng, pushes = np.random.default_rng(seed), push(len(outputs))
     joint = joint_loop(who.plant(), who.observer(), np.array([who.recorder]))
     roots = []
@@ -371,7 +371,7 @@ def test_with_a_bound_it_is_that_of_many_particles(
 
 @pytest.mark.parametrize("limit", [np.inf, 0.5])
 def test_a_target_of_a_cart_only_moves_the_origin(limit: float) -> None:
-    """A recording about a target has the likelihood of the same one about rest, with its slopes."""
+    """A recording about a target has the same likelihood and gradient as one about rest."""
     who = Someone(limit=limit)
     y = recorded(who, 200).outputs
     there = recorded_about(who, 200, 0.4)
@@ -387,7 +387,7 @@ def test_a_target_of_a_cart_only_moves_the_origin(limit: float) -> None:
 
 
 def recorded_about(who: Someone, samples: int, target: float) -> Array:
-    """The same noise about a target, the person having begun there."""
+    """The same noise about a target, with the subject starting there."""
     law, person, pushed = who.controller(), who.observer(), push(samples)
     found = simulate_person(
         law, person, pushed, recorder=who.recorder, seed=1, x0=[target, 0], target={"x": target}

@@ -1,4 +1,4 @@
-"""What is remembered of people who sense with noise; the rest is in test_subject.py."""
+"""Checkpoints of output-feedback fits; test_subject.py has the others."""
 
 from __future__ import annotations
 

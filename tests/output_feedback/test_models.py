@@ -1,4 +1,4 @@
-"""Models side by side: which there are, and predictions against those of the plant alone."""
+"""Competing sensorimotor models, and predictions against those of the plant alone."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_without_limit_and_perturbation_there_are_three_models() -> None:
         "sees every state, noise in the loop",
         "sees every state, noise in the recorder alone",
     ]
-    # The recorder alone is a special case of noise in the loop, where the motor has none.
+    # Recording noise alone is the special case of noise in the loop without motor noise.
     fits = [item.fit for item in report.models]
     assert fits[1] is not None
     assert fits[2] is not None
@@ -55,12 +55,12 @@ def test_who_cannot_estimate_has_a_reason() -> None:
     found = fit(posed(Observer(cart()), 0.01, np.inf, trials=1))
     report = person_report(found, asked, np.zeros(0))
     assert report.models[0].fit is None
-    assert "no stationary gain" in report.models[0].reason
+    assert "no stationary Kalman filter" in report.models[0].reason
     assert report.covariance is None
 
 
 def test_a_structure_is_set_beside_any_gain() -> None:
-    """Behind a delay: the same recordings, with fewer numbers and hardly less likelihood."""
+    """Behind a delay: the same recordings, with fewer unknowns and hardly less likelihood."""
     problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
     person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
     report = person_report(fit(problem), person, np.zeros(0))

@@ -1,4 +1,4 @@
-"""A person who senses: what is understood, what is refused, and what is believed."""
+"""Observers: accepted and rejected arguments, and the subject's filter."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def test_levels_are_read_and_written_in_one_order() -> None:
         ({"sensed": ["angle"], "sensory": 1}, "angle"),
         ({"sensed": ["x"], "sensory": 0}, "sensory: has a zero"),
         ({"motor": -1}, "motor: got"),
-        ({"walk": 1}, "walk: is given, but every state is seen"),
-        ({"persistence": 1.1}, "persistence: got \\[1.1\\]; give shares between 0 and 1"),
+        ({"walk": 1}, "walk: is given, but all states are observed"),
+        ({"persistence": 1.1}, "persistence: got \\[1.1\\]; give numbers between 0 and 1"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(given: dict[str, object], message: str) -> None:
@@ -59,7 +59,7 @@ def test_a_perturbation_that_is_not_known_is_a_state_of_the_belief() -> None:
     np.testing.assert_allclose(C, [[1, 0, 0]])
     np.testing.assert_allclose(Q, np.diag(np.array([0.0, 9e-4, 0.25])))
     assert float(R[0, 0]) == pytest.approx(0.01)
-    # A constant push is found out: the estimate of it ends at its value.
+    # A constant push is learned: its estimate converges to its value.
     L, true, estimate = believed_filter(cart(), person).L, np.zeros(2), np.zeros(3)
     for _ in range(400):
         error = true[:1] - C @ estimate
@@ -69,5 +69,5 @@ def test_a_perturbation_that_is_not_known_is_a_state_of_the_belief() -> None:
 
 
 def test_who_is_never_disturbed_and_does_not_decay_has_no_filter() -> None:
-    with pytest.raises(SolverError, match="no stationary gain"):
+    with pytest.raises(SolverError, match="no stationary Kalman filter"):
         believed_filter(cart(), Observer(cart(), ["v"], motor=1, sensory=1))

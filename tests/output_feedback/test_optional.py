@@ -1,4 +1,4 @@
-"""Without its folder all the rest imports and works, and asking for it is one line."""
+"""Without the subpackage everything else imports and works; its use gives one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-# What is tried in a package without the folder; each line that is printed is compared.
+# Script that runs in a package without the subpackage; each printed line is compared.
 TRIED = """
 import importlib, pkgutil, sys
 # An editable installation finds the folder where it stands in the checkout.
@@ -52,8 +52,8 @@ def test_the_rest_works_without_it(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         "True",
-        "[fit.observer]: needs impc.output_feedback, which is not there; install all of impc, or "
-        "leave the table out",
-        "impc.fit_output_feedback: needs impc.output_feedback, which is not there; install all of "
-        "impc",
+        "[fit.observer]: needs impc.output_feedback, which is not installed; install the complete "
+        "package, or remove the table",
+        "impc.fit_output_feedback: needs impc.output_feedback, which is not installed; install the "
+        "complete package",
     ]

@@ -1,4 +1,4 @@
-"""A fit with a person who senses with noise: first sentences, tables, what result.json keeps."""
+"""Report of a fit with sensory noise: first sentences, tables, result.json."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ TABLE: dict[str, Any] = {
 
 
 def trials() -> list[Recording]:
-    """Someone whose senses err by half of what is to be seen."""
+    """A subject whose sensory noise is half the size of the movement."""
     plant = cart()
     bounds = Bounds(plant, u_min=-0.9, u_max=0.9)
     law = Controller(plant, Weights(np.diag([8.0, 1.0]), 1), bounds, 5, terminal_set=False)
@@ -74,7 +74,7 @@ def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
 
 
 def findings(section: Section) -> dict[str, Finding]:
-    """Those of a section, in folds too."""
+    """Findings of a section, including folded ones."""
     inside = [one.blocks if isinstance(one, Fold) else [one] for one in section.blocks]
     return {one.name: one for part in inside for one in part if isinstance(one, Finding)}
 
@@ -155,7 +155,7 @@ def test_each_model_is_a_stage_and_intervals_follow_the_likelihood_where_asked()
     assert covariance is not None
     about = np.asarray(fit.K)[..., None] + 1.959964 * covariance.entries[..., None] * [-1, 1]
     np.testing.assert_allclose(rough["K_intervals"], about, rtol=1e-6)
-    # The gain is well identified: ends are half a width at most from those of deviations.
+    # The gain is well identified: ends are within half a width of the sandwich intervals.
     width = np.ptp(about, axis=-1, keepdims=True)
     assert np.all(np.abs((kept["K_intervals"] - about) / width) < 0.5)
     assert "profile likelihood" not in findings(quick.person.section())["person_gain"].caption

@@ -1,4 +1,4 @@
-"""Intervals of levels by profile, against another maximiser and against deviations."""
+"""Profile intervals of noise SDs, against another maximiser and against standard errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.full
 
 @pytest.fixture(scope="module")
 def fitted() -> OutputFeedbackFit:
-    """Motor noise is well identified; the sense of a state that is recorded too is not."""
+    """Motor noise is well identified; the noise of a sensed state that is also recorded is not."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.01)
     return fit_output_feedback(impc.fit(posed(person, 0.01, 3.0)), person)
 
@@ -54,7 +54,7 @@ def test_a_level_that_is_well_told_has_the_interval_of_its_deviation(
 def test_at_its_end_the_likelihood_has_fallen(
     fitted: OutputFeedbackFit, name: str, end: int
 ) -> None:
-    """By half of 1.96^2, all else being at its best by another search."""
+    """By half of 1.96^2, maximised over all else by another search."""
     names, own = fitted.space.names, fitted.space.own
     index = own + names.index(name) if name in names else 0  # or the first coordinate of the gain
     value = profile(fitted, np.eye(len(fitted.theta))[index])[end]
@@ -86,7 +86,7 @@ def test_at_its_end_the_likelihood_has_fallen(
 
 
 def test_entries_of_the_gain_that_are_told_have_intervals(fitted: OutputFeedbackFit) -> None:
-    """Near a parabola they are those of the deviation; what is not identified has none."""
+    """Near a parabola they equal those of the standard error; unidentified entries have none."""
     expected = person_covariance(fitted, "expected")
     ends = entry_intervals(fitted, expected)
     about = np.ravel(fitted.K)[:, None] + 1.96 * np.ravel(expected.entries)[:, None] * [-1, 1]
@@ -107,7 +107,7 @@ def test_a_level_that_is_hardly_told_has_its_interval_by_profile(fitted: OutputF
 
 
 def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
-    """Someone who sees all but exactly."""
+    """A subject whose senses are almost exact."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[1e-4, 1e-4])
     fit = fit_output_feedback(impc.fit(posed(person, 0.01, 3.0)), person)
     low, high = level_interval(fit, fit.space.names.index("sensory x"))
@@ -117,7 +117,7 @@ def test_a_level_that_may_be_none_is_told_on_one_side() -> None:
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -> None:
-    """Without a prior of levels a sense slides to none here, and the motor noise takes its part."""
+    """Without a prior a sensory noise SD tends to zero here, and motor noise takes its part."""
     who = subject("cart", seed, "both", 90.0, 0.7)
     first, motor = impc.fit(recorded(who, seed).problem), float(who.person.levels[0])
     fit = fit_output_feedback(first, blind(who))
@@ -131,7 +131,7 @@ def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -
 
 @pytest.mark.slow
 def test_all_levels_are_in_their_intervals() -> None:
-    """A person with noise in motor and senses, at the limit, as the page prints it."""
+    """A subject with noise in motor and senses, at the limit, as the report prints it."""
     who = subject("cart", 1, "both", 90.0, 0.7)
     fit = fit_output_feedback(impc.fit(recorded(who, 1).problem), blind(who))
     true = [*who.person.levels[who.person.levels > 0], *who.recorder]

@@ -1,4 +1,4 @@
-"""The search for the largest likelihood: its step, its end, what slides beside it."""
+"""The search for the maximum: its step, convergence, and noise SDs that tend to zero."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.full
 
 
 def sliding_person() -> OutputFeedbackFit:
-    """Someone whose senses err so little that these levels are not identified."""
+    """A subject whose sensory noise is so small that it is not identified."""
     person = Observer(cart(), ["x", "v"], motor=0.4, sensory=[0.002, 0.004])
     return fit_output_feedback(
         impc.fit(posed(person, 0.01, 0.9)), person.with_levels(np.array([0.1, 0, 0, 0, 0.1, 0.1]))
@@ -40,7 +40,7 @@ def test_a_step_is_the_best_of_its_box(seed: int) -> None:
     curvature, bound = root @ root.T + 0.1 * np.eye(6), float(rng.uniform(0.1, 1.0))
     step, promised = boxed_step(gradient, curvature, bound)
     found = np.zeros(6)
-    for _ in range(2000):  # one coordinate after the other, each at its best
+    for _ in range(2000):  # Coordinate search: each coordinate at its best in turn.
         for k in range(6):
             rest = gradient[k] - curvature[k] @ found + curvature[k, k] * found[k]
             found[k] = np.clip(rest / curvature[k, k], -bound, bound)
@@ -49,7 +49,7 @@ def test_a_step_is_the_best_of_its_box(seed: int) -> None:
 
 
 def test_levels_that_slide_do_not_hold_back_the_rest(sliding: OutputFeedbackFit) -> None:
-    """A step that was scaled as a whole took more than 30 likelihoods here, and 100 on the seat."""
+    """Regression: a step scaled as a whole took more than 30 evaluations here, 100 on the seat."""
     space, theta = sliding.space, np.array(sliding.space.start)
     _, _, spent, settled = climb(sliding.prior, sliding.prior.at(space.start), 100)
     assert settled
@@ -74,7 +74,7 @@ def test_a_search_that_may_not_go_on_says_so(sliding: OutputFeedbackFit) -> None
 
 
 def test_the_prior_bends_as_it_says(sliding: OutputFeedbackFit) -> None:
-    """The gradient against differences; without a spread it says nothing."""
+    """The gradient against differences; with infinite spread the prior is constant."""
     space, theta = sliding.space, np.array(sliding.theta)
     rng, scales = np.random.default_rng(0), space.start[space.own :]
     prior, step, h = Prior(space, 0.5, scales), rng.normal(size=len(theta)), 1e-5
@@ -87,7 +87,7 @@ def test_the_prior_bends_as_it_says(sliding: OutputFeedbackFit) -> None:
 
 
 def test_initial_states_are_as_any_other_state(sliding: OutputFeedbackFit) -> None:
-    """About zero, with second moments of the states and what noise in the loop adds."""
+    """Mean zero, with second moments of the states plus noise in the loop."""
     space = sliding.space
     scales, driven = space.start[space.own :], np.diag([0.3, 0.2])
     prior = Prior(space, 1.0, scales, driven)
@@ -101,7 +101,7 @@ def test_initial_states_are_as_any_other_state(sliding: OutputFeedbackFit) -> No
 
 
 def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
-    """Against a grid over the gain, at the levels that were found and at twice the motor noise."""
+    """Against a grid over the gain, at the fitted noise SDs and at twice the motor noise."""
     person = Observer(cart(), ["x"], motor=0.4, sensory=0.05)
     problem = replace(posed(person, 0.01, 3.0, trials=1), unknown_start=False)
     fit = fit_output_feedback(impc.fit(problem), person)
@@ -126,11 +126,11 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
 
 
 def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: OutputFeedbackFit) -> None:
-    """Against searches of all else with a level a little lower and higher."""
+    """Against searches over all else with a noise SD a little lower and higher."""
     prior, theta = sliding.prior, np.array(sliding.theta)
     own = sliding.space.own
     found, others, step = unseen_slope(prior, prior.at(theta)), np.eye(len(theta))[:, :own], 0.05
-    for index in (own, own + 3):  # those that are identified: motor, recorder
+    for index in (own, own + 3):  # The identified ones: motor and recording noise.
         lost = []
         for sign in (-1, 1):
             start = theta + sign * step * np.eye(len(theta))[index]
@@ -143,7 +143,7 @@ def test_the_slope_of_what_levels_lose_follows_the_ridge(sliding: OutputFeedback
 
 
 def test_what_levels_lose_is_learned(sliding: OutputFeedbackFit) -> None:
-    """After a long step along one level the slope along it is what was lost over the length."""
+    """After a long step along one noise SD, the gradient along it is the mean change."""
     prior, theta, own = sliding.prior, np.array(sliding.theta), sliding.space.own
     here, slope = prior.at(theta.copy()), np.array(sliding.unseen)
     theta[own] += 2.0

@@ -1,4 +1,4 @@
-"""Delay and muscle: against the exact transfer functions and against python-control's Padé."""
+"""Delay and muscle against exact transfer functions and python-control's Padé."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_realisation_has_the_transfer_function_of_the_pade_approximant(order: in
         s = 1j * frequency
         expected = np.polyval(numerator, s) / np.polyval(denominator, s)
         assert abs(realised.response(frequency) - expected) < 1e-12
-        # All-pass, and so with direct feedthrough: an approximant of equal degrees never rolls off.
+        # All-pass, therefore with direct feedthrough.
         assert abs(abs(realised.response(frequency)) - 1) < 1e-12
     assert (realised.D > 0) == (order % 2 == 0)
 

@@ -1,4 +1,4 @@
-"""Parameters from mass and height: the table of fractions, and the default person."""
+"""Parameters from mass and height: table of fractions, and default person."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_default_person_has_the_default_parameters() -> None:
     for name, digits in (("m1", 1), ("m2", 1), ("l1", 3), ("l2", 3), ("l12", 3), ("J1", 2)):
         assert round(getattr(found, name), digits) == getattr(expected, name), name
     assert round(found.J2, 2) == expected.J2
-    # What mass and height do not say is left as it was.
+    # Parameters that do not depend on mass and height keep their defaults.
     for name in ("k_h", "c_h", "k_r", "c_r", "tau_d", "tau_m", "gravity"):
         assert getattr(found, name) == getattr(expected, name)
 

@@ -35,7 +35,7 @@ def test_poles_names_and_controllability(
     assert plant.C.shape == (len(outputs), 2)
     assert not np.any(plant.D)
     assert make.__doc__ is not None
-    for word in ("Source", "Confidence", "lost"):
+    for word in ("Source", "Confidence", "available"):
         assert word in make.__doc__
 
 

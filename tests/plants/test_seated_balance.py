@@ -37,7 +37,7 @@ def random_parameters(rng: np.random.Generator) -> SeatedBalanceParameters:
 
 
 def energies(p: SeatedBalanceParameters) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """State, kinetic and potential energy, from the places of the two centres of mass alone."""
+    """Kinetic and potential energy from the positions of the two centres of mass."""
     state = ca.SX.sym("state", 4)
     angles, rates = state[:2], state[2:]
     lower = p.l1 * ca.vertcat(ca.sin(angles[0]), ca.cos(angles[0]))

@@ -1,4 +1,4 @@
-"""Ternary sequences: the properties that make them perturbations, and their sampling."""
+"""Ternary sequences: properties of the spectrum, and sampling."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_autocorrelation_is_zero_except_at_half_periods(stages: int) -> None:
 
 @pytest.mark.parametrize("stages", [2, 3, 4, 5])
 def test_each_window_occurs_once_in_a_period(stages: int) -> None:
-    # Independent of the polynomial: the register runs through every state but zero.
+    # Independent of the polynomial: the register visits every state except zero.
     values = ternary_sequence(stages)
     windows = {tuple(np.roll(values, -k)[:stages].tolist()) for k in range(len(values))}
     assert len(windows) == 3**stages - 1

@@ -1,4 +1,4 @@
-"""A cache computes each result once, and uses nothing that is damaged or made of other."""
+"""Cache: each result is computed once; damaged or foreign files are ignored."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from impc.studies.cache import Cache, Steps, from_json
 
 @dataclass(frozen=True)
 class Found(Frozen):
-    """What a step finds."""
+    """Result of a step."""
 
     gain: Array
     parts: tuple[Array, ...]
@@ -58,7 +58,7 @@ def counted(seed: int, made: list[int]) -> Callable[[], Found]:
 def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list[int]) -> None:
     kept, stated, made = Cache(tmp_path / "kept"), list[str](), list[int]()
     first = Steps(kept, "digest", stated.append)
-    assert first.kept() == "nothing was done yet"
+    assert first.kept() == "no step was finished"
     for seed in (1, 2):
         same(found(seed), first.get(f"step {seed}", counted(seed, made), decode))
     assert made == [1, 2]

@@ -1,4 +1,4 @@
-"""What takes hours, or more memory than there is, is said before it is begun."""
+"""Estimates of run time and memory, and confirmation of large requests."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from tests.support import random_plant
 
 @pytest.mark.parametrize(("n", "m", "horizon"), [(2, 1, 300), (4, 2, 100), (8, 1, 150)])
 def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) -> None:
-    """Against what building the rows and their derivatives takes, as numpy's allocator counts."""
+    """Compare with the memory allocated by NumPy for rows and derivatives."""
     plant = random_plant(np.random.default_rng(5), n, m, 0.95)
     bounds = Bounds(plant, u_min=-1, u_max=1)
     trial = Recording(plant, np.ones((50, n)))
@@ -86,7 +86,7 @@ def test_time_grows_with_what_is_asked() -> None:
 def test_consent(monkeypatch: pytest.MonkeyPatch) -> None:
     require_consent(Effort(60, 0.1), given=False)
     require_consent(Effort(1e9, 0.1), given=True)
-    with pytest.raises(InputError, match=r"would take about 2\.78e\+05 hours.*or say --yes"):
+    with pytest.raises(InputError, match=r"would take about 2\.78e\+05 hours.*or pass --yes"):
         require_consent(Effort(1e9, 0.1), given=False)
     machine = psutil.virtual_memory().total / 1e9
     with pytest.raises(InputError, match="more than this machine has"):
@@ -97,7 +97,7 @@ def test_consent(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_request_for_hours_or_memory_ends_at_once(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before anything is fitted, and nothing is written."""
+    """A large request is refused before any fit, without output files."""
 
     def unwanted(*_: object, **__: object) -> None:
         raise AssertionError("the request is refused before the work")
@@ -164,7 +164,7 @@ def drug() -> tuple[ParametricModel, tuple[Trial, ...]]:
 def test_compiling_a_model_is_no_part_of_what_a_selection_takes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A clock that shows 6 s for the first call and 0.02 s for the others: 15 minutes, not 79 h."""
+    """Simulated clock, 6 s for the first call, then 0.02 s: estimate 15 minutes, not 79 h."""
     model, trials = drug()
     clock = iter([0.0, 6.0, 6.0, 6.02, 6.02, 6.05])
     monkeypatch.setattr("impc.studies.effort.time.perf_counter", lambda: next(clock))
@@ -172,7 +172,7 @@ def test_compiling_a_model_is_no_part_of_what_a_selection_takes(
 
 
 def test_a_cohort_for_days_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six subjects: refused as one request, begun with --yes, and not asked for when it is done."""
+    """Six subjects: refused, started with --yes, and not asked again when finished."""
     here(monkeypatch)
     study = write_study(tmp_path, 1, replicates=100_000)
     for number in range(2, 7):

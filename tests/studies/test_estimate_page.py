@@ -1,4 +1,4 @@
-"""The page of one estimate from Python."""
+"""Report of a single estimate from Python."""
 
 from __future__ import annotations
 

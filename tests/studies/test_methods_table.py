@@ -1,4 +1,4 @@
-"""One table of methods for every command: words, numbers and result.json agree."""
+"""Table of methods: labels and numbers agree with result.json in all commands."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_columns_without_a_number_are_not_shown(fits: list[MethodFit]) -> None:
     left = [replace(fits[0], held_out=np.array([[50.0], [60.0]]))]
     table = methods_finding(left)
     assert float(table.rows[0][table.shown.index(f"held_out_vaf_{output}")]) == 55
-    assert f"vaf_{output}" not in table.shown  # where trials were left out, these count
+    assert f"vaf_{output}" not in table.shown  # left-out trials replace it
     assert table.table is not None
     assert "note" not in table.table
 

@@ -1,4 +1,4 @@
-"""Workers on this machine: they work, they may die, and nobody else reaches them."""
+"""Workers on this machine: results, crashes, and isolation from other users."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def square(value: int) -> int:
 
 
 def die(value: int, marks: str) -> int:
-    """Ends its process the first time, and always for 13."""
+    """Kill the worker at the first call, and always for 13."""
     mark = Path(marks) / str(value)
     if value == 13 or not mark.exists():
         mark.touch()
@@ -74,7 +74,7 @@ def test_tasks_deaths_and_faults(tmp_path: Path) -> None:
         )  # fmt: skip
         assert found["once"].content == 1
         faults = {name: str(item.fault) for name, item in found.items()}
-        assert "worker: ended 4 times, at last with signal 9;" in faults["always"]
+        assert "worker: died 4 times, last with signal 9;" in faults["always"]
         assert "task exit: SystemExit: 0;" in faults["exit"]
         assert "task error: ValueError: two\\nlines of text;" in faults["error"]
         assert faults["refused"] == "subject 3: fell; leave it out"
@@ -88,7 +88,7 @@ def test_tasks_deaths_and_faults(tmp_path: Path) -> None:
 
 
 def test_of_a_batch_only_the_task_that_ends_workers_is_lost(tmp_path: Path) -> None:
-    """Short tasks go together; the one that is the cause is found among them."""
+    """Short tasks are batched; the task that kills workers is found."""
     tasks = [task(f"{value}", die_of_13, value) for value in range(400)]
     with processes(1) as pool:
         found = results(pool, tmp_path, *tasks)
@@ -97,7 +97,7 @@ def test_of_a_batch_only_the_task_that_ends_workers_is_lost(tmp_path: Path) -> N
 
 
 def test_what_is_kept_is_not_done_again_and_more_may_follow(tmp_path: Path) -> None:
-    """Stopped after three results, and gone on with: the same, each once; a damaged one again."""
+    """Continue after three results: same results, none repeated except a damaged one."""
     made: list[int] = []
 
     def count(value: int) -> int:
@@ -124,14 +124,14 @@ def test_what_is_kept_is_not_done_again_and_more_may_follow(tmp_path: Path) -> N
 
 
 def _works(child: psutil.Process) -> bool:
-    """Whether a child is a worker that lives; what another test left behind has no command line."""
+    """Whether a child process is a live worker; zombies have no command line."""
     if child.status() == psutil.STATUS_ZOMBIE:
         return False
     return "spawn_main" in " ".join(child.cmdline())
 
 
 def test_a_module_of_the_current_folder_does_not_stand_in_for_pythons(tmp_path: Path) -> None:
-    """A worker starts with the folder's modules out of reach: multiprocessing, pickle, numpy."""
+    """Workers do not import modules from the current folder: multiprocessing, pickle, numpy."""
     for name in ("multiprocessing", "pickle", "numpy", "impc"):
         (tmp_path / f"{name}.py").write_text("open('taken', 'w').close()\nraise SystemExit(3)\n")
     code = (

@@ -1,4 +1,4 @@
-"""A scheduler with certificates: who has them works on it, who has not is said so in one line."""
+"""Scheduler with certificates: connection with them, one-line errors without."""
 
 from __future__ import annotations
 
@@ -21,16 +21,20 @@ from impc.studies.cache import Cache
 from impc.studies.pool import Task, run
 from impc.studies.scheduler import Cluster, connected
 
-# A client whose scheduler is gone leaves its socket to the garbage collector, at any later time.
+# After the loss of the scheduler, the garbage collector closes the socket at any later time.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+OPENSSL = """\
+openssl req -x509 -newkey rsa:2048 -nodes -days 365 -subj /CN=impc-ca -keyout ca-key.pem -out ca.pem
+openssl req -newkey rsa:2048 -nodes -subj /CN=impc -keyout key.pem -out request.pem
+openssl x509 -req -in request.pem -CA ca.pem -CAkey ca-key.pem -CAcreateserial -out cert.pem
+"""
 
 
 def certificates(folder: Path) -> tuple[Path, Path, Path]:
-    """An authority, a certificate that it signed, and its key, as docs/cohorts.md makes them."""
-    page = (Path(__file__).parents[2] / "docs" / "cohorts.md").read_text()
-    lines = [line for line in page.splitlines() if line.startswith("openssl ")]
-    for line in lines:
-        subprocess.run(line.split(" #")[0], shell=True, cwd=folder, check=True, capture_output=True)
+    """Make a CA, a certificate signed by it, and its key."""
+    for line in OPENSSL.splitlines():
+        subprocess.run(line, shell=True, cwd=folder, check=True, capture_output=True)
     return folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
 
 
@@ -43,7 +47,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
 
 @pytest.fixture
 def scheduler(files: tuple[Path, Path, Path]) -> Iterator[Any]:
-    """One with a worker, in this process."""
+    """Scheduler with one worker in this process."""
     ca, cert, key = map(str, files)
     security = Security(
         tls_ca_file=ca, tls_scheduler_cert=cert, tls_scheduler_key=key, tls_worker_cert=cert,
@@ -80,7 +84,7 @@ def test_certificates_that_are_missing(
     missing: int, files: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     given: list[Path | None] = list(files)
-    for other, says in ((None, "needs --tls-"), (tmp_path / "none.pem", "is no file")):
+    for other, says in ((None, "needs --tls-"), (tmp_path / "none.pem", "is not a file")):
         given[missing] = other
         with (
             pytest.raises(InputError, match=says),
@@ -125,7 +129,7 @@ def test_a_scheduler_that_is_lost(
         scheduler.close()
         with pytest.raises(OutputError, match="was lost") as caught:
             pool.take()
-        # How many threads it has was asked while nobody knew that it was gone: a defect once.
+        # Querying the number of threads of a lost scheduler raises OutputError.
         with pytest.raises(OutputError, match="was lost"):
             assert pool.threads
     assert "\n" not in str(caught.value)

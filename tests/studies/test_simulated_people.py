@@ -1,4 +1,4 @@
-"""The simulated subject: what the reference has of it, and what noise and a fall do."""
+"""Simulated subjects: reference values, noise, and falls."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_on_the_linear_plant_it_is_the_closed_loop() -> None:
 
 
 def test_who_hardly_errs_moves_as_who_sees_all() -> None:
-    """Estimates of a person with next to no noise are the states of the linear plant."""
+    """With almost no noise, the state estimates equal the states of the linear plant."""
     work = seat(1, 5.0, 6.0)
     torque = held(work.drives[0].disturbance[:, 0])
     sensed = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
@@ -54,7 +54,7 @@ def test_who_hardly_errs_moves_as_who_sees_all() -> None:
 
 
 def test_ranges_and_saturation_of_the_reference() -> None:
-    """30 s at 6 Nm on the nonlinear plant: 12.3 %, 6.90 and 5.19 degrees; at 4.5 Nm 33.9 %."""
+    """30 s at 6 N m on the nonlinear plant: 12.3 %, 6.90 and 5.19 degrees; at 4.5 N m 33.9 %."""
     torque = plants.ternary_torque(duration=30.0, rate=1000.0)
     trial = simulate_subject(seat(1, 1.0, 6.0).controller, STEP, torque)
     assert trial.saturated == pytest.approx(0.123, abs=0.005)
@@ -78,7 +78,7 @@ def test_nonlinear_and_linear_part_as_the_cube_of_the_torque() -> None:
 
 
 def test_noise_is_as_asked_and_follows_the_seed() -> None:
-    """Seed 9: sensor noise on the outputs alone, motor noise in the motion."""
+    """Seed 9: recording noise only on the outputs, motor noise in the motion."""
     controller = seat(1, 1.0, 6.0).controller
     torque = plants.ternary_torque(duration=10.0, rate=1000.0)
     sensor = np.array([0.002, 0.003])
@@ -108,6 +108,6 @@ def test_a_person_by_mass_and_height() -> None:
     usual, known = plants.seated_parameters_for(), plants.seated_parameters_for(60, 1.7, "female")
     assert known.m2 < usual.m2
     assert plants.seated_parameters_for(k_h=33.0).k_h == 33.0
-    with pytest.raises(ValueError, match="weight: is no parameter"):
+    with pytest.raises(ValueError, match="weight: is not a parameter"):
         plants.seated_parameters_for(weight=3.0)
     assert plants.seated_balance_for(60, 1.7, "female", delay_order=3).nstates == 8

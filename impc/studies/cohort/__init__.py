@@ -1,1 +1,1 @@
-"""Many subjects, many replicates, on one machine or a cluster."""
+"""Study of many subjects with bootstrap replicates, on one machine or a cluster."""

@@ -1,13 +1,13 @@
-"""Groups and visits of a cohort compared, measure by measure.
+"""Comparison of groups and visits of a cohort, measure by measure.
 
-    two groups     Welch's t on the subjects' means over their visits, Hedges' g
-    two visits     paired t on subjects who have both, d_z = mean / SD of the differences
-    both           Welch's t on the subjects' changes per visit: whether groups change differently
-    all visits     a mixed model of cost weights within a structure: group, visit, a mean for each
-    subject reliability    ICC(A,1) between visits
+    two groups     Welch's t-test on subject means over visits, Hedges' g
+    two visits     paired t-test on subjects with both visits, d_z = mean / SD of the differences
+    both           Welch's t-test on the subjects' changes per visit
+    all visits     mixed model of cost weights within a structure: group, visit, subject
+    reliability    ICC(A,1) between visits
 
-A gain that the recordings of a unit do not identify is no datum (`not_identified`).
-Several measures are tested at once: beside each p stands Holm's, over the measures of one question.
+A gain that the recordings of a unit do not identify is treated as missing (`not_identified`).
+P-values are also given after Holm's correction over the measures of one question.
 """
 
 from __future__ import annotations
@@ -37,39 +37,38 @@ if TYPE_CHECKING:
 
 _FEWEST = 3
 _COST_WEIGHT = "log_cost_weight."
-# A deviation may be so many times the usual size of an entry. Small entries that are well
-# identified stay: those of a gain whose truth is zero have a median size of 0.67 of their
-# deviation. It is not compared with the unit's own value, for what stayed would then be too large
-# on average.
+# Largest standard error over the median size of an entry. The unit's own value is not used, because
+# the remaining values would then be too large on average. Well identified small entries are kept:
+# entries with true value zero have a median size of 0.67 standard errors.
 _LARGEST = 2.0
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One question asked of one measure in one condition; NaN where there is no number."""
+    """One comparison of one measure in one condition; missing numbers are NaN."""
 
     question: str  # "group", "visit", "change", "mixed" or "reliability"
     measure: str
     condition: str
-    first: str = ""  # What is compared; empty for the reliability
+    first: str = ""  # Compared groups or visits; empty for the reliability
     second: str = ""
-    estimate: float = np.nan  # Difference of means (second minus first), or the ICC
-    low: float = np.nan  # Interval of 95 %
+    estimate: float = np.nan  # Difference of means (second minus first), or ICC
+    low: float = np.nan  # 95 % interval
     high: float = np.nan
     effect: float = np.nan  # Hedges' g or d_z
     p: float = np.nan
-    n: int = 0  # Subjects
+    n: int = 0  # Number of subjects
     p_holm: float = np.nan
-    note: str = ""  # Why there is no number; empty otherwise
+    note: str = ""  # Reason why there is no number
 
 
 def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
-    """Columns of the table `units` that are compared: few, chosen before the data are seen.
+    """Columns of the table `units` that are compared, independent of the data.
 
-    Logarithms of cost weights within a structure, or without one cost weights of recorded outputs
-    in the analytic centre; gains on recorded outputs and their rates; and VAF. Gains on states of a
-    delay or a muscle, one by one, say little, and every measure makes Holm's correction harder on
-    the others. All gains where no state has an output's name.
+    Logarithms of cost weights within a structure (without one: cost weights of recorded outputs in
+    the analytic centre), gains on recorded outputs and their rates (all gains if no state has the
+    name of an output), and VAF. Gains on delay or muscle states are left out: they have little
+    meaning, and more measures reduce the power after Holm's correction.
     """
     outputs = [name.removeprefix("vaf.") for name in units.columns if name.startswith("vaf.")]
     shown = {*outputs, *(f"{name}_rate" for name in outputs)}
@@ -82,7 +81,7 @@ def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
 
 
 def compare_cohort(units: pd.DataFrame) -> tuple[Comparison, ...]:
-    """Answer every question that the units allow, without gains that a unit does not identify."""
+    """All possible comparisons; gains that a unit does not identify are missing."""
     if len(units) == 0:
         return ()
     chosen = measures_of(units)
@@ -119,7 +118,7 @@ def _welch(asked: Comparison, a: Array, b: Array) -> Comparison:
 
 
 def _tested(asked: Comparison, test: Any, estimate: float, effect: float, n: int) -> Comparison:
-    """With the numbers of one of scipy's t-tests."""
+    """Comparison with the results of a t-test of SciPy."""
     low, high = map(float, test.confidence_interval(0.95))
     return replace(asked, estimate=float(estimate), low=low, high=high, effect=float(effect),
                    p=float(test.pvalue), n=n)  # fmt: skip
@@ -137,7 +136,7 @@ def _visits(part: pd.DataFrame, asked: Comparison) -> Comparison:
 
 
 def _changes(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    """Welch's t on each subject's change per visit, its least-squares slope over the visits."""
+    """Welch's t-test on each subject's change per visit (least-squares slope over visits)."""
     place = {visit: index for index, visit in enumerate(dict.fromkeys(part["visit"]))}
     slopes: dict[str, list[float]] = {asked.first: [], asked.second: []}
     for (group, _), rows in part.dropna(subset=[asked.measure]).groupby(["group", "subject"]):
@@ -148,7 +147,7 @@ def _changes(part: pd.DataFrame, asked: Comparison) -> Comparison:
 
 
 def _mixed(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    """Group effect with a mean for each visit and each subject, by restricted likelihood."""
+    """Group effect in a mixed model with visit effects and subject intercepts (REML)."""
     pair = [asked.first, asked.second]
     rows = part[part["group"].isin(pair)].dropna(subset=[asked.measure])
     each = rows.groupby("group")["subject"].nunique().reindex(pair, fill_value=0)
@@ -164,10 +163,10 @@ def _mixed(part: pd.DataFrame, asked: Comparison) -> Comparison:
         fitted = MixedLM(scores, np.transpose(design), rows["subject"]).fit(reml=True)
     effect, error = float(fitted.params[1]), float(fitted.bse[1])
     if not (np.isfinite(error) and error > 0) or not fitted.converged:
-        why = "; ".join(str(item.message) for item in raised[:1]) or "no deviation"
+        why = "; ".join(str(item.message) for item in raised[:1]) or "no standard error"
         note = f"the mixed model did not converge ({one_line(why)[:60]})"
         return replace(asked, n=n, note=note)
-    # The effect lies between subjects: exact where every subject has all visits.
+    # n - 2 degrees of freedom between subjects: exact if every subject has all visits.
     reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
     p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
     return replace(asked, estimate=effect, low=effect - reach, high=effect + reach, p=p, n=n)
@@ -183,7 +182,7 @@ def _reliable(part: pd.DataFrame, asked: Comparison) -> Comparison:
 
 
 def _hedges(a: Array, b: Array) -> float:
-    """Hedges' g: difference over the pooled SD, corrected for small samples."""
+    """Hedges' g: difference divided by the pooled SD, corrected for small samples."""
     freedom = len(a) + len(b) - 2
     pooled = np.sqrt(((len(a) - 1) * a.var(ddof=1) + (len(b) - 1) * b.var(ddof=1)) / freedom)
     if pooled == 0:
@@ -201,12 +200,11 @@ def _holm(found: list[Comparison]) -> list[Comparison]:
 
 
 def not_identified(units: pd.DataFrame) -> dict[str, int]:
-    """How many units do not identify a gain, by its column; none for gains of all units.
+    """Number of units that do not identify a gain, by its column; zero counts are omitted.
 
-    A unit says an entry whose standard deviation is at most twice the median size of the entry
-    over the units that give a deviation. The deviation counts what the entry may owe to directions
-    that are not identified (`GainCovariance.entries`), so that one identified only with others is
-    data too where it is identified well enough.
+    An entry is identified if its standard error is at most twice the median size of the entry over
+    all units with a standard error. The standard error includes unidentified directions
+    (`GainCovariance.entries`).
     """
     gains = units.filter(regex=r"^K\.")
     lost = (only_identified(units)[gains.columns].isna() & gains.notna()).sum()
@@ -214,7 +212,7 @@ def not_identified(units: pd.DataFrame) -> dict[str, int]:
 
 
 def only_identified(units: pd.DataFrame) -> pd.DataFrame:
-    """The table `units` with NaN for each gain that `not_identified` has of its unit."""
+    """The table `units` with NaN for gains that a unit does not identify."""
     kept = units.copy()
     for name in units.columns:
         beside = f"K_deviation{name[1:]}"

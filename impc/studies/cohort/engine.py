@@ -1,12 +1,12 @@
-"""Run a study: the fit of each unit, then its replicates, results to disk as they come.
+"""Run a study: the fit of each unit, then its replicates; results are stored at once.
 
-    OUT/manifest.json                  the units, their digests, the versions
+    OUT/manifest.json                  units, their digests, versions
     OUT/units/NAME/fit.json            a fit (`impc.studies.cache`), or
-    OUT/units/NAME/failed.json         why there is none
+    OUT/units/NAME/failed.json         the reason why there is none
     OUT/units/NAME/replicate-0007.json, or replicate-0007-failed.json
-    OUT/cohort.log                     what happened when
+    OUT/cohort.log                     log with times
 
-What is there is not computed again. What cannot be fitted is reported and stops nothing else.
+Stored results are not computed again. A unit that cannot be fitted does not stop the others.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from impc.studies.cohort.tasks import FitTask
     from impc.studies.pool import Pool, Result
 
-# What a replicate needs of its fit.
+# Entries of a fit that its replicates need.
 _NEEDED = ("starts", "logarithms", "offsets", "K", "S", "Q", "R")
 
 
@@ -43,17 +43,16 @@ class Store:
     """The results of a study in its folder."""
 
     folder: Path
-    # Of every unit, by its name, as the study is now (`unit_digest`). A unit without one, because a
-    # recording cannot be read, has no results.
+    # Digest of each unit by name (`unit_digest`); none for a unit that cannot be read
     digests: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def cache(self) -> Cache:
-        """Where they are kept."""
+        """Cache of fits and replicates."""
         return Cache(self.folder / "units")
 
     def fit(self, unit: str, index: int | None = None) -> dict[str, Any] | None:
-        """The fit of a unit, or its replicate `index`; None where there is none."""
+        """Fit of a unit, or its replicate `index`; None if there is none."""
         if unit not in self.digests:
             return None
         found: dict[str, Any] | None = self.cache.find(_name(unit, index), self.digests[unit])
@@ -72,15 +71,15 @@ class Store:
 
 @dataclass
 class Failures:
-    """What could not be done, and why."""
+    """Failed fits and replicates with their reasons."""
 
     units: dict[str, str] = field(default_factory=dict)  # Unit -> reason why it has no fit
-    # Unit -> number of the replicate, from 1 -> reason
+    # Unit -> number of the replicate (from 1) -> reason
     replicates: dict[str, dict[int, str]] = field(default_factory=dict)
 
     @property
     def lines(self) -> list[str]:
-        """A sentence each, for the terminal."""
+        """Lines for the terminal."""
         lines = [f"{unit}: {reason}" for unit, reason in self.units.items()]
         for unit, found in self.replicates.items():
             first = min(found)
@@ -93,12 +92,12 @@ class Failures:
 
 
 def _name(unit: str, index: int | None = None) -> str:
-    """Of the result of a fit, or of its replicate `index`."""
+    """Name in the cache of a fit, or of its replicate `index`."""
     return f"{unit}/fit" if index is None else f"{unit}/replicate-{index:04d}"
 
 
 def work_kept(study: Study, store: Store) -> tuple[int, int]:
-    """Number of tasks whose result has a file, and of all tasks."""
+    """Number of tasks with a stored result, and number of all tasks."""
     count = int(study.configuration.fit.get("replicates", 0))
     names = [
         name
@@ -109,19 +108,19 @@ def work_kept(study: Study, store: Store) -> tuple[int, int]:
 
 
 def require_same(store: Store) -> None:
-    """Refuse a folder that has fits of other recordings, settings, plants or versions."""
+    """Raise InputError if the folder has fits of other recordings, settings or versions."""
     try:
         known = json.loads((store.folder / "manifest.json").read_bytes())["units"]
         before = {unit: known[unit]["digest"] for unit in store.digests if unit in known}
-    except (OSError, ValueError, KeyError, TypeError):  # none, or damaged: no result is used then
-        return  # that has another digest
+    except (OSError, ValueError, KeyError, TypeError):  # none or damaged: then results with
+        return  # another digest are ignored
     for unit, digest in before.items():
         path = store.cache.path(_name(unit))
         if digest not in (None, store.digests[unit]) and path.exists():
             raise InputError(
                 f"file {path}",
                 "was fitted to other recordings or with other settings, plant or versions",
-                "give another folder, or remove it",
+                "choose another folder, or remove it",
             )
 
 
@@ -132,7 +131,7 @@ def run_study(
     pool: Pool,
     done: Callable[[Result], None] = lambda _: None,
 ) -> Failures:
-    """Do what is left of a study."""
+    """Run the remaining tasks of a study."""
     require_same(store)
     count = int(study.configuration.fit.get("replicates", 0))
     manifest = {
@@ -173,7 +172,7 @@ def run_study(
                 f"{content['memory_mb']:.0f} MB"
             )
         if index is None and result.fault is None:
-            # Before other fits: a unit is finished before the next is begun.
+            # At the front of the queue: finish a unit before the next one.
             needed = {key: content[key] for key in _NEEDED}
             queue.extendleft(
                 Task(_name(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
@@ -184,10 +183,10 @@ def run_study(
 
 
 def keep_failure(store: Store, unit: str, reason: str) -> None:
-    """Write down the `reason` why a `unit` cannot be fitted: none of its recordings can be read."""
+    """Store the `reason` why the recordings of a `unit` cannot be read."""
     store.cache.keep(_failed(_name(unit)), "", {"reason": reason})
 
 
 def _failed(name: str) -> str:
-    """Where the reason is kept why there is no such result."""
+    """Name in the cache of the reason why the result `name` is missing."""
     return f"{name}-failed".replace("/fit-", "/")

@@ -1,4 +1,4 @@
-"""Figures of a cohort: people by group, and a subject's first trial."""
+"""Figures of a cohort: forest plot of all people, and a subject's first trial."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.cohort.verdict import Cohort
 
-_NAMED = 45  # Rows up to which each has the name of its subject
+_NAMED = 45  # Largest number of rows with names of subjects
 
 
 def forest(cohort: Cohort, narrow: bool) -> Figure:
-    """A row each unit with its interval, by group or visit, and the mean of each."""
+    """Forest plot: one row per unit with its interval, and the mean of each group or visit."""
     lead, units = cohort.lead, cohort.units.join(cohort.ends)
     units = units if lead is None else units[units["condition"] == lead.condition]
     label = "visit" if lead is not None and lead.question == "visit" else "group"
@@ -37,7 +37,7 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
         ax.set_xscale("log")
     column = "value" if units["value"].count() > 2 else "shown"
     low, high = ax.xaxis.get_transform().transform([units[column].min(), units[column].max()])
-    pad = 0.6 * (high - low) or 1.0  # wider intervals go on beyond the figure
+    pad = 0.6 * (high - low) or 1.0  # wider intervals are cut off
     ax.set_xlim(*ax.xaxis.get_transform().inverted().transform([low - pad, high + pad]))
     across: Any = {"transform": ax.get_yaxis_transform(), "va": "center"}
     for block, part in blocks:
@@ -66,7 +66,7 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
 
 
 def _mean(ax: Axes, means: Array, at: float, rows: int, ratio: bool, across: Any) -> None:
-    """The mean over people with its interval, behind their rows."""
+    """Draw the mean over people with its interval behind their rows."""
     own = np.log(means) if ratio else means
     reach = scipy.stats.t.ppf(0.975, len(own) - 1) * scipy.stats.sem(own)
     ends = own.mean() + reach * np.array([-1.0, 0.0, 1.0])
@@ -78,7 +78,7 @@ def _mean(ax: Axes, means: Array, at: float, rows: int, ratio: bool, across: Any
 
 
 def subject_figure(fit: Mapping[str, Any], narrow: bool) -> Figure:
-    """Recorded and modelled outputs of a unit's first trial, from the content of its `fit`."""
+    """Recorded and modelled outputs of a unit's first trial, from its stored `fit`."""
     shown = fit["trajectory"]
     recorded, simulated = np.array(shown["recorded"]), np.array(shown["simulated"])
     time = np.arange(len(recorded) // (3 if narrow else 1)) * shown["dt"]

@@ -1,4 +1,4 @@
-"""Tables, pages and figures of a cohort, made from its folder."""
+"""Report of a cohort: tables, pages and figures, made from the results in its folder."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 _BESIDE = {
     "units": "All numbers of every fit, angles in radians.",
-    "replicates": "Gain and parameters of every bootstrap repetition, angles in radians.",
-    "intervals": "Percentiles of the bootstrap repetitions.",
+    "replicates": "Gain and parameters of every bootstrap replicate, angles in radians.",
+    "intervals": "Percentiles of the bootstrap replicates.",
 }
 _QUESTIONS = {
     "group": "between groups",
@@ -48,10 +48,10 @@ _METHODS = (
     "for each person, visit and condition. Groups were compared by Welch's t-test on the means of "
     "people over their visits (effect size: Hedges' g), visits by paired t-tests (Cohen's d of the "
     "differences). P-values were corrected by Holm's method over the measures of one question. "
-    "Gains with a standard error above twice the median size of that gain were taken as not "
+    "Gains with a standard error above twice the median size of that gain were treated as not "
     "identified and left out."
 )
-#: Word of a fit's badge in a table, and its level, by the name of the level; worst last.
+#: Name of a level -> badge of a fit in a table, and the level; worst last.
 _BADGES = {
     "green": ("Ready", Level.GREEN),
     "amber": ("Check", Level.AMBER),
@@ -59,7 +59,7 @@ _BADGES = {
 }
 _HOME = Markup('<a href="../report.html">All subjects</a>')
 _INTERVAL = {"low": "95 % CI low", "high": "95 % CI high"}
-_CURVES = "First trial. Grey: recorded. Blue: the model, moved by the perturbation alone."
+_CURVES = "First trial. Grey: recorded. Blue: model, simulated from the perturbation."
 
 
 def write_report(
@@ -70,7 +70,7 @@ def write_report(
     for unit in study.units:
         subjects.setdefault(unit.subject, []).append(unit)
     for subject, own in subjects.items():
-        # One after the other: the pages of a thousand subjects would fill the memory.
+        # Written one by one: the pages of a thousand subjects would fill the memory.
         page = _subject_page(subject, own, store, failures)
         write_files(store.folder, {_address(subject): page.page().encode()})
     described = next((fit for unit in study.units if (fit := store.fit(unit.name))), {})
@@ -92,7 +92,7 @@ def write_report(
 
 
 def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -> Report:
-    """The page of a cohort."""
+    """Report of a cohort."""
     verdict, name = cohort_verdict(cohort), cohort.name(cohort.measure)
     people = len({unit.subject for unit in study.units})
     provenance = Provenance(command=command)
@@ -105,19 +105,19 @@ def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -
         results = f"{verdict.headline} {verdict.sentence} {others}{without}".strip()
         copied = Copy(_METHODS.format(people=people), results)
     caption = (
-        "A row for each fit, with its 95 % CI where there is one. Grey band: mean of the people "
-        "with its 95 % CI. Lines at the edge go on. Hollow: not identified, and not compared."
+        "One row per fit, with its 95 % CI if there is one. Grey band: mean of the people with its "
+        "95 % CI. Lines that reach the edge go on. Hollow: not identified, and not compared."
     )
     alternative = f"{name[:1].upper()}{name[1:]} of every person, by group, with intervals"
     return Report(
         "impc cohort", "cohort report", verdict,
         [
-            Section("Comparisons", compared or ["With one group and visit nothing is compared."]),
+            Section("Comparisons", compared or ["None: there is one group and one visit only."]),
             Section("Subjects", [_subjects(study, cohort)]),
             Section("Checks", [Checks(checks)]),
             Section("Provenance", [Terms([("Recordings", recordings), *provenance.terms])]),
         ],
-        meta=("Cohort", f"{people} people", f"{len(study.units)} fits asked for"),
+        meta=("Cohort", f"{people} people", f"{len(study.units)} fits requested"),
         hero=Picture("people", alternative, caption) if name else None,
         keys=_keys(cohort),
         figures={"people": partial(forest, cohort)} if name else {},
@@ -144,7 +144,7 @@ def _keys(cohort: Cohort) -> list[Key]:
 
 
 def comparisons(cohort: Cohort) -> Finding:
-    """Every comparison; those of logarithms as ratios."""
+    """Table of all comparisons; logarithms are shown as ratios."""
     rows = []
     for item in cohort.compared:
         ends, unit = np.array([item.estimate, item.low, item.high]), cohort.unit(item.measure)
@@ -164,12 +164,12 @@ def comparisons(cohort: Cohort) -> Finding:
     weights = (
         "Cost weights are those of the structure, compared as ratios."
         if "structure_refused" in cohort.units.columns
-        else "Central cost weights are a convention, the same for everybody: compare gains first."
+        else "Central cost weights are a convention, the same for all people: compare gains first."
     )
     caption = (
-        "Difference of means (second minus first) or ICC(A,1), with 95 % CI. Effect: Hedges' g, "
-        "between visits Cohen's d of the differences. n: people. p (Holm): corrected over the "
-        f"measures of one question. {weights}"
+        "Difference of means (second minus first) or ICC(A,1), with 95 % CI. Effect: Hedges' g; "
+        "between visits Cohen's d of the differences. n: number of people. p (Holm): corrected "
+        f"over the measures of one question. {weights}"
     )
     heads = ("question", "condition", "compared", "note")
     return Finding(
@@ -181,7 +181,7 @@ def comparisons(cohort: Cohort) -> Finding:
 
 
 def _subjects(study: Study, cohort: Cohort) -> Finding:
-    """Every unit in a table, with a badge and a link to its page."""
+    """Table of all units with a badge and a link to their pages."""
     rows, name = [], cohort.name(cohort.measure)
     found = cohort.units.join(cohort.ends) if cohort.measure else cohort.units
     made = {row["unit"]: row for row in found.to_dict("records")}
@@ -204,7 +204,7 @@ def _subjects(study: Study, cohort: Cohort) -> Finding:
     plain = [one for one in ("group", "visit", "condition", "why") if table[one].nunique() < 2]
     return Finding(
         "subjects", table,
-        "Every subject and visit; click a head to sort. Without a number: not identified.",
+        "All subjects and visits; click a heading to sort. Without a number: not identified.",
         digits=4,
         labels={
             **{head: f"{words}, VAF (%)" for head, words in signals.items()}, **_INTERVAL,
@@ -218,7 +218,7 @@ def _subjects(study: Study, cohort: Cohort) -> Finding:
 
 
 def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> list[Check]:
-    """What was checked over all fits; amber where it restricts what may be reported."""
+    """Checks over all fits; amber if they restrict what may be reported."""
     units, total, warned = cohort.units, len(study.units), cohort.warned
     fits, (name, known, of) = len(units), cohort.identified
     never = int(np.sum(units["saturated"] == 0)) if fits else 0
@@ -226,16 +226,17 @@ def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> l
     drawn = fits * int(study.configuration.fit.get("replicates", 0))
     lost = sum(map(len, failures.replicates.values()))
     cases = (
-        (True, fits == total, "Fits", f"{fits} of {total} fits were made."),
+        (True, fits == total, "Fits", f"{fits} of {total} fits are complete."),
         (True, not warned, "Warnings", f"{warned} of {fits} fits have a warning."),
         (name, known == of, "Identified",
          f"The {name} is identified in {known} of {of} people; the others are not compared."),
         (never, None, "Limit",
-         f"{never} of {fits} fits never reach the torque limit, and say nothing about it."),
+         f"{never} of {fits} fits never reach the torque limit, so they cannot check it."),
         ("structure_refused" in units.columns, refused <= 0.1 * fits, "Structure",
-         f"Rejected in {refused} of {fits} fits; at 5 % one in twenty is so by chance."),
+         f"Rejected in {refused} of {fits} fits; at a level of 5 %, one in 20 is expected by "
+         "chance."),
         (drawn, not lost, "Bootstrap",
-         f"{drawn - lost} of {drawn} bootstrap repetitions done, {lost} failed."),
+         f"{drawn - lost} of {drawn} bootstrap replicates are complete, {lost} failed."),
     )  # fmt: skip
     levels = {True: Level.GREEN, False: Level.AMBER, None: Level.NOTE}
     found = [Check(levels[passed], head, said) for there, passed, head, said in cases if there]
@@ -243,7 +244,7 @@ def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> l
 
 
 def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> Check:
-    """Trials that were left out because the person fell, by group."""
+    """Check of the number of trials with a fall, by group."""
     fallen: dict[str, int] = {}
     for unit in units:
         fit, group = store.fit(unit.name), unit.group or "all"
@@ -255,13 +256,13 @@ def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> Check:
     counts = ", ".join(f"{lost} in group {group}" for group, lost in sorted(fallen.items()))
     return Check(
         Level.AMBER, "Falls",
-        f"Trials with a fall were left out ({counts}). If one group falls more often, the rest "
-        "may understate how the groups differ: compare the numbers of falls as well.",
+        f"Trials with a fall were left out ({counts}). If one group falls more often, the other "
+        "trials may understate the difference between groups: also compare the numbers of falls.",
     )  # fmt: skip
 
 
 def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failures) -> Report:
-    """The page of a subject: a section for each visit and condition."""
+    """Report of one subject, with a section for each visit and condition."""
     fits = {unit.name: fit for unit in units if (fit := store.fit(unit.name)) is not None}
     sections, first = [], next(iter(fits), "")
     for unit in units:
@@ -272,7 +273,7 @@ def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failu
             blocks = [*([shown] if unit.name != first else []), *_blocks(unit, fits[unit.name])]
         sections.append(Section(title or "Fit", blocks))
     verdict = Verdict(Level.RED, "No recording of this subject could be fitted.", "")
-    if fits:  # That of the fit with the worst level
+    if fits:  # verdict of the fit with the worst level
         worst = max((fit["verdict"] for fit in fits.values()),
                     key=lambda one: [*_BADGES].index(one["level"]))  # fmt: skip
         verdict = Verdict(Level(worst["level"]), worst["headline"], worst["sentence"])
@@ -289,7 +290,7 @@ def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failu
 def _subject_keys(fit: Mapping[str, Any]) -> list[Key]:
     least, name = min((or_nan(value), name) for name, value in fit["vaf"].items())
     return [
-        Key(number(least, 4), "%", "explained (VAF)", f"least: {fit['words'].get(name, name)}"),
+        Key(number(least, 4), "%", "explained (VAF)", f"lowest: {fit['words'].get(name, name)}"),
         Key(number(100 * fit["saturated"]), "% of the time", "at the torque limit"),
         *(Key(number(row["gain"]), row["unit"], f"gain on {row['state']}",
               f"95 % CI {between(row['low'], row['high'])}")
@@ -315,7 +316,7 @@ def _blocks(unit: Unit, fit: Mapping[str, Any]) -> list[Block]:
 
 
 def _gains(fit: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Every entry of the gain; an interval where it is identified by itself."""
+    """All entries of the gain; with an interval if individually identified."""
     words, rows = fit["words"], []
     for i, control in enumerate(fit["controls"]):
         for j, state in enumerate(fit["states"]):

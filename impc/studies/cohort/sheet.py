@@ -1,4 +1,4 @@
-"""A small table of a study, recordings or participants: .csv, .tsv, .xlsx or .ods."""
+"""Tables of recordings or participants of a study: .csv, .tsv, .xlsx or .ods."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impc.files.apart import cells_apart
 if TYPE_CHECKING:
     from pathlib import Path
 
-# 100 000 participants of 100 characters are 10 MB.
+# Largest file in bytes; 100 000 participants of 100 characters are 10 MB.
 _LARGEST = 100_000_000
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
@@ -25,13 +25,13 @@ _THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+|[+-]?\d{1,3}(\.\d{3})+")
 class Sheet:
     """The rows of a table."""
 
-    name: str  # Of its file
+    name: str  # Name of its file
     heads: tuple[str, ...]  # Names of the columns
-    rows: tuple[dict[str, str], ...]  # Head -> text, its ends stripped
+    rows: tuple[dict[str, str], ...]  # Column name -> stripped text
 
     @property
     def where(self) -> str:
-        """How messages call it."""
+        """Name of the table in messages."""
         return f"table {self.name}"
 
 
@@ -40,29 +40,29 @@ def read_sheet(path: Path) -> Sheet:
     where = f"table {path.name}"
     lines = _cells(where, path)
     if len(lines) < 2:
-        raise InputError(where, "has no rows", "write a head and a row for each")
+        raise InputError(where, "has no rows", "write a row of column names, then the data")
     heads = tuple(cell.strip() for cell in lines[0])
     for name in heads:
         if not name or heads.count(name) > 1:
             problem = (
                 f"has {heads.count(name)} columns {name!a}" if name else "has an unnamed column"
             )
-            raise InputError(where, problem, "give each column a name of its own")
+            raise InputError(where, problem, "give each column a unique name")
     for number, line in enumerate(lines[1:], start=2):
         if len(line) != len(heads):
             raise InputError(
-                where, f"row {number} has {len(line)} cells, the head {len(heads)}",
-                "decimal commas between commas need quotes, or semicolons between the cells",
+                where, f"row {number} has {len(line)} cells, but there are {len(heads)} columns",
+                "quote cells with decimal commas, or separate cells by semicolons",
             )  # fmt: skip
     rows = (dict(zip(heads, map(str.strip, line), strict=True)) for line in lines[1:])
     return Sheet(path.name, heads, tuple(rows))
 
 
 def _cells(where: str, path: Path) -> list[list[str]]:
-    """Every line that is not empty."""
+    """All lines that are not empty."""
     try:
         if path.exists() and not path.is_file():
-            raise InputError(where, "is no ordinary file", "check the path")
+            raise InputError(where, "is not a regular file", "check the path")
         if path.stat().st_size > _LARGEST:
             raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
         if path.suffix.lower() in (".xlsx", ".ods"):
@@ -70,9 +70,9 @@ def _cells(where: str, path: Path) -> list[list[str]]:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise InputError(where, f"cannot be read ({reason})", "check it") from None
+        raise InputError(where, f"cannot be read ({reason})", "check path and encoding") from None
     if "\0" in text:
-        raise InputError(where, "has a NUL in it", "save it again as UTF-8 text")
+        raise InputError(where, "contains a NUL character", "save it again as UTF-8 text")
     first = text.partition("\n")[0]
     delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
     try:
@@ -82,7 +82,7 @@ def _cells(where: str, path: Path) -> list[list[str]]:
 
 
 def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
-    """The cells of a column `name`: numbers where all are, else text; None for an empty cell."""
+    """Cells of the column `name`: numbers if all are numbers, else text; None if empty."""
     cells = [row[name] for row in sheet.rows]
     given = [cell for cell in cells if cell not in ("", "n/a")]
     where = f"{sheet.where}: column {name}"
@@ -95,11 +95,11 @@ def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
     points = [cell for cell in given if "." in cell]
     if commas and points:
         raise InputError(
-            where, f"has {points[0]} and {commas[0]}", "write all with points or all with commas"
+            where, f"has {points[0]} and {commas[0]}", "use only decimal points or only commas"
         )
     if commas and all(_THOUSANDS.fullmatch(cell) for cell in commas):
         raise InputError(
-            where, f"has {commas[0]}, which may be thousands", "write it with a decimal point"
+            where, f"{commas[0]} may have a thousands separator", "write it with a decimal point"
         )
     numbers = {cell: float(cell.replace(",", ".")) for cell in given}
     for cell, value in numbers.items():

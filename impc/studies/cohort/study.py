@@ -1,4 +1,4 @@
-"""A study: which recordings belong together, and how they are fitted. One TOML file.
+"""Study file (TOML): which recordings belong together, and how they are fitted.
 
     [study]
     plant = "seated-balance"
@@ -7,19 +7,11 @@
 
     [recording] ... [signals.NAME] ... [plant] ... [fit] ...     as for `impc fit`
 
-`recordings` is a pattern relative to the file; instead of it, `table` names a table with the
-columns file, subject, visit, condition, trial, and `bids` a folder whose file names say sub-,
-ses-, task- and run- as BIDS has them. `participants` is a table with a column subject (or
-participant_id, as in BIDS); a column group says the groups; other columns that are arguments of
-the plant (mass, height) replace those of [plant] for that subject. All trials with the same
-subject, visit and condition make a unit: one fit.
+All trials with the same subject, visit and condition form a unit, which gets one fit.
 
-Where the recordings of a study are: by a pattern, a table, or names as BIDS has them.
-
-Names of subjects, visits, conditions, trials and groups, checked where a study is read.
-
-They become names of files and folders, cells of tables and lines on the terminal. What is let in
-here is safe in all of them: letters, digits, spaces and . + - _, beginning with a letter or digit.
+Names of subjects, visits, conditions, trials and groups become names of files and folders, table
+cells and terminal output. Only names that are safe in all of them are accepted: letters, digits,
+spaces and . + - _, beginning with a letter or digit.
 """
 
 from __future__ import annotations
@@ -46,17 +38,36 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
 
 class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The [study] table."""
+    """The [study] table. Paths are relative to the study file.
 
-    plant: str | None = None  # As the option of `impc fit`; a model for `impc select`
+    Attributes
+    ----------
+    plant : str, optional
+        Plant of `impc cohort` and `impc reliability`: a short name, ``module:function`` or a file,
+        as for `impc fit --plant`.
+    model : str, optional
+        Import path ``module:function`` of the model of `impc select` and `impc key-parameters`.
+    recordings : str, optional
+        Path pattern of the recordings with {subject}, {visit}, {condition} and {trial}. Exactly one
+        of `recordings`, `table` and `bids` is required.
+    table : str, optional
+        Table with the columns file and subject, and optionally visit, condition and trial.
+    bids : str, optional
+        Folder whose file names contain sub-, ses-, task- and run- as in BIDS.
+    participants : str, optional
+        Table with a column subject (or participant_id), optionally a column group; other columns
+        that are arguments of the plant, such as mass, replace those of [plant] for that subject.
+    """
+
+    plant: str | None = None
     model: str | None = None
-    recordings: str | None = None  # Where the recordings are: one of the three
+    recordings: str | None = None
     table: str | None = None
     bids: str | None = None
-    participants: str | None = None  # Table of the subjects
+    participants: str | None = None
 
 
-#: What a unit is called by.
+#: Labels of a unit.
 LABELS = ("subject", "visit", "condition", "group")
 
 
@@ -64,39 +75,38 @@ LABELS = ("subject", "visit", "condition", "group")
 class Unit:
     """All trials of one subject, visit and condition."""
 
-    subject: str  # Empty where the study has none
-    visit: str
-    condition: str
-    files: tuple[Path, ...]  # By trial
-    group: str = ""  # Empty where participants have none
-    # Other columns of the participants, for this subject
+    subject: str
+    visit: str  # Empty if the study has none
+    condition: str  # Empty if the study has none
+    files: tuple[Path, ...]  # In the order of the trials
+    group: str = ""  # Empty if there is no column group
+    # Other columns of the participants for this subject
     person: Mapping[str, float | str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """Name of its folder: sub-01_ses-1_task-EO."""
+        """Name of its folder, for example sub-01_ses-1_task-EO."""
         parts = (("sub", self.subject), ("ses", self.visit), ("task", self.condition))
         return "_".join(f"{key}-{safe_name(value)}" for key, value in parts if value)
 
 
 def safe_name(name: str) -> str:
-    """A checked `name` as a part of a file's name."""
+    """Convert a checked `name` to a part of a file name."""
     return _UNSAFE.sub("-", name)
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study that has been read."""
+    """Contents of a study file."""
 
-    # Name, import path or file of the plant; import path of the model. Empty when not given.
-    plant: str
-    configuration: Configuration  # Signals and settings of every fit
+    plant: str  # Name, import path or file of the plant; empty if not given
+    configuration: Configuration  # Signals and settings of all fits
     units: tuple[Unit, ...]  # In the order of subject, visit and condition
-    model: str = ""
+    model: str = ""  # Import path of the model; empty if not given
 
 
 def read_study(path: Path) -> Study:
-    """Read the study at `path` and find its recordings; none of them is opened."""
+    """Read the study at `path` and find its recordings without opening them."""
     configuration = read_configuration(path, "study", "model", "select")
     table = _table(path, configuration)
     people = _people(path.parent / table.participants) if table.participants else None
@@ -123,7 +133,7 @@ def _table(path: Path, configuration: Configuration) -> StudyTable:
     try:
         table = msgspec.convert(configuration.study, StudyTable)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: study", str(error), "see docs/cohorts.md") from None
+        raise InputError(f"{path}: study", str(error), "see docs/ref/settings.md") from None
     for name in table.__struct_fields__:
         value = getattr(table, name)
         if value is not None and (not value.strip() or "\0" in value):
@@ -146,14 +156,14 @@ def _found(path: Path, table: StudyTable) -> list[Found]:
             find = find_by_entities if given[0] == "bids" else find_by_table
             found = find(path.parent / written)
     except OSError as error:
-        raise InputError(where, f"cannot be looked for ({error.strerror})", "check it") from None
+        raise InputError(where, f"cannot be searched ({error.strerror})", "check it") from None
     if not found:
         raise InputError(where, "matches no file", "check the path")
     return found
 
 
 def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
-    """Subject -> group and the other columns."""
+    """Subject -> group and other columns."""
     sheet = read_sheet(path)
     named = [name for name in ("subject", "participant_id") if name in sheet.heads]
     others = [name for name in sheet.heads if name not in (*named, "group")]
@@ -164,17 +174,17 @@ def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
         subject = checked_name(sheet.where, "subject", text.removeprefix("sub-"))
         if not subject:
             raise InputError(
-                sheet.where, "lacks a subject", "name the column subject, fill every row"
+                sheet.where, "has a row without subject", "name the column subject, fill every row"
             )
         if subject in found:
-            raise InputError(sheet.where, f"has two rows of subject {subject}", "keep one")
+            raise InputError(sheet.where, f"has two rows of subject {subject}", "remove one")
         person = {name: value for name in others if (value := values[name][number]) is not None}
         found[subject] = checked_name(sheet.where, "group", row.get("group", "")), person
     return found
 
 
 def _natural(text: str) -> tuple[Any, ...]:
-    """2 before 10."""
+    """Sort key that puts 2 before 10."""
     return tuple(
         (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in re.findall(r"\d+|\D+", text)
@@ -182,14 +192,14 @@ def _natural(text: str) -> tuple[Any, ...]:
 
 
 def _require_once(path: Path, found: Iterable[Found]) -> None:
-    """No file twice, by whatever name, and no trial in two formats."""
+    """Raise InputError if a file, or a trial in two formats, is found twice."""
     places: dict[str, Path] = {}
     stems: dict[Path, Path] = {}
     for _, file in found:
         other = places.setdefault(os.path.realpath(file), file)
         if other is not file:
             problem = f"names the same file twice, {str(other)!a} and {str(file)!a}"
-            raise InputError(f"{path}: study", problem, "a trial counts once")
+            raise InputError(f"{path}: study", problem, "name each trial once")
         other = stems.setdefault(file.with_suffix(""), file)
         if other is not file:
             problem = f"finds {str(other)!a} and {file.name!a}, the same trial in two formats"
@@ -197,7 +207,7 @@ def _require_once(path: Path, found: Iterable[Found]) -> None:
 
 
 def _require_distinct(path: Path, units: Iterable[Unit]) -> None:
-    """No two units in one folder, no two subjects on one page; capitals make no difference."""
+    """Raise InputError if two units have the same folder or two subjects the same page."""
     seen: dict[str, Unit] = {}
     subjects: dict[str, str] = {}
     for unit in units:
@@ -205,7 +215,7 @@ def _require_distinct(path: Path, units: Iterable[Unit]) -> None:
         page = subjects.setdefault(safe_name(unit.subject).lower(), unit.subject)
         if other is not unit or page != unit.subject:
             raise InputError(
-                f"{path}: {unit.name}", "is the name of two units", "use letters, digits, - and +"
+                f"{path}: {unit.name}", "is the folder of two units", "use letters, digits, - and +"
             )
 
 
@@ -219,7 +229,7 @@ Found = tuple[dict[str, str], Path]
 
 
 def find_by_pattern(where: str, folder: Path, pattern: str) -> list[Found]:
-    """Files whose path matches a pattern with {subject}, {visit}, {condition} and {trial}."""
+    """Files whose paths match a pattern with {subject}, {visit}, {condition} and {trial}."""
     if Path(pattern).is_absolute():
         folder = Path(Path(pattern).anchor)
         pattern = pattern[len(folder.as_posix()) :]
@@ -235,7 +245,7 @@ def find_by_pattern(where: str, folder: Path, pattern: str) -> list[Found]:
 
 
 def _expression(where: str, pattern: str) -> str:
-    """The regular expression of a pattern."""
+    """Regular expression of a pattern."""
     names = re.findall(r"\{(\w+)\}", pattern)
     unknown = [name for name in names if name not in KEYS]
     if unknown or "subject" not in names:
@@ -246,12 +256,12 @@ def _expression(where: str, pattern: str) -> str:
     rest = re.sub(r"\{\w+\}", "", pattern)
     if re.search(r"[{}\x00-\x1f]", rest) or "**" in pattern:
         raise InputError(
-            where, f"cannot be {pattern[:80]!a}", "write a path with names in {braces}"
+            where, f"invalid pattern {pattern[:80]!a}", "write a path with names in {braces}"
         )
     together = re.search(r"\{\w+\}\{\w+\}", pattern)
     if together:
         raise InputError(
-            where, f"has nothing between {together[0]}", "write a character between, or use `table`"
+            where, f"has nothing between {together[0]}", "add a separator, or use `table`"
         )
     expression = ""
     for part in re.split(r"(\{\w+\})", Path(pattern).as_posix()):
@@ -264,7 +274,7 @@ def _expression(where: str, pattern: str) -> str:
 
 
 def find_by_entities(folder: Path) -> list[Found]:
-    """Files in a `folder` and below whose names have sub-, and may have ses-, task- and run-."""
+    """Files in a `folder` and below with sub- (and ses-, task-, run-) in their names."""
     found = []
     for file in sorted(folder.rglob("sub-*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
@@ -278,10 +288,10 @@ def find_by_entities(folder: Path) -> list[Found]:
 
 
 def find_by_table(path: Path) -> list[Found]:
-    """Files and labels from the table at `path`, with the columns file and subject, maybe more."""
+    """Files and labels from the table at `path` with the columns file, subject and others."""
     sheet = read_sheet(path)
     if not {"file", "subject"} <= set(sheet.heads):
-        raise InputError(sheet.where, "lacks a column", "name the columns file, subject")
+        raise InputError(sheet.where, "lacks a column", "add the columns file and subject")
     if not all(row["file"] and row["subject"] for row in sheet.rows):
         raise InputError(sheet.where, "has a row without file or subject", "fill every row")
     return [(_labels(sheet.where, row), path.parent / row["file"]) for row in sheet.rows]
@@ -292,7 +302,7 @@ def _labels(where: str, given: dict[str, str]) -> dict[str, str]:
 
 
 def _printable(file: Path) -> str:
-    """A path for a message: its name may have bytes that are no text, and control characters."""
+    """Printable form of a path, whose name may contain control characters or invalid bytes."""
     text = str(file).encode("utf-8", "backslashreplace").decode()
     return text if text.isprintable() else ascii(text)[1:-1]
 
@@ -302,17 +312,17 @@ _LONGEST = 64
 
 
 def checked_name(where: str, what: str, text: str) -> str:
-    """The name as it is used: its ends stripped, its accents composed (NFC)."""
+    """Strip and normalise (NFC) a name; InputError if it is not safe."""
     name = unicodedata.normalize("NFC", text.strip())
     bad = [letter for letter in name if not (letter.isalnum() or letter in _BETWEEN)]
     if bad:
         raise InputError(
-            f"{where}: {what} {name[:_LONGEST]!a}", f"has {bad[0]!a} in it",
+            f"{where}: {what} {name[:_LONGEST]!a}", f"contains {bad[0]!a}",
             "use letters, digits, spaces and . + - _",
         )  # fmt: skip
     if name and not name[0].isalnum():
         raise InputError(
-            f"{where}: {what} {name!a}", "begins oddly", "begin with a letter or digit"
+            f"{where}: {what} {name!a}", f"begins with {name[0]!a}", "begin with a letter or digit"
         )
     if len(name) > _LONGEST:
         raise InputError(

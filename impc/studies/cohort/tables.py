@@ -1,13 +1,13 @@
-"""Tables of a cohort, made from the folder: what pandas, R and MATLAB read.
+"""Tables of a cohort for pandas, R and MATLAB, made from the results in its folder.
 
-    units.csv       a row a unit: labels, verdict, VAF, gain and its standard errors, parameters,
-                    logarithms of the cost weights within a structure
-    replicates.csv  a row a replicate: labels, number, gain, parameters
-    intervals.csv   a row an entry of the gain or a parameter: percentiles of the replicates, empty
-                    where the recordings do not identify the entry by itself
+    units.csv       one row per unit: labels, verdict, VAF, gain and its standard errors,
+                    parameters, logarithms of the cost weights within a structure
+    replicates.csv  one row per replicate: labels, number, gain, parameters
+    intervals.csv   one row per gain entry or parameter: percentiles of the replicates, empty if the
+                    entry is not individually identified
 
-Rows are in the order of the study and columns in that of the plant: the same results give the same
-bytes, whatever ran them. Times and memory are in the log, not here.
+Rows are in the order of the study, columns in the order of the plant. Run times and memory are in
+the log, so that the same results give identical files.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CENTRE = "analytic centre (no units)"
 
 
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
-    """The tables of the module's text by name; units without a fit are in none."""
+    """Tables by name (see the module's docstring); units without a fit are omitted."""
     found: dict[str, list[dict[str, Any]]] = {"units": [], "replicates": [], "intervals": []}
     count = int(study.configuration.fit.get("replicates", 0))
     for unit in study.units:
@@ -85,8 +85,7 @@ def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, A
     estimate = _gain(fit, "K", fit["K"]) | fit["parameters"]
     identified = _gain(fit, "K", fit["K_identified"])
     for name, values in drawn.items():
-        # Replicates stay where the search began along what is not identified: their spread says
-        # nothing.
+        # Along unidentified directions replicates stay at the start: their spread has no meaning.
         known = identified.get(str(name), True)
         low, high = percentiles(values, 0.95) if known else (np.nan, np.nan)
         yield {
@@ -96,7 +95,7 @@ def _intervals(fit: dict[str, Any], drawn: pd.DataFrame) -> Iterator[dict[str, A
 
 
 def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
-    """The columns of units.csv, from the content of a `fit`; none without a structure."""
+    """Columns of units.csv on the structure of a `fit`; empty without a structure."""
     found = fit.get("structure")
     if found is None:
         return {}
@@ -110,5 +109,5 @@ def structure_row(fit: dict[str, Any]) -> dict[str, Any]:
 
 
 def or_nan(value: float | None) -> float:
-    """A `value` that may be missing, as JSON and pandas have it."""
+    """Replace None by NaN."""
     return float("nan") if value is None else float(value)

@@ -1,7 +1,7 @@
-"""The tasks of a study: for each unit its fit, and bootstrap replicates of it.
+"""Tasks of a study: the fit of each unit, and its bootstrap replicates.
 
-Tasks carry file names and settings; a worker reads the recordings itself and keeps the last few.
-Nothing here depends on the order of tasks or on how many workers there are.
+A task contains file names and settings; workers read the recordings and cache the last few. Results
+do not depend on the order of tasks or the number of workers.
 """
 
 from __future__ import annotations
@@ -57,17 +57,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FitTask:
-    """All that a worker needs of a unit."""
+    """Inputs of the fit of a unit."""
 
     files: tuple[str, ...]  # Paths of the recordings
-    plant: str  # Its import path or file
-    arguments: dict[str, Any] = field(hash=False)  # Of the plant
+    plant: str  # Import path or file of the plant
+    arguments: dict[str, Any] = field(hash=False)  # Arguments of the plant
     configuration: Configuration = field(hash=False)
-    digest: str = ""  # Of all of these and of the files' content
+    digest: str = ""  # Digest of all these and of the content of the files
 
 
 def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
-    """Tasks of all units by name, and why a unit has none; every recording is read for a digest."""
+    """Tasks by unit, and reasons for units without a task; reads all files for the digests."""
     unused = set(unused_columns(study, source))
     tasks: dict[str, FitTask] = {}
     failed: dict[str, str] = {}
@@ -85,9 +85,9 @@ def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], 
 
 
 def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
-    """Columns of the participants that are no arguments of the plant, and stay out of the fit."""
+    """Columns of the participants that are not arguments of the plant."""
     names = {name: None for unit in study.units for name in unit.person}
-    if ":" not in source.name:  # matrices in a file have no arguments of a person
+    if ":" not in source.name:  # a file with matrices has no arguments
         return tuple(names)
     taken = inspect.signature(source.make).parameters
     if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in taken.values()):
@@ -98,14 +98,14 @@ def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
 def unit_digest(
     files: Sequence[str], plant: str, arguments: Mapping[str, Any], configuration: Configuration
 ) -> str:
-    """Of the whole content of recordings, of plant, settings and versions."""
+    """Digest of the recordings' content, plant, settings and versions."""
     return digest(
         [(Path(Path(name).name), content_digest(Path(name))) for name in files],
         source_digest(plant, arguments),
         dict(arguments),
         configuration.recording,
         configuration.signals,
-        # How many replicates there are says not what any of them is.
+        # The number of replicates does not affect any result.
         {key: value for key, value in configuration.fit.items() if key != "replicates"},
         versions(),
     )
@@ -122,7 +122,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
 
 
 def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, Any]:
-    """One bootstrap replicate of a fitted unit, by its number `index`; `fit` is its content."""
+    """Bootstrap replicate `index` of a unit with the stored `fit`."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
     here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "offsets")))
@@ -140,16 +140,16 @@ def _finished(content: dict[str, Any], started: float) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=4)
 def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
-    """The recordings of a unit as an inverse problem, read once for all that is done with it."""
+    """Inverse problem of a unit; cached."""
     settings = fit_settings(task.configuration.fit)
     source = plant_source(task.plant, task.arguments)
-    # A worker on another machine, or one that has run for days, may have other files and code.
+    # A worker on another machine, or one that was started earlier, may have other files or code.
     here = unit_digest(task.files, source.name, task.arguments, task.configuration)
     if here != task.digest:
         raise DataError(
             "worker",
             "has other recordings, another plant or other versions than this command",
-            "give all machines the same, and start the workers again",
+            "copy the same files and versions to all machines, and restart the workers",
         )
     configuration = task.configuration
     plant, family = asked_plant(source, configuration.recorded, settings, configuration.aimed)
@@ -164,10 +164,9 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
 
 
 def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
-    """What the first unit that can be read takes, and as how many such units all `tasks` count.
+    """Effort of the first readable unit, and the number of such units that all `tasks` equal.
 
-    Units are compared by the size of their files. A study no unit of which can be read takes
-    nothing: it will end at once.
+    Units are compared by the size of their files. Without a readable unit the effort is zero.
     """
     sizes = {
         name: sum(Path(file).stat().st_size for file in task.files) for name, task in tasks.items()
@@ -175,7 +174,7 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
     for name, task in tasks.items():
         try:
             problem, settings = unit_problem(task)
-        except ImpcError:  # reported as the unit's own when its turn comes
+        except ImpcError:  # reported when the unit is fitted
             continue
         alone = replace(settings, profiles=[], horizons=[], unknown_limit=False)
         return fit_effort(problem, alone), sum(sizes.values()) / max(sizes[name], 1)
@@ -234,7 +233,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
 
 
 def _named(plant: Plant) -> dict[str, Any]:
-    """Names and units of what the pages of a cohort show."""
+    """Names and units for the pages of a cohort."""
     names = (*plant.outputs, *plant.states, *plant.controls)
     units = {
         f"K.{control}.{state}": gain_unit(plant, control, state)
@@ -247,13 +246,13 @@ def _named(plant: Plant) -> dict[str, Any]:
         "outputs": plant.outputs,
         "shown_units": [shown_unit(plant, name) for name in plant.outputs],
         "words": {name: signal_name(plant, name) for name in names},
-        # Of the measures that a cohort compares, by their columns of units.csv.
+        # Units of the compared measures, by their columns in units.csv.
         "units": {name: "-" if unit == "1" else unit for name, unit in units.items()},
     }
 
 
 def _trajectory(fit: MethodFit) -> dict[str, Any]:
-    """A few hundred points of the first trial, recorded and modelled."""
+    """Thinned recorded and modelled outputs of the first trial."""
     plant, first = fit.estimate.problem.plant, fit.estimate.problem.recordings[0]
     step = max(1, first.samples // 600)
     return {
@@ -264,7 +263,7 @@ def _trajectory(fit: MethodFit) -> dict[str, Any]:
 
 
 def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Array:
-    """VAF of each trial left out (trials, p), %; of none when not wanted or there is but one."""
+    """VAF (trials, p) of each left-out trial, %; no rows if not requested or for one trial."""
     count = len(problem.recordings)
     rows = np.empty((count if settings.held_out and count > 1 else 0, len(problem.plant.outputs)))
     for index in range(len(rows)):
@@ -274,7 +273,7 @@ def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Arra
 
 
 def _structure(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any] | None:
-    """Logarithms of cost weights with ends of 95 %; None where no structure is asked for."""
+    """Logarithms of cost weights with 95 % intervals; None if no structure is requested."""
     if settings.structure is None:
         return None
     structure = fit_structures(problem.plant, settings)[0]

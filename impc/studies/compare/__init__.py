@@ -1,1 +1,1 @@
-"""Every method on the same trials."""
+"""Comparison of all methods on the same trials."""

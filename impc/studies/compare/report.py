@@ -1,4 +1,4 @@
-"""The page of a comparison of methods, and its files."""
+"""Report of a comparison of methods."""
 
 from __future__ import annotations
 
@@ -41,48 +41,48 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.reporting.provenance import Provenance
 
-# Below this VAF, %, a model explains little; more variance left than this many times is worse.
+# VAF (%) below which a model is poor; ratio of unexplained variances above which it is worse.
 _HALF, _WORSE = 50.0, 1.1
-# Trials whose trajectories are on the page, the first ones.
+# Number of trials, from the first, whose trajectories are on the page.
 _DRAWN = 6
 
 
 class _Facts:
-    """What the methods come to: sentences and numbers are made of these."""
+    """Ranking and labels that sentences and numbers share."""
 
     def __init__(self, fits: Sequence[MethodFit]) -> None:
         plant, bounds = fits[0].estimate.problem.plant, fits[0].bounds
         word = signal_name(plant, plant.controls[0]).removeprefix("commanded ")
         self.fits = fits
-        # Those that reach the end of every trial, the best one first
+        # Methods that reach the end of every trial, best first
         self.ranked = [one for one in by_score(fits) if not np.any(np.isnan(explained(one)))]
-        # Such as "6 N m", empty without limits; "torque limit"
+        # For example "6 N m" (empty without limits) and "torque limit"
         self.limit = " and ".join(limits(plant, np.array(bounds.u_min), np.array(bounds.u_max)))
         self.word = f"{word} limit" if plant.m == 1 else "limit"
-        # The best that does not know the limits; without limits the next
+        # Best method that ignores the limits; without limits the second best
         free = [one for one in self.ranked if not _knows(one)]
         self.other = next(iter(free if self.limit else self.ranked[1:]), None)
         self.against = "best model without a limit" if self.limit else "next model"
         self.held = bool(self.ranked) and all(len(one.held_out) for one in self.ranked)
-        self.where = "left-out trials" if self.held else "the trials that it was fitted to"
+        self.where = "left-out trials" if self.held else "the fitted trials"
 
     @property
     def best(self) -> MethodFit:
-        """Of those that reach the end."""
+        """Best method that reaches the end of every trial."""
         return self.ranked[0]
 
     @property
     def times(self) -> float:
-        """How many times as much variance the other one leaves."""
+        """Unexplained variance of the other method over that of the best."""
         return 1.0 if self.other is None else unexplained(self.other) / unexplained(self.best)
 
 
 def compare_report(
     problem: Problem, compared: Sequence[MethodFit], provenance: Provenance
 ) -> Report:
-    """Page, result.json, tables and figure."""
+    """Report of `impc compare`."""
     subject = str(problem.recordings[0].label.subject) or "one person"
-    found = compared[-1].estimate.problem.recordings  # with their offsets
+    found = compared[-1].estimate.problem.recordings  # with fitted offsets
     problem, facts = replace(problem, recordings=found), _Facts(compared)
     verdict, count = _verdict(facts), len(found)
     ranked = [*by_score(compared), *(fit for fit in compared if fit.estimate.K is None)]
@@ -92,7 +92,7 @@ def compare_report(
     sway = trajectory_table(problem, names, {one.name: one.runs for one in ranked if one.runs})
     seconds = sum(trial.samples for trial in found) * problem.plant.dt
     chart = Fold(
-        "Recorded, and simulated by each method from the start of the trial",
+        "Recorded signals, and simulations by each method from the start of the trial",
         [Chart("Trajectories", drawn)],
     )
     methods: list[Block] = [methods_finding(ranked), methods_fold(fit.name for fit in compared)]
@@ -114,20 +114,20 @@ def compare_report(
         hero=Picture(
             "comparison",
             "Variance that each method leaves unexplained, and the largest command it needs",
-            f"Left: variance in {facts.where}; farther left is better (logarithmic axis)."
-            + (" Blue: stays within the limit. Shaded: beyond it." if facts.limit else ""),
+            f"Left: unexplained variance in {facts.where}; farther left is better (logarithmic "
+            "axis)." + (" Blue: stays within the limit. Shaded: beyond it." if facts.limit else ""),
         ),
         keys=_keys(facts),
         figures={"comparison": lambda narrow: methods_figure(compared, narrow, HALF)},
         copy=_copy(facts, count) if verdict.level is Level.GREEN else verdict.sentence,
-        beside=[*controller_findings(compared), Finding("trajectories", sway, "A row a sample.")],
+        beside=[*controller_findings(compared), Finding("trajectories", sway, "Row: one sample.")],
         data=problem_data(problem, compared),
         provenance=provenance,
     )
 
 
 def _knows(fit: MethodFit) -> bool:
-    """Whether the method knows the limits of the command."""
+    """Whether the method takes the limits of the command into account."""
     return bool(np.any(np.isfinite(fit.estimate.problem.bounds.u_max)))
 
 
@@ -136,7 +136,7 @@ def _share(fit: MethodFit) -> str:
 
 
 def _needs(fit: MethodFit) -> str:
-    """Its largest command in words: "12.7 N m", of several commands "210 % of a limit"."""
+    """Largest command in words: "12.7 N m", or "210 % of a limit" for several commands."""
     value, _, label = largest_commands(fit)
     unit = label[label.rindex("(") + 1 : -1].replace("its limit", "a limit")
     return with_unit(number(value), unit)
@@ -145,7 +145,8 @@ def _needs(fit: MethodFit) -> str:
 def _verdict(facts: _Facts) -> Verdict:
     if not facts.ranked:
         headline = "No model follows these recordings to their end."
-        return Verdict(Level.RED, headline, "The simulation of every model falls.")
+        said = "The simulations of every model stop before the end of a trial."
+        return Verdict(Level.RED, headline, said)
     best, other = facts.best, facts.other
     sentence = f"“{method_label(best.name)}” explains {_share(best)} of the variance in "
     sentence += facts.where
@@ -153,26 +154,26 @@ def _verdict(facts: _Facts) -> Verdict:
         sentence += f", the {facts.against} {_share(other)} with up to {_needs(other)}"
     sentence += "."
     if float(np.min(explained(best))) < _HALF:
-        poor = Claim("Which model is the best one.", "All are poor.")
-        headline = "No model explains half of this movement."
+        poor = Claim("Which model is best.", "All explain less than half of a recorded signal.")
+        headline = "No model explains half of every recorded signal."
         return Verdict(Level.RED, headline, sentence, may_not=[poor])
     level, headline = _headline(facts)
     alert = Alert(
         Level.AMBER,
         f"The {facts.word} does not agree with the recordings",
-        f"“{method_label(best.name)}” explains most and takes up to {_needs(best)}; "
-        f"{facts.limit} was given.",
-        "The limit may be too low, or the movement is not that of a controller with such a limit.",
+        f"“{method_label(best.name)}” explains most and needs up to {_needs(best)}; the limit was "
+        f"given as {facts.limit}.",
+        "The limit may be too low, or the person does not move like a controller with this limit.",
         [
-            "Fit with `unknown_limit = true`, which estimates the limit, and compare again.",
+            "Run impc fit with `unknown_limit = true`, which estimates the limit; compare again.",
             "Check body mass, height and the units of the recordings.",
         ],
     )
-    same = "Models with the same gain and the same limit move identically."
+    same = "Any controller with the same commands moves identically."
     may_not = [
         Claim("Gains and cost weights.", "They have no intervals here; impc fit computes them."),
-        Claim("That the person computes in this way.", same),
-        *([] if facts.held else [Claim("How well it predicts.", "No trial was left out.")]),
+        Claim("That the person computes commands in this way.", same),
+        *([] if facts.held else [Claim("How well a model predicts.", "No trial was left out.")]),
     ]
     alerts = [] if level is Level.GREEN else [alert]
     return Verdict(level, headline, sentence, alerts, _may(facts, level), may_not)
@@ -181,15 +182,15 @@ def _verdict(facts: _Facts) -> Verdict:
 def _headline(facts: _Facts) -> tuple[Level, str]:
     best, limit, word = facts.best, facts.limit, facts.word
     if facts.other is None or not limit:
-        return Level.GREEN, f"“{method_label(best.name)}” explains {_share(best)} of this movement."
+        return Level.GREEN, f"“{method_label(best.name)}” explains {_share(best)} of the variance."
     kept = [fit for fit in facts.ranked if fit.keeps_bounds]
     free = [fit.keeps_bounds for fit in facts.ranked if not _knows(fit)]
     if not best.keeps_bounds and (not kept or unexplained(kept[0]) > _WORSE * unexplained(best)):
         return Level.AMBER, f"The model that explains most needs more than {limit}."
     if all(free):
-        return Level.GREEN, f"No model needs more than {limit}: the {word} decides nothing here."
+        return Level.GREEN, f"No model needs more than {limit}: the {word} does not matter here."
     if any(free):
-        return Level.GREEN, f"The model that explains most keeps to the {word} of {limit}."
+        return Level.GREEN, f"A model that stays within the {word} of {limit} explains most."
     which = (
         f"Only models with a {word} fit" if len(kept) > 1 else f"Only a model with a {word} fits"
     )
@@ -201,13 +202,13 @@ def _may(facts: _Facts, level: Level) -> list[Claim]:
     plant = best.estimate.problem.plant
     parts = zip(plant.outputs, explained(best), strict=True)
     each = ", ".join(f"{value:.2f} % ({signal_name(plant, name)})" for name, value in parts)
-    which = "How much is explained."
+    which = "How much of the movement is explained."
     if other is not None:
         which = f"“{method_label(best.name)}” explains most."
     found = [Claim(which, f"{each} of {facts.where}.")]
     if other is not None and facts.limit and not other.keeps_bounds and level is Level.GREEN:
-        much = f"{number(facts.times, 2)} times as much variance is left, and "
-        why = f"Without it, {much * (facts.times > _WORSE)}up to {_needs(other)} is needed."
+        much = f"leaves {number(facts.times, 2)} times as much variance unexplained and "
+        why = f"The {facts.against} {much * (facts.times > _WORSE)}needs up to {_needs(other)}."
         found.append(Claim(f"The {facts.word} matters.", why))
     return found
 
@@ -224,7 +225,7 @@ def _keys(facts: _Facts) -> list[Key]:
         beyond = Key(number(100 * best.exceeded), "% of the time", "beyond the limit")
         return [first, Key(value, unit, "largest command", limit), beyond]
     lead = number(unexplained(other) - unexplained(best))
-    left = f"{number(facts.times, 2)} times as much variance is left"
+    left = f"which leaves {number(facts.times, 2)} times as much variance"
     needs = f"{method_label(other.name)}; {limit}"
     return [
         first,
@@ -237,28 +238,28 @@ def _checks(facts: _Facts, problem: Problem) -> list[Check]:
     count = len(problem.recordings)
     odd = sum(bool(trial.findings) for trial in problem.recordings)
     falls = [(method_label(fit.name), first_fall(fit)) for fit in facts.fits]
-    fallen = " ".join(f"{name}: fell at {time:.1f} s." for name, time in falls if time is not None)
+    fallen = " ".join(f"{name}: stops at {time:.1f} s." for name, time in falls if time is not None)
     stopped = [method_label(f.name) for f in facts.fits if f.estimate.status is Status.STOPPED]
     left_out, level = "No trial was left out.", Level.NOTE
     if facts.held and facts.other is not None:
         ahead = facts.best.held_out.mean(axis=1) > facts.other.held_out.mean(axis=1)
         level = Level.GREEN if np.all(ahead) else Level.NOTE
-        left_out = f"The best model leads in {np.count_nonzero(ahead)} of {len(ahead)}."
+        left_out = f"The best model leads in {np.count_nonzero(ahead)} of {len(ahead)} trials."
     good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
-    ended = f"Stopped early: {'; '.join(stopped)}." if stopped else "Every search converged."
+    ended = f"Not converged: {'; '.join(stopped)}." if stopped else "All searches converged."
     rows = [
         (
             doubt if odd else good,
             "Recordings",
-            f"{count - odd} of {count} trials without findings.",
+            f"{count - odd} of {count} trials without problems.",
         ),
         (level, "Left-out trials", left_out),
-        (note if fallen else good, "Falls", fallen or "No model fell."),
+        (note if fallen else good, "Simulations", fallen or "All simulations reach the end."),
         (doubt if stopped else good, "Searches", ended),
     ]
     for fit in facts.fits:
         doubts = fit.estimate.doubts if len(facts.fits) == 1 else ()
-        # Without the remedy, which is for programs
+        # Without the remedy, which is for Python users
         for said in (fit.estimate.reason.partition(";")[0], *doubts):
             if said:
                 text = f"{said[:1].upper()}{said[1:].rstrip('.')}."
@@ -268,7 +269,7 @@ def _checks(facts: _Facts, problem: Problem) -> list[Check]:
 
 def _copy(facts: _Facts, count: int) -> Copy:
     best, other = facts.best, facts.other
-    others = " and to all trials but one, which they then predicted" if facts.held else ""
+    others = ", and to all trials except one, which they then predicted," if facts.held else ""
     results = f"{method_label(best.name)} explained {_share(best)} of the variance in {facts.where}"
     if other is not None:
         results += f"; the {facts.against} explained {_share(other)}"

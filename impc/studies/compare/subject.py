@@ -1,6 +1,6 @@
-"""All methods on the recordings of a subject, in sample and on trials left out.
+"""Fit all methods to the recordings of a subject and predict left-out trials.
 
-docs/comparing.md says what each method is and where it breaks.
+docs/howto/compare.md describes the methods and their limitations.
 """
 
 from __future__ import annotations
@@ -25,21 +25,20 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-    #: (stage, compute) -> the estimate, from memory or computed now.
+    #: (stage, compute) -> the estimate, stored or computed.
     Remember = Callable[[str, Callable[[], Estimate]], Estimate]
 
-# Needs states to be named; what is compared in its two parts; and what needs a structure, which has
-# a table of its own in `impc fit`.
+# Excluded: needs `feedback_states`; is compared in its two branches; needs a structure.
 _LEFT_OUT = ("preliminary", "inverse_lqr", "structured")
 
 
 def compared_methods() -> tuple[str, ...]:
-    """Names of the methods that are compared: those of the registry, in its order."""
+    """Names of the compared methods, in the order of the registry."""
     return tuple(name for name in METHODS if name not in _LEFT_OUT)
 
 
 def stages(trials: int, *, held_out: bool = True) -> int:
-    """Number of estimates that `compare_recordings` makes of `trials`, some `held_out` or none."""
+    """Number of estimates that `compare_recordings` computes for `trials`."""
     return len(compared_methods()) * (1 + (trials if held_out and trials > 1 else 0))
 
 
@@ -50,7 +49,7 @@ def compare_recordings(
     *,
     held_out: bool = True,
 ) -> tuple[MethodFit, ...]:
-    """Run every method on all trials, then on all but each one; `remember` (stage, compute)."""
+    """Fit every method to all trials, then to all trials except each one."""
     count, names = len(problem.recordings), compared_methods()
     whole = cross_checked(problem, _all(problem, names, "all", remember))
     parts = []
@@ -58,7 +57,7 @@ def compare_recordings(
         stage, others = f"without {index + 1}", problem.leaving_out(index)
         try:
             parts.append(_all(others, names, stage, remember))
-        except (WeightsError, SolverError):  # nothing fits these trials: NaN in the table
+        except (WeightsError, SolverError):  # no fit of these trials: NaN in the table
             parts.append({})
     return tuple(
         replace(
@@ -72,7 +71,7 @@ def compare_recordings(
 def _all(
     problem: Problem, names: Sequence[str], stage: str, remember: Remember
 ) -> dict[str, Estimate]:
-    """Every method on one set of trials, in the order of the names."""
+    """Fit every method to one set of trials, in the order of the names."""
     start = remember(f"{stage}/inverse_mpc", functools.partial(fit, problem))
     return {
         name: start

@@ -1,8 +1,7 @@
 """The simulation example of section 3.4: one plant, three initial states, seven methods.
 
-The dissertation's own matrices (3.8), initial state and bound are lost. The plant that the command
-line passes here is a stand-in that shows everything its text says; the reference solution of each
-method is in tests/.
+The dissertation's own matrices (3.8), initial state and bound are not available. The command line
+passes a plant that has the properties described in its text; reference solutions are in tests/.
 """
 
 from __future__ import annotations
@@ -44,13 +43,13 @@ EXAMPLE = (
     "inverse_mpc",
     "inverse_mpc_reduced",
 )
-#: N of the controller, in samples.
+#: Horizon of the controller, in samples.
 HORIZON = 3
-#: Samples of a recording.
+#: Number of samples of a recording.
 STEPS = 20
 #: Largest magnitude of the input.
 BOUND = 1.0
-#: The numbers of the example, as its page and result.json name them.
+#: Settings of the example by their names on the page and in result.json.
 SETTINGS: dict[str, float] = {
     "horizon": HORIZON,
     "steps": STEPS,
@@ -58,50 +57,50 @@ SETTINGS: dict[str, float] = {
     "condition_weight": CONDITION_WEIGHT,
     "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
 }
-#: What the page of the example says of the dissertation's own plant.
+#: Sentences on the dissertation's own plant.
 LOST = (
-    "The dissertation's own plant, initial state and limit are lost. This plant stands in for "
-    "them: it shows everything that the dissertation says of its own, with other numbers."
+    "The dissertation's own plant, initial state and limit are not available. This plant replaces "
+    "them: it shows all properties that the dissertation describes, with other numbers."
 )
 
 
 @dataclass(frozen=True)
 class MethodResult(Frozen):
-    """What one method makes of the recording."""
+    """Result of one method on one recording."""
 
-    name: str  # One of the seven, as in the first column of the table
+    name: str  # Name of the method
     weights: Weights | None  # Scaled to R[0, 0] = 1; None for a gain without weights
-    K: Array | None  # Gain (m, n); None when the method has no answer
-    simulation: Simulation | None  # The recording as the method explains it
+    K: Array | None  # Gain (m, n); None if the method has no solution
+    simulation: Simulation | None  # Simulation with this gain
     state_misfit: float | None  # 2-norm over all states and steps
     max_abs_u: float | None  # Largest magnitude of an input
     bound_kept: bool | None  # Whether every input is inside the bound, to 1e-9
-    residual: float | None  # (3.10), against the true weights
-    seconds: float  # Time of this method alone in s, given what it starts from
-    # Closed loops simulated, with derivatives, on the way; 0 for methods that need none
+    residual: float | None  # Distance (3.10) to the true weights
+    seconds: float  # Run time of the method without its start, s
+    # Number of simulated closed loops with derivatives; 0 for methods that need none
     simulations: int
-    feasible: bool | None  # For the LMI
+    feasible: bool | None  # Whether the LMI is feasible; None for other methods
 
 
 @dataclass(frozen=True)
 class CaseResult(Frozen):
-    """One initial state: the truth, the methods of the table, and what was determined."""
+    """Results for one initial state."""
 
     name: str  # One of `CASES`
     x0: Array  # Initial state (n,)
-    controller: Controller  # The true one, with its terminal set
+    controller: Controller  # True controller with its terminal set
     truth: Simulation  # The recording
     branch: str  # Branch of Table 3.1 that was taken: ``"LMI"`` or ``"gradient"``
     methods: tuple[MethodResult, ...]
     identifiability: Identifiability  # At the weights of the direct inverse MPC
 
     def method(self, name: str) -> MethodResult:
-        """The result of a method by its name."""
+        """Result of the method `name`."""
         return next(item for item in self.methods if item.name == name)
 
 
 def true_weights(plant: Plant) -> Weights:
-    """Return Q = I, R = 1, the weights that the methods are to find again, equation (3.9)."""
+    """True weights Q = I, R = 1 (3.9)."""
     return Weights(np.eye(plant.n), np.eye(plant.m))
 
 
@@ -112,12 +111,12 @@ def run_case(
     solver: str = COMPILED,
     progress: Callable[[str], None] = lambda _: None,
 ) -> CaseResult:
-    """Simulate the true controller from a case's initial state and run every method on it."""
+    """Simulate the true controller from an initial state and run every method."""
     bounds = Bounds(plant, u_min=-BOUND, u_max=BOUND)
     truth_weights = true_weights(plant)
     controller = Controller(plant, truth_weights, bounds, HORIZON, solver=solver)
     truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
-    # Scale and condition weights as the equations have them: the table is in the plant's own units.
+    # No scaling: the equations of the table are in the plant's own units.
     problem = Problem(
         plant,
         bounds,
@@ -132,7 +131,7 @@ def run_case(
     results = [_result(evaluate_method(table[name], bounds), truth_weights) for name in EXAMPLE]
     branch = "gradient" if table["inverse_lqr_lmi"].weights is None else "LMI"
     direct = next(item for item in results if item.name == "inverse_mpc")
-    assert direct.weights is not None  # it raises where there are none
+    assert direct.weights is not None  # the method raises otherwise
     return CaseResult(
         name,
         frozen(CASES[name]),

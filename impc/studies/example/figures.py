@@ -1,4 +1,4 @@
-"""The recording of a case against three methods."""
+"""Figure of the example: the recording of a case and three methods."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 #: Methods that are drawn.
 DRAWN = ("inverse_mpc", "feedback_gain", "inverse_lqr_output")
-_SLACK = 1e-6  # Of the limit, above which it is exceeded
+_SLACK = 1e-6  # Relative excess above which the limit counts as exceeded
 
 
 def comparison_figure(case: CaseResult, width: float, narrow: bool) -> Figure:
-    """States and command of three methods next to each other; on a phone the command alone."""
+    """States and command of three methods side by side; on a phone only the command."""
     runs = [case.method(name).simulation for name in DRAWN]
-    found = [run for run in runs if run is not None]  # All: the LMI alone can have no answer
+    found = [run for run in runs if run is not None]  # all three: only the LMI can be infeasible
     if narrow:
         figure = new_figure(PHONE, 5.4)
         titles = below = figure.subplots(len(found), 1, sharex=True, sharey=True)

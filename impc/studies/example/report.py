@@ -1,4 +1,4 @@
-"""The page of the example, and its result.json (docs/results.md)."""
+"""Report of the example, and its result.json."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
     from impc.studies.example.cases import CaseResult, MethodResult
 
-# Distance to the true weights of those that are found; measured 1e-14.
+# Largest distance to the true weights that counts as found; typical 1e-14.
 _FOUND = 1e-6
-# Behind the point: what is below is rounding of a search.
+# Decimal places; further ones are rounding errors of a search.
 _DIGITS = 9
 _COUNTS = ("None", "One", "Two", "Three", "Four", "Five", "Six", "Seven")
 _SETTING = (
     "A model predictive controller (MPC) drives an unstable system to rest without exceeding a "
-    "limit of its command. Its cost weights Q and R say how much a deviation of each state costs, "
-    "against effort. The methods see the states alone, as in a recorded movement, and look for "
-    "these weights. It is the simulation example of A. Ramadan's dissertation (Michigan State "
-    "University, 2018)."
+    "limit of its command. Its cost weights Q and R define the cost of a deviation of each state "
+    "relative to the cost of the command. The methods receive only the states, as in a recorded "
+    "movement, and estimate these weights. It is the simulation example of A. Ramadan's "
+    "dissertation (Michigan State University, 2018)."
 )
 _GAIN = (
-    "The controller depends on Q and R through its gain alone, so no recording distinguishes two "
-    "pairs of cost weights with the same gain. Which pair is printed is set by convention: the "
-    "least condition number. Read the gain and the limit as findings, and Q as one of many "
-    "descriptions of them. Here the convention happens to give the true weights."
+    "With one command, the controller depends on Q and R only through its gain, so no recording "
+    "distinguishes two pairs of cost weights with the same gain. The printed pair is set by "
+    "convention: the smallest condition number. Interpret the gain and the limit, and treat Q as "
+    "one of many equivalent choices. Here the convention happens to give the true weights."
 )
 _CODE = Markup("<code>{}</code>")
 _YOURS = (
-    Markup("{} writes down what the columns of your recording mean.").format(
+    Markup("{} drafts a file with the meaning of the columns of your recording.").format(
         _CODE.format("impc inspect trial_1.csv --plant seated-balance --out subject.toml")
     ),
     Markup("{} fits the controller and writes a page like this one.").format(
@@ -57,7 +57,7 @@ _YOURS = (
 
 
 def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Report:
-    """Page, result.json, tables and figures."""
+    """Report of `impc example`."""
     plant, first = cases[0].controller.plant, cases[0]
     figures = {
         f"comparison-case-{case.name}": partial(
@@ -101,7 +101,7 @@ def _within(cases: Sequence[CaseResult]) -> list[str]:
 
 
 def example_verdict(cases: Sequence[CaseResult]) -> Verdict:
-    """Who stays within the limit, and who finds the weights, over all cases."""
+    """Verdict: methods that stay within the limit and methods that find the true weights."""
     within, found, others = _within(cases), [], [0.0]
     for name in EXAMPLE:
         results = [case.method(name) for case in cases]
@@ -111,18 +111,18 @@ def example_verdict(cases: Sequence[CaseResult]) -> Verdict:
             found.append(f"“{method_label(name)}”")
     verb = "needs" if len(within) == 1 else "need"
     finds = f"{' and '.join(found) or 'No method'} find{'s' * (len(found) < 2)}"
-    rest = f" The others need up to {max(others):.3g}, where {BOUND:g} was available."
+    rest = f" The others need a command of up to {max(others):.3g}; the limit is {BOUND:g}."
     return Verdict(
         Level.NOTE,
-        f"{_COUNTS[len(EXAMPLE)]} methods watched the same movement; "
-        f"{_COUNTS[len(within)].lower()} {verb} no more than was available.",
+        f"{_COUNTS[len(EXAMPLE)]} methods were fitted to the same movement; "
+        f"{_COUNTS[len(within)].lower()} {verb} no more than the limit.",
         f"{finds} the true cost weights.{rest if any(others) else ''}",
     )
 
 
 def _keys(cases: Sequence[CaseResult]) -> list[Key]:
     within, found = len(_within(cases)), cases[0].identifiability
-    fixed = "directions of the cost weights that the recording fixes"
+    fixed = "directions of the cost weights identified"
     return [
         Key(str(len(EXAMPLE)), "methods", "compared", "on the same recordings"),
         Key(str(within), f"of {len(EXAMPLE)}", "stay within the limit", "in every case"),
@@ -140,14 +140,13 @@ def _case_section(case: CaseResult, *, hero: bool) -> Section:
 def _picture(case: CaseResult) -> Picture:
     return Picture(
         f"comparison-case-{case.name}",
-        "States and command over time: recorded, and as three methods explain them",
-        f"Case {case.name}. Grey: recorded. Blue: as the method explains it; orange: beyond the "
-        "limit.",
+        "States and command over time: recorded, and modelled by three methods",
+        f"Case {case.name}. Grey: recorded. Blue: model; orange: model beyond the limit.",
     )
 
 
 def methods_finding(case: CaseResult) -> Finding:
-    """The true controller, then every method."""
+    """Table of the true controller and all methods."""
     truth, K = true_weights(case.controller.plant), case.controller.K
     largest = float(np.max(np.abs(case.truth.u)))
     rows: list[dict[str, Any]] = [
@@ -171,13 +170,13 @@ def methods_finding(case: CaseResult) -> Finding:
     numeric = [*_entries(truth, K), "misfit", "largest_u", "residual", "seconds"]
     heads = ["method", *numeric[:-2], "kept", *numeric[-2:], "name"]
     table = pd.DataFrame(rows, columns=heads)
-    # Adding zero: what is rounded to -0 is printed as 0.
+    # Adding zero turns -0 into 0.
     table[numeric] = table[numeric].astype(float).round(_DIGITS) + 0.0
     return Finding(
         f"methods-{case.name}",
         table,
-        f"Case {case.name}: cost weights Q at R = 1, gain K, distance of the states, and the "
-        "largest command u.",
+        f"Case {case.name}: cost weights Q at R = 1, gain K, misfit of the states (2-norm), and "
+        "the largest command u.",
         digits=3,
         labels={"largest_u": "Largest u", "kept": "Limit kept"},
         hidden=["residual", "seconds", "name"],
@@ -185,7 +184,7 @@ def methods_finding(case: CaseResult) -> Finding:
 
 
 def _entries(weights: Weights | None, gain: Array | None) -> dict[str, float]:
-    """Q11, Q12, Q22 at R = 1, then the gain."""
+    """Entries Q11, Q12, Q22 at R = 1, then the gain."""
     found: dict[str, float] = {}
     if weights is not None:
         Q = normalised(weights).Q
@@ -224,7 +223,7 @@ def _case(case: CaseResult) -> dict[str, Any]:
         "x0": case.x0,
         "branch": case.branch,
         "truth": truth,
-        # The truth stands among the methods too, so that a reader can compare them in one loop.
+        # The truth is also listed as a method, so that programs can loop over all.
         "methods": {"truth": truth} | {item.name: _method(item) for item in case.methods},
         "identifiability": {name: getattr(found, name) for name in named} | {"others": others},
     }

@@ -1,1 +1,1 @@
-"""One subject: the constrained controller behind a few trials."""
+"""Fit of the bounded controller behind the trials of one subject."""

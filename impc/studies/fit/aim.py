@@ -1,4 +1,4 @@
-"""What a fitted controller regulates to, and what of its recordings is fitted beside outputs."""
+"""Targets, learned disturbances, offsets and recorded commands of a fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def aim_data(result: FitResult) -> dict[str, Any]:
-    """`aim` of result.json: targets, rates (1/s) of lasting disturbances, offsets, commands."""
+    """`aim` in result.json: targets, observer rates (1/s), offsets, recorded commands."""
     problem = result.fitted.problem
     plant, trials = problem.plant, problem.recordings
     count = physical_disturbances(plant)
@@ -36,7 +36,7 @@ def aim_data(result: FitResult) -> dict[str, Any]:
 
 
 def aim_sentences(result: FitResult) -> list[str]:
-    """That in a sentence, where the controller does not just regulate to rest."""
+    """The contents of `aim_data` as a sentence; empty if the controller regulates to rest."""
     aim, plant = aim_data(result), result.fitted.problem.plant
     said = []
     if aim["targets"]:
@@ -53,8 +53,8 @@ def aim_sentences(result: FitResult) -> list[str]:
                 if interval is not None
                 else ""
             )
-            how = f"learns it at {number(rate, 3)} 1/s{between}"
-        said.append(f"it takes the {signal_name(plant, name)} for lasting and {how}")
+            how = f"learns it at a rate of {number(rate, 3)} 1/s{between}"
+        said.append(f"it assumes that the {signal_name(plant, name)} persists and {how}")
     for name, values in aim["offsets"].items():
         factor, unit = shown_unit(plant, name)
         low, high = factor * min(values), factor * max(values)

@@ -1,4 +1,4 @@
-"""What the settings of a fit ask for of plant and recordings: controller, bounds, structures."""
+"""Plant, bounds and structures from the settings of a fit and the recordings."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.studies.fit.settings import FitSettings
 
-# A recorded angle is differentiated over this time, by a parabola: noise of 1 % of the largest
-# angle at 100 Hz then gives a rate of a few per cent of the largest.
+# Window in s of the Savitzky-Golay derivative: noise of 1 % of the largest angle at 100 Hz then
+# gives errors of a few per cent of the largest rate.
 _RATE_WINDOW = 0.15
 
 
@@ -38,34 +38,34 @@ def output_feedback() -> Any:
     except ModuleNotFoundError as error:
         if not str(error.name).startswith("impc.output_feedback"):
             raise
-        remedy = "install all of impc, or leave the table out"
+        remedy = "install the complete package, or remove the table"
         raise InputError(
-            "[fit.observer]", "needs impc.output_feedback, which is not there", remedy
+            "[fit.observer]", "needs impc.output_feedback, which is not installed", remedy
         ) from None
 
 
 def fit_structures(plant: Plant, settings: FitSettings) -> tuple[Structure, ...]:
-    """Structures of the weights that the settings name, that of [fit.structure] first."""
+    """Structures of the weights named in the settings, [fit.structure] first."""
     first = [] if settings.structure is None else [settings.structure]
     found: list[Structure] = []
     for item in (*first, *settings.structures):
         one = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
         if one.name in [other.name for other in found]:
-            raise InputError("[fit] structures", f"has {one.name!r} twice", "name each by itself")
+            raise InputError("[fit] structures", f"has {one.name!r} twice", "set unique names")
         found.append(one)
     return tuple(found)
 
 
-#: The setting of that name, and how the rates of an observer are called where they are fitted.
+#: Name of the setting and, in `free`, of the fitted observer rates.
 OBSERVER = "observer_rate"
 
 
 def asked_plant(
     source: PlantSource, recorded: Sequence[str], settings: FitSettings, aimed: Sequence[str] = ()
 ) -> tuple[Plant, PlantFamily | None]:
-    """The plant of a source and its family, with what the settings say of the controller.
+    """Plant of a source and its family, extended by rates, observer and preview.
 
-    Inputs that are `recorded` are disturbances; signals that are `aimed` have a target.
+    Inputs named in `recorded` are disturbances; outputs named in `aimed` have a target.
     """
     rates = _observer_rates(settings)
     learned = [name for name in settings.free if name in rates]
@@ -90,7 +90,7 @@ def asked_plant(
 
 
 def _observer_rates(settings: FitSettings) -> dict[str, float]:
-    """The rates of the observer by the names that they have where they are fitted."""
+    """Observer rates by their names in `free`."""
     given = settings.observer_rate
     if isinstance(given, dict):
         return {f"{OBSERVER}.{name}": rate for name, rate in given.items()}
@@ -100,7 +100,7 @@ def _observer_rates(settings: FitSettings) -> dict[str, float]:
 def _dressed(
     plant: Plant, settings: FitSettings, aimed: Sequence[str], rates: Mapping[str, float]
 ) -> Plant:
-    """The plant with changes of commands, then an observer with these rates, then a preview."""
+    """Extend the plant by command changes, then an observer with these rates, then a preview."""
     plant = plant.linear() if settings.body == "linear" else plant
     if settings.rates:
         plant = with_rates(plant)
@@ -109,46 +109,46 @@ def _dressed(
         unknown = [name for name in rates if name not in (OBSERVER, *names)]
         if unknown:
             has = ", ".join(plant.disturbances) or "none"
-            raise InputError(f"[fit] {unknown[0]}", "is of no disturbance", f"the plant has {has}")
+            raise InputError(f"[fit] {unknown[0]}", "is not a disturbance", f"the plant has {has}")
         if not names:
-            remedy = "take the line out, or give [signals.NAME] of a disturbance"
-            raise InputError(f"[fit] {OBSERVER}", "has no disturbance to learn", remedy)
+            remedy = "remove the line, or add [signals.NAME] of a disturbance"
+            raise InputError(f"[fit] {OBSERVER}", "needs a recorded disturbance", remedy)
         plant = with_observer(plant, [rates.get(OBSERVER, rates.get(name, 0.0)) for name in names])
     aimed = [name for name in aimed if name in plant.outputs]
     if settings.preview and not aimed:
-        remedy = "write target in the [signals.NAME] of an output"
-        raise InputError("[fit] preview", "has no target to be known ahead", remedy)
+        remedy = "set target in the [signals.NAME] table of an output"
+        raise InputError("[fit] preview", "needs an output with a target", remedy)
     return with_preview(plant, aimed, settings.preview) if settings.preview else plant
 
 
 def require_dressed(plant: Plant, settings: FitSettings) -> None:
-    """Refuse a plant of the caller's own that has not what the settings say of it."""
+    """Raise InputError if a plant from Python lacks an extension that the settings name."""
     for name, asked, there, function in (
         ("rates", settings.rates, plant.commands, "with_rates"),
         (OBSERVER, settings.observer_rate, np.any(plant.observer), "with_observer"),
         ("preview", settings.preview, plant.ahead, "with_preview"),
     ):
         if asked and not there:
-            remedy = f"give impc.{function}(plant), and recordings of it"
-            raise InputError(f"[fit] {name}", "is set, and the plant is without", remedy)
+            remedy = f"pass impc.{function}(plant), and recordings of that plant"
+            raise InputError(f"[fit] {name}", "is set, but the plant was made without it", remedy)
 
 
 def moving_body(
     plant: Plant, family: PlantFamily | None, settings: FitSettings
 ) -> tuple[Plant, PlantFamily | None]:
-    """The plant and its family with the body that the settings ask for."""
+    """Plant and family with the equations of motion that [fit] body selects."""
     if settings.body != "linear":
         return plant, family
     return plant.linear(), None if family is None else family.linear()
 
 
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
-    """Bounds of the controller: inputs as set, states as set or from the data (3.22)."""
+    """Bounds of the controller: inputs from the settings, states from settings or data (3.22)."""
     x_max = np.full(plant.n, np.inf)
     for name, value in settings.bounded_states.items():
         if name not in plant.states:
             raise InputError(
-                f"[fit] bounded_states {name}", "is not a state", f"known: {list(plant.states)}"
+                f"[fit] bounded_states {name}", "is not a state", f"use one of {list(plant.states)}"
             )
         limit = value
         if isinstance(value, str):
@@ -157,11 +157,11 @@ def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recordi
     u_max = None if settings.u_max is None else np.asarray(settings.u_max, dtype=np.float64)
     if u_max is not None and u_max.shape not in ((), (plant.m,)):
         raise InputError(
-            "[fit] u_max", f"has {len(u_max)} numbers", f"give one, or {plant.m}, one an input"
+            "[fit] u_max", f"has {len(u_max)} numbers", f"give 1, or {plant.m}, one per input"
         )
-    if settings.rates:  # the commands are states, and the controls their changes
+    if settings.rates:  # the commands are states, the inputs their changes
         limits = settings.rates if isinstance(settings.rates, dict) else {}
-        require_known("[fit] rates {}".format, limits, plant.commands, "is no command")
+        require_known("[fit] rates {}".format, limits, plant.commands, "is not a command")
         if u_max is not None:
             x_max[np.isin(plant.states, plant.commands)] = u_max
         u_max = np.array([limits.get(name, np.inf) for name in plant.commands])
@@ -189,5 +189,5 @@ def _largest_rate(values: Array, dt: float) -> float:
     if len(values) < window:
         raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
     rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt, mode="nearest")
-    half = window // 2  # at the ends the parabola is one-sided
+    half = window // 2  # the filter is one-sided at the ends
     return float(np.nanmax(np.abs(rate[half:-half])))

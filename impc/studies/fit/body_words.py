@@ -1,4 +1,4 @@
-"""What a fit says of the body: how well it is known, and whether the recordings contradict it."""
+"""Sentences on the body model: its stated uncertainty, and tests against the recordings."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
     from impc.studies.fit.result import FitResult, FittedParameter
 
-# Of a stated deviation: what is known no better after the fit is not identified by it.
+# Standard deviation after the fit over the stated one above which nothing was learned.
 _AS_BEFORE = 0.9
-# Of the variance of the gain: a smaller share of a parameter is not named.
+# Smallest share of the gain's variance for which a parameter is named.
 _NAMED = 0.05
 
 _KINDS = {
@@ -38,17 +38,17 @@ _KINDS = {
     PUSH: "another size of the perturbation, or another inertia",
     STIFFNESS: "another stiffness or damping where the perturbation acts",
     MODE: "a further mode of the body",
-    NONLINEAR: "a body that is not linear, or noise that the person answers at the limit",
+    NONLINEAR: "a nonlinear body, or a reaction to noise at the limit",
 }
 
 
 def body_sentence_of(result: FitResult) -> str:
-    """How well the body is known, and what that makes of the intervals."""
+    """State which uncertainty of the body model the intervals include."""
     stated = _stated(result)
     if not stated:
         return (
-            "The body model was taken as exact: intervals contain noise, and not what is uncertain "
-            "about masses, lengths, delay and limit; state it in [plant.uncertainty]."
+            "The body model was taken as exact: intervals include noise, but not the uncertainty "
+            "of masses, lengths, delay and limit; state it in [plant.uncertainty]."
         )
     count = "one parameter was" if len(stated) == 1 else f"{len(stated)} parameters were"
     return (
@@ -58,17 +58,17 @@ def body_sentence_of(result: FitResult) -> str:
 
 
 def parameter_words(result: FitResult) -> Markup:
-    """Which parameters cause the uncertainty of the gain, and which only a measurement improves."""
+    """Parameters that cause the gain's variance, and those that the recordings do not improve."""
     stated = _stated(result)
     parts = sorted(stated, key=lambda item: -item.share)
     named = [f"{item.name} {100 * item.share:.0f} %" for item in parts if item.share > _NAMED]
     as_before = [item.name for item in stated if item.learned > _AS_BEFORE]
     said, code = [], Markup("<code>{}</code>")
     if named:
-        said.append(f"Of the variance of the gain these cause: {code.format(', '.join(named))}.")
+        said.append(f"Shares of the variance of the gain: {code.format(', '.join(named))}.")
     if as_before:
         names = code.format(", ".join(as_before))
-        said.append(f"The recordings add nothing on {names}: they can only be measured.")
+        said.append(f"The recordings add no information on {names}: measure them directly.")
     return Markup(" ").join(map(Markup, said))
 
 
@@ -81,13 +81,13 @@ def _stated(result: FitResult) -> list[FittedParameter]:
 
 
 def _is_added(result: FitResult, item: FittedParameter) -> bool:
-    """Whether a parameter is fitted because a first fit was found to lack it."""
+    """Whether a parameter was added because the tests of a first fit pointed to it."""
     added = None if result.added is None else PARAMETERS.get(result.added.name)
     return added is not None and item.name.startswith(added)
 
 
 def _wider(result: FitResult) -> str:
-    """How much wider the intervals are than for an exact body."""
+    """Median ratio of the intervals to those with an exactly known body."""
     found, exact = result.estimate.covariance, result.estimate.exact
     identified = np.array(found.individually_identified)
     if exact is None or not np.any(identified):
@@ -97,7 +97,7 @@ def _wider(result: FitResult) -> str:
 
 
 def error_words(result: FitResult, error: ModelError) -> str:
-    """An error of the model, with its size where it has one."""
+    """A model error in words, with its size if it has one."""
     plant, size, deviation = result.given.plant, error.size, error.deviation
     words = _KINDS[error.name]
     if not np.isfinite(size):
@@ -108,13 +108,14 @@ def error_words(result: FitResult, error: ModelError) -> str:
 
 
 def added_sentence(result: FitResult) -> str:
-    """What was fitted too because a first fit lacked it; empty where nothing was."""
+    """Sentence on the unknown that was added after a first fit; empty if there is none."""
     added = result.added
     if added is None:
         return ""
     said = (
         f"The residuals of a first fit pointed to {error_words(result, added)} "
-        f"({probability_words(added)}). It was fitted too: all numbers come from that fit."
+        f"({probability_words(added)}). It was added to the unknowns: all numbers come from the "
+        "second fit."
     )
     unknown = [
         item for item in result.parameters if _is_added(result, item) and not item.determined
@@ -122,28 +123,28 @@ def added_sentence(result: FitResult) -> str:
     if added.name != DELAY or not unknown:
         return said
     return (
-        f"{said} A gain on the last command makes up for much of a delay, so that the intervals "
-        "are wide: measure it, and state it in [plant.uncertainty] extra_delay."
+        f"{said} A gain on the last command compensates for much of a delay, so the intervals are "
+        "wide: measure the delay, and state it in [plant.uncertainty] extra_delay."
     )
 
 
 def alternative_reason(result: FitResult, error: ModelError) -> str:
-    """That noise in the loop does the same, where the limit is reached and it may be that."""
+    """Alternative explanation by noise in the loop, if the limit is reached; else empty."""
     if result.saturated == 0 or error.name not in (LEAN, NONLINEAR):
         return ""
     return (
-        " Noise in muscles or senses that the person answers at the limit does the same: it is "
-        "mistaken for a reaction to the perturbation."
+        " A reaction to noise in muscles or senses at the limit has the same effect: the test "
+        "mistakes it for a reaction to the perturbation."
     )
 
 
 def probability_words(error: ModelError) -> str:
-    """The probability of as much where the model holds."""
+    """Format the p-value of a model error."""
     return "p < 0.0001" if error.probability < 1e-4 else f"p = {error.probability:.4f}"
 
 
 def lack_finding(found: LackOfFit) -> Finding:
-    """Every error of the model that was tested."""
+    """Table of all model errors that were tested."""
     table = table_of(
         found.errors,
         {
@@ -155,13 +156,13 @@ def lack_finding(found: LackOfFit) -> Finding:
     )
     untestable = ", ".join(_KINDS[name] for name in found.untestable)
     caption = (
-        "Errors of the model that would move the outputs as the residuals do; p is the probability "
-        "of as much if the model holds, each test by itself. Sizes: delay in samples, limit and "
-        "perturbation as shares."
+        "Tests for errors of the model whose effect on the outputs resembles the residual. p: "
+        "p-value of each test if the model is right, without correction for several tests. Sizes: "
+        "delay in samples; limit and perturbation as fractions."
     )
     if untestable:
         caption += (
-            f" The fit makes up for {untestable}, whatever the size: it can only be measured."
+            f" The fit compensates for {untestable}, whatever the size: check by measurement."
         )
     level = Level.AMBER if found.alarm else Level.GREEN
     return Finding(

@@ -1,40 +1,42 @@
-"""What result.json has of a fit in addition to its verdict and findings (docs/results.md).
+"""Content of a fit's result.json in addition to verdict and findings.
 
-    vaf.<output>, held_out_vaf.<output>      %, all trials; the mean of left-out trials
-    states, controls, outputs, disturbances  names, in the order of every array below
-    units.<signal>                           where the plant says them
+    vaf.<output>, held_out_vaf.<output>      VAF of all trials; mean VAF of left-out trials, %
+    states, controls, outputs, disturbances  names, in the order of all arrays below
+    units.<signal>                           units, if the plant states them
     body                                     "nonlinear" or "linear"
-    solver                                   what solved the quadratic programs
-    usable                                   whether half of every recorded signal is explained
-    K                                        the gain that the recordings identify
+    solver                                   solver of the quadratic programs
+    usable                                   whether the VAF of every recorded signal is >= 50 %
+    K                                        estimated gain (without the restriction to weights)
     estimate                                 standard errors of K and of its directions, and which
                                              of them are identified
-    Q, R, P, S, weights_gain                 the weights whose gain comes nearest, at R[0][0] = 1
-    weights_rule                             which of all weights with that gain Q and R are
-    weights_test                             whether any weights explain K: statistic, freedom,
+    Q, R, P, S, weights_gain                 weights with the nearest gain, scaled to R[0][0] = 1
+    weights_rule                             convention by which Q and R were selected
+    weights_test                             test whether any weights explain K: statistic, freedom,
                                              p_value, rejected, return_difference
-    terminal_set, doubts                     of the fitted controller; sentences
+    terminal_set, doubts                     whether the controller has one; warnings as sentences
     horizon, bounds                          as given
-    lack_of_fit                              of the first fit and, where something was added, of the
-                                             last: alarm, and errors with probability and size
-    failures.<stage>                         why the stage has no result
+    lack_of_fit                              tests of the first fit and, if an unknown was added, of
+                                             the last: alarm, and errors with probability and size
+    failures.<stage>                         reason why the stage has no result
     ceiling                                  VAF that repeats with the perturbation, low, high, %
-    limit                                    given, value, low, high, where it was estimated
-    lasting                                  command for a lasting output of 1, with its interval
-    falls                                    trials that ended in a fall, and when
-    intent                                   eigenvalues (ascending), dominant, weights of each rule
-    structures                               weights and gain of each that was named
-    person                                   of [fit.observer]: K, levels with intervals, models
-                                             with log_likelihood and aic, whiteness, errors ahead
-    identifiability                          rank, free, chosen, singular_values
-    aim                                      targets, samples that they are known ahead, rates (1/s)
-                                             of lasting disturbances, offsets (SI), commands
+    limit                                    given, value, low, high of the limit, if estimated
+    lasting                                  steady-state command for an output of 1, with interval
+    falls                                    trials that ended in a fall, with the time
+    intent                                   eigenvalues (ascending), dominant direction, weights by
+                                             each convention
+    structures                               weights and gain of each structure
+    person                                   [fit.observer]: K, noise SDs with intervals, whiteness,
+                                             models with log_likelihood and aic, prediction errors
+    identifiability                          rank, free, chosen (by convention), singular_values of
+                                             the weights
+    aim                                      targets, samples known ahead, observer rates (1/s),
+                                             offsets (SI), recorded commands
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
-    methods.<name>                           as in every result (docs/results.md)
-    truth                                    K of a truth.json beside the recordings, or null
+    methods.<name>                           as in every result
+    truth                                    K of a truth.json next to the recordings, or null
     plant, settings, files, versions, made
 
-Matrices are lists of rows, in SI units. What is not a number, or not determined, is null.
+Matrices are lists of rows, in SI units. NaN, infinity and undetermined values are null.
 """
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ if TYPE_CHECKING:
 
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
-    """What result.json has beside the findings."""
+    """Entries of result.json in addition to the findings."""
     plant, found = result.fitted.problem.plant, result.identifiability
     return _controller(result) | {
         "estimate": _estimate(result),

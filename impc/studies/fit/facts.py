@@ -1,4 +1,4 @@
-"""Numbers of a fit in words: what verdict, sections, checks and the text for a paper share."""
+"""Numbers and phrases shared by verdict, sections, checks and the text for a paper."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ _BEST = "inverse_lqr_output"
 
 
 class GainRow(NamedTuple):
-    """An entry of the gain as a reader meets it: the command against one unit of a state."""
+    """An entry of the gain in shown units: opposing command per unit of a state."""
 
-    state: str  # Its words
+    state: str  # Name in words
     control: str
-    per: str  # "1° of seat tilt"
-    unit: str  # Of the command
+    per: str  # For example "1° of seat tilt"
+    unit: str  # Unit of the command
     value: float
     low: float
     high: float
-    interval: Interval  # As the plant has it
-    inner: bool  # Of a state of nerves or muscles, whose gain means nothing by itself
+    interval: Interval  # In units of the plant
+    inner: bool  # State of nerves or muscles, whose single gain has no meaning
 
     @property
     def ends(self) -> str:
-        """Its interval in words."""
+        """The interval in words."""
         return between(self.low, self.high)
 
     @property
     def identified(self) -> bool:
-        """Whether it is identified by itself."""
+        """Whether it is individually identified."""
         return self.interval.identified
 
     @property
@@ -50,7 +50,7 @@ class GainRow(NamedTuple):
 
 
 def between(low: float, high: float) -> str:
-    """Both ends of an interval, to as many digits as tell them apart."""
+    """Both ends of an interval, with enough digits to distinguish them."""
     if not (np.isfinite(low) and np.isfinite(high)):
         return "not determined"
     size = max(abs(low), abs(high), 1e-300)
@@ -59,9 +59,9 @@ def between(low: float, high: float) -> str:
 
 
 def limit_ends(found: LimitFound) -> str:
-    """How well an estimated limit is known."""
+    """Interval of an estimated limit, or the neighbouring limits that were tried."""
     ends = between(found.low, found.high)
-    return f"95 % CI {ends}" if found.fitted else f"of the limits tried, from {ends}"
+    return f"95 % CI {ends}" if found.fitted else f"best of the limits tried; next ones {ends}"
 
 
 def with_unit(value: str, unit: str) -> str:
@@ -70,12 +70,12 @@ def with_unit(value: str, unit: str) -> str:
 
 
 def one_of(unit: str) -> str:
-    """One of a unit."""
+    """The number 1 with this unit."""
     return with_unit("1", unit)
 
 
 def gain_rows(result: FitResult) -> list[GainRow]:
-    """Every entry of the gain, row by row, in shown units."""
+    """All entries of the gain, row by row, in shown units."""
     plant, found = result.given.plant, result.preferred
     inner, rows = follows_command(result.fitted.problem.plant), []
     for control in plant.controls:
@@ -95,20 +95,20 @@ def gain_rows(result: FitResult) -> list[GainRow]:
 
 
 def named_gains(result: FitResult) -> list[tuple[str, GainRow]]:
-    """The entries that mean something by themselves, with their names."""
+    """Entries whose single values have a meaning, with their names."""
     several = result.given.plant.m > 1
     rows = [row for row in gain_rows(result) if not row.inner] or gain_rows(result)
     return [(f"{row.state} by {row.control}" if several else row.state, row) for row in rows]
 
 
 def first_gain(result: FitResult) -> GainRow | None:
-    """The entry that a reader sees first: of the first output, else of any that is identified."""
+    """The first entry that may be reported; None if there is none."""
     rows = [row for _, row in named_gains(result) if row.certain]
     return rows[0] if rows else None
 
 
 def lasting_or_first(result: FitResult) -> str:
-    """One gain with its interval, as an example."""
+    """Sentence with one gain and its interval as an example."""
     row = first_gain(result)
     if row is None:
         return ""
@@ -116,7 +116,7 @@ def lasting_or_first(result: FitResult) -> str:
 
 
 def limits(plant: Plant, low: Array, high: Array) -> list[str]:
-    """The limits of these bounds (m,) in words, of the controls that have one."""
+    """Finite limits of the inputs in words, from the bounds (m,)."""
     found = []
     for k, name in enumerate(plant.controls):
         factor, unit = shown_unit(plant, name)
@@ -129,7 +129,7 @@ def limits(plant: Plant, low: Array, high: Array) -> list[str]:
 
 
 def given_limit(result: FitResult) -> str | None:
-    """The limit that was given, "6 N m"; None where there is none."""
+    """The given limit, for example "6 N m"; None if there is none."""
     plant, bounds = result.given.plant, result.given.bounds
     parts = limits(plant, np.array(bounds.u_min), np.array(bounds.u_max))
     most = dict(zip(plant.states, bounds.x_max, strict=True))
@@ -143,36 +143,36 @@ def given_limit(result: FitResult) -> str | None:
 
 
 def amount(result: FitResult, values: Array) -> str:
-    """The first command of (m,) with its unit."""
+    """The value of the first command in `values` (m,) with its unit."""
     plant = result.given.plant
     factor, unit = shown_unit(plant, plant.controls[0])
     return f"{number(float(factor * values[0]))} {unit}"
 
 
 def saturation(result: FitResult) -> float:
-    """% of the time at the limit."""
+    """Time at the limit, %."""
     return 100 * result.saturated
 
 
 def shares(result: FitResult, values: Array, digits: int = 2) -> str:
-    """Shares (p,) with the outputs they are of: 99.99 % (seat tilt) and 99.98 % (trunk tilt)."""
+    """VAF (p,) with output names: 99.99 % (seat tilt) and 99.98 % (trunk tilt)."""
     plant = result.given.plant
     parts = [
         f"{value:.{digits}f} % ({signal_name(plant, name)})" if np.isfinite(value)
-        else f"no number ({signal_name(plant, name)}; a simulation does not reach the end)"
+        else f"not available ({signal_name(plant, name)}; a simulation stops early)"
         for name, value in zip(plant.outputs, values, strict=True)
     ]  # fmt: skip
     return " and ".join(parts)
 
 
 def held_out(result: FitResult) -> Array | None:
-    """Mean VAF of left-out trials (p,)."""
+    """Mean VAF of left-out trials (p,); None if there are none."""
     held = [one.vaf for one in result.held_out]
     return np.mean(held, axis=0) if held else None
 
 
 def left_out_text(result: FitResult) -> str:
-    """How much is explained, of left-out trials where there are any."""
+    """VAF in left-out trials if there are any, else in fitted trials."""
     held = held_out(result)
     if held is None:
         return f"{shares(result, result.inverse_mpc.vaf)} of the variance, in fitted trials."
@@ -180,19 +180,19 @@ def left_out_text(result: FitResult) -> str:
 
 
 def shares_text(result: FitResult) -> str:
-    """The same of the fitted trials."""
+    """VAF in fitted trials."""
     return f"{shares(result, result.inverse_mpc.vaf, 0)} of the variance"
 
 
 def unlimited_ratio(result: FitResult) -> str:
-    """How much more the best model without a limit leaves; empty where it does not matter."""
+    """Sentence on the unexplained variance without a limit; empty if below twice as much."""
     methods = {item.name: item for item in result.methods}
     other, own = methods.get(_BEST), result.inverse_mpc
     if other is None or np.any(np.isnan(other.vaf)):
         return ""
     ratios = (100 - other.vaf) / np.maximum(100 - own.vaf, 1e-9)
     place = int(np.argmax(ratios))
-    if ratios[place] < 1.05:
+    if ratios[place] < 2:
         return ""
     name = signal_name(result.given.plant, result.given.plant.outputs[place])
     much = number(float(ratios[place]), 2)
@@ -200,7 +200,7 @@ def unlimited_ratio(result: FitResult) -> str:
 
 
 def no_limit(result: FitResult) -> str:
-    """Why nothing may be said about the limit."""
+    """Reason why no statement about the limit is possible."""
     limit = given_limit(result)
     if limit is None:
         return "No limit was given."
@@ -210,13 +210,13 @@ def no_limit(result: FitResult) -> str:
 
 
 def decided(result: FitResult) -> list[Statement]:
-    """Comparisons of cost that hold for all weights and gains that the recordings allow."""
+    """Decided comparisons of cost: they hold for all weights and (almost) all gains tried."""
     summary = result.uncertainty.weights
     return [] if summary is None else [item for item in summary.statements if item.made]
 
 
 def statement_text(plant: Plant, item: Statement) -> str:
-    """A comparison in words, as it holds."""
+    """A comparison of cost in words."""
     one, other = signal_name(plant, item.first), signal_name(plant, item.second)
     more = "less" if item.holds is False else "more"
     if item.kind == "order":

@@ -1,4 +1,4 @@
-"""Figures of a fit: each takes whether it is drawn for a phone."""
+"""Figures of a fit; `narrow` selects the version for phones."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
 
 _WINDOW, _PHONE_WINDOW = 10.0, 6.0  # s
-_LAGS = 1.0  # s of the autocorrelation
-# Signals that are drawn of each kind: more are in the part that readers explore.
+_LAGS = 1.0  # Largest lag of the autocorrelation, s
+# Largest number of signals of each kind; the interactive part shows all.
 _MOST = 3
 _MOST_STATEMENTS = 12
 
 
 def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
-    """Some seconds of a trial: outputs, recorded and modelled, and commands within their limit."""
+    """Part of a trial: recorded and modelled outputs, and commands with their limits."""
     plant, trial = result.fitted.problem.plant, result.fitted.problem.recordings[index]
     run = result.inverse_mpc.runs[index]
     window = shown_window(result, index, _PHONE_WINDOW if narrow else _WINDOW)
@@ -75,7 +75,7 @@ def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
 
 
 def _command(ax: Axes, result: FitResult, index: int, column: int, window: slice) -> None:
-    """The command of the model, with the area beyond its limit and the samples at it."""
+    """Plot the modelled command, its limit, and the samples at the limit."""
     plant, bounds = result.fitted.problem.plant, result.fitted.problem.bounds
     factor, _ = shown_unit(plant, plant.controls[column])
     run = result.inverse_mpc.runs[index]
@@ -103,7 +103,7 @@ def _command(ax: Axes, result: FitResult, index: int, column: int, window: slice
 
 
 def shown_window(result: FitResult, index: int, seconds: float) -> slice:
-    """The samples of a trial that are drawn: where the command is at its limit most often."""
+    """Samples of a trial to draw: the window with most samples at the limit."""
     problem = result.fitted.problem
     run, samples = result.inverse_mpc.runs[index], problem.recordings[index].samples
     length = min(round(seconds / problem.plant.dt), samples)
@@ -115,7 +115,7 @@ def shown_window(result: FitResult, index: int, seconds: float) -> slice:
 
 
 def residual_figure(result: FitResult, narrow: bool) -> Figure:
-    """Residuals of the first output, trial after trial, and their autocorrelation."""
+    """Residuals of the first output in each trial, and their autocorrelation."""
     plant, trials = result.fitted.problem.plant, result.fitted.problem.recordings
     factor, unit = shown_unit(plant, plant.outputs[0])
     series = [
@@ -145,7 +145,7 @@ def residual_figure(result: FitResult, narrow: bool) -> Figure:
 
 
 def limit_figure(result: FitResult, curve: LimitCurve, narrow: bool) -> Figure:
-    """Variance not explained against the limit."""
+    """Unexplained variance against the limit assumed in the fit."""
     plant = result.given.plant
     factor, unit = shown_unit(plant, curve.control)
     figure = new_figure(PHONE if narrow else 5.4, 3.5)
@@ -168,7 +168,7 @@ def limit_figure(result: FitResult, curve: LimitCurve, narrow: bool) -> Figure:
 
 
 def _plain_log(ax: Axes, axis: str) -> None:
-    """A logarithmic axis whose numbers are no powers."""
+    """Label a logarithmic axis with plain numbers instead of powers."""
     one = ax.yaxis if axis == "y" else ax.xaxis
     one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     if len(one.get_majorticklocs()) > 3:
@@ -178,7 +178,7 @@ def _plain_log(ax: Axes, axis: str) -> None:
 
 
 def frequency_figure(result: FitResult, found: FrequencyResponse, narrow: bool) -> Figure:
-    """Magnitude, phase and coherence of every output: recorded as points, modelled as lines."""
+    """Magnitude, phase and coherence: recorded as points, modelled as lines."""
     plant = result.given.plant
     outputs = plant.outputs[: 1 if narrow else 2]
     figure = new_figure(PHONE if narrow else WIDE, 5.4)
@@ -219,7 +219,7 @@ def frequency_figure(result: FitResult, found: FrequencyResponse, narrow: bool) 
 
 
 def statements_figure(result: FitResult, narrow: bool) -> Figure:
-    """The range of each comparison of costs over all weights; its side of zero decides."""
+    """Range of each difference in cost over all weights with the fitted gain."""
     plant = result.given.plant
     shown = sorted(result.compared, key=lambda item: not item.made)[:_MOST_STATEMENTS]
     figure = new_figure(PHONE if narrow else WIDE, 1.4 + (0.5 if narrow else 0.3) * len(shown))
@@ -235,7 +235,7 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
         low, high = np.clip(ends[row], -reach, reach)
         colour, width = (BLUE, 7) if item.made else (RECORDED, 5)
         ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt")
-        if narrow:  # above its bar: beside it there is no room
+        if narrow:  # label above the bar for lack of space
             ax.text(0, row - 0.22, labels[-1], transform=ax.get_yaxis_transform(), va="bottom",
                     fontsize=10)  # fmt: skip
     ax.axvline(0, color=INK, linewidth=1)
@@ -260,7 +260,7 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
 def interval_figure(
     labels: list[str], ends: Array, values: Array, axis: str, narrow: bool
 ) -> Figure:
-    """Rows with a value and an interval (rows, 2) each on a logarithmic axis; arrows go on."""
+    """Values with intervals (rows, 2) on a logarithmic axis; arrows mark truncated ends."""
     figure = new_figure(PHONE if narrow else WIDE, 0.9 + 0.32 * len(labels))
     ax = figure.subplots()
     finite = np.append(ends[np.isfinite(ends) & (ends > 0)], values[np.isfinite(values)])

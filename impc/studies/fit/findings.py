@@ -1,4 +1,4 @@
-"""The tables of a fit: gain, trials, weights."""
+"""Tables of a fit: gain, parameters, limits, trials, weights."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 
-# Parts of a direction below this are not named.
+# Smallest component of a direction that is printed.
 _NAMED = 0.15
-# Intervals by other methods than that of low and high.
+# Methods whose intervals have columns of their own.
 _OTHER = ("block", "profile")
 
 
 def per_unit_finding(result: FitResult) -> Finding:
-    """The command against one shown unit of each state that means something by itself."""
+    """Opposing command per shown unit of each state whose single gain has a meaning."""
     several = result.given.plant.m > 1
     table = table_of(
         [row for _, row in named_gains(result)],
@@ -54,18 +54,18 @@ def per_unit_finding(result: FitResult) -> Finding:
     inner = [row for row in gain_rows(result) if row.inner]
     known = sum(row.identified for row in inner)
     of_inner = (
-        f" The gains on {len(inner)} states of nerves and muscles, {known} of them identified, "
-        "mean nothing one by one; they stand under details."
+        f" Single gains on the {len(inner)} states of nerves and muscles ({known} identified) have "
+        "no meaning; they are listed under details."
         if inner
         else ""
     )
     labels = {"for_every": "For every ...", "low": "95 % CI, low", "high": "95 % CI, high"}
-    caption = f"Identified: the recordings determine this number by itself.{of_inner}"
+    caption = f"Identified: the recordings determine this single number.{of_inner}"
     return Finding("gain_per_unit", table, caption, labels=labels, digits=3)
 
 
 def gain_finding(result: FitResult, truth: Array | None = None) -> Finding:
-    """Every number with its intervals, in SI units, beside the gain of the weights."""
+    """All fitted numbers with intervals, in SI units, and the gain of the weights."""
     uncertainty, plant = result.uncertainty, result.fitted.problem.plant
     of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
     found = {(item.name, item.method): item for item in uncertainty.intervals}
@@ -98,21 +98,24 @@ def gain_finding(result: FitResult, truth: Array | None = None) -> Finding:
         rows.append(row)
     level = 100 * uncertainty.intervals[0].level if rows else 95
     exact_words = (
-        " Exact body: the interval if the body were known exactly as it was found." if exact else ""
+        " Exact body: interval for a body that is known exactly and equals the fitted one."
+        if exact
+        else ""
     )
     return Finding(
         "gain",
         pd.DataFrame(rows),
         f"The gain K of u = -K x with {level:.0f} % intervals, which allow for autocorrelated "
-        "residuals. Of an entry that is not identified only combinations with others are "
-        f"determined.{exact_words} The gain of the weights is that of the reported cost weights.",
+        "residuals. If an entry is not identified, the recordings may still determine its "
+        f"combinations with others.{exact_words} The files also have the gain of the reported "
+        "cost weights.",
         hidden=("gain_of_the_weights",),
         labels={"number": "Gain on"},
     )
 
 
 def direction_finding(result: FitResult) -> Finding:
-    """Combinations of entries that the recordings determine, best first."""
+    """Combinations of gain entries, ordered by how well the recordings determine them."""
     plant, covariance = result.fitted.problem.plant, result.estimate.covariance
     words = [signal_name(plant, state) for state in plant.states]
     names = tuple(
@@ -134,21 +137,21 @@ def direction_finding(result: FitResult) -> Finding:
     )
     caption = (
         "Combinations of entries of the gain, best determined first, as commands at typical "
-        "states. The standard error is relative to the largest gain that is optimal: 1 means "
+        "states. The standard error is relative to the largest gain that can be optimal: 1 means "
         f"practically unknown, above {IDENTIFIED:g} not identified."
     )
     return Finding("directions", table, caption, digits=2)
 
 
 def direction_name(direction: Array, names: tuple[str, ...]) -> str:
-    """A direction (n,) as a sum of parts called by their `names`, the largest first."""
+    """A direction (n,) as a sum of terms called by their `names`, largest first."""
     order = np.argsort(-np.abs(direction), kind="stable")
     parts = [f"{direction[k]:+.2f} {names[k]}" for k in order if abs(direction[k]) >= _NAMED]
     return " ".join(parts)
 
 
 def parameter_findings(result: FitResult) -> list[Finding]:
-    """Physical parameters that were fitted with the gain, where there are any."""
+    """Table of the physical parameters that were fitted with the gain, if any."""
     if not result.parameters:
         return []
     table = table_of(
@@ -165,15 +168,15 @@ def parameter_findings(result: FitResult) -> list[Finding]:
         },
     )
     caption = (
-        "Physical parameters fitted with the gain, in SI units. One with a stated deviation keeps "
-        "to its nominal value as far as that says; its share is by how much the variance of the "
-        "gain would fall if it were measured exactly. One without is free."
+        "Physical parameters fitted with the gain, in SI units. A stated deviation is a prior "
+        "around the nominal value; a parameter without one is free. Share: reduction of the "
+        "variance of the gain if the parameter were measured exactly."
     )
     return [Finding("parameters", table, caption)]
 
 
 def limit_findings(result: FitResult) -> list[Finding]:
-    """The limit of each command, other horizons and the curve of limits, where computed."""
+    """Limits of the commands, other horizons and the limit curve, as far as computed."""
     found, plant = [], result.given.plant
     if result.uncertainty.limits:
         table = table_of(
@@ -187,7 +190,7 @@ def limit_findings(result: FitResult) -> list[Finding]:
                 "threshold": lambda pair: float(pair[1].quantile),
             },
         )
-        found.append(Finding("limits", table, "Limits of the command as unknowns, 95 %."))
+        found.append(Finding("limits", table, "Estimated limits of the command, 95 % intervals."))
     if result.uncertainty.alternatives:
         first = result.uncertainty.alternatives[0]
         table = table_of(
@@ -201,8 +204,8 @@ def limit_findings(result: FitResult) -> list[Finding]:
             },
         )
         caption = (
-            "The same recordings with other horizons and without limit. AIC is above the least; "
-            "VAF (%) is of left-out trials."
+            "The same recordings with other horizons and without limit. AIC: difference to the "
+            "smallest. VAF (%): in left-out trials."
         )
         found.append(Finding("alternatives", table, caption))
     if result.curves:
@@ -218,7 +221,7 @@ def limit_findings(result: FitResult) -> list[Finding]:
 
 
 def number_name(plant: Plant, name: str) -> str:
-    """What a reader calls a number of a fit by its `name`, such as K.command.theta1."""
+    """Name in words of a fitted number such as K.command.theta1."""
     kind, _, rest = name.partition(".")
     if name not in number_units(plant):
         return name
@@ -230,7 +233,7 @@ def number_name(plant: Plant, name: str) -> str:
 
 
 def number_units(plant: Plant) -> dict[str, str]:
-    """Units of the numbers of a fit by their names: K.<control>.<state>, u_max.<control>."""
+    """Units of the fitted numbers by name: K.<control>.<state>, u_max.<control>."""
     return {
         f"K.{control}.{state}": gain_unit(plant, control, state)
         for control in plant.controls
@@ -239,27 +242,27 @@ def number_units(plant: Plant) -> dict[str, str]:
 
 
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
-    """The gain of the truth.json that lies beside recordings. Returns (m, n)."""
+    """Gain (m, n) in the truth.json next to the recordings; None if there is none."""
     folders = {path.absolute().parent for path in recordings}
     said = truth_beside(folders.pop()) if len(folders) == 1 else {}
     try:
         states, gain = tuple(said["states"]), np.array(said["K"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError):  # none, or another program's file
+    except (ValueError, KeyError, TypeError):  # no truth.json, or not one of impc
         return None
     return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
 
 
 def truth_count(result: FitResult, truth: Array) -> tuple[int, int, float]:
-    """How many entries of the true gain (m, n) lie inside their intervals, of all; their level."""
+    """Number of true gain entries inside their intervals, number of all, level in %."""
     pairs = _pairs(result, truth)
     inside = sum(item.low <= value <= item.high for item, value in pairs)
     return inside, len(pairs), 100 * pairs[0][0].level
 
 
 def truth_sentence(result: FitResult, truth: Array) -> str:
-    """The same in words, with the farthest off, and of the person who senses with noise."""
+    """Sentence that compares the estimated gains with the true gain (m, n)."""
     if not result.preferred:
-        return "The recordings are simulated: no gain was estimated to compare with the true one."
+        return "The recordings are simulated, but there is no estimated gain to compare."
     inside, count, level = truth_count(result, truth)
     text = (
         f"The recordings are simulated: {inside} of the {count} entries of their true gain lie "
@@ -272,20 +275,20 @@ def truth_sentence(result: FitResult, truth: Array) -> str:
     item, value = max(off, key=lambda pair: _distance(*pair))
     name = number_name(result.given.plant, item.name)
     return (
-        f"{text}; farthest off is the gain on {name}, {number(item.low, 4)} to "
-        f"{number(item.high, 4)} where the truth is {number(value, 4)}.{person}"
+        f"{text}. The largest deviation is in the gain on {name}: interval {number(item.low, 4)} "
+        f"to {number(item.high, 4)}, true value {number(value, 4)}.{person}"
     )
 
 
 def _of_person(result: FitResult, truth: Array) -> str:
     if result.person is None or result.person.fit is None:
         return ""
-    ends = np.array(result.person.entries)  # NaN of what is not individually identified
+    ends = np.array(result.person.entries)  # NaN if not individually identified
     identified = np.count_nonzero(~np.isnan(ends[:, 0]))
     inside = np.count_nonzero((ends[:, 0] <= truth.ravel()) & (truth.ravel() <= ends[:, 1]))
     return (
-        f" Of the gain of the person who senses with noise {inside} of {identified} lie inside "
-        "theirs."
+        f" In the model with sensory noise, {inside} of the {identified} identified entries lie "
+        "inside their intervals."
     )
 
 
@@ -296,13 +299,13 @@ def _pairs(result: FitResult, truth: Array) -> list[tuple[Interval, float]]:
 
 
 def _distance(item: Interval, value: float) -> float:
-    """From the middle of the interval, in its halves."""
+    """Distance of `value` from the centre of the interval, in half widths."""
     half = (item.high - item.low) / 2
     return abs(value - (item.low + item.high) / 2) / half if half else np.inf
 
 
 def agreement_finding(result: FitResult) -> Finding:
-    """Each trial: length, how much of each output is explained, time at the limit."""
+    """Table of trials: length, VAF, whiteness, time at the limit."""
     plant, rows, labels = result.given.plant, [], {"length_s": "Length (s)"}
     for index, trial in enumerate(result.trials):
         row: dict[str, object] = {"trial": trial_name(result, index)}
@@ -323,7 +326,7 @@ def agreement_finding(result: FitResult) -> Finding:
 
 
 def offset_findings(result: FitResult) -> list[Finding]:
-    """What the outputs of each trial have too much, where that was asked for."""
+    """Table of the fitted offsets of the outputs, if requested."""
     plant, offsets = result.fitted.problem.plant, aim_data(result)["offsets"]
     rows = [
         (trial_name(result, index), signal_name(plant, name), shown_unit(plant, name)[1],
@@ -332,12 +335,12 @@ def offset_findings(result: FitResult) -> list[Finding]:
         for index, value in enumerate(values)
     ]  # fmt: skip
     table = pd.DataFrame(rows, columns=["trial", "output", "unit", "offset"])
-    caption = "What the recorded outputs have too much, found with the gain."
+    caption = "Constant offsets of the recorded outputs, estimated with the gain."
     return [Finding("offsets", table, caption, folded="Offsets of the outputs")] if rows else []
 
 
 def command_findings(result: FitResult) -> list[Finding]:
-    """The gain by regression on recorded commands beside that of the fit, where there are any."""
+    """Table of the gain by regression on recorded commands and of the fitted gain, if any."""
     if result.commands is None:
         return []
     table = result.commands.reset_index(names="number")
@@ -348,24 +351,24 @@ def command_findings(result: FitResult) -> list[Finding]:
         "intervals of a regression of the recorded commands on the states."
     )
     caption = (
-        "The regression takes samples inside the limit. Noise in recorded states biases it; a "
-        "wrong body model or limit biases the fit. Where the two differ by much, one of these is "
-        "present."
+        "The regression uses samples inside the limit. Noise in recorded states biases the "
+        "regression; a wrong body model or limit biases the fit. A large difference indicates one "
+        "of these errors."
     )
     folded = "Regression of the commands"
     return [Finding("command_regression", table, caption, [said], folded=folded)]
 
 
 def trajectory_finding(result: FitResult) -> Finding:
-    """A row a sample of the trials of the page, recorded and modelled, in shown units."""
+    """Recorded and modelled signals of the trials on the page, one row per sample."""
     names = {index: trial_name(result, index) for index in shown_trials(result)}
     runs = {"simulated": result.inverse_mpc.runs}
     table = trajectory_table(result.fitted.problem, names, runs)
-    return Finding("trajectories", table, "Recorded and modelled signals, a row a sample.")
+    return Finding("trajectories", table, "Recorded and modelled signals, one row per sample.")
 
 
 def response_findings(result: FitResult) -> list[Finding]:
-    """The frequency response in numbers."""
+    """Table of the frequency response."""
     found, plant = result.response, result.given.plant
     if found is None:
         return []
@@ -383,11 +386,12 @@ def response_findings(result: FitResult) -> list[Finding]:
     heads = ["frequency_hz", "output", "magnitude_recorded", "magnitude_model",
              "phase_recorded_deg", "phase_model_deg", "coherence"]  # fmt: skip
     table = pd.DataFrame(rows, columns=heads)
-    return [Finding("frequency_response", table, "From the perturbation to the movement.")]
+    caption = "Frequency response from the perturbation to the movement."
+    return [Finding("frequency_response", table, caption)]
 
 
 def weight_findings(result: FitResult) -> list[Finding]:
-    """Comparisons of cost, cost weights with ranges, and the reported weights."""
+    """Tables of comparisons of cost, ranges of cost weights, and reported weights."""
     summary, plant = result.uncertainty.weights, result.given.plant
     if summary is None:
         return [weight_finding(result)]
@@ -404,9 +408,10 @@ def weight_findings(result: FitResult) -> list[Finding]:
         },
     )
     caption = (
-        "Low and high: the difference in cost, or the cross weight, over the cost of the state "
-        f"named first, at typical sizes, over all weights with the fitted gain. {summary.drawn} "
-        "other gains were tried; a comparison is decided if all of them but one at most agree."
+        "Low and high: range of the difference in cost, or of the cross weight, relative to the "
+        "cost of the state named first, at typical sizes, over all weights with the fitted gain. "
+        f"{summary.drawn} other gains were tried; a comparison is decided if at most one of them "
+        "disagrees."
     )
     found = [Finding("statements", table, caption)]
     if summary.cost_weights:
@@ -421,8 +426,8 @@ def weight_findings(result: FitResult) -> list[Finding]:
             },
         )
         caption = (
-            "What a typical excursion costs over all weights, at R = 1: with the fitted gain, and "
-            "(95 %) with it or any other that the recordings allow."
+            "Range of the cost of a typical excursion over all weights, at R = 1: with the fitted "
+            "gain, and (95 %) with all gains that the recordings allow."
         )
         found.append(Finding("cost_weights", table, caption))
     return [*found, weight_finding(result)]
@@ -431,14 +436,14 @@ def weight_findings(result: FitResult) -> list[Finding]:
 def _verdict(item: Statement) -> str:
     if item.holds is None:
         return "undecided: weights with the fitted gain differ"
-    return "decided" if item.made else "undecided: other gains differ"
+    return "decided" if item.made else "undecided: other possible gains differ"
 
 
 def weight_finding(result: FitResult) -> Finding:
-    """Entries of the reported weights, with their ranges where they were computed."""
+    """Table of the reported weights, with ranges if they were computed."""
     plant, weights = result.given.plant, result.intent.reported.weights
     summary = result.uncertainty.weights
-    # At trace R = m: with one command the scale of the entries.
+    # Ranges are at trace R = m: with one command the same scale as the entries.
     ranged = summary.entries if summary is not None and plant.m == 1 else ()
     ranges = {frozenset((item.first, item.second)): (item.low, item.high) for item in ranged}
     none = (np.nan, np.nan)
@@ -461,7 +466,7 @@ def weight_finding(result: FitResult) -> Finding:
 
 
 def reading_finding(result: FitResult) -> Finding:
-    """Weights with the fitted gain by several conventions."""
+    """Table of weights with the fitted gain by several conventions."""
     plant, found = result.fitted.problem.plant, result.intent
     names = tuple(signal_name(plant, state) for state in plant.states)
     table = table_of(
@@ -475,8 +480,8 @@ def reading_finding(result: FitResult) -> Finding:
         },
     )
     caption = (
-        "Weights with exactly the same gain, so with the same movement, by several conventions. "
-        f"The costliest combination depends on the convention: others turn it by up to "
+        "Weights with exactly the same gain, and therefore the same movement, by several "
+        f"conventions. The costliest combination depends on the convention: it turns by up to "
         f"{result.widest_angle:.0f} degrees."
     )
     said = [f"Not available: {line}" for line in found.missing]

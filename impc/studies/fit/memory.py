@@ -1,4 +1,4 @@
-"""What an interrupted fit or comparison had done, for one set of recordings, settings and plant."""
+"""Finished steps of an interrupted fit or comparison, for the same inputs and settings."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ if TYPE_CHECKING:
 
 Part = TypeVar("Part")
 
-# Stages of a fit, and of a comparison.
+# Names of stages that decide which problem an estimate belongs to.
 _WHOLE = "inverse_mpc"
 _LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
 
 @dataclass(frozen=True)
 class FitMemory(Steps):
-    """The steps of `impc fit` and `impc compare`; its methods are what these two keep."""
+    """Stored steps of `impc fit` and `impc compare`."""
 
-    problem: Problem = field(kw_only=True)  # As it was posed
+    problem: Problem = field(kw_only=True)  # As posed
 
     def about(self, problem: Problem) -> FitMemory:
-        """The memory of another problem of the same recordings, which has one unknown more."""
+        """Store for another problem of the same recordings, with one more unknown."""
         known = digest(self.digest, problem.parameter_names, problem.offsets)
         return replace(self, digest=known, problem=problem)
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
-        """The estimate of the stage `name`, as `compute` makes it."""
+        """Stored estimate of the stage `name`, or the result of `compute`."""
 
         def decode(kept: dict[str, Any]) -> Estimate:
             posed = self.problem
             whole = None if name == _WHOLE else self.cache.find(_WHOLE, self.digest)
-            if whole is not None and posed.family is not None:  # the body that it has found
+            if whole is not None and posed.family is not None:  # the fitted body
                 found = np.array(whole["logarithms"], dtype=float)
                 posed = posed.at(np.array(posed.starts), found, np.array(posed.shifts))
             if len(kept["logarithms"]) < len(posed.logarithms):
@@ -57,7 +57,7 @@ class FitMemory(Steps):
         return self.get(name, compute, decode, encode_estimate)
 
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
-        """The bootstrap replicate of the stage `name`, as `compute` makes it."""
+        """Stored bootstrap replicate of the stage `name`, or the result of `compute`."""
         return self.get(name, compute, lambda kept: from_json(kept, Replicate))
 
     def part(
@@ -67,22 +67,22 @@ class FitMemory(Steps):
         encode: Callable[[Part], Any],
         decode: Callable[[Any], Part],
     ) -> Part:
-        """What an optional subpackage finds in the stage `name`, as `compute` makes it."""
+        """Stored result of an optional subpackage, or the result of `compute`."""
         return self.get(name, compute, decode, encode)
 
 
 def open_memory(
     folder: Path, problem: Problem, settings: FitSettings, command: str = "fit", made_of: str = ""
 ) -> FitMemory:
-    """The memory of a command in a folder, empty when there is none for this very problem."""
-    # Of a family the plant at its nominal values; its code is in `made_of` (`impc.files.digests`).
+    """Open the stored steps of a command in a folder; empty if they belong to other inputs."""
+    # A family enters by its nominal plant; `made_of` contains its code (`impc.files.digests`).
     body = () if problem.family is None else (problem.family.names, problem.family.deviations)
     known = digest(replace(problem, family=None), *body, settings, made_of, versions())
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 
 
 def _seen(problem: Problem, stage: str, method: Method) -> Problem:
-    """The problem of a stage as its method sees it."""
+    """The problem that the method of a stage solves."""
     left_out = _LEFT_OUT.match(stage)
     posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
     return (

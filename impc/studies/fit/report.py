@@ -1,4 +1,4 @@
-"""The page of a fit: what stands on it, in its order."""
+"""Report of a fit: sections, figures, checks, and text for a paper."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
+from impc.assess.lack_of_fit import LIMIT
 from impc.assess.lasting_response import LastingResponse, lasting_responses
 from impc.control.named_solver import described
 from impc.reporting.document import (
@@ -84,7 +85,7 @@ _HIDDEN = "Not shown as a result, because of the warning above."
 def fit_report(
     result: FitResult, provenance: Provenance, truth: Array | None = None, missing: str = ""
 ) -> Report:
-    """Page, result.json, tables and figures; `truth` (m, n)."""
+    """Report of a fit; `truth` (m, n) is the gain of a simulated subject."""
     verdict, subject = fit_verdict(result), str(result.given.recordings[0].label.subject)
     trials, dt = result.given.recordings, result.given.plant.dt
     seconds = sum(trial.samples for trial in trials) * dt
@@ -109,7 +110,7 @@ def fit_report(
 
 
 def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
-    """The page where the subject fell in every trial."""
+    """Report for a subject who fell in every trial."""
     verdict = fallen_verdict(falls)
     sections = [Section("Falls", [Lines(falls)]), _made(provenance)]
     data = {"falls": falls}
@@ -127,8 +128,8 @@ def _hero(result: FitResult, index: int) -> Picture:
     return Picture(
         "movement",
         f"Recorded and modelled outputs, and the command within its limit, in {name}",
-        f"{name}, some seconds of it. Grey: recorded; blue: model{limit}. Over all of it they "
-        f"differ by {said} (RMS, {signal_name(plant, plant.outputs[0])}).",
+        f"Part of {name[:1].lower()}{name[1:]}. Grey: recorded; blue: model{limit}. In the whole "
+        f"trial they differ by {said} (RMS, {signal_name(plant, plant.outputs[0])}).",
     )
 
 
@@ -162,7 +163,7 @@ def _keys(result: FitResult) -> list[Key]:
         limit = given_limit(result)
         keys.append(
             Key(value, unit, "largest command in the model",
-                f"{limit} was allowed" if limit else "no limit was given")
+                f"with a limit of {limit}" if limit else "no limit was given")
         )  # fmt: skip
     row, gains = first_gain(result), named_gains(result)
     if row is None or GAIN in forbidden(result):
@@ -178,7 +179,7 @@ def _keys(result: FitResult) -> list[Key]:
 
 
 def _draws(result: FitResult, window: int) -> dict[str, Draw]:
-    """How every figure of the page is drawn."""
+    """Functions that draw the figures of the page."""
     found: dict[str, Draw] = {
         "movement": functools.partial(figures.movement_figure, result, window),
         "methods": functools.partial(methods_figure, result.methods[::-1]),
@@ -199,7 +200,7 @@ def _draws(result: FitResult, window: int) -> dict[str, Draw]:
 def _sections(
     result: FitResult, provenance: Provenance, truth: Array | None, missing: str
 ) -> list[Section]:
-    """A section more is a line here."""
+    """Sections of the page; add a line here for a new section."""
     no = forbidden(result)
     return [
         Section("Feedback gain", _gain(result, truth, GAIN in no)),
@@ -224,19 +225,18 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
     if hidden:
         return [
             *aim_sentences(result),
-            Quiet(f"{_HIDDEN} Numbers are kept under details for troubleshooting."),
+            Quiet(f"{_HIDDEN} The numbers below are for troubleshooting only."),
             Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
         ]
     settled = [_lasting(result, one) for one in lasting_responses(result.estimate)]
     lasting = (
-        f" Contributions add up and partly cancel: {'; '.join(settled)}, once nerves and muscles "
-        "have settled."
+        f" In steady state the contributions of all states add up: {'; '.join(settled)}."
         if settled
         else ""
     )
     return [
-        "Gain is the command against a deviation, as long as the limit is not reached."
-        f"{lasting} {body_sentence_of(result)}",
+        "A gain is the opposing command per unit of a deviation, as long as the limit is not "
+        f"reached.{lasting} {body_sentence_of(result)}",
         *aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
         findings.per_unit_finding(result),
@@ -250,13 +250,13 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
 
 
 def _lasting(result: FitResult, found: LastingResponse) -> str:
-    """What an output that persists ends up with, in words."""
+    """Steady-state command for a constant output, in words."""
     plant = result.given.plant
     (factor, unit), (scale, of) = (shown_unit(plant, one) for one in (found.state, found.control))
     value, low, high = (scale / factor * one for one in (found.value, found.low, found.high))
     known = f"95 % CI {between(low, high)}" if found.identified else "not identified"
     return (
-        f"a {signal_name(plant, found.state)} of {one_of(unit)} that persists ends up with "
+        f"a constant {signal_name(plant, found.state)} of {one_of(unit)} leads to a command of "
         f"{fixed(value)} {of} ({known})"
     )
 
@@ -264,18 +264,18 @@ def _lasting(result: FitResult, found: LastingResponse) -> str:
 def _limit(result: FitResult, doubtful: bool) -> list[Block]:
     limit, ratio = given_limit(result), unlimited_ratio(result)
     if limit is None:
-        said = "No limit was given, so that the model has none."
+        said = "No limit was given, so the model has none."
     elif not result.met:
-        said = "These recordings cannot answer it: the limit is never reached."
+        said = "These recordings cannot answer this question: the limit is never reached."
     elif doubtful:
-        said = f"Some limit may, but {limit} is probably not the one of this person."
+        said = f"A limit may matter, but {limit} is in doubt (see the warning above)."
     elif ratio:
         said = (
-            "Yes. The same recordings were fitted with and without a limit. Models without a limit "
-            "leave more of the movement unexplained."
+            "Yes. The same recordings were fitted with and without a limit; the best model without "
+            "a limit leaves more of the movement unexplained."
         )
     else:
-        said = "Not measurably: models without a limit explain these recordings as well."
+        said = "Not measurably: the best model without a limit explains the recordings as well."
     methods: Block = Picture(
         "methods",
         "Variance not explained, and largest command, of every method",
@@ -296,7 +296,8 @@ def _limit_pictures(result: FitResult) -> list[Block]:
         Picture(
             f"limit-{place + 1}",
             "Variance not explained against the limit of the command in the fit",
-            "Limit curve: each point is a fit of its own with that limit. The lowest fits best.",
+            "Limit curve: each point is a separate fit with that limit. The lowest point fits "
+            "best.",
         )
         for place in range(len(result.curves))
     ]
@@ -313,17 +314,18 @@ def _intent(result: FitResult, hidden: bool) -> list[Block]:
     if summary is None:
         return [Quiet(f"Not available: {result.uncertainty.weights_reason}"), *tables]
     drawn = (
-        f" They hold for {summary.drawn} other gains that the recordings allow too."
+        f" Of {summary.drawn} other gains that the recordings allow, at most one disagrees with "
+        "each of them."
         if summary.drawn and made
         else ""
     )
     count = f"{len(made)} of {len(summary.statements)} comparisons"
     return [
-        "Many cost weights lead to exactly this movement. Only what holds for all of them says "
-        f"something about the person: {count}, at the 95 % level.{drawn}",
+        "Many cost weights lead to exactly this movement. Only statements that hold for all of "
+        f"them describe the person: {count}, at the 95 % level.{drawn}",
         *([Lines([statement_text(plant, item) for item in made])] if made else []),
         *([_STATEMENTS] if summary.statements else []),
-        Fold("Cost weights by convention, and how far they could differ", tables),
+        Fold("Cost weights by convention, and their ranges", tables),
     ]
 
 
@@ -331,7 +333,7 @@ _STATEMENTS = Picture(
     "statements",
     "Ranges of the differences in cost over all weights with the fitted gain",
     "Each bar is the range of one difference in cost over all weights with the fitted gain. Blue: "
-    "on one side of zero, for other gains that the recordings allow too. Grey: undecided.",
+    "on one side of zero, also for other gains that the recordings allow. Grey: undecided.",
 )
 
 
@@ -341,14 +343,14 @@ def _response(result: FitResult) -> list[Block]:
     known = found.coherence > found.threshold[:, None]
     share = 100 * float(np.mean(known))
     return [
-        f"From the {signal_name(plant, found.signal)} to the movement, estimated in the same way "
-        "from recording and model. Points are left out where chance alone reaches their "
-        f"coherence ({share:.0f} % are shown).",
+        f"Response of the movement to the {signal_name(plant, found.signal)}, estimated in the "
+        "same way from recording and model. Points whose coherence could be due to chance are left "
+        f"out ({share:.0f} % are shown).",
         Picture(
             "frequency-response",
             "Magnitude, phase and coherence of the response to the perturbation",
-            "Grey: recorded, with 95 % intervals; blue: model. The lower panel is the coherence of "
-            "the recording.",
+            "Grey: recorded, with 95 % intervals; blue: model. Lower panel: coherence of the "
+            "recording; dashed: level that chance alone reaches.",
         ),
     ]
 
@@ -404,12 +406,15 @@ def _recordings(result: FitResult) -> Check:
 def _limit_check(result: FitResult) -> list[Check]:
     limit, found = given_limit(result), result.limit_found
     if limit is None:
-        return [Check(Level.NOTE, "Limit", "None was given.")]
+        return [Check(Level.NOTE, "Limit", "No limit was given.")]
     if not result.met:
-        return [Check(Level.NOTE, "Limit", "Never reached: nothing can be said about it.")]
+        return [Check(Level.NOTE, "Limit", "Never reached: the recordings cannot check it.")]
+    if result.culprit is not None and result.culprit.name == LIMIT:
+        return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
     if found is None:
         if result.curves and all(curve.best == curve.own for curve in result.curves):
-            return [Check(Level.GREEN, "Limit", f"Given as {limit}: of the limit curve the best.")]
+            said = f"Given as {limit}; it fits best of all limits of the limit curve."
+            return [Check(Level.GREEN, "Limit", said)]
         return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not estimated.")]
     said = (
         f"Given as {limit}; the recordings point to {number(found.value)} {found.unit} "
@@ -429,19 +434,19 @@ def _model(result: FitResult) -> Check:
     return Check(
         Level.GREEN,
         "Body model",
-        f"No sign of a mismatch in {len(last.errors)} tests (smallest {probability(least)}).",
+        f"{len(last.errors)} tests found no model error (smallest {probability(least)}).",
     )
 
 
 def _weights(result: FitResult) -> Check:
     test = result.weights_test
     if test.rejected:
-        return Check(Level.AMBER, "Cost weights", "No cost weights lead to this gain.")
-    return Check(Level.GREEN, "Cost weights", "Some cost weights lead to this gain.")
+        return Check(Level.AMBER, "Cost weights", "The recordings reject all cost weights.")
+    return Check(Level.GREEN, "Cost weights", "The recordings do not reject all cost weights.")
 
 
 def _others(result: FitResult) -> list[Check]:
-    """Notes: residuals, what repeats, doubts of the search, what could not be computed."""
+    """Notes: residuals, repeatable variance, doubts of the search, failed stages."""
     white = min(float(np.nanmin(one.whiteness)) for one in result.trials)
     coloured = "Autocorrelated" if white < 0.05 else "Not autocorrelated"
     found = [
@@ -451,9 +456,9 @@ def _others(result: FitResult) -> list[Check]:
     if result.ceiling is not None:
         one = result.ceiling
         found.append(
-            Check(Level.NOTE, "What repeats",
+            Check(Level.NOTE, "Repeatable movement",
                   f"{shares(result, one.vaf, 1)} of the variance repeats with the perturbation "
-                  f"({one.repetitions} repetitions): no controller without noise explains more.")
+                  f"({one.repetitions} repetitions): a model without noise cannot explain more.")
         )  # fmt: skip
     found += [Check(Level.NOTE, "Search", doubt) for doubt in result.fitted.doubts]
     for stage, reason in result.failures.items():
@@ -463,7 +468,7 @@ def _others(result: FitResult) -> list[Check]:
 
 def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy | str:
     if verdict.level in (Level.AMBER, Level.RED):
-        return "There is text to copy when no check is open."
+        return "Text to copy is available only if no warning restricts the report."
     plant, problem, limit = result.given.plant, result.fitted.problem, given_limit(result)
     trials, dt = result.given.recordings, plant.dt
     seconds = sum(trial.samples for trial in trials) * dt
@@ -507,9 +512,9 @@ def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy |
 
 
 def _model_name(provenance: Provenance) -> str:
-    """The function or file of the plant, in words."""
+    """Name of the plant's function or file in words."""
     name = provenance.plant_name.rpartition(":")[2].removesuffix("_for").replace("_", " ")
-    return f"“{name}”" if name else "that of the program"
+    return f"“{name}”" if name else "given by a program"
 
 
 def _made(provenance: Provenance, result: FitResult | None = None, missing: str = "") -> Section:
@@ -535,8 +540,8 @@ def _made(provenance: Provenance, result: FitResult | None = None, missing: str 
 
 def _terminal_set(result: FitResult) -> str:
     changed, within = result.terminal_set_difference, bool(result.fitted.problem.terminal_set)
-    ends = "The controller ends in it" if within else "The controller has none"
+    ends = "The controller has a terminal set" if within else "The controller has no terminal set"
     if np.isnan(changed):
         return f"{ends}."
     other = "without" if within else "with"
-    return f"{ends}; {other} it an output differs by {changed:.2g} of its size at most."
+    return f"{ends}; {other} one, an output would change by at most {changed:.2g} of its size."

@@ -1,4 +1,4 @@
-"""Everything that a fit of a subject found (section 3.5), as values."""
+"""Result of a fit of a subject (section 3.5)."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from impc.output_feedback.page import PersonReport
     from impc.studies.fit.settings import FitSettings
 
-#: Trials that are drawn one by one: 500 made a page of 51 MB and took 6.3 GB.
+#: Largest number of trials on a page: 500 trials gave 51 MB and needed 6.3 GB of memory.
 MOST_TRIALS = 24
 
-# Share of what a given limit leaves, below which another that was tried is better.
+# Another limit of the curve is better if its residual is below this share of the given limit's.
 _BETTER = 0.7
-#: % of an output below which a fit explains less than it leaves.
+#: VAF (%) of an output below which a fit is not usable.
 LITTLE = 50.0
 
 
@@ -49,47 +49,43 @@ LITTLE = 50.0
 class FittedParameter:
     """A physical parameter of the plant that was fitted with the gain."""
 
-    name: str  # An argument of the plant's function
-    nominal: float  # In its unit
+    name: str  # Argument of the plant's function
+    nominal: float  # In the unit of the parameter
     value: float
-    # Standard deviation of the value, in its unit; infinite when nothing determines it
-    deviation: float
-    stated: float | None = None  # Standard deviation that was stated, in its unit; None when free
-    share: float = 0.0  # Of the variance of the gain's entries, on average, that it causes
+    deviation: float  # Standard error of the value; infinite if not determined
+    stated: float | None = None  # Stated standard deviation; None if the parameter is free
+    share: float = 0.0  # Mean share of the variance of the gain's entries that it causes
 
     @property
     def learned(self) -> float:
-        """Standard deviation after the fit over the stated one: 1 where nothing was learned."""
+        """Standard error after the fit over the stated one: 1 if nothing was learned."""
         return self.deviation / self.stated if self.stated else 0.0
 
     @property
     def pull(self) -> float:
-        """How far it was moved, in stated deviations; NaN when it is free."""
+        """Change by the fit in stated standard deviations; NaN if it is free."""
         return (self.value - self.nominal) / self.stated if self.stated else float("nan")
 
     @property
     def determined(self) -> bool:
-        """Whether it is identified: to a factor of e at 95 %, its logarithm to 0.5.
-
-        What is not stays near its nominal value, where the search began.
-        """
+        """Whether it is identified: standard error of its logarithm below 0.5."""
         return self.deviation < PARAMETER * self.value
 
 
 class LimitFound(NamedTuple):
-    """The limit of a control as the recordings have it, in its shown unit."""
+    """Estimated limit of an input, in its shown unit."""
 
     given: float
     value: float
     low: float  # At 95 %
     high: float
     unit: str
-    known: float  # How far it may be from the given one by what was stated about it
-    fitted: bool = True  # Whether low and high are of 95 %, else the next limits that were tried
+    known: float  # Largest difference from the given limit that its stated uncertainty allows
+    fitted: bool = True  # True: low and high are a 95 % interval; False: the next limits tried
 
     @property
     def disagrees(self) -> bool:
-        """Whether the given limit is outside the interval, and beyond what was stated."""
+        """Whether the given limit is outside the interval, and further off than was stated."""
         outside = not self.low <= self.given <= self.high
         return outside and abs(self.value - self.given) > max(self.known, 0.01 * self.given)
 
@@ -99,44 +95,44 @@ class FitResult:
     """Result of `fit_recordings`."""
 
     settings: FitSettings
-    given: Problem  # The problem as it was posed: nominal plant, trials at rest
-    # Weights and their gain; `fitted.problem` holds the initial states and the plant found
+    given: Problem  # Problem as posed: nominal plant, trials at rest
+    # Weights and their gain; `fitted.problem` holds the fitted initial states and plant
     fitted: Estimate
-    # The gain that the recordings identify, and how far: what is printed with intervals
+    # Gain fitted without weights, with standard errors; the report prints its intervals
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
     intent: Intent
-    # Directions of the weights that the recordings determine, and how many they leave
+    # Identified directions of the weights, and number of the others
     identifiability: Identifiability
-    # Intervals, the set of weights with this gain, and what else was asked for
+    # Intervals, the set of weights with this gain, and other requested analyses
     uncertainty: Uncertainty
-    trials: tuple[TrialAgreement, ...]  # Of inverse MPC, one a trial
-    held_out: tuple[HeldOut, ...]  # One a trial; empty for a single trial or when not asked for
-    # Those of `impc.inverse.methods` that a fit asks for; the last is inverse MPC
+    trials: tuple[TrialAgreement, ...]  # Inverse MPC, one per trial
+    held_out: tuple[HeldOut, ...]  # One per trial; empty for a single trial or if not requested
+    # Requested methods; the last is inverse MPC
     methods: tuple[MethodFit, ...]
-    # The tests of the model: of the first fit and, where one unknown was added, of the last
+    # Tests of the model in the first fit and, if an unknown was added, in the last
     lack: tuple[LackOfFit | None, ...]
-    # Largest change of a scaled output when the terminal set is added (or taken away); NaN when the
-    # loop with it does not reach the end
+    # Largest change of a scaled output if the terminal set is added (or removed); NaN if a
+    # simulation then stops early
     terminal_set_difference: float
-    seconds: float  # Time of the whole fit, s
-    weights_test: WeightsTest  # Whether any weights explain the gain
-    # Stages that failed, and why; what they would have found is missing
+    seconds: float  # Run time of the whole fit, s
+    weights_test: WeightsTest  # Test whether any weights explain the gain
+    # Stages that failed, with the reason; their results are missing
     failures: Mapping[str, str] = field(default_factory=dict)
-    # Those that were asked for, that of [fit.structure] first
+    # Requested structures, [fit.structure] first
     structures: tuple[StructureFit, ...] = ()
-    person: PersonReport | None = None  # Of [fit.observer]; None where none was asked for
-    # The part of the outputs that repeats with the perturbation; None where it does not repeat
+    person: PersonReport | None = None  # Result of [fit.observer]; None if not requested
+    # Part of the outputs that repeats with the perturbation; None if it does not repeat
     ceiling: Ceiling | None = None
-    # The gain by regression on recorded commands (`command_regression`); None where there are none
+    # Gain by regression on recorded commands (`command_regression`); None if there are none
     commands: pd.DataFrame | None = None
-    curves: tuple[LimitCurve, ...] = ()  # Of the controls that reach their limit
+    curves: tuple[LimitCurve, ...] = ()  # For the inputs that reach their limit
     response: FrequencyResponse | None = None  # From the perturbation to the outputs
-    falls: tuple[str, ...] = ()  # Trials that ended in a fall and were not fitted, and when
+    falls: tuple[str, ...] = ()  # Trials that ended in a fall and were not fitted, with the time
 
     @property
     def limit_found(self) -> LimitFound | None:
-        """The limit of the first control that has one, where it was estimated."""
+        """Estimated limit of the first input that has one; None if not estimated."""
         for control, item in zip(self.given.plant.controls, self.uncertainty.limits, strict=False):
             if item.value is not None:
                 given = float(self.given.bounds.u_max[self.given.plant.controls.index(control)])
@@ -164,23 +160,23 @@ class FitResult:
 
     @property
     def usable(self) -> bool:
-        """Whether half of every recorded signal is explained: else nothing may be said."""
+        """Whether the VAF of every recorded signal is at least 50 %."""
         return bool(np.all(self.inverse_mpc.vaf >= LITTLE))
 
     @property
     def gain_vaf(self) -> float:
-        """Variance that the identified gain explains, over all outputs in their scales, %."""
+        """Variance that the estimated gain explains, over all scaled outputs, %."""
         size = recorded_size(self.given)
         return 100 * (1 - (self.estimate.misfit / size) ** 2) if size else float("nan")
 
     @property
     def met(self) -> bool:
-        """Whether a bound of an input or a state is active at any sample."""
+        """Whether any bound (input, state, terminal set) is active at any sample."""
         return any(np.any(run.status != Status.FREE) for run in self.inverse_mpc.runs)
 
     @property
     def gain_intervals(self) -> tuple[Interval, ...]:
-        """The intervals of the gain's entries, by the sandwich."""
+        """Intervals of the gain's entries from the sandwich (HAC) covariance."""
         names = entry_names(self.given.plant)
         return tuple(
             item
@@ -190,7 +186,7 @@ class FitResult:
 
     @property
     def preferred(self) -> dict[str, Interval]:
-        """The first interval of every number by its name: the sandwich's, where it has one."""
+        """First interval of every number by its name: from the sandwich if there is one."""
         first: dict[str, Interval] = {}
         for item in self.uncertainty.intervals:
             first.setdefault(item.name, item)
@@ -198,51 +194,51 @@ class FitResult:
 
     @property
     def compared(self) -> tuple[Statement, ...]:
-        """Comparisons of cost that were tried."""
+        """All comparisons of cost, decided or not."""
         return () if self.uncertainty.weights is None else self.uncertainty.weights.statements
 
     @property
     def reported_P(self) -> Array:  # noqa: N802
-        """Terminal weight (3.4) of the reported weights (n, n)."""
+        """Terminal weight (3.4) of the reported weights, shape (n, n)."""
         return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
 
     @property
     def widest_angle(self) -> float:
-        """How far other weights with this gain turn the dominant direction, degrees."""
+        """Largest angle between dominant directions of weights with this gain, degrees."""
         found = self.uncertainty.weights
         over_set = 0.0 if found is None else found.widest_angle
         return max(self.intent.widest_angle, over_set)
 
     @property
     def added(self) -> ModelError | None:
-        """What a first fit was found to lack, so that it was fitted too."""
+        """Model error that the first fit pointed to and that was added as an unknown."""
         first = self.lack[0]
         return first.culprit if len(self.lack) > 1 and first is not None else None
 
     @property
     def culprit(self) -> ModelError | None:
-        """What explains most of what follows the perturbation in the last fit's residuals."""
+        """Model error with the smallest p-value in the last fit, if its tests reject."""
         return None if self.lack[-1] is None else self.lack[-1].culprit
 
     @property
     def saturated(self) -> float:
-        """Share of the samples at which the command is at its bound."""
+        """Share of samples at which the command is at its bound, between 0 and 1."""
         return sum(item.saturated for item in self.trials) / len(self.trials)
 
     @property
     def inverse_mpc(self) -> MethodFit:
-        """The method that the page is about."""
+        """The fit by inverse MPC."""
         return self.methods[-1]
 
 
 def trial_name(result: FitResult, index: int) -> str:
-    """What the trial `index` is called: as its file says, else by its number."""
+    """Name of the trial `index`: from its file, else its number."""
     name = result.given.recordings[index].label.trial or str(index + 1)
     return f"Trial {name}" if name.isdigit() else name
 
 
 def shown_trials(result: FitResult) -> list[int]:
-    """Trials of a `result` that have a figure: all, or of many those that are explained least."""
+    """Trials with a figure: all, or the `MOST_TRIALS` with the smallest VAF."""
     explained = [float(np.mean(item.vaf)) for item in result.trials]
     least = sorted(range(len(explained)), key=lambda index: explained[index])
     return sorted(least[:MOST_TRIALS])

@@ -1,4 +1,4 @@
-"""Settings of a fit, as the [fit] table of a configuration gives them (docs/fitting.md)."""
+"""Settings of a fit: the [fit] table of a configuration (docs/ref/settings.md)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from impc.files.plant_sources import PlantSource
 
-# Percentiles of 95 % lie between replicates only from 20 on.
+# Fewest replicates for percentiles of 95 %.
 _FEWEST = 20
-# Settings that ask for assessments which not every command makes.
+# Settings that not every command supports.
 _OF_SOME = (
     "feedback_states",
     "horizons",
@@ -33,113 +33,141 @@ _OF_SOME = (
     "structures",
     "unknown_limit",
 )
-_PAGES = {"fit": "docs/fitting.md", "plan": "docs/planning.md", "select": "docs/selection.md"}
+_PAGE = "docs/ref/settings.md"
 
-#: Methods that a fit shows beside inverse MPC, which comes last (docs/fitting.md).
+#: Methods that a fit compares with inverse MPC by default (docs/howto/compare.md).
 BESIDE = ("feedback_gain", "inverse_lqr", "inverse_lqr_output", "clipped_lqr")
 
-Length = Annotated[int, Meta(ge=1, le=5000)]  # Of a horizon, in samples
+Length = Annotated[int, Meta(ge=1, le=5000)]  # Horizon in samples
 Rate = Annotated[float, Meta(ge=0)]  # 1/s
 T = TypeVar("T")
 
 
 class StructureSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What may be costed, by name (`impc.model.structure`)."""
+    """Structure of the cost weights (docs/howto/weights.md).
 
-    # "diagonal", "full", for Q "outputs", or features with a cost weight each
+    Attributes
+    ----------
+    Q : str or list of str
+        Penalised features of the states: "diagonal" (one cost weight for each state), "full" (all
+        entries of Q), "outputs" (one cost weight for each output), or a list of features such as
+        "theta2 - 0.5 theta1" with one cost weight each.
+    R : str or list of str
+        The same for the commands: "diagonal", "full" or a list of features.
+    over : list of str, optional
+        Features that "diagonal" or "full" of Q refers to. Not given: all states.
+    name : str, optional
+        Name of the structure in tables and sentences.
+    """
+
     Q: str | list[str] = "diagonal"
     R: str | list[str] = "diagonal"
-    # Features that "diagonal" or "full" is over; all states by default
     over: list[str] | None = None
-    name: str | None = None  # In tables and sentences
+    name: str | None = None
 
 
 class ObserverSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a person senses, and which noise is in the loop (`impc.model.observer`)."""
+    """Senses of a person and noise in the loop (docs/why/output_feedback.md).
 
-    # Combinations of states and outputs; none for a person who sees every state
+    Attributes
+    ----------
+    sensed : list of str
+        Signals that the person senses with noise: states, outputs, or linear combinations of them.
+        Empty: the person observes all states exactly.
+    motor : bool
+        Whether the commands have additive noise; its standard deviation is estimated.
+    share : bool
+        Whether the commands have signal-dependent noise, proportional to the command; its
+        proportion is estimated.
+    process : bool
+        Whether the states have process noise; its standard deviation is estimated.
+    known : bool
+        Whether the person knows the perturbation.
+    profiles : bool
+        Whether weakly identified gains and noise standard deviations get profile-likelihood
+        intervals. This takes ten minutes or more on the seat.
+    """
+
     sensed: list[str] = []
-    motor: bool = True  # Whether there is such noise; its size is searched
+    motor: bool = True
     share: bool = False
     process: bool = False
-    known: bool = True  # Whether the person knows the perturbation
-    # Whether intervals of the gain and of levels that are weakly identified follow the likelihood:
-    # ten minutes and more on the seat
+    known: bool = True
     profiles: bool = False
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What a user may set of a fit.
+    """Settings of a fit: the [fit] table.
 
     Attributes
     ----------
     horizon : int
-        N, in samples.
-    u_max : float or list of float or None
-        Largest magnitude of each input, in its unit; None where there is no bound.
+        Prediction horizon of the controller in samples.
+    u_max : float or list of float, optional
+        Largest magnitude of each input, in its unit. Not given: no limit.
     bounded_states : dict of str to float or "data"
-        Largest magnitude of states by name, in their SI units. "data" takes the largest recorded
-        value of an output of that name, or of the derivative of output y for a state `y_rate`,
-        times `margin` (3.22).
+        Largest magnitude of states by name, in SI units. "data": the largest recorded value of the
+        output of that name (for a state `y_rate`, of the derivative of output y) times `margin`
+        (3.22).
     margin : float
-        At 1 the bound lies on the recorded maximum, and a controller that never met a bound would
-        meet one there: on the simulated seat a margin of 1 changes the angles by one to two
-        hundredths of a radian, 1.05 by nothing.
+        Factor of "data" in `bounded_states`. With 1 the bound equals the recorded maximum, so that
+        the fitted controller reaches it even if the person had no such bound.
     terminal_set : bool or "auto"
-        Whether the controller ends in its maximal invariant set. "auto" takes what explains the
-        recordings better: without it, unless that leaves more than white noise.
+        Whether the controller has the maximal invariant set as terminal set. "auto": no terminal
+        set, unless the fit without it leaves more than white noise and the fit with it is better.
     free : list of str
-        Physical parameters of the plant that are fitted with the gain (3.19), and
-        "observer_rate", or "observer_rate.<disturbance>", where that is given.
+        Physical parameters of the plant that are fitted with the gain (3.19); also "observer_rate"
+        or "observer_rate.<disturbance>" if that rate is given.
     rates : bool or dict of str to float
-        Whether the controls are changes of the commands (`with_rates`); limits of the change per
-        sample by the name of a command, in its unit. `u_max` stays the limit of the commands.
-    observer_rate : float or dict of str to float or None
-        Rate at which the controller learns disturbances that last (`with_observer`), 1/s, of all
-        or by name; infinite where it knows them. None: it takes none for lasting.
+        Whether the controller decides on changes of the commands (`with_rates`). A table also sets
+        limits of the change per sample by command name, in the unit of the command. `u_max` remains
+        the limit of the commands.
+    observer_rate : float or dict of str to float, optional
+        Rate in 1/s at which the controller learns persistent disturbances (`with_observer`), for
+        all or by name; inf: they are known at once. Not given: the controller ignores them.
     preview : int
-        Samples that all targets are known ahead (`with_preview`).
+        Number of samples that all targets are known ahead (`with_preview`).
     offsets : list of str
-        Outputs with an offset that is not known, one a trial (`Problem.offsets`).
+        Outputs with an unknown constant offset in each trial (`Problem.offsets`).
     feedback_states : list of str
-        States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits; it is left
-        out when there are none.
+        States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits. Empty: no
+        preliminary estimate.
     settle : float
-        Seconds at the start of a left-out trial that serve to find its initial state and do not
-        count in its VAF.
+        Time in s at the start of a left-out trial that is used to estimate its initial state and
+        is not counted in its VAF.
     held_out : bool
-        Whether each trial is predicted from the others.
+        Whether each trial is also predicted by a fit to the other trials.
     replicates : int
-        Bootstrap replicates; 0 for none, else at least 20.
+        Number of bootstrap replicates: 0 (none) or at least 20.
     bootstrap : "block"
-        How residuals are drawn: in moving blocks (`impc.assess.resampling`).
+        Resampling of the residuals: moving blocks.
     seed : int
-        Of the bootstrap.
+        Seed of the bootstrap.
     profiles : list of str
-        Entries of the gain, K.<control>.<state>, and free parameters whose profile likelihood is
-        wanted.
+        Entries of the gain, K.<control>.<state>, and free parameters that get profile-likelihood
+        intervals.
     intent_draws : bool
-        Whether statements on the intent are tried on gains that the recordings allow beside the
-        fitted one (`impc.assess.intent_draws`); without that none is made.
+        Whether comparisons of cost are tried on other gains that the recordings allow. With false,
+        no comparison is decided.
     unknown_limit : bool
         Whether the limit of each input is estimated too.
     horizons : list of int
-        Other horizons, in samples, to compare with; and the fit without limit beside them.
+        Other horizons in samples to compare with; adds a fit without limit to the comparison.
     methods : list of str
-        Methods that are shown beside inverse MPC, by their names in `impc.inverse.methods`.
-    structure : StructureSettings or None
-        What may be costed: the table [fit.structure]. None: any weights, and no word on it. The
-        gain of a person who senses with noise keeps to gains of such weights.
+        Methods that are compared with inverse MPC, by name.
+    structure : StructureSettings, optional
+        Structure of the cost weights: the table [fit.structure]. Not given: any weights, no test.
+        With [fit.observer], the gain is restricted to gains of such weights.
     structures : list of StructureSettings
-        Others, to compare it with.
+        Other structures to compare with.
     body : str
-        What moves in every simulation: "nonlinear", the equations that the plant offers, where it
-        does, or "linear", its matrices in any case.
+        Equations of motion in all simulations: "nonlinear" (those of the plant, if it has any) or
+        "linear" (its matrices).
     solver : str
-        What solves the controller's quadratic programs (`impc.control.named_solver`).
-    observer : ObserverSettings or None
-        A person who senses with noise: the table [fit.observer]. None: no word on it.
+        Solver of the controller's quadratic programs: compiled, daqp, qpoases or ipopt.
+    observer : ObserverSettings, optional
+        Model with sensory and motor noise: the table [fit.observer]. Not given: no such model.
 
     Examples
     --------
@@ -178,34 +206,34 @@ class FitSettings:
 
 
 def plain_settings(settings: FitSettings) -> dict[str, Any]:
-    """Settings as result.json has them; numbers of numpy as Python's."""
+    """Settings as built-in Python types, for result.json."""
     found: dict[str, Any] = msgspec.to_builtins(settings, enc_hook=lambda number: number.item())
     return found
 
 
 def require_used(settings: FitSettings, used: Collection[str], command: str) -> None:
-    """Refuse what is set and not used, so that nothing is left out without a word."""
+    """Raise InputError if a setting is given that the command does not use."""
     usual = FitSettings()
     for name in _OF_SOME:
         if name not in used and getattr(settings, name) != getattr(usual, name):
             raise InputError(
                 f"[fit] {name}",
                 f"is not used by impc {command}",
-                "take the line out, or use impc fit",
+                "remove the line, or use impc fit",
             )
 
 
 def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
-    """The `table` of a file that is called `name`, as a dataclass of this `kind`."""
+    """Convert the `table` called `name` of a file to a dataclass of this `kind`."""
 
     def where(path: str) -> str:
-        """The path structure.over as [fit.structure] over."""
+        """Format the path structure.over as "[fit.structure] over"."""
         *tables, key = path.split(".")
         return f"[{'.'.join((name, *tables))}] {key}".rstrip()
 
     known = (item.name for item in fields(kind))  # type: ignore[arg-type]
     require_known(where, table, known, "is not a setting")
-    return converted(where, table, kind, f"see {_PAGES[name]}")
+    return converted(where, table, kind, f"see {_PAGE}")
 
 
 def fit_settings(table: Mapping[str, Any]) -> FitSettings:
@@ -213,7 +241,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     for name, value in table.items():
         if value == FILL_IN:
             raise InputError(
-                f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or take the line out"
+                f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or remove the line"
             )
     if table.get("bootstrap") == "model":
         raise InputError("[fit] bootstrap", '"model" was removed', 'use "block"')
@@ -239,17 +267,17 @@ def _require_distinct(settings: FitSettings) -> None:
         given = getattr(settings, name)
         twice = [item for index, item in enumerate(given) if item in given[:index]]
         if twice:
-            raise InputError(f"[fit] {name}", f"names {twice[0]} twice", "name each once")
+            raise InputError(f"[fit] {name}", f"contains {twice[0]} twice", "list each name once")
 
 
 def missing(settings: FitSettings, source: PlantSource) -> str:
-    """What was not given, and what that excludes, in one line; empty where nothing is missing."""
+    """Settings that were not given, and the consequence, in one line; empty if complete."""
     parts = []
     if settings.u_max is None:
-        parts.append("u_max: without a limit of the command inverse MPC is inverse LQR")
+        parts.append("u_max: without a limit of the command, inverse MPC equals inverse LQR")
     typical = source.assumed()
     own = [name for name in typical if name not in settings.free]
     if own:
         values = ", ".join(f"{name} {typical[name]}" for name in own)
-        parts.append(f"the subject's own {' and '.join(own)}: the gains are those of {values}")
+        parts.append(f"the subject's own {' and '.join(own)}: the gains assume {values}")
     return f"Not given: {'; '.join(parts)}." if parts else ""

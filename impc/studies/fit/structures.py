@@ -1,4 +1,4 @@
-"""What a fit says of structures of the weights (docs/structures.md)."""
+"""Report section on structures of the cost weights (docs/howto/weights.md)."""
 
 from __future__ import annotations
 
@@ -26,28 +26,29 @@ if TYPE_CHECKING:
     from impc.assess.structures import StructureFit
     from impc.studies.fit.result import FitResult
 
-# A test that rejects a departure less often than this has little power.
+# Power below which the test is said to have little power.
 _BLIND = 0.1
 _PICTURE = Picture(
     "structured-weights",
     "Cost weights of the features with their intervals, one row each, on a logarithmic axis",
     "Cost weights within the structure, at a cost weight of one for the first input, with 95 % "
-    "intervals that allow for autocorrelated residuals. An arrow: it may be zero.",
+    "intervals that allow for autocorrelated residuals. An arrow marks an interval that goes on; "
+    "to the left, the cost weight may be zero.",
 )
-# docs/structures.md, What was measured.
+# Coverage of intervals at a zero cost weight: experiments/structures.md.
 _AT_ZERO = (
-    "Where the best cost weight is zero, 95 % intervals contained the true value in 78 to 96 % of "
-    "simulated seats: take the intervals of all cost weights as somewhat wider."
+    "If the best cost weight is zero, 95 % intervals contained the true value in 78 to 96 % of "
+    "simulated seats: treat the intervals of all cost weights as somewhat too narrow."
 )
-# The test holds its level where noise is in the recorder and the plant is the body.
+# The test keeps its level only with measurement noise and a correct plant.
 _OF_THE_MODEL = (
-    "The recordings also show an error of the body model or of the controller, whatever the "
-    "weights: the structure may be rejected for that error alone."
+    "The recordings also indicate an error of the body model or of the controller, whatever the "
+    "weights: that error alone may be the reason why the structure is rejected."
 )
 
 
 def structure_section(result: FitResult) -> Section:
-    """Section of the page."""
+    """Section of the report."""
     found = result.structures[0]
     blocks: list[Block] = list(structure_sentences(result))
     if found.estimate is not None:
@@ -59,7 +60,7 @@ def structure_section(result: FitResult) -> Section:
 
 
 def structure_data(result: FitResult) -> list[dict[str, Any]]:
-    """Weights and gain of every structure, for result.json."""
+    """`structures` in result.json: weights and gain of each structure."""
     rows = []
     for found in result.structures:
         structure, estimate = found.structure, found.estimate
@@ -74,7 +75,7 @@ def structure_data(result: FitResult) -> list[dict[str, Any]]:
 
 
 def structure_draw(result: FitResult) -> Draw:
-    """How the cost weights of the first structure are drawn."""
+    """Function that draws the cost weights of the first structure."""
     found = result.structures[0]
     ends = np.exp([[item.low, item.high] for item in found.intervals])
     values = np.exp([item.value for item in found.intervals])
@@ -84,7 +85,7 @@ def structure_draw(result: FitResult) -> Draw:
 
 
 def structure_sentences(result: FitResult) -> list[str]:
-    """What may be said within the first structure; nothing where none was given."""
+    """Sentences on the first structure; empty if none was given."""
     if not result.structures:
         return []
     found = result.structures[0]
@@ -110,36 +111,36 @@ def structure_sentences(result: FitResult) -> list[str]:
 
 
 def _outcome(found: StructureFit) -> str:
-    """How the test of a structure came out."""
+    """Outcome of the test of a structure."""
     name, test = found.structure.name, found.test
     if test is None:
         return f"The structure “{name}” has no result: {found.reason}."
     tested = f"{probability(test.probability)}, {test.freedom} directions of the gain"
     if test.refused:
         return (
-            f"The structure “{name}” is rejected: other gains explain what its weights leave "
-            f"({tested}). Its cost weights are not those of the person."
+            f"The recordings reject the structure “{name}” ({tested}): gains outside it explain "
+            "them better. Do not interpret its cost weights."
         )
-    within = "Within it statements on cost weights need no convention."
+    within = "If it holds, its cost weights need no further convention."
     if test.freedom:
-        return f"The structure “{name}” is not rejected ({tested}). {within}"
+        return f"The recordings do not reject the structure “{name}” ({tested}). {within}"
     return (
-        f"The structure “{name}” could not be tested: the recordings identify nothing of the gain "
+        f"The structure “{name}” was not tested: the recordings determine nothing about the gain "
         f"beyond it. {within}"
     )
 
 
 def _identified(result: FitResult, found: StructureFit) -> str:
-    """How many combinations are identified, and which unknowns are not."""
+    """Number of identified combinations, and the unknowns that are not identified."""
     covariance, structure, limit = found.covariance, found.structure, np.log(IDENTIFIED_FACTOR)
     assert covariance is not None
     text = (
         f"Of its {structure.count} unknowns the recordings identify {found.identified} "
-        f"combinations to a factor of {IDENTIFIED_FACTOR:g} or better"
+        f"combinations to within a factor of {IDENTIFIED_FACTOR:g}"
     )
     each = zip(_names(result, structure.unknowns), covariance.each, strict=True)
     loose = [name for name, own in each if not TWO_SIDED * own < limit]
-    return f"{text}; not by themselves: {', '.join(loose)}." if loose else f"{text}."
+    return f"{text}; not individually: {', '.join(loose)}." if loose else f"{text}."
 
 
 def _names(result: FitResult, features: Sequence[str]) -> tuple[str, ...]:
@@ -163,9 +164,9 @@ def _cost_weights(result: FitResult, found: StructureFit) -> Finding:
     return Finding(
         "structure_cost_weights",
         pd.DataFrame(rows, columns=heads),
-        "Unknowns of the structure: cost weights over that of the first command, in SI units, "
-        "with 95 % intervals that allow for autocorrelated residuals. Last: what the feature costs "
-        "at its typical size, over what the command costs.",
+        "Unknowns of the structure: cost weights relative to that of the first command, in SI "
+        "units, with 95 % intervals that allow for autocorrelated residuals. Last column: cost of "
+        "the feature at its typical size, relative to the cost of the command.",
         figure=_PICTURE if found.ratios else None,
         labels={"of": "Cost weight of"},
         hidden=["feature"],
@@ -183,7 +184,7 @@ def _ratios(result: FitResult, found: StructureFit) -> Finding:
             "high": lambda item: float(np.exp(item.interval.high)),
         },
     )
-    caption = "What one feature costs over another, both at their typical size (95 %)."
+    caption = "Cost of one feature relative to another, both at their typical size (95 %)."
     fold = "Ratios of cost weights"
     return Finding("structure_ratios", table, caption, digits=3, folded=fold)
 
@@ -197,10 +198,10 @@ def _powers(result: FitResult, found: StructureFit) -> Finding:
         },
     )
     caption = (
-        "Power of the test: how probably it rejects the structure for a cross term as large as "
-        "half the geometric mean of two cost weights, at a level of 5 %."
+        "Power of the test: probability that it rejects the structure at a level of 5 % if there "
+        "is a cross term of half the geometric mean of two cost weights."
     )
-    fold = "What the test would see"
+    fold = "Power of the test"
     return Finding("structure_power", table, caption, digits=2, folded=fold)
 
 
@@ -231,8 +232,9 @@ def _comparison(result: FitResult) -> Finding:
     return Finding(
         "structures",
         pd.DataFrame(rows, columns=heads),
-        "Every structure on the same recordings. A structure with p below 0.05 is rejected. AIC: "
-        "of the innovations of the residuals, two for each combination that is identified.",
-        labels={**labels, "aic_above_the_least": "AIC above the least"},
+        "All structures on the same recordings. A structure with p below 0.05 is rejected. AIC: "
+        "from the innovations of the residuals, with a penalty of two for each identified "
+        "combination.",
+        labels={**labels, "aic_above_the_least": "AIC above the smallest"},
         hidden=[name for name in labels if name.startswith("vaf" if held else "left_out")],
     )

@@ -1,8 +1,8 @@
-"""Section 3.5 as one function: from the recordings of a subject to a `FitResult`.
+"""Fit the bounded controller of a subject to all trials (section 3.5).
 
-Preliminary gain and physical parameters (3.19), bounds (3.22), weights of the constrained
-controller over all trials at once with an initial state for each, VAF (3.24) in and out of sample,
-intent (3.23) to (3.26), and the same recordings by inverse LQR.
+Preliminary gain and physical parameters (3.19), bounds (3.22), weights of the controller from all
+trials with an initial state for each, VAF (3.24) in fitted and left-out trials, intent (3.23) to
+(3.26), and the other methods on the same recordings.
 """
 
 from __future__ import annotations
@@ -72,26 +72,25 @@ if TYPE_CHECKING:
     from impc.output_feedback.page import PersonReport
 
 _THREADS = 2
-_UNUSABLE = "the controller explains less than half of a recorded signal."
+_UNUSABLE = "the controller explains less than half of a recorded signal (VAF below 50 %)."
 
 
 @dataclass(frozen=True)
 class FitProgress:
-    """What a caller wants to hear of a fit, and what it remembers of an earlier one."""
+    """Callbacks that report progress and return stored results of an interrupted fit."""
 
-    done: Callable[[str], None] = lambda _: None  # Given the name of each stage when it is done
-    # (name of stage, compute) -> the estimate, from memory when it is there
-    # (`impc.studies.fit.memory`). By default every one is computed.
+    done: Callable[[str], None] = lambda _: None  # Called with the name of each completed stage
+    # (name of stage, compute) -> estimate, stored (`impc.studies.fit.memory`) or computed
     estimate: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute()
-    # (name of stage, compute) -> a bootstrap replicate, in the same way
+    # (name of stage, compute) -> bootstrap replicate, stored or computed
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
-    # (name of stage, compute, encode, decode) -> what an optional subpackage finds, likewise
+    # (name of stage, compute, encode, decode) -> result of an optional subpackage
     part: Callable[..., Any] = lambda _name, compute, _encode, _decode: compute()
-    # The same for another problem, which has one unknown more; None where nothing is remembered
+    # Callbacks for a problem with one more unknown; None if nothing is stored
     about: Callable[[Problem], FitProgress] | None = None
 
     def anew(self, problem: Problem) -> FitProgress:
-        """The same for another problem."""
+        """Callbacks for another problem."""
         return FitProgress(self.done) if self.about is None else self.about(problem)
 
 
@@ -109,7 +108,7 @@ def stages(problem: Problem, settings: FitSettings) -> int:
 
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:
-    """Methods that are shown beside inverse MPC, in the order of the table."""
+    """Methods that are compared with inverse MPC, in the order of the table."""
     first = ("preliminary",) if settings.feedback_states else ()
     return (*first, *settings.methods)
 
@@ -121,12 +120,29 @@ def fit_problem(
     settings: FitSettings,
     family: PlantFamily | None = None,
 ) -> Problem:
-    """Pose the inverse problem of a subject: outputs scaled by their size, starts unknown.
+    """Pose the inverse problem of a subject with scaled outputs and unknown initial states.
+
+    Parameters
+    ----------
+    plant : Plant
+        Plant; its disturbances are the recorded perturbations.
+    recordings : sequence of Recording
+        Trials of one subject.
+    settings : FitSettings
+        Horizon, bounds and options.
+    family : PlantFamily, optional
+        Plant as a function of the physical parameters that are fitted with the gain.
+
+    Returns
+    -------
+    Problem
+        Each output is scaled by its root mean square over all trials.
 
     Raises
     ------
     DataError, InputError, BoundsError
-        When there is no recording, an output is zero throughout, or a bound cannot be set.
+        If there is no recording, a trial is too short, an output is zero in all trials, or a bound
+        cannot be set.
 
     Examples
     --------
@@ -140,7 +156,7 @@ def fit_problem(
     (True, array([0.5]))
     """
     if not recordings:
-        raise DataError("recordings", "there are none", "give at least one trial")
+        raise DataError("recordings", "the list is empty", "pass at least one trial")
     outputs = np.concatenate([trial.outputs for trial in recordings])
     scale = np.sqrt(np.nanmean(outputs**2, axis=0))
     for name, size in zip(plant.outputs, scale, strict=True):
@@ -151,8 +167,8 @@ def fit_problem(
     if shortest <= least:
         raise DataError(
             "recordings",
-            f"the shortest has {shortest} samples, {least} serve to find where it starts",
-            "give longer ones, or lower [fit] settle",
+            f"the shortest trial has {shortest} samples, but its initial state needs {least}",
+            "use longer trials, or lower [fit] settle",
         )
     require_dressed(plant, settings)
     plant, family = moving_body(plant, family, settings)
@@ -177,9 +193,9 @@ def fit_recordings(
     settings: FitSettings,
     progress: FitProgress | Callable[[str], None] | bool | None = None,
 ) -> FitResult:
-    """Fit a subject: all that `impc fit` says, as values.
+    """Fit a subject as `impc fit` does.
 
-    With True for `progress` a bar is drawn; a callable is given the name of each stage.
+    With `progress` True a bar is shown; a callable is called with the name of each completed stage.
     """
     if progress is True:
         with tqdm(total=stages(problem, settings), unit="stage") as bar:
@@ -190,14 +206,14 @@ def fit_recordings(
 
             return fit_recordings(problem, settings, advance)
     if settings.observer is not None:
-        output_feedback()  # refused at once where it is not installed
+        output_feedback()  # raises early if it is not installed
     if not isinstance(progress, FitProgress):
         progress = FitProgress(progress) if callable(progress) else FitProgress()
     return _fitted(problem, settings, progress)
 
 
 def _attempt(failures: dict[str, str], stage: str, compute: Callable[[], Any], default: Any) -> Any:
-    """What a stage finds; where it fails the default, and why among the failures."""
+    """Result of a stage; if it fails, the default, with the reason in `failures`."""
     try:
         return compute()
     except (ImpcError, np.linalg.LinAlgError) as error:
@@ -211,7 +227,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     attempt = functools.partial(_attempt, failures)
     problem, progress, fitted, estimate, lack = _first_fits(problem, progress, attempt)
     found = _estimates(problem, fitted, settings, progress)
-    if not np.array_equal(found["inverse_mpc"].gain, fitted.gain):  # another method's was better
+    if not np.array_equal(found["inverse_mpc"].gain, fitted.gain):  # improved from another method
         estimate = gain_estimate(found["inverse_mpc"])
     fitted = found["inverse_mpc"]
     known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
@@ -223,7 +239,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     test = weights_test(fitted, estimate, contradicted=doubted)
 
     def whole_set() -> tuple[WeightsSummary | None, str]:
-        """The set of weights with the gain, or why nothing may be said of it."""
+        """Summary of all weights with the fitted gain, or None and the reason."""
         if not usable or test.rejected:
             return None, test.sentence if usable else _UNUSABLE
         drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
@@ -253,7 +269,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         held_out,
         methods,
         lack,
-        _terminal_set_difference(methods[-1]),
+        attempt("terminal set", functools.partial(_terminal_set_difference, methods[-1]), np.nan),
         time.perf_counter() - started,
         test,
         failures,
@@ -267,14 +283,14 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
 
 
 def _curves(fitted: Estimate, own: MethodFit) -> tuple[LimitCurve, ...]:
-    """Other limits of every control that reaches its own."""
+    """Limit curve of each input that reaches its limit."""
     reached = own.largest_input >= (1 - 1e-6) * np.asarray(fitted.problem.bounds.u_max)
     found = [limit_curve(fitted, int(control)) for control in np.flatnonzero(reached)]
     return tuple(curve for curve in found if curve is not None)
 
 
 def _regressed(fitted: Estimate) -> pd.DataFrame | None:
-    """The gain by regression, where commands were recorded; of changes the first is not known."""
+    """Gain by regression on recorded commands; None without them, or for command changes."""
     problem = fitted.problem
     recorded = any(len(trial.commands) for trial in problem.recordings)
     return command_regression(fitted) if recorded and not problem.plant.commands else None
@@ -283,7 +299,7 @@ def _regressed(fitted: Estimate) -> pd.DataFrame | None:
 def _first_fits(
     problem: Problem, progress: FitProgress, attempt: Attempt
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
-    """Inverse MPC, and once more with an unknown that the first fit is found to lack."""
+    """Inverse MPC, repeated with one more unknown if the tests of the model point to it."""
     lack: list[LackOfFit | None] = []
     while True:
         fitted = progress.estimate("inverse_mpc", functools.partial(fit, problem))
@@ -300,7 +316,7 @@ def _first_fits(
 def _estimates(
     problem: Problem, fitted: Estimate, settings: FitSettings, progress: FitProgress
 ) -> dict[str, Estimate]:
-    """What every method finds, inverse MPC last, none beaten by another's answer."""
+    """Estimates of all methods, inverse MPC last; each also tries the solutions of the others."""
     found = {
         name: progress.estimate(name, functools.partial(METHODS[name].estimate, problem, fitted))
         for name in _beside(settings)
@@ -317,7 +333,7 @@ def _beside_it(
     attempt: Attempt,
     whole_set: Callable[[], tuple[WeightsSummary | None, str]],
 ) -> tuple[tuple[MethodFit, ...], tuple[HeldOut, ...], tuple[WeightsSummary | None, str]]:
-    """The other methods, trials predicted by the rest, and the set of weights, side by side."""
+    """Other methods, left-out trials and the set of weights, computed in parallel."""
     methods, held_out = [own], []
     with threads(_THREADS) as pool:
         pending = _left_out(pool, own.estimate, settings, progress)
@@ -334,7 +350,7 @@ def _beside_it(
         found_set = in_background.result()
         progress.done("set of weights")
     if None in held_out:
-        held_out = []  # the table has a row for each trial, or none
+        held_out = []  # the table has rows for all trials or for none
     if held_out:
         methods[-1] = replace(own, held_out=frozen([item.vaf for item in held_out]))
     return tuple(methods), tuple(held_out), found_set
@@ -347,7 +363,7 @@ def _predicted(other: Future[Estimate], trial: Recording, settle: float) -> Held
 def _person(
     problem: Problem, settings: FitSettings, fitted: Estimate, progress: FitProgress
 ) -> PersonReport | None:
-    """A subject with sensory noise, where one was asked for."""
+    """Fit of the model with sensory noise, if requested."""
     asked = settings.observer
     if asked is None:
         return None
@@ -362,7 +378,7 @@ def _person(
 
 
 def _asked(problem: Problem, asked: ObserverSettings) -> tuple[Any, Array]:
-    """That subject and its perturbation, as `asked_observer` of the subpackage makes them."""
+    """Requested observer and its perturbation (`asked_observer` of the subpackage)."""
     given = msgspec.structs.asdict(asked)
     del given["profiles"]
     found: tuple[Any, Array] = output_feedback().asked_observer(
@@ -374,7 +390,7 @@ def _asked(problem: Problem, asked: ObserverSettings) -> tuple[Any, Array]:
 def _structures(
     problem: Problem, settings: FitSettings, fitted: Estimate, progress: FitProgress
 ) -> tuple[StructureFit, ...]:
-    """Every structure that the settings name, fitted from the weights that fit at all."""
+    """Fits of all structures in the settings, started at the unrestricted weights."""
     found, held_out = [], _leaves_out(len(problem.recordings), settings)
     for index, structure in enumerate(fit_structures(problem.plant, settings)):
         stage = f"structure {index + 1}"
@@ -403,7 +419,7 @@ def _agreements(
 
 
 def _first_guess(plant: Plant, trial: Recording) -> Recording:
-    """Where the search for x0 starts: at rest, or in the first output when nothing drives it."""
+    """Start of the search for x0: rest, or the first output if there is no disturbance."""
     if np.any(trial.disturbance) or np.any(trial.x0):
         return trial
     return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ np.nan_to_num(trial.outputs[0])))
@@ -416,10 +432,7 @@ def _leaves_out(trials: int, settings: FitSettings) -> bool:
 def _left_out(
     pool: ThreadPoolExecutor, fitted: Estimate, settings: FitSettings, progress: FitProgress
 ) -> list[Future[Estimate]]:
-    """Controllers fitted to all trials but one, each from where the fit to all has ended.
-
-    What is uncertain of the body stays as all trials have it.
-    """
+    """Fits to all trials except one, started at the fit to all trials; body parameters fixed."""
     pending = []
     for index in range(len(fitted.problem.recordings)):
         if _leaves_out(len(fitted.problem.recordings), settings):
@@ -457,19 +470,16 @@ def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:
 
 
 def state_sizes(runs: tuple[Simulation, ...]) -> Array:
-    """Root-mean-square of each state (n,); states that never move count as the least that does.
-
-    Of simulated `runs`.
-    """
+    """RMS of each state (n,); for states that stay zero, the smallest RMS of the others."""
     sizes = np.sqrt(np.mean(np.concatenate([run.x for run in runs]) ** 2, axis=0))
     moving = sizes[sizes > 0]
     if len(moving) == 0:
-        raise SolverError("simulation", "no state moves", "check the disturbance's column")
+        raise SolverError("simulation", "all states stay zero", "check the disturbance's column")
     return np.asarray(np.maximum(sizes, np.min(moving)))
 
 
 def _terminal_set_difference(fitted: MethodFit) -> float:
-    """Largest change of a scaled output where the terminal set is added, or taken away."""
+    """Largest change of a scaled output if the terminal set is added (or removed)."""
     found = fitted.estimate
     if aims(found.problem.plant, found.problem.recordings):
         return float("nan")

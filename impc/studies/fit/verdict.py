@@ -1,7 +1,7 @@
-"""What a fit allows to be said: kinds of findings, worst first, and the verdict they add up to.
+"""Verdict of a fit: findings that restrict the report, ordered by severity.
 
-A kind is one function: the result -> a `Kind` where it applies. The page shows the headline of the
-first, and an alert of each; what they forbid is not shown as a result anywhere on the page.
+Each finding is one function that maps the result to a `Kind`, or None if it does not apply. The
+page shows the headline of the first and an alert for each; results that they forbid are hidden.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from impc.studies.fit.result import LITTLE
 if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
 
-# Explained variance (%) below which much is left, and p of a residual that is no recorder's.
+# VAF (%) below which the residual is large; p of the whiteness test that rules out white noise.
 _MUCH, _COLOURED = 90.0, 1e-3
-# Recorded numbers below which a left-out trial says little.
+# Recorded numbers below which the VAF of left-out trials is unreliable.
 _SHORT = 200
-#: What a kind may forbid.
+#: Results that a kind may forbid: gains, cost weights, time at the limit.
 GAIN, WEIGHTS, SHARE = "gain", "weights", "share"
 
 
@@ -56,13 +56,13 @@ class Kind:
 
 
 def fit_kinds(result: FitResult) -> list[Kind]:
-    """Those that apply, worst first."""
+    """Findings that apply, worst first."""
     found = [kind(result) for kind in _KINDS]
     return [kind for kind in found if kind is not None]
 
 
 def forbidden(result: FitResult) -> frozenset[str]:
-    """What none of the page may show as a result."""
+    """Results that the page must not show."""
     return frozenset().union(*(kind.forbids for kind in fit_kinds(result)))
 
 
@@ -81,23 +81,23 @@ def fit_verdict(result: FitResult) -> Verdict:
 
 
 def fallen_verdict(falls: tuple[str, ...]) -> Verdict:
-    """The verdict where nothing was fitted: a fall in every trial."""
+    """Verdict if every trial ended in a fall, so that nothing was fitted."""
     alert = Alert(
         Level.RED,
         "No trial is long enough to fit",
         f"{'; '.join(falls)}.",
-        "The recordings show that the task was too hard, not how it was controlled.",
+        "The recordings show that the task was too hard; they do not show how it was controlled.",
         (
             "Report the times of the falls; they are a result.",
-            "For new recordings, use a weaker perturbation or a more stable seat: impc plan shows "
-            "what would be enough.",
+            "For new recordings, use a weaker perturbation or a more stable seat: impc plan "
+            "predicts the number of falls.",
             "If nobody fell, a recording has a jump or a wrong unit: run impc inspect.",
         ),
     )
     return Verdict(
         Level.RED,
         "The person fell in every trial.",
-        "Nothing was fitted: from a fall on, nobody is balancing.",
+        "Nothing was fitted: after a fall the person no longer balances.",
         [alert],
         [Claim("The number and times of the falls.")],
         [Claim("Gains, torque limit, cost weights.", "No controller was fitted.")],
@@ -105,15 +105,15 @@ def fallen_verdict(falls: tuple[str, ...]) -> Verdict:
 
 
 def _explained(result: FitResult) -> tuple[str, str, Alert | None]:
-    """Headline and sentence where nothing restricts, and a note on the limit where one is due."""
+    """Headline and sentence of a green verdict, and a note if no limit was reached."""
     limit = given_limit(result)
     if limit is None:
         note = Alert(
             Level.NOTE,
             "Note: no limit of the command was given",
-            "The model was fitted without a limit: it is the one of inverse LQR.",
-            "Gains and cost weights hold if the person never met a limit.",
-            ("Set u_max in [fit] to ask whether a limit matters.",),
+            "The model was fitted without a limit: it is the model of inverse LQR.",
+            "Gains and cost weights are valid only if the person never reached a limit.",
+            ("Set u_max in [fit] to find out whether a limit matters.",),
         )
         return (
             "A linear feedback explains this movement; no limit was given.",
@@ -124,27 +124,28 @@ def _explained(result: FitResult) -> tuple[str, str, Alert | None]:
         largest = amount(result, result.inverse_mpc.largest_input)
         note = Alert(
             Level.NOTE,
-            "Note: these recordings say nothing about the limit",
-            f"The largest command in the model is {largest}. Models with and without the limit are "
-            "the same model here.",
-            "Gains and cost weights are as valid as without a limit. An estimate of the limit "
-            f"would only say “more than {largest}”.",
+            "Note: the limit was not reached",
+            f"The largest command in the model is {largest}. Models with and without the limit "
+            "give the same movement here.",
+            "Gains and cost weights are as valid as without a limit. The recordings show only that "
+            f"the limit is not below {largest}.",
             (
                 "Do not report the limit as a finding, or that it matters.",
-                "If the limit is your question, record again with a stronger perturbation: impc "
-                "plan shows how strong.",
+                "To study the limit, record again with a stronger perturbation: impc plan shows "
+                "how strong.",
             ),
         )
         return (
             "The controller explains this movement, but its limit was never reached.",
             f"You may report the gains. Nothing can be said about the limit: the largest command "
-            f"was {largest}, and {limit} was allowed.",
+            f"was {largest}, with a limit of {limit}.",
             note,
         )
-    held = "It predicts trials it was not fitted to, its" if result.held_out else "Its"
+    held = "It predicts trials it was not fitted to, a" if result.held_out else "A"
     return (
         f"A controller with a limit of {limit} explains this movement.",
-        f"{held} limit is reached, and the command per unit of tilt or velocity is identified.",
+        f"{held} limit is reached, and at least one gain (command per unit of tilt or velocity) is "
+        "identified.",
         None,
     )
 
@@ -155,38 +156,39 @@ def _little(result: FitResult) -> Kind | None:
     if result.usable and not np.any(shares < LITTLE):
         return None
     if result.weights_test.rejected and result.gain_vaf > LITTLE:
-        return None  # the gain explains it, and its nearest weights do not
+        return None  # the gain explains the movement, only its nearest weights do not
     short = result.given.recorded_numbers < _SHORT
     if result.usable and short and _weak(result) is not None:
-        return None  # what is hardly known predicts a few samples badly, whatever moved
+        return None  # uncertain gains predict short trials badly even if the model is right
     said = " and ".join(
         f"{value:.0f} % of the {signal_name(result.given.plant, name)}"
         if np.isfinite(value)
-        else f"nothing of the {signal_name(result.given.plant, name)}, since no simulation ends"
+        else f"an unknown part of the {signal_name(result.given.plant, name)} (the simulation "
+        "stops early)"
         for name, value in zip(outputs, shares, strict=True)
     )
     where = "left-out trials" if result.usable else "the recordings"
     alert = Alert(
         Level.RED,
         "The model does not describe these recordings",
-        f"In {where} it explains {said}. With recordings that suit the model, values above 90 % "
-        "are usual.",
-        "Gains and cost weights describe the best of a set of poor models. They are kept under "
-        "details for troubleshooting only.",
+        f"In {where} it explains {said}. If a model suits the recordings, values above 90 % are "
+        "typical.",
+        "Gains and cost weights come from a poor fit and do not describe the person. They are kept "
+        "under details for troubleshooting only.",
         (
-            "Look at the figure above. If the model moves in the opposite direction, a sign is "
-            "reversed; if it lags or leads, the clocks of two devices differ; if it has the wrong "
-            "size, a unit is wrong.",
+            "Look at the figure above. If the model moves in the opposite direction, a sign may be "
+            "reversed; if it lags or leads, the clocks of two devices may differ; if it has the "
+            "wrong size, a unit may be wrong.",
             "Run impc inspect and compare the range of each signal with what you expect.",
             "Check that the column of the perturbation is what reached the person, and that "
             "nothing else did.",
-            "If all of this is right, the person may have moved on purpose, or this body model "
-            "does not apply.",
+            "If all of this is right, the search may have failed, the person may have moved on "
+            "purpose, or this body model does not apply.",
         ),
     )
     return Kind(
-        "The model explains less than half of this movement.",
-        f"It explains {said} in {where}. Nothing else on this page says anything about the person.",
+        "The model explains less than half of a recorded signal.",
+        f"It explains {said} in {where}. Do not interpret the other numbers on this page.",
         alert,
         frozenset([GAIN, WEIGHTS, SHARE]),
     )
@@ -197,13 +199,16 @@ def _unfinished(result: FitResult) -> Kind | None:
         return None
     alert = Alert(
         Level.AMBER,
-        "The search ended before it converged",
+        "The search stopped before it converged",
         f"{result.fitted.status.sentence}",
-        "A better fit may exist, with other gains.",
-        ("Fit longer or less noisy recordings.", "Fit fewer unknowns: take names out of free."),
+        "A better fit with other gains may exist.",
+        (
+            "Fit longer or less noisy recordings.",
+            "Fit fewer unknowns: remove names from free in [fit].",
+        ),
     )
     return Kind(
-        "The model follows the movement, but the search did not finish.",
+        "The model follows the movement, but the search did not converge.",
         "Gains and cost weights may still change: do not report them.",
         alert,
         frozenset([GAIN, WEIGHTS]),
@@ -222,25 +227,25 @@ def _limit(result: FitResult) -> Kind | None:
     of_what = (
         f"The gains on this page are those of a fit with {value}."
         if refitted and not culprit
-        else "With a wrong limit gains come out several times too small or too large, and their "
-        "intervals do not show it."
+        else "With a wrong limit, gains may be several times too small or too large, and their "
+        "intervals do not show this."
     )
     alert = Alert(
         Level.AMBER,
         "The limit does not agree with the recordings",
         f"It was given as {limit}. Fitted together with the gain it is {value} ({ends}).",
-        f"{of_what} A high percentage of explained variance is no protection.",
+        f"{of_what} A high percentage of explained variance does not exclude this error.",
         (
             f"Set u_max = {number(estimated.value)} if the person can produce no more, and fit "
             "again.",
-            "If a warning stays, allow for noise in muscles and senses: add [fit.observer].",
-            "If it still stays, check body mass, height and the model of the body.",
+            "If a warning remains, allow for noise in muscles and senses: add [fit.observer].",
+            "If it still remains, check body mass, height and the model of the body.",
         ),
     )
     return Kind(
         f"The model follows the movement, but a limit of {limit} is probably wrong.",
-        f"When the limit is estimated, the recordings point to {value}. Until that is settled, do "
-        "not report gains or cost weights from this page.",
+        f"The recordings agree better with a limit of {value}. Until this is resolved, do not "
+        "report gains or cost weights from this page.",
         alert,
         frozenset([GAIN, WEIGHTS, SHARE]),
     )
@@ -251,80 +256,88 @@ def _observer(result: FitResult) -> Kind | None:
         return None
     alert = Alert(
         Level.AMBER,
-        "The person reacts to noise",
-        "A model whose person senses and moves with noise explains the recordings better than one "
-        "with noise in the recorder alone.",
-        "Gains that do not allow for it may be wrong by half.",
+        "The person seems to react to noise",
+        "By AIC, the model with noise in senses or muscles explains the recordings better than all "
+        "other models that were compared, or about as well.",
+        "Gains of the model without this noise may be wrong by half of their value.",
         ("Report the gains of the section on noise in the loop, with their intervals.",),
     )
     return Kind(
-        "The model follows the movement, and the person reacts to noise.",
+        "The model follows the movement, and the person seems to react to noise.",
         "Report the gains of the section on noise in the loop, not those of the model without it.",
         alert,
         frozenset([GAIN, WEIGHTS]),
     )
 
 
+_OTHER_LIMIT = (
+    "Set u_max to the most that the person can produce, or state its uncertainty in "
+    "[plant.uncertainty], and fit again."
+)
+
+
 def _body(result: FitResult) -> Kind | None:
     error = result.culprit
-    if error is None or _limit(result) is not None:  # a wrong limit does all that
+    if error is None or _limit(result) is not None:  # a wrong limit has the same effects
         return None
-    reason = alternative_reason(result, error)
+    reason, of_limit = alternative_reason(result, error), error.name == LIMIT
     alert = Alert(
         Level.AMBER,
-        "What the model misses depends on the perturbation",
-        f"Part of the residual follows the perturbation, which measurement noise cannot do. Most "
-        f"of it is explained by {error_words(result, error)} ({probability_words(error)}).{reason}",
-        "The gains make up for the error. Their intervals do not contain it; the true uncertainty "
-        "may be several times larger.",
+        "The residual depends on the perturbation",
+        f"Part of the residual follows the perturbation, unlike measurement noise. The tested "
+        f"model error with the smallest p-value is {error_words(result, error)} "
+        f"({probability_words(error)}).{reason}",
+        "The gains compensate for part of the error. Their intervals do not include it; the true "
+        "uncertainty may be several times larger.",
         (
             *(("Add [fit.observer] to the settings and fit again.",) if reason else ()),
-            "Check body mass, height and sex in the settings, and the measures of the device.",
-            "State how well they are known in [plant.uncertainty], or let a doubtful one vary with "
+            *((_OTHER_LIMIT,) if of_limit else ()),
+            "Check body mass, height and sex in the settings, and the dimensions of the device.",
+            "State how well they are known in [plant.uncertainty], or fit a doubtful one with "
             "free = [...], and report how much the gains change.",
             "For group comparisons, use the same model for everyone: much of the error then "
             "cancels.",
         ),
     )
     headline = (
-        "The model follows the movement, but the person seems to react to noise."
+        "The model follows the movement, but the person may react to noise."
         if reason
-        else "The model follows the movement, but the body model does not quite fit."
+        else "The model follows the movement, but the body model seems to be inexact."
     )
     return Kind(
         headline,
-        "Part of what it misses follows the perturbation. Gains may be off by more than their "
-        "intervals show, so do not report them yet.",
+        "Part of the residual follows the perturbation. The error of the gains may be larger than "
+        "their intervals show, so do not report them yet.",
         alert,
-        frozenset([GAIN, WEIGHTS]),
+        frozenset([GAIN, WEIGHTS, SHARE] if of_limit else [GAIN, WEIGHTS]),
     )
 
 
 def _noise(result: FitResult) -> Kind | None:
-    """Much is left, and it is no recorder's noise: the person may react to what made it."""
+    """A large residual that is not white: noise in the loop may have caused it."""
     least = float(np.min(result.inverse_mpc.vaf))
     coloured = all(np.nanmin(one.whiteness) < _COLOURED for one in result.trials)
     if least > _MUCH or not coloured or result.person is not None or result.weights_test.rejected:
         return None
     alert = Alert(
         Level.AMBER,
-        "Much of the movement is not explained, and it is no measurement noise",
-        f"The model explains {shares_text(result)}. What it misses is autocorrelated, as movement "
-        "is and noise of a recorder is not.",
-        "Noise of a recorder does no harm, because nobody reacts to it. Noise in muscles or senses "
-        "does: where the person answers it at the limit, or its share is large, gains may be wrong "
-        "by half.",
+        "Much of the movement is not explained, and the residual is not white noise",
+        f"The model explains {shares_text(result)}. The residual is autocorrelated, as movement is "
+        "and white measurement noise is not.",
+        "Measurement noise does not bias the gains, because the person does not react to it. Noise "
+        "in muscles or senses does: if the person reacts to it at the limit, or if it causes much "
+        "of the movement, gains may be wrong by half of their value.",
         (
             "Add [fit.observer] to the settings and fit again; expect about half an hour.",
             "Report the gains of that fit, with its intervals, if its checks pass.",
-            "For new recordings, use a stronger perturbation: it makes the reaction to noise "
-            "relatively smaller.",
+            "For new recordings, use a stronger perturbation: the reaction to noise is then a "
+            "smaller part of the movement.",
         ),
     )
     return Kind(
         "The model follows part of the movement; the person may react to noise.",
-        "Noise in muscles or senses probably feeds back into the movement. Do not report gains "
-        "that do not allow for it yet.",
+        "The reaction to noise in muscles or senses is probably part of the movement. Do not "
+        "report gains of a model without this noise yet.",
         alert,
         frozenset([GAIN, WEIGHTS]),
     )
@@ -337,19 +350,20 @@ def _no_weights(result: FitResult) -> Kind | None:
         Level.AMBER,
         "No cost weights lead to this gain",
         result.weights_test.sentence,
-        "Either the person does not keep a cost of this form small, or an error in the body model, "
+        "Either the person does not minimise a cost of this form, or an error in the body model, "
         "the delay or the limit has shifted the gain.",
         (
             "Report the gain with its intervals; leave out cost weights and intent.",
-            "Let the uncertain parts of the model vary, and see whether the conflict remains.",
-            "Do not enter a similar gain by hand to obtain weights: they would not be this "
-            "person's.",
+            "Fit uncertain parameters of the model too (free in [fit]), and check whether the "
+            "conflict remains.",
+            "Do not enter a similar gain by hand to obtain weights: they would not describe this "
+            "person.",
         ),
     )
     return Kind(
         "The gain is identified, but no cost weights explain it.",
-        "No quadratic cost makes this gain the best one. You may report the gain; you may not "
-        "infer intent.",
+        "The recordings reject all quadratic costs of this form (p < 0.001). You may report the "
+        "gain; you may not infer intent.",
         alert,
         frozenset([WEIGHTS]),
     )
@@ -364,8 +378,8 @@ def _fell(result: FitResult) -> Kind | None:
         Level.AMBER,
         "One trial ended in a fall" if one else f"{len(result.falls)} trials ended in a fall",
         f"{'; '.join(result.falls)}. The other trials were fitted.",
-        "From the fall on, nobody is balancing, so there is nothing to fit. Leaving out trials "
-        "that ended in a fall makes a person, or a group, look steadier than it is.",
+        "After a fall the person no longer balances, so there is nothing to fit. Leaving out "
+        "trials that ended in a fall makes a person, or a group, look steadier than it is.",
         (
             "Report how many trials ended in a fall, in each group.",
             "To use the part before a fall, set stop in [recording] for that file and fit again.",
@@ -388,9 +402,9 @@ def _weak(result: FitResult) -> Kind | None:
     alert = Alert(
         Level.AMBER,
         "The recordings are too short, or the perturbation is too weak",
-        f"None of the {len(gains)} gains is known to within half of its size. At most combinations "
-        "of them are identified; they are listed under details.",
-        "The model is not wrong, but many controllers would have moved in this way.",
+        f"None of the {len(gains)} gains is known to within half of its value. Combinations of "
+        "gains may be identified; they are listed under details.",
+        "The model is not contradicted, but many controllers would have moved in this way.",
         (
             "Record more trials, or use a stronger or faster perturbation: impc plan shows how "
             "many intervals would become narrow enough.",
@@ -398,8 +412,8 @@ def _weak(result: FitResult) -> Kind | None:
         ),
     )
     return Kind(
-        "The model explains the movement, but the recordings do not pin down its gains.",
-        "Gains that differ by much produce nearly the same movement. You may report the explained "
+        "The model explains the movement, but the recordings do not determine its gains.",
+        "Very different gains produce nearly the same movement. You may report the explained "
         "variance, but no single gain.",
         alert,
         frozenset([GAIN, WEIGHTS]),
@@ -413,9 +427,9 @@ def _structure(result: FitResult) -> Kind | None:
     alert = Alert(
         Level.AMBER,
         f"The recordings reject the structure “{name}”",
-        "Other gains explain what its cost weights leave.",
-        "What the structure says about cost weights is not the person's.",
-        ("Report the gain without it, or try another structure.",),
+        "Gains outside the structure explain the recordings better than its cost weights.",
+        "The cost weights within this structure do not describe the person.",
+        ("Report the gain without the structure, or try another structure.",),
     )
     return Kind(
         f"The gain is identified, but the structure “{name}” does not explain it.",
@@ -440,7 +454,7 @@ _KINDS: tuple[Callable[[FitResult], Kind | None], ...] = (
 
 
 def _may(result: FitResult) -> list[Claim]:
-    """What may be reported, with its numbers."""
+    """Statements that may be reported, with their numbers."""
     no = forbidden(result)
     if _little(result) is not None:
         return [Claim("That this model does not explain the movement.",
@@ -448,7 +462,7 @@ def _may(result: FitResult) -> list[Claim]:
     if result.weights_test.rejected:
         claims = [Claim("A linear feedback follows the movement.",
                         f"Its gain explains {result.gain_vaf:.1f} % of the variance, the nearest "
-                        f"that has cost weights {shares_text(result)}.")]  # fmt: skip
+                        f"gain with cost weights {shares_text(result)}.")]  # fmt: skip
     else:
         claims = [Claim("The model follows the movement.", left_out_text(result))]
     limit = given_limit(result)
@@ -504,7 +518,7 @@ def _may_not(result: FitResult) -> list[Claim]:
         claims.append(Claim("The time at the limit, or that the limit matters.", no_limit(result)))
     claims += [
         Claim("That the person computes an optimal plan.",
-              "Any controller with this gain and this limit moves identically."),
+              "Any controller with the same commands moves identically."),
         Claim("Other tasks, people or perturbations.",
               f"{count} of one person in one condition."),
     ]  # fmt: skip

@@ -1,1 +1,1 @@
-"""Before anyone is measured: what a planned experiment would identify of a presumed person."""
+"""Planning of experiments: expected intervals for an assumed subject."""

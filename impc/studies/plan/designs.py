@@ -1,9 +1,8 @@
-"""The experiments to choose from, each tried on the presumed person.
+"""Candidate experiments of a plan, simulated for the assumed subject (docs/howto/plan.md).
 
-Every experiment sees the same draws of the perturbation, scaled and held as it says, so that what
-differs between two is the experiment. A person falls when no input keeps the bounds, when the
-motion grows without end, or when an output passes its mechanical stop.
-See docs/planning.md.
+All experiments use the same random draws of the perturbation, scaled and held as specified. A trial
+ends in a fall if no input keeps the bounds, if the motion has not decayed after a rest of the
+length of the trial, or if an output exceeds its mechanical stop.
 """
 
 from __future__ import annotations
@@ -32,24 +31,24 @@ if TYPE_CHECKING:
     from impc.model.structure import Structure
 
 
-#: (amplitude, dwell, number of the draw) -> disturbance (samples, d).
+#: (amplitude, hold time, number of the draw) -> disturbance (samples, d).
 Perturbation = Callable[[float, float, int], Array]
 
-# Of the largest motion: what may be left of it after a rest that is as long as the trial.
+# Share of the peak that may remain after a rest of the length of the trial.
 _CALM = 0.5
 
 
 @dataclass(frozen=True)
 class Person(Frozen):
-    """The presumed person, and how they would be recorded."""
+    """Assumed subject and recording noise."""
 
     controller: Controller
-    structure: Structure  # Of the weights
-    cost_weights: Array  # Its unknowns (count,), logarithms
-    deviation: Array  # Of the noise in the recorder (p,), in the outputs' units
-    root: float  # Its correlation from one sample to the next
-    stops: Array  # Largest magnitude of each output (p,), infinite where there is no stop
-    # With the physical parameters that a fit would have to find too
+    structure: Structure  # Structure of the weights
+    cost_weights: Array  # Unknowns of the structure (count,), logarithms
+    deviation: Array  # SD of the recording noise (p,), in the units of the outputs
+    root: float  # Correlation of the noise between neighbouring samples
+    stops: Array  # Largest magnitude of each output (p,); infinite without a stop
+    # Plant with physical parameters that the fit estimates too
     family: PlantFamily | None = None
 
 
@@ -57,35 +56,33 @@ class Person(Frozen):
 class Design:
     """One experiment."""
 
-    amplitude: float  # Of the perturbation, in the disturbance's unit; a factor for one from a file
-    dwell: float  # For how long each value is kept, s; NaN for one from a file
+    amplitude: float  # Amplitude in the disturbance's unit; a factor for recorded perturbations
+    dwell: float  # Hold time of each value, s; NaN for recorded perturbations
 
 
 @dataclass(frozen=True)
 class Outcome(Frozen):
-    """What an experiment would give."""
+    """Simulated outcome of an experiment."""
 
     design: Design
-    falls: float  # Share of the trials that end in a fall
-    # Share of the samples at which an input stands on a bound, in trials without a fall
-    at_limit: float
-    peaks: Array  # Largest magnitude of each output in these (p,)
-    vaf: Array  # What a fit without an error would explain of each output, % (p,)
-    # The recordings, without noise, of so many trials as a person does; None where too few trials
-    # end without a fall
+    falls: float  # Share of trials that end in a fall
+    at_limit: float  # Share of samples with an input at its bound, in trials without a fall
+    peaks: Array  # Largest magnitude of each output in these trials (p,)
+    vaf: Array  # VAF of the true controller with recording noise, % (p,)
+    # Noise-free recordings of the planned number of trials; None if too many trials end in a fall
     problem: Problem | None
-    expected: Expectation | None  # What they would identify
+    expected: Expectation | None  # Expected intervals
 
 
 def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Design, ...]:
-    """All pairs, amplitudes within dwells."""
+    """All pairs of amplitude and hold time; the amplitude varies fastest."""
     return tuple(Design(a, d) for d, a in itertools.product(dwells, amplitudes))
 
 
 def try_design(
     person: Person, design: Design, perturbation: Perturbation, *, trials: int, draws: int
 ) -> Outcome:
-    """Simulate one experiment, and say what its recordings would; `perturbation` (samples, d)."""
+    """Simulate one experiment and compute the expected intervals."""
     plant, limits = person.controller.plant, person.controller.bounds
     numbers = range(max(draws, trials))
     tried = [_held(person, perturbation(design.amplitude, design.dwell, k)) for k in numbers]
@@ -112,7 +109,7 @@ def try_design(
 
 
 def _held(person: Person, push: Array) -> tuple[Recording, Array] | None:
-    """The recording of a `push` (samples, d) and its inputs (samples, m), or None for a fall."""
+    """Recording of a `push` (samples, d) and its inputs (samples, m); None for a fall."""
     plant, samples = person.controller.plant, len(push)
     alone = np.vstack([push, np.zeros_like(push)])
     run = simulate(person.controller, scenario(plant, np.zeros(plant.n), disturbance=alone))
@@ -127,7 +124,7 @@ def _held(person: Person, push: Array) -> tuple[Recording, Array] | None:
 
 
 def _problem_of(person: Person, recordings: Sequence[Recording]) -> Problem:
-    """The inverse problem of simulated trials."""
+    """Inverse problem of simulated trials."""
     controller = person.controller
     return Problem(
         controller.plant,
@@ -142,7 +139,7 @@ def _problem_of(person: Person, recordings: Sequence[Recording]) -> Problem:
 
 
 def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome]:
-    """The A-optimal experiment and the D-optimal one."""
+    """A-optimal and D-optimal experiment among those with few enough falls."""
     held = [
         (item, item.expected)
         for item in outcomes
@@ -152,9 +149,9 @@ def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome
         least = min(item.falls for item in outcomes)
         raise SolverError(
             "[plan]",
-            f"the person falls in {100 * least:.0f} % of the trials or more, whatever the "
-            "perturbation",
-            "lower amplitude, or raise u_max or falls",
+            f"in every experiment the simulated subject falls in at least {100 * least:.0f} % of "
+            "the trials",
+            "reduce amplitude, or increase u_max or the allowed share falls",
         )
     return (
         min(held, key=lambda pair: pair[1].mean_variance)[0],

@@ -1,4 +1,4 @@
-"""The assumed person of a plan from the results of a fit: `impc plan --like`."""
+"""Assumed subject of a plan from the results of a fit: `impc plan --like`."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ class _Fit(msgspec.Struct):
 
 
 def filled(configuration: Configuration, folder: Path) -> tuple[Configuration, str]:
-    """The configuration with what the fit in a `folder` says, where it is silent; the plant's name.
+    """Complete a configuration by the fit in a `folder`; also return the name of the plant.
 
-    The noise is that of the residuals; cost weights are those of the fit's [fit.structure].
+    The noise is the RMS of the residuals; the cost weights are those of the fit's [fit.structure].
     """
     where = f"--like {os.fspath(folder)}"
     try:
         found = msgspec.convert(read_result(folder).content, _Fit)
     except msgspec.ValidationError as error:
-        remedy = "name a folder of impc fit"
-        raise InputError(where, f"is no result of a fit ({error})", remedy) from None
+        remedy = "pass an output folder of impc fit"
+        raise InputError(where, f"is not a result of impc fit ({error})", remedy) from None
     own: dict[str, Any] = {}
     if "noise" not in configuration.plan:
         squares = np.mean([np.square(trial.rms_residual) for trial in found.trials], axis=0)
@@ -65,7 +65,7 @@ def filled(configuration: Configuration, folder: Path) -> tuple[Configuration, s
     if "cost_weights" not in configuration.plan:
         named = found.findings.structure_cost_weights
         if named is None:
-            remedy = "fit with a diagonal [fit.structure], or give [plan] cost_weights"
+            remedy = "fit with a diagonal [fit.structure], or set [plan] cost_weights"
             raise InputError(where, "has no cost weights of named features", remedy)
         own["cost_weights"] = dict(zip(named.table.feature, named.table.value, strict=True))
     settings = {name: one for name, one in found.settings.items() if one is not None}

@@ -1,4 +1,4 @@
-"""The page of a plan, and its files (docs/planning.md)."""
+"""Report of a plan."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
 _TRIALS = Picture(
     "trials",
     "Width of the interval of each cost weight over the number of trials, and the target",
-    "How far a 95 % interval reaches beyond the assumed cost weight. Lower is better; to first "
-    "order. Dashed: the difference to be seen.",
+    "Largest distance of a 95 % interval's end from the assumed cost weight, to first order. Lower "
+    "is better. Dashed: difference to be detected.",
 )
 _LINES = ((BLUE, "o", "-"), (GREEN, "s", "--"), (INK, "^", ":"), (MUTED, "D", "-."))
-# Lines of text next to a curve, of the height of an axis; beyond this many % nothing is drawn.
+# Height of a line of text relative to the axis; largest width that is drawn, %.
 _LINE, _MOST = 0.07, 1e4
 
 
 def plan_report(plan: Plan, provenance: Provenance) -> Report:
-    """Page, result.json, tables and figure."""
+    """Report of `impc plan`."""
     count = plan.settings.trials
     return Report(
         "impc plan",
@@ -65,7 +65,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
         meta=(
             "Simulated before anyone is measured",
             f"{count} trial{'s' * (count > 1)}",
-            f"{len(plan.outcomes)} experiments tried",
+            f"{len(plan.outcomes)} experiments simulated",
         ),
         hero=_TRIALS,
         keys=plan_keys(plan),
@@ -77,7 +77,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
 
 
 def _trials_figure(plan: Plan, narrow: bool) -> Figure:
-    """The longer side of each interval over the number of trials."""
+    """Longer side of each interval over the number of trials."""
     figure = new_figure(PHONE if narrow else HALF, 3.6)
     ax = figure.subplots()
     counts, sides = widths(plan)
@@ -92,7 +92,7 @@ def _trials_figure(plan: Plan, narrow: bool) -> Figure:
         ax.plot(counts, values, color=color, marker=marker, linestyle=line)
     names = weight_names(plan)
     for k in np.argsort(shares[-1])[: np.count_nonzero(np.isfinite(shares[-1]))]:
-        # A name at the right end of each curve, none over another.
+        # Names at the right ends of the curves, without overlap.
         least = max((math.log(shares[-1, k]) - low) / (high - low), least + _LINE)
         place = float(counts[-1]), math.exp(low + least * (high - low))
         ax.annotate(names[k], place, (7, 0), textcoords="offset points", va="center",
@@ -116,7 +116,7 @@ def _trials_figure(plan: Plan, narrow: bool) -> Figure:
 
 
 def _experiments(plan: Plan) -> Finding:
-    """Every experiment and what it would identify, as factors of the cost weights (95 %)."""
+    """Table of experiments with expected 95 % intervals relative to the cost weights."""
     plant, names, rows = plan.person.controller.plant, plan.person.structure.unknowns, []
     marks = {"A-optimal": plan.best, "D-optimal": plan.sharpest}
     for item in plan.outcomes:
@@ -145,14 +145,14 @@ def _experiments(plan: Plan) -> Finding:
     return Finding(
         "experiments",
         pd.DataFrame(rows),
-        "Widest interval: how far it reaches beyond the assumed cost weight; to first order where "
-        "it has no end. A-optimal: least mean variance, which is chosen. D-optimal: least joint "
-        "region.",
+        "Widest interval: largest distance of its end from the assumed cost weight; to first order "
+        "if it has no end. A-optimal: smallest mean variance (selected). D-optimal: smallest "
+        "joint confidence region.",
         digits=3,
         labels={
             "amplitude": "Factor" if plan.settings.files else f"Amplitude ({unit})",
             "dwell": "Held for (s)",
-            "smallest_vaf_percent": "Highest VAF (%)",
+            "smallest_vaf_percent": "Attainable VAF (%)",
         },
         hidden=list(rows[0])[7:],
     )
@@ -183,10 +183,11 @@ def _cost_weights(plan: Plan) -> Finding:
     return Finding(
         "cost_weights",
         table,
-        "Expected 95 % intervals of the best experiment, with one for the first command.",
+        "Expected 95 % intervals in the best experiment, at a cost weight of 1 for the first "
+        "command.",
         digits=3,
         labels={
-            "interval": "About the assumed",
+            "interval": "Relative to assumed",
             "in_simulated_fits": "Scatter in simulated fits (log)",
         },
         hidden=hidden,
@@ -194,7 +195,7 @@ def _cost_weights(plan: Plan) -> Finding:
 
 
 def _body(plan: Plan) -> list[Block]:
-    """What measuring the body would help, the most helpful parameter first."""
+    """Table of the benefit of measuring body parameters, most useful first."""
     found, problem = expected(plan), plan.best.problem
     if found.body is None or problem is None:
         return []
@@ -213,11 +214,11 @@ def _body(plan: Plan) -> list[Block]:
         Finding(
             "body",
             table.iloc[np.argsort(-np.nanmean(shares, axis=1), kind="stable")],
-            "Body: by how much each interval would be narrower if this parameter were known "
-            f"exactly. With an exactly known body the intervals would be {exact:.0f} % narrower on "
-            f"average, with ten times as many trials {tenfold:.0f} %.",
+            "Body: reduction of each interval if this parameter were known exactly. With an "
+            f"exactly known body the intervals would be {exact:.0f} % narrower on average, with "
+            f"ten times as many trials {tenfold:.0f} %.",
             digits=2,
-            folded="What measuring each parameter of the body would help",
+            folded="Benefit of measuring each parameter of the body",
             labels={"stated_percent": "Stated (%)", **dict(zip(heads, words, strict=True))},
         ),
     ]
@@ -236,11 +237,11 @@ def _groups(plan: Plan) -> Finding:
     return Finding(
         "groups",
         pd.DataFrame(rows, columns=heads),
-        f"Power to see a difference of {settings.difference:g} % between two groups whose persons "
-        f"differ by {settings.between:g} % (t-test at 5 %).",
+        f"Power to detect a difference of {settings.difference:g} % between two groups whose "
+        f"persons differ by {settings.between:g} % (SD; t-test at 5 %).",
         digits=3,
         labels={
-            heads[2]: "SD in a group (log)",
+            heads[2]: "SD within a group (log)",
             heads[-1]: "Persons per group for 80 %",
             **{key: f"{size} per group (%)" for key, size in sizes},
         },
@@ -257,7 +258,7 @@ def _person(plan: Plan) -> Terms:
     limit = listed(plan, names, controller.bounds.u_max[limited])
     terms = [
         ("Measurement noise", f"{listed(plan, plant.outputs, person.deviation)}; {kind}"),
-        ("Predicts ahead", f"{controller.horizon * plant.dt:g} s"),
+        ("Prediction horizon", f"{controller.horizon * plant.dt:g} s"),
         ("Limit", limit or "none"),
     ]
     return Terms(terms)

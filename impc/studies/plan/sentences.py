@@ -1,4 +1,4 @@
-"""What a plan says: its verdict, its three numbers, and what was checked."""
+"""Verdict, key numbers and checks of a plan."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from impc.studies.plan.designs import Design
     from impc.studies.plan.study import Plan
 
-# Nearer to one on both sides, an interval is printed in percent; beyond this, as a factor.
+# Intervals within this factor are printed in percent; widest (log) that is printed in percent.
 _NARROW, _FACTOR = 1.5, math.log(3)
-_HELD = 0.8  # Share of simulated fits whose cost weights should lie in the intervals
+_HELD = 0.8  # Smallest acceptable coverage of the intervals in simulated fits
 
 
 def expected(plan: Plan) -> Expectation:
-    """What the best experiment would identify."""
-    assert plan.best.expected is not None  # `best_of` takes no other
+    """Expected intervals of the best experiment."""
+    assert plan.best.expected is not None  # ensured by `best_of`
     return plan.best.expected
 
 
 def weight_names(plan: Plan) -> list[str]:
-    """The cost weights in words: "seat tilt", "trunk tilt - seat tilt"."""
+    """Names of the cost weights in words: "seat tilt", "trunk tilt - seat tilt"."""
     person = plan.person
     return [words_of(person.controller.plant, name) for name in person.structure.unknowns]
 
@@ -51,7 +51,7 @@ def design_name(plan: Plan, design: Design) -> str:
 
 
 def listed(plan: Plan, names: tuple[str, ...], values: Array) -> str:
-    """Signals and their values: "seat tilt 0.1°, trunk tilt 0.2°"."""
+    """List of signals with values: "seat tilt 0.1°, trunk tilt 0.2°"."""
     plant, parts = plan.person.controller.plant, []
     for name, value in zip(names, values, strict=True):
         factor, unit = shown_unit(plant, name)
@@ -61,17 +61,17 @@ def listed(plan: Plan, names: tuple[str, ...], values: Array) -> str:
 
 
 def target(plan: Plan) -> float:
-    """What an interval has to stay within on both sides, of the logarithm of a cost weight."""
+    """Largest allowed distance of interval ends, in the logarithm of a cost weight."""
     return math.log1p(plan.settings.difference / 100)
 
 
 def half(item: WeightInterval) -> float:
-    """The longer side of an interval, of the logarithm."""
+    """Longer side of an interval of the logarithm."""
     return max(item.high - item.value, item.value - item.low)
 
 
 def widths(plan: Plan) -> tuple[Array, Array]:
-    """Numbers of trials (k,), and the longer side of each interval with so many (k, count)."""
+    """Numbers of trials (k,), and longer sides of the intervals (k, count)."""
     found = expected(plan)
     sides, errors = np.array([half(item) for item in found.intervals]), np.array(found.deviations)
     usable = np.isfinite(sides) & np.isfinite(errors)
@@ -82,7 +82,7 @@ def widths(plan: Plan) -> tuple[Array, Array]:
 
 
 def trials_needed(plan: Plan) -> float:
-    """Least number of trials for which every interval is within the target; infinite if none."""
+    """Smallest number of trials with all intervals within the target; infinite if none."""
     counts, sides = widths(plan)
     worst = np.max(sides, axis=1)
     if not worst[-1] <= target(plan):
@@ -94,10 +94,10 @@ def trials_needed(plan: Plan) -> float:
 
 
 def stated_as(item: WeightInterval) -> str:
-    """An interval about the assumed value: "-7 to +8 %", "0.4 to 2.1 times", "0 to 3 times"."""
+    """Interval relative to the assumed value: "-7 to +8 %", "0.4 to 2.1 times"."""
     low, high = (math.exp(end - item.value) for end in (item.low, item.high))
     if math.isinf(item.high):
-        return "not at all" if low == 0 else f"{number(low, 2)} times and more"
+        return "not determined" if low == 0 else f"{number(low, 2)} times or more"
     if low > 1 / _NARROW and high < _NARROW:
         ends = [f"{100 * (end - 1):+.2g}".replace("-", "\u2212") for end in (low, high)]
         return f"{ends[0]} to {ends[1]} %"
@@ -105,13 +105,13 @@ def stated_as(item: WeightInterval) -> str:
 
 
 def plan_verdict(plan: Plan) -> Verdict:
-    """Whether the experiment is enough."""
+    """Verdict: whether the intervals of the experiment are narrow enough."""
     found, aim = expected(plan), f"{plan.settings.difference:g} %"
     sides, tried = [half(item) for item in found.intervals], len(plan.outcomes)
     good, count, worst = sum(side <= target(plan) for side in sides), len(sides), max(sides)
     weights = "cost weight" if count == 1 else "cost weights"
     verb = f"{_experiment(plan)} identif{'ies' if plan.settings.trials == 1 else 'y'}"
-    which = f"best of {tried} experiments" if tried > 1 else "only experiment that was tried"
+    which = f"best of {tried} experiments" if tried > 1 else "only experiment that was simulated"
     chosen = f"This is the {which}: {design_name(plan, plan.best.design)}."
     if good == count:
         close = f"a factor of {number(math.exp(worst), 2)}"
@@ -123,9 +123,10 @@ def plan_verdict(plan: Plan) -> Verdict:
     needed, steps = trials_needed(plan), []
     more = f"{max(widths(plan)[0]):g} trials would not be enough."
     if math.isfinite(needed):
-        more, steps = f"With {needed:.0f} trials all would be.", [f"Record {needed:.0f} trials."]
+        more = f"{needed:.0f} trials would be enough for all."
+        steps = [f"Record {needed:.0f} trials."]
     if found.body is not None:
-        steps.append("Measure the body better; the table of the body names the parameters.")
+        steps.append("Measure the body more exactly; the table of the body lists the parameters.")
     level, badge = (Level.AMBER, "Depends") if good else (Level.RED, "Not enough")
     missed = "; ".join(
         f"{name}: {stated_as(item)}"
@@ -135,10 +136,10 @@ def plan_verdict(plan: Plan) -> Verdict:
     alert = Alert(
         level,
         "Some intervals are too wide" if good else "All intervals are too wide",
-        f"{missed[:1].upper()}{missed[1:]} (95 % intervals, as shares of the cost weight).",
-        f"A difference of {aim} in these cost weights would not be seen in one person.",
-        [*steps, "Try stronger or longer perturbations, more amplitudes and hold times.",
-         "Give fewer features a cost weight, or accept a larger difference."],
+        f"{missed[:1].upper()}{missed[1:]} (95 % intervals relative to the cost weight).",
+        f"A difference of {aim} in these cost weights could not be detected in one person.",
+        [*steps, "Try stronger or longer perturbations, and more amplitudes and hold times.",
+         "Assign cost weights to fewer features, or accept a larger difference."],
     )  # fmt: skip
     which = f"{good} of {count} {weights}" if good else "no cost weight"
     headline = f"{verb} {which} to within {aim}."
@@ -156,7 +157,7 @@ def _experiment(plan: Plan) -> str:
 
 
 def plan_keys(plan: Plan) -> list[Key]:
-    """Trials needed, risk of a fall, time at the limit."""
+    """Key numbers: trials needed, risk of a fall, time at the limit."""
     settings, best, needed = plan.settings, plan.best, trials_needed(plan)
     trials = f"{needed:.0f}" if math.isfinite(needed) else f"> {max(widths(plan)[0]):g}"
     length = "as long as recorded" if settings.files else f"of {settings.duration:g} s"
@@ -171,7 +172,7 @@ def plan_keys(plan: Plan) -> list[Key]:
 
 
 def plan_checks(plan: Plan) -> list[Check]:
-    """What the plan takes for granted, and how far that was tested."""
+    """Assumptions of the plan, and tests of them."""
     found, fits, controller = expected(plan), plan.simulated, plan.person.controller
     limit = ", ".join(
         f"{signal_name(controller.plant, name)} to ±{number(100 * TWO_SIDED * error, 2)} %"
@@ -181,27 +182,27 @@ def plan_checks(plan: Plan) -> list[Check]:
     tried, inside = "None: set fits = 100 in [plan] to fit simulated recordings.", math.nan
     if fits is not None:
         inside = float(np.mean(fits.inside(found))) if len(fits.cost_weights) else 0.0
-        tried = f"{100 * inside:.0f} % of the cost weights lay in their 95 % intervals in "
-        tried += f"{len(fits.cost_weights)} fits; {fits.failed} fits failed."
+        tried = f"{100 * inside:.0f} % of the fitted cost weights were inside the expected 95 % "
+        tried += f"intervals in {len(fits.cost_weights)} fits; {fits.failed} fits failed."
     size, own = found.gain.entries.size, int(np.sum(found.gain.individually_identified))
     good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
     exact = "Taken as exact: state how well it is known in [plant.uncertainty]."
-    stated = "The intervals contain the stated uncertainty of the body."
+    stated = "The intervals include the stated uncertainty of the body."
     falls = f"{100 * plan.best.falls:.0f} % of the simulated trials; {plan.settings.falls:g} % are "
-    free = f"Assumed. Without it {own} of {size} gains would be identified by themselves."
+    free = f"Assumed. Without it {own} of {size} gains would be individually identified."
     rows = [
         (good, "Falls", f"{falls}accepted."),
         (good if limit else note, "Limit", limit or "Never reached, or none is assumed."),
         (good if found.body else doubt, "Body", stated if found.body else exact),
         (note if fits is None else good if inside >= _HELD else doubt, "Simulated fits", tried),
         (note, "Form of the cost", free),
-        (note, "Noise", "Of measurement alone; noise in muscles and senses widens intervals."),
+        (note, "Noise", "Measurement noise only; noise in muscles and senses widens intervals."),
     ]
     return [Check(*row) for row in rows]
 
 
 def plan_copy(plan: Plan) -> Copy | str:
-    """The sample size for a paper."""
+    """Text on the sample size for a paper, or the reason why there is none."""
     settings = plan.settings
     needed = [
         f"{item.needed:.0f} persons per group for the cost weight of {name}"
@@ -209,12 +210,12 @@ def plan_copy(plan: Plan) -> Copy | str:
         if math.isfinite(item.needed)
     ]
     if not needed:
-        return "No number of persons would show the difference."
+        return "No number of persons would be enough to detect the difference."
     return Copy(
         f"The sample size was computed for one assumed person, simulated with "
-        f"{_experiment(plan).lower()}. Persons of a group were taken to differ by "
+        f"{_experiment(plan).lower()}. Persons within a group were assumed to differ by "
         f"{settings.between:g} % (standard deviation of the logarithm of a cost weight), in "
         "addition to the expected error of each estimate.",
         f"To detect a difference of {settings.difference:g} % between two groups with a power of "
-        f"80 % (two-sided t-test, 5 %) takes {'; '.join(needed)}.",
+        f"80 % (two-sided t-test, 5 %) requires {'; '.join(needed)}.",
     )

@@ -1,4 +1,4 @@
-"""Settings of a plan, as the [plan] table of a configuration gives them (docs/planning.md)."""
+"""Settings of a plan: the [plan] table of a configuration (docs/ref/settings.md)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.settings import FitSettings
 
-# The most is far beyond any use.
+# Wide limits that only exclude numerical overflow.
 Amplitude = Annotated[float, Meta(ge=1e-100, le=1e100)]
 Dwell = Annotated[float, Meta(ge=1e-4, le=1e4)]
 Persons = Annotated[int, Meta(ge=2, le=100_000)]
@@ -34,42 +34,68 @@ _NUMBER = re.compile(r"\s*([0-9.eE+-]+)\s*(.*\S)\s*")
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """The presumed person, the experiments to choose from, and what is asked of them."""
+    """Settings of a plan: assumed subject, candidate experiments, and required precision.
 
-    # Presumed cost weight of each feature of the structure, with the first input's at one; without
-    # [fit.structure] its keys are the features
+    Attributes
+    ----------
+    cost_weights : dict of str to float
+        Assumed cost weight of each feature of [fit.structure], relative to that of the first input.
+        Without [fit.structure] the keys are the features.
+    noise : dict of str to float or str
+        Standard deviation of the recording noise of each output: a number in the plant's unit, or a
+        text with a unit such as "0.1 deg".
+    correlation : float
+        Correlation time of this noise in s (decay to 1/e); 0: white noise.
+    stops : dict of str to float or str
+        Largest magnitude of outputs beyond which the subject falls, written like `noise`. Not
+        given: the limits in [signals].
+    perturbed : list of str
+        Inputs of the plant that perturb the subject. Empty: those named in [signals].
+    amplitude : list of float
+        Amplitudes of the perturbation to try, in the unit of the disturbance; with `files` factors.
+    dwell : list of float
+        Hold times of the values of the ternary perturbation to try, s.
+    duration : float
+        Duration of a trial, s.
+    trials : int
+        Number of trials per subject.
+    files : list of str
+        Files of recorded perturbations, relative to the configuration; they replace the ternary
+        perturbation.
+    draws : int
+        Number of simulated trials per experiment for the share of falls.
+    falls : float
+        Largest allowed share of simulated trials with a fall, %.
+    groups : list of int
+        Numbers of subjects per group for which the power of a comparison is computed.
+    difference : float
+        Difference of a cost weight, between groups or in one subject, that is to be detected, %.
+    between : float
+        Standard deviation of the logarithm of a cost weight within a group, %.
+    fits : int
+        Number of fits to simulated recordings of the best experiment, to check the expected
+        intervals: 0 (none) or at least 20.
+    seed : int
+        Seed of all random numbers.
+    """
+
     cost_weights: dict[str, float]
-    # Standard deviation of the noise in the recorder, for each output: in the plant's unit, or with
-    # one, as in "0.1 deg"
     noise: dict[str, float | str]
-    # Time in s over which this noise falls to 1/e of its correlation; 0 for white noise
     correlation: Annotated[float, Meta(ge=0, le=100)] = 0.0
-    # Largest magnitude of outputs beyond which a person falls, written as `noise` is; by default
-    # the limits of [signals]
     stops: dict[str, float | str] = field(default_factory=dict)
-    # Inputs of the plant that perturb the person; by default those that [signals] names
     perturbed: list[str] = field(default_factory=list)
-    # Of the perturbation, in the disturbance's unit; with `files` a factor
     amplitude: Annotated[list[Amplitude], Some] = field(default_factory=lambda: [2.5, 5.0, 10.0])
-    # For how long the ternary perturbation keeps each value, s
     dwell: Annotated[list[Dwell], Some] = field(default_factory=lambda: [0.125, 0.25, 0.5])
-    duration: Annotated[float, Meta(ge=0.1, le=1e4)] = 30.0  # Of a trial, s
-    trials: Annotated[int, Meta(ge=1, le=100)] = 3  # Of a person
-    # Recordings of perturbations in the place of the ternary one, beside the configuration
+    duration: Annotated[float, Meta(ge=0.1, le=1e4)] = 30.0
+    trials: Annotated[int, Meta(ge=1, le=100)] = 3
     files: list[str] = field(default_factory=list)
-    # Trials that are simulated of each experiment to see how often the person falls
     draws: Annotated[int, Meta(ge=1, le=1000)] = 20
-    # Largest share of them that may end in a fall, %
     falls: Annotated[float, Meta(ge=0, le=100)] = 5.0
-    # Persons in each of two groups that are to be distinguished
     groups: Annotated[list[Persons], Some] = field(default_factory=lambda: [10, 20])
-    # By which a cost weight differs between the groups, %
     difference: Annotated[float, Meta(ge=0.1, le=1e4)] = 50.0
-    # Standard deviation of the logarithm of a cost weight within a group, %
     between: Annotated[float, Meta(ge=0, le=1000)] = 30.0
-    # Fits of simulated recordings of the best experiment, to compare with; 0 for none
     fits: Annotated[int, Meta(ge=0, le=10_000)] = 0
-    seed: Annotated[int, Meta(ge=0, le=2**31)] = 0  # All that is drawn follows from it
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
 
 def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
@@ -83,7 +109,7 @@ def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
 def assumed_cost_weights(
     plant: Plant, settings: PlanSettings, fit: FitSettings
 ) -> tuple[Structure, Array]:
-    """The structure of the presumed person, and its unknowns (count,)."""
+    """Structure of the assumed subject's weights, and its unknowns (count,)."""
     given = settings.cost_weights
     item = fit.structure
     if item is None:
@@ -91,18 +117,16 @@ def assumed_cost_weights(
     else:
         structure = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
     if structure.coupled or structure.input_coupled:
-        raise InputError(
-            "[fit.structure]", "cost weights products too", "plan with a diagonal structure"
-        )
+        raise InputError("[fit.structure]", "has cross terms", "plan with a diagonal structure")
     for name in structure.unknowns:
         if name not in given:
             raise InputError(
-                "[plan] cost_weights", f"lacks {name!r}", "presume a cost weight for each feature"
+                "[plan] cost_weights", f"lacks {name!r}", "give a cost weight for each feature"
             )
     for name, cost_weight in given.items():
         if name not in structure.unknowns:
             known = ", ".join(structure.unknowns)
-            raise InputError(f"[plan] cost_weights {name}", "is not a feature", f"known: {known}")
+            raise InputError(f"[plan] cost_weights {name}", "is not a feature", f"use: {known}")
         if not 1e-100 < cost_weight < 1e100:
             raise InputError(
                 f"[plan] cost_weights {name}", f"got {cost_weight:g}", "give a positive number"
@@ -111,11 +135,11 @@ def assumed_cost_weights(
 
 
 def noise_deviations(plant: Plant, settings: PlanSettings) -> Array:
-    """Standard deviation of the noise of each output (p,), in the plant's units."""
+    """Standard deviation of the recording noise of each output (p,), in the plant's units."""
     found = _of_outputs(plant, "noise", settings.noise)
     for name in plant.outputs:
         if name not in found:
-            raise InputError("[plan] noise", f"lacks {name}", "give one for each output")
+            raise InputError("[plan] noise", f"lacks {name}", "give a value for each output")
     return np.array([found[name] for name in plant.outputs])
 
 
@@ -137,7 +161,7 @@ def _of_outputs(plant: Plant, key: str, given: Mapping[str, float | str]) -> dic
     for name, written in given.items():
         if name not in plant.outputs:
             known = ", ".join(plant.outputs)
-            raise InputError(f"[plan] {key} {name}", "is not an output", f"known: {known}")
+            raise InputError(f"[plan] {key} {name}", "is not an output", f"use: {known}")
         found[name] = _in_units(f"[plan] {key} {name}", plant.unit(name), written)
         if not 1e-100 < found[name] < 1e100:
             raise InputError(f"[plan] {key} {name}", f"got {written}", "give a positive number")
@@ -153,8 +177,8 @@ def _in_units(place: str, expected: str, given: float | str) -> float:
     except ValueError:
         size = None
     if parts is None or size is None:
-        raise InputError(place, f"got {brief(given)}", 'write as in "0.1 deg"')
+        raise InputError(place, f"got {brief(given)}", 'write a number and a unit: "0.1 deg"')
     unit = si_unit(parts[2])
     if expected != UNKNOWN and si_unit(expected).base not in (unit.base, "dimensionless"):
-        raise InputError(place, f"is in {parts[2]}, the plant's in {expected}", "correct it")
+        raise InputError(place, f"is in {parts[2]}", f"use a unit compatible with {expected}")
     return size * unit.factor

@@ -1,8 +1,8 @@
-"""A plan as a value: every experiment tried, the best of them, and what groups would show.
+"""Compute a plan: experiments, the best one, power of comparisons, simulated fits.
 
-Beside it fits of simulated recordings, which show what the plan foresaw. Each begins at the truth
-and searches without linearisation: it shows how the best answer scatters, not whether a search
-finds it from the default start. See docs/planning.md, docs/structures.md.
+Fits to simulated recordings check the expected intervals. They start at the true weights and use
+the full nonlinear search: they show the scatter of the best solution, not whether a search from the
+default start finds it (docs/howto/plan.md).
 """
 
 from __future__ import annotations
@@ -35,35 +35,35 @@ if TYPE_CHECKING:
     from impc.studies.plan.settings import PlanSettings
 
 _SIZE, _POWER = 0.05, 0.8
-# Persons in a group: a t-test needs two, and nobody measures more.
+# Range of the number of persons per group; a t-test needs two.
 _SMALLEST, _LARGEST = 2.0, 1e6
-# Simulations with derivatives of a fit that begins at the truth: 20 to 40 with limits.
+# Simulations with derivatives of a fit that starts at the true weights: 20 to 40 with limits.
 _A_FIT = 40
 
 
 @dataclass(frozen=True)
 class GroupPower(Frozen):
-    """Whether two groups can be distinguished by one cost weight."""
+    """Power of a comparison of two groups by one cost weight."""
 
-    feature: str  # Whose cost weight
-    # Of the logarithm of an estimate within a group: of persons and of the estimate, by its
-    # interval; infinite where that has no end
+    feature: str  # Feature of the cost weight
+    # SD of the logarithm of estimates within a group, between persons and by estimation (from the
+    # interval); infinite if the interval has no end
     deviation: float
-    powers: Array  # How often a t-test at 5 % sees the difference, for each size of group (g,)
-    needed: float  # Persons in each group for 80 %; infinite beyond a million
+    powers: Array  # Power of a t-test at 5 % for each group size (g,)
+    needed: float  # Persons per group for a power of 80 %; infinite above a million
 
 
 @dataclass(frozen=True)
 class Plan(Frozen):
-    """What experiments would identify of a presumed person."""
+    """Result of `make_plan`."""
 
     person: Person
     settings: PlanSettings
-    outcomes: tuple[Outcome, ...]  # One an experiment, in the order of `designs`
-    best: Outcome  # With the least mean variance of the logarithms of cost weights (A-optimal)
-    sharpest: Outcome  # With the least determinant of their covariance (D-optimal)
-    groups: tuple[GroupPower, ...]  # For the best one, one a cost weight
-    simulated: SimulatedFits | None  # Of the best one
+    outcomes: tuple[Outcome, ...]  # One per experiment, in the order of `designs`
+    best: Outcome  # Smallest mean variance of the logarithms of cost weights (A-optimal)
+    sharpest: Outcome  # Smallest determinant of their covariance (D-optimal)
+    groups: tuple[GroupPower, ...]  # For the best experiment, one per cost weight
+    simulated: SimulatedFits | None  # For the best experiment
 
 
 def _grid(settings: PlanSettings) -> tuple[Design, ...]:
@@ -71,7 +71,7 @@ def _grid(settings: PlanSettings) -> tuple[Design, ...]:
 
 
 def steps_of(settings: PlanSettings) -> int:
-    """Count of the steps that `make_plan` says of."""
+    """Number of steps that `make_plan` reports."""
     return len(_grid(settings)) + settings.fits
 
 
@@ -82,7 +82,7 @@ def make_plan(
     done: Callable[[str], None] = lambda _: None,
     remember: RememberFit = lambda _, compute: compute(),
 ) -> Plan:
-    """Try every experiment on the person; `perturbation` (samples, d)."""
+    """Simulate all experiments, choose the best, and check it by simulated fits if requested."""
     outcomes = []
     for design in _grid(settings):
         outcomes.append(
@@ -100,7 +100,7 @@ def make_plan(
 def group_powers(
     person: Person, outcome: Outcome, settings: PlanSettings
 ) -> tuple[GroupPower, ...]:
-    """Two groups whose weights differ by `settings.difference`, each estimated once a person."""
+    """Power to detect `settings.difference` between two groups, one estimate per person."""
     if outcome.expected is None:
         return ()
     from statsmodels.stats.power import TTestIndPower  # noqa: PLC0415  # a second to load
@@ -120,12 +120,12 @@ def group_powers(
 
 
 def _needed(test: Any, effect: float) -> float:
-    """Least size of a group that sees an effect, in deviations, with `_POWER`."""
+    """Smallest group size that detects an effect (in SDs) with `_POWER`."""
 
     def lacking(size: float) -> float:
         return float(test.power(effect, size, _SIZE)) - _POWER
 
-    # From below: far above, the noncentral t has no numbers.
+    # Start from below: for large sizes the noncentral t distribution is not computable.
     size = _SMALLEST
     while lacking(size) < 0:
         if size > _LARGEST:
@@ -137,7 +137,7 @@ def _needed(test: Any, effect: float) -> float:
 
 
 def plan_effort(person: Person, settings: PlanSettings) -> Effort:
-    """What `make_plan` will take: simulations, and those that are differentiated for the fits."""
+    """Effort of `make_plan`: simulations, and simulations with derivatives for the fits."""
     plant, m = person.controller.plant, person.controller.plant.m
     samples = settings.duration / plant.dt
     once = samples * plant.n * person.controller.horizon * SECONDS_A_SAMPLE
@@ -147,40 +147,40 @@ def plan_effort(person: Person, settings: PlanSettings) -> Effort:
     return Effort(once * (tried + _A_FIT * settings.trials * settings.fits), 8e-9 * numbers)
 
 
-# Correlation left of the noise before the first sample: 1e-6.
+# Length of the noise's transient that is dropped, in correlation times: exp(-14) is 1e-6.
 _FORGOTTEN = 14.0
 
 
 @dataclass(frozen=True)
 class SimulatedFits(Frozen):
-    """What so many fits found."""
+    """Results of the fits to simulated recordings."""
 
     cost_weights: Array  # Unknowns (fits, count); minus infinity for a cost weight of zero
-    gains: Array  # Gain without a structure, as it is printed with intervals (fits, m, n)
-    failed: int  # Fits that ended without an answer, and bodies that fell
+    gains: Array  # Gains fitted without a structure (fits, m, n)
+    failed: int  # Number of fits without a solution, including simulations with a fall
 
     def inside(self, expected: Expectation) -> Array:
-        """Share of the fits whose unknowns lie in the expected intervals (count,)."""
+        """Share of the fits whose unknowns are inside the expected intervals (count,)."""
         ends = np.array([[item.low, item.high] for item in expected.intervals])
         held = (self.cost_weights >= ends[:, 0]) & (self.cost_weights <= ends[:, 1])
         return np.asarray(np.mean(held, axis=0))
 
 
 def spread(values: Array) -> Array:
-    """Half of what the middle 68 % span (k,), of values (fits, k): a deviation without tails."""
+    """Half the range (k,) of the middle 68 % of values (fits, k): a robust SD."""
     low, high = np.percentile(values, (15.866, 84.134), axis=0, method="inverted_cdf")
     return np.asarray((high - low) / 2)
 
 
 @dataclass(frozen=True)
 class OneFit(Frozen):
-    """What one of them found; both empty where it ended without an answer."""
+    """Result of one simulated fit; both arrays are empty if it failed."""
 
     cost_weights: Array
     gain: Array
 
 
-#: (name, compute) -> a fit: from memory, or computed now.
+#: (name, compute) -> a fit, stored or computed.
 RememberFit = Callable[[str, Callable[[], OneFit]], OneFit]
 
 
@@ -192,7 +192,7 @@ def simulated_fits(
     done: Callable[[str], None] = lambda _: None,
     remember: RememberFit = lambda _, compute: compute(),
 ) -> SimulatedFits:
-    """Fit recordings of one experiment with fresh noise, again and again."""
+    """Fit recordings of one experiment `count` times, each with new noise."""
     truth = np.array(person.cost_weights)
 
     def fit(number: int) -> OneFit:
@@ -201,7 +201,7 @@ def simulated_fits(
             end = search_from(noisy, person.structure, truth)
             fitted = structured_estimate(noisy, person.structure, end)
             gain = identified_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
-        except ImpcError:  # counted, and identified
+        except ImpcError:  # counted as failed
             return OneFit(frozen([]), frozen([]))
         return OneFit(frozen(end.cost_weights), frozen(gain))
 
@@ -218,20 +218,20 @@ def simulated_fits(
 
 
 def _measured(person: Person, problem: Problem, rng: np.random.Generator) -> Problem:
-    """Recordings of the presumed weights in a body drawn from what is stated of it."""
+    """Noisy recordings with the assumed weights, in a body drawn from its stated uncertainty."""
     unknown = np.where(problem.stated, problem.parameter_units, 0.0)
     drawn = problem.at(problem.starts, unknown * rng.standard_normal(len(unknown)))
     weights, trials = person.structure.weights(person.cost_weights), []
     for trial, run in zip(problem.recordings, verify_hard(drawn, weights), strict=True):
         if not run.complete:
-            raise SolverError("simulation", "the person falls", "lower amplitude")
+            raise SolverError("simulation", "the simulated subject falls", "reduce amplitude")
         noise = recorded_noise(person, trial.samples, rng)
         trials.append(replace(trial, outputs=run.x @ drawn.plant.C.T + noise))
     return replace(problem, recordings=trials, output_scale=person.deviation)
 
 
 def recorded_noise(person: Person, samples: int, rng: np.random.Generator) -> Array:
-    """Stationary first-order noise of the recorder of a person (samples, p), drawn from `rng`."""
+    """Draw stationary first-order recording noise (samples, p)."""
     root = person.root
     before = 0 if root == 0 else int(np.ceil(-_FORGOTTEN / np.log(root)))
     white = rng.standard_normal((samples + before, len(person.deviation)))

@@ -1,21 +1,19 @@
-"""The reliability of a study: every measure by output and condition, over subjects and visits.
+"""Reliability of all measures by output and condition, over subjects and visits.
 
-A score is the mean over the last trials of a visit (three, as in chapter 2). A subject who lacks a
-visit is left out of that analysis, and the result says so.
+A score is the mean over the last trials of a visit (three, as in chapter 2). Subjects without all
+visits are left out of an analysis, with a note.
 
-Coefficient of multiple correlation of transfer functions, within and between visits.
-
-Kadaba et al. (1989) for curves that are complex: |.| is the complex modulus, so that real and
-imaginary parts are two coordinates of each frequency. Y_ijt at visit i of M, trial j of N,
-frequency t of T:
+Coefficient of multiple correlation (CMC) of transfer functions, after Kadaba et al. (1989), for
+complex curves: |.| is the complex modulus. With Y_ijt at visit i of M, trial j of N, frequency t of
+T:
 
     within   1 - [sum |Y_ijt - mean_j|^2 / (M T (N - 1))]
                  / [sum |Y_ijt - mean_jt|^2 / (M (N T - 1))]
     between  1 - [sum |Y_ijt - mean_ij|^2 / (T (M N - 1))]
                  / [sum |Y_ijt - mean_ijt|^2 / (M N T - 1)]
 
-(the mean over the named indices) and the square root. Where the difference is negative there is no
-root: NaN, which says that curves differ more than frequencies do.
+where mean_j is the mean over j, and so on; the CMC is the square root. If the difference is
+negative, the CMC is NaN: curves differ more between trials than between frequencies.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ if TYPE_CHECKING:
     from impc.studies.reliability.icc import Icc, MeasurementError
     from impc.studies.reliability.measures import ComplexArray, Passband, TransferFunction
 
-#: Name of a measure -> what it is.
+#: Name of a measure -> description.
 MEASURES = {"rms": "sway (RMS about upright)", "energy": "energy in the band"}
 
 
@@ -61,7 +59,7 @@ class Trials:
     rate: float  # Samples per second
     # (subject, visit, condition) -> the trials analysed, in order
     cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
-    words: Mapping[str, str] = field(default_factory=dict)  # What outputs are called for readers
+    words: Mapping[str, str] = field(default_factory=dict)  # Names of the outputs in words
 
 
 @dataclass(frozen=True)
@@ -71,17 +69,17 @@ class MeasureResult:
     measure: str  # One of `MEASURES`
     output: str
     condition: str
-    # (subjects, visits), NaN where a cell is missing, in the output's unit (squared for energy)
+    # (subjects, visits), NaN if missing, in the output's unit (squared for energy)
     scores: Array
-    icc: Icc | None = None  # (A,k), between visits, with the generalised interval
-    # Of the score of one visit, with the minimal detectable change (95 %), in the score's unit
+    icc: Icc | None = None  # ICC(A,k) between visits with the generalised interval
+    # SEM and minimal detectable change (95 %) of the score of one visit, in its unit
     error: MeasurementError | None = None
     anova: Anova | None = None
     pairs: tuple[PairedTest, ...] = ()
-    trend: Trend | None = None  # Learning: change from visit to visit
-    # Of subjects, visits and trials; empty when trials are too few
+    trend: Trend | None = None  # Change from visit to visit (learning)
+    # Variance of subjects, visits and trials; empty if there are too few trials
     components: tuple[VarianceComponent, ...] = ()
-    notes: tuple[str, ...] = ()  # Why something is missing
+    notes: tuple[str, ...] = ()  # Reasons for missing results
 
 
 @dataclass(frozen=True)
@@ -90,32 +88,32 @@ class CmcResult:
 
     output: str
     condition: str
-    within: Array  # (subjects,), NaN where there is none
+    within: Array  # (subjects,), NaN if undefined
     between: Array
-    undefined: int  # How many are the root of a negative number
+    undefined: int  # Number of undefined coefficients (root of a negative number)
 
 
 @dataclass(frozen=True)
 class Reliability:
-    """Everything that is found of a study."""
+    """Results of a reliability study."""
 
     subjects: tuple[str, ...]  # Names, in the order of the study
     visits: tuple[str, ...]
     conditions: tuple[str, ...]
     outputs: tuple[str, ...]
-    band: Passband  # Of the input
+    band: Passband  # Passband of the input
     measures: tuple[MeasureResult, ...]
     cmc: tuple[CmcResult, ...]
-    # (subject, visit, condition) -> transfer function, average over trials
+    # (subject, visit, condition) -> transfer function, mean over trials
     responses: Mapping[tuple[str, str, str], TransferFunction]
-    notes: tuple[str, ...]  # On the study as a whole
+    notes: tuple[str, ...]  # Notes on the whole study
 
 
 def analyse(trials: Trials) -> Reliability:
     """Analyse a study."""
     if not trials.cells:
-        raise DataError("study", "has no trial", "check where it looks for recordings")
-    # In the order in which they come.
+        raise DataError("study", "has no trial", "check [study] recordings, table or bids")
+    # In the order of their first occurrence.
     subjects, visits, conditions = (
         tuple(dict.fromkeys(one)) for one in zip(*trials.cells, strict=True)
     )
@@ -123,7 +121,7 @@ def analyse(trials: Trials) -> Reliability:
     samples, rate = min(lengths), trials.rate
     notes = []
     if max(lengths) > samples:
-        notes.append(f"Trials have {samples} to {max(lengths)} samples: all were cut to {samples}.")
+        notes.append(f"Trials have {samples} to {max(lengths)} samples; all were cut to {samples}.")
     inputs = {
         key: [item.disturbance[:samples, 0] for item in cell] for key, cell in trials.cells.items()
     }
@@ -132,7 +130,7 @@ def analyse(trials: Trials) -> Reliability:
     responses = {
         key: transfer_function(inputs[key], outputs[key], rate, band) for key in trials.cells
     }
-    # Of each trial: scores by measure (p,), and its own transfer function (frequencies, p).
+    # For each trial: scores by measure (p,), and its transfer function (frequencies, p).
     scores: dict[str, dict[tuple[str, str, str], list[Array]]] = {
         "rms": {key: [rms(item) for item in cell] for key, cell in outputs.items()},
         "energy": {
@@ -175,7 +173,7 @@ def _measure(
     table: list[list[list[float]]],
     visits: tuple[str, ...],
 ) -> MeasureResult:
-    """Scores of every trial, by subject and visit, analysed; an empty list is a missing cell."""
+    """Analyse the scores of all trials, by subject and visit; an empty list is a missing cell."""
     scores = np.array([[np.mean(cell) if cell else np.nan for cell in row] for row in table])
     found: dict[str, Any] = {}
     notes: list[str] = []
@@ -194,7 +192,7 @@ def _measure(
     complete = [row for row in table if all(row)]
     try:
         if not complete:
-            raise DataError("scores", "are complete for no subject", "record every visit")
+            raise DataError("scores", "no subject has all visits", "record all visits")
         fewest = min(len(cell) for row in complete for cell in row)
         even = np.array([[cell[-fewest:] for cell in row] for row in complete])
         found["components"] = variance_components(even)
@@ -204,7 +202,7 @@ def _measure(
 
 
 def _cmc(output: str, condition: str, subjects: list[list[list[ComplexArray]]]) -> CmcResult:
-    """Of the curves (frequencies,) of every trial, by subject and visit."""
+    """CMC of the curves (frequencies,) of all trials, by subject and visit."""
     found, undefined = np.full((2, len(subjects)), np.nan), 0
     for place, visits in enumerate(subjects):
         fewest = min((len(trials) for trials in visits), default=0)
@@ -219,26 +217,26 @@ def _cmc(output: str, condition: str, subjects: list[list[list[ComplexArray]]]) 
 
 
 def cmc_within(curves: ComplexArray) -> float:
-    """Within visits; curves (visits, trials, frequencies)."""
+    """CMC within visits; curves (visits, trials, frequencies)."""
     M, N, T = curves.shape
     if N < 2 or T < 2:
-        raise DataError("curves", f"are of {N} trials, {T} frequencies", "a CMC needs 2 or more")
+        raise DataError("curves", f"got {N} trials, {T} frequencies", "give at least 2 of each")
     own = np.sum(np.abs(curves - curves.mean(axis=1, keepdims=True)) ** 2)
     all_of_visit = np.sum(np.abs(curves - curves.mean(axis=(1, 2), keepdims=True)) ** 2)
     return _root(own / (M * T * (N - 1)), all_of_visit, M * (N * T - 1))
 
 
 def cmc_between(curves: ComplexArray) -> float:
-    """Between visits; curves (visits, trials, frequencies)."""
+    """CMC between visits; curves (visits, trials, frequencies)."""
     M, N, T = curves.shape
     if M < 2 or T < 2:
-        raise DataError("curves", f"are of {M} visits, {T} frequencies", "a CMC needs 2 or more")
+        raise DataError("curves", f"got {M} visits, {T} frequencies", "give at least 2 of each")
     own = np.sum(np.abs(curves - curves.mean(axis=(0, 1), keepdims=True)) ** 2)
     everything = np.sum(np.abs(curves - curves.mean()) ** 2)
     return _root(own / (T * (M * N - 1)), everything, M * N * T - 1)
 
 
 def _root(own: float, squares: float, freedom: int) -> float:
-    """Of one less the share of `own` in the mean square; NaN where there is none."""
+    """Root of 1 minus the share of `own` in the mean square; NaN if negative."""
     share = 1 - own * freedom / squares if squares else -1.0
     return float(np.sqrt(share)) if share >= 0 else float("nan")

@@ -1,10 +1,8 @@
-"""Repeated-measures analysis of variance over visits, and what follows it.
+"""Repeated-measures analysis of variance, paired tests, trend, and variance components.
 
-One-way, uncorrected and with the epsilon of Greenhouse and Geisser (1959); paired t between
-visits, uncorrected and with the correction of Holm (1979); the trend over visits, the learning
-effect.
-
-Variance of subjects, visits and trials behind scores, with intervals.
+One-way analysis over visits, uncorrected and with the epsilon of Greenhouse and Geisser (1959);
+paired t-tests between visits, uncorrected and with the correction of Holm (1979); trend over visits
+(learning). Variance components of subjects, visits and trials:
 
     x_ijk = m + subject_i + visit_ij + trial_ijk          i = 1..n, j = 1..v, k = 1..t
 
@@ -15,10 +13,10 @@ analysis of variance (degrees of freedom n - 1, n (v - 1), n v (t - 1)) the comp
     visit    (MS_v - MS_t) / t
     subject  (MS_s - MS_v) / (t v)
 
-An interval of the trial's is chi-squared's. Those of the others, differences of mean squares, are
-the modified large-sample intervals of Ting, Burdick, Graybill, Jeyaratnam and Lu (1990), which keep
-their level far better than Satterthwaite's when the difference is small. Estimates may be negative,
-and are reported as they are.
+The interval of the trial component is from the chi-squared distribution. The others are differences
+of mean squares and have the modified large-sample intervals of Ting, Burdick, Graybill, Jeyaratnam
+and Lu (1990), whose coverage is better than that of Satterthwaite's if the difference is small.
+Negative estimates are not truncated.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ from impc.studies.reliability.icc import complete_rows, mean_squares
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Of an interval of 95 %, on each side.
+# Tail probability of a 95 % interval on each side.
 _TAIL = 0.025
 
 
@@ -46,38 +44,38 @@ class Anova(NamedTuple):
     """F test of a difference between visits."""
 
     F: float  # Mean square of visits over that of visits by subjects
-    freedom: tuple[int, int]  # Of numerator and denominator, uncorrected
+    freedom: tuple[int, int]  # Degrees of freedom of numerator and denominator, uncorrected
     p: float  # Uncorrected
-    epsilon: float  # Greenhouse and Geisser's, between 1 / (k - 1) and 1
-    p_corrected: float  # With both degrees of freedom times epsilon
-    left_out: int  # Subjects who lack a visit
+    epsilon: float  # Greenhouse-Geisser epsilon, between 1 / (k - 1) and 1
+    p_corrected: float  # Both degrees of freedom times epsilon
+    left_out: int  # Number of subjects without all visits
 
 
 class PairedTest(NamedTuple):
-    """Paired t between two visits."""
+    """Paired t-test between two visits."""
 
-    first: str  # The visits
+    first: str  # Visits
     second: str
     difference: float  # Mean of second minus first, in the score's unit
-    p: float  # Without and with Holm's correction over all pairs
-    p_holm: float
+    p: float  # Uncorrected
+    p_holm: float  # With Holm's correction over all pairs
 
 
 class Trend(NamedTuple):
     """Slope over visits."""
 
-    slope: float  # Mean of the subjects' least-squares slopes, in the score's unit a visit
-    low: float  # Ends of its interval of 95 %
+    slope: float  # Mean of the subjects' least-squares slopes, in the score's unit per visit
+    low: float  # 95 % interval
     high: float
-    p: float  # Of Student's t that the mean slope is zero
+    p: float  # t-test of a mean slope of zero
 
 
 def visit_anova(scores: Array) -> Anova:
-    """Test of visits; scores (subjects, visits), NaN where missing."""
+    """Test for differences between visits; scores (subjects, visits), NaN if missing."""
     kept, left_out = complete_rows(scores)
     squares = mean_squares(kept)
     if np.ptp(kept - kept.mean(axis=1, keepdims=True)) == 0:
-        raise DataError("scores", "are the same at every visit", "there is nothing to test")
+        raise DataError("scores", "are the same at all visits", "check the recordings")
     F = squares.occasions / squares.error if squares.error else np.inf
     freedom = (squares.k - 1, (squares.n - 1) * (squares.k - 1))
     epsilon = _greenhouse_geisser(kept)
@@ -88,13 +86,13 @@ def visit_anova(scores: Array) -> Anova:
 
 
 def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
-    """Every pair of visits, of subjects who have both; `scores` (subjects, visits)."""
+    """Tests of all pairs of visits, on subjects with both; `scores` (subjects, visits)."""
     rows = []
     for i, j in itertools.combinations(range(len(visits)), 2):
         both = scores[np.all(np.isfinite(scores[:, [i, j]]), axis=1)]
         if len(both) < 2:
             raise DataError(
-                f"visits {visits[i]} and {visits[j]}", f"share {len(both)} subjects", "two at least"
+                f"visits {visits[i]} and {visits[j]}", f"share {len(both)} subjects", "2 are needed"
             )
         test: Any = scipy.stats.ttest_rel(both[:, j], both[:, i])
         p = float(test.pvalue)
@@ -104,7 +102,7 @@ def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]
 
 
 def learning_trend(scores: Array) -> Trend:
-    """Whether scores rise or fall from visit to visit; scores (subjects, visits)."""
+    """Trend of the scores over visits; scores (subjects, visits)."""
     kept, _ = complete_rows(scores)
     visit = np.arange(kept.shape[1]) - (kept.shape[1] - 1) / 2
     slopes = kept @ visit / float(visit @ visit)
@@ -114,7 +112,7 @@ def learning_trend(scores: Array) -> Trend:
 
 
 def _greenhouse_geisser(scores: Array) -> float:
-    """tr(S)^2 / ((k - 1) tr(S^2)), S the covariance of visits, doubly centred."""
+    """tr(S)^2 / ((k - 1) tr(S^2)), where S is the doubly centred covariance of visits."""
     k = scores.shape[1]
     centring = np.eye(k) - 1 / k
     S = centring @ np.cov(scores, rowvar=False) @ centring
@@ -123,11 +121,11 @@ def _greenhouse_geisser(scores: Array) -> float:
 
 
 class VarianceComponent(NamedTuple):
-    """One component."""
+    """One variance component."""
 
     name: str  # "subject", "visit" or "trial"
-    value: float  # Estimate and ends of its interval of 95 %, in the score's unit squared
-    low: float
+    value: float  # In the score's unit squared
+    low: float  # 95 % interval
     high: float
 
 
@@ -136,8 +134,8 @@ def variance_components(scores: Array) -> tuple[VarianceComponent, ...]:
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 3 or min(table.shape) < 2:
         raise DataError(
-            "scores", f"are {' x '.join(map(str, table.shape))}",
-            "give two or more subjects, visits and trials",
+            "scores", f"got {' x '.join(map(str, table.shape))}",
+            "give at least 2 subjects, visits and trials",
         )  # fmt: skip
     n, v, t = table.shape
     cells, subjects = table.mean(axis=2), table.mean(axis=(1, 2))
@@ -159,7 +157,7 @@ def variance_components(scores: Array) -> tuple[VarianceComponent, ...]:
 def _difference(
     squares: tuple[float, ...], freedom: tuple[int, ...], over: int
 ) -> tuple[float, float, float]:
-    """(MS_1 - MS_2) / over, and the ends of Ting's interval."""
+    """(MS_1 - MS_2) / over, and its interval after Ting et al."""
     first, second = squares
     f = np.array(freedom)
     (G1, G2), (H1, H2) = 1 - f / chi2.ppf(1 - _TAIL, f), f / chi2.ppf(_TAIL, f) - 1

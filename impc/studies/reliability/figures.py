@@ -38,7 +38,7 @@ _LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, ":"), (INK, "-."))
 
 
 def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
-    """How each figure is drawn, by name; one trial and several people are files alone."""
+    """Functions that draw the figures, by name; some are written to files only."""
     person, visit, condition = result.subjects[0], result.visits[0], result.conditions[0]
     visits = {f"visit {one}": (person, one, condition) for one in result.visits}
     people = {f"subject {one}": (one, visit, condition) for one in result.subjects}
@@ -54,7 +54,7 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
 
 
 def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
-    """Every ICC with its interval over the bands from poor to excellent."""
+    """All ICCs with their intervals over the bands from poor to excellent."""
     items = [item for item in known(result) if item.measure == "rms" or not narrow]
     figure = new_figure(PHONE if narrow else HALF, 0.9 + 0.29 * len(items))
     ax, labels, name = figure.subplots(), [], ""
@@ -82,7 +82,7 @@ def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
 
 
 def _bland_altman(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
-    """Difference of first and last visit over their mean, person by person."""
+    """Difference of last and first visit over their mean, one dot per person."""
     items = [item for item in known(result) if item.measure == "rms"]
     columns = 2 if narrow else max(len(result.conditions), 2)
     rows = -(-len(items) // columns)
@@ -103,7 +103,7 @@ def _bland_altman(result: Reliability, words: Mapping[str, str], narrow: bool) -
 
 
 def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
-    """Perturbation and outputs of one trial, over time and as power."""
+    """Perturbation and outputs of one trial over time, and their power spectra."""
     trial = next(iter(trials.cells.values()))[0]
     factor, angle = shown_angle()
     signals = [("perturbation torque", trial.disturbance[:, 0], "N m")]
@@ -128,7 +128,7 @@ def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
 def _responses(
     trials: Trials, result: Reliability, cells: dict[str, tuple[str, str, str]], narrow: bool
 ) -> Figure:
-    """Size and phase of the averaged responses of up to four cells; no phase without coherence."""
+    """Magnitude and phase of the averaged responses of up to four cells."""
     outputs = result.outputs[: 1 if narrow else None]
     figure = new_figure(PHONE if narrow else WIDE, 3.4)
     axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False)
@@ -140,14 +140,15 @@ def _responses(
         style: Any = {"color": color, "linestyle": line, "label": label}
         for index, (above, below) in enumerate(axes.T):
             response, seen = factor * found.response[:, index], found.coherence[:, index]
-            clear = seen >= 1 - 0.05 ** (1 / max(len(trials.cells[key]) - 1, 1e-9))  # chance
+            # Phase only above the coherence that chance alone reaches in 5 %.
+            clear = seen >= 1 - 0.05 ** (1 / max(len(trials.cells[key]) - 1, 1e-9))
             phase = np.full(len(response), np.nan)
             phase[clear] = np.degrees(np.unwrap(np.angle(response[clear])))
             above.loglog(found.frequency, np.abs(response), **style)
             below.semilogx(found.frequency, phase, **style)
     for (above, below), output in zip(axes.T, outputs, strict=True):
         name = word_of(output, trials.words)
-        above.set_title(f"{name[:1].upper()}{name[1:]}, size ({unit}/(N m))")
+        above.set_title(f"{name[:1].upper()}{name[1:]}, magnitude ({unit}/(N m))")
         below.set_title("Phase (°)")
         below.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend(loc="lower left")

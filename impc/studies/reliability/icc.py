@@ -7,25 +7,24 @@ n subjects are measured on k occasions. From the two-way analysis of variance
     MSE = sum_ij (x_ij - m_i. - m_.j + m)^2 / ((n - 1)(k - 1))
     MSW = sum_ij (x_ij - m_i.)^2 / (n (k - 1))                within subjects, one-way
 
-    (A,1)   (MSR - MSE) / (MSR + (k - 1) MSE + k (MSC - MSE) / n)      of a single score
-    (A,k)   (MSR - MSE) / (MSR + (MSC - MSE) / n)                      of the mean of k
+    (A,1)   (MSR - MSE) / (MSR + (k - 1) MSE + k (MSC - MSE) / n)      single score
+    (A,k)   (MSR - MSE) / (MSR + (MSC - MSE) / n)                      mean of k scores
 
-Whether occasions are random or fixed changes the meaning and not the number. Estimates may be
-negative, and are reported as they are.
+The formulas are the same for random and fixed occasions. Negative estimates are not truncated.
 
-McGraw and Wong's interval of (A,1) and (A,k) is too narrow where occasions differ and are few; the
-generalised one (Tian and Cappelleri, Statistics in Medicine 23, 2004, 2125) covers there too. With
-U chi-squared over its degrees of freedom it is the range of the ICC of MSR / U_r, MSC / U_c and
-MSE / U_e (docs/reliability.md has how often each covers).
+McGraw and Wong's interval is too narrow if there are few and different occasions. The generalised
+interval (Tian and Cappelleri, Statistics in Medicine 23, 2004, 2125) keeps its level: it is the
+95 % range of the ICC of MSR / U_r, MSC / U_c and MSE / U_e, where each U is chi-squared over its
+degrees of freedom.
 
-The error of one measurement does not depend on how many are averaged for an ICC. Two measurements
-of a subject on two occasions differ by two occasions and two errors, so
+The error of one measurement does not depend on the number of averaged scores. The difference of two
+measurements of a subject contains two occasions and two errors, so
 
     SEM^2 = var(occasion) + var(error),  estimated by MSW = ((n - 1) MSE + MSC) / n,
     MDC   = t sqrt(2) SEM,
 
-t Student's with Satterthwaite's degrees of freedom of MSW. SEM is SD sqrt(1 - ICC(A,1)), and not
-with ICC(A,k), the reliability of a mean.
+where t is Student's quantile with Satterthwaite's degrees of freedom of MSW. SEM equals
+SD sqrt(1 - ICC(A,1)), not with ICC(A,k), which is the reliability of a mean.
 """
 
 from __future__ import annotations
@@ -41,58 +40,57 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-_ALIKE = 1e-24  # of mean squares: round-off of means
+_ALIKE = 1e-24  # Relative size of mean squares that is rounding error
 _LEVEL = 0.95
-#: Of a single score, or of the mean over all occasions.
+#: ICC of a single score, or of the mean over all occasions.
 Form = Literal["A,1", "A,k"]
 FORMS: tuple[Form, ...] = ("A,1", "A,k")
 
-#: How an interval is made: McGraw and Wong's, or the generalised one.
+#: Interval: McGraw and Wong's F, or the generalised one.
 Method = Literal["F", "generalised"]
-# Draws behind a generalised interval: its ends then vary by .01 of its width from seed to seed.
+# Draws of a generalised interval: its ends then vary by 1 % of its width between seeds.
 _DRAWS = 20_000
 
 
 class MeanSquares(NamedTuple):
-    """Mean squares of the two-way layout, and its size."""
+    """Mean squares of the two-way layout in the score's unit squared, and its size."""
 
-    subjects: float  # MSR, MSC, MSE and MSW, in the score's unit squared
-    occasions: float
-    error: float
-    within: float
-    n: int  # Number of subjects and of occasions
-    k: int
+    subjects: float  # MSR
+    occasions: float  # MSC
+    error: float  # MSE
+    within: float  # MSW
+    n: int  # Number of subjects
+    k: int  # Number of occasions
 
 
 class Icc(NamedTuple):
-    """One intraclass correlation with its interval of 95 %."""
+    """Intraclass correlation with its 95 % interval."""
 
-    # NaN when all scores are equal, or the denominator is not positive. An estimate of 1 has the
+    # NaN if all scores are equal or the denominator is not positive. An estimate of 1 has the
     # interval 1 to 1.
     value: float
     low: float
     high: float
     subjects: int
-    left_out: int  # Subjects that lacked a score on some occasion
+    left_out: int  # Number of subjects without all scores
 
 
 class MeasurementError(NamedTuple):
     """Error of one measurement of one subject, in the scores' unit."""
 
     sem: float  # Standard error of measurement
-    # Minimal detectable change: what the difference of two measurements exceeds by error alone in
-    # 5 % of all subjects
+    # Minimal detectable change: by error alone, 5 % of differences of two measurements exceed it
     mdc: float
 
 
 def icc(scores: ArrayLike, form: Form = "A,k", method: Method = "F") -> Icc:
-    """Intraclass correlation of scores; `scores` (subjects, occasions)."""
+    """Intraclass correlation of `scores` (subjects, occasions)."""
     if form not in FORMS:
-        raise InputError(f"ICC form {form!r}", "is not one of agreement", "take 'A,1' or 'A,k'")
+        raise InputError(f"ICC form {form!r}", "is not a form of agreement", "use 'A,1' or 'A,k'")
     complete, left_out = complete_rows(scores)
     squares = mean_squares(complete)
     value = _estimate(squares, form)
-    # Of subjects whose means are the same number nothing says how far others might differ.
+    # If all subjects have the same mean, there is no interval.
     alike = squares.subjects <= _ALIKE * (squares.within + squares.occasions)
     if alike or np.isnan(value):
         low, high = np.nan, np.nan
@@ -123,7 +121,7 @@ def mean_squares(scores: Array) -> MeanSquares:
 
 
 def measurement_error(scores: ArrayLike) -> MeasurementError:
-    """Error of one measurement, and the change that it hides; `scores` (subjects, occasions)."""
+    """SEM and minimal detectable change of one measurement; `scores` (subjects, occasions)."""
     complete = complete_rows(scores)[0]
     if np.ptp(complete - complete[:, :1]) == 0:
         return MeasurementError(0.0, 0.0)
@@ -137,16 +135,16 @@ def measurement_error(scores: ArrayLike) -> MeasurementError:
 
 
 def complete_rows(scores: ArrayLike) -> tuple[Array, int]:
-    """Scores (subjects, occasions) of the subjects who have all, and how many lack one."""
+    """Scores of the subjects with all occasions, and the number of the others."""
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 2:
-        raise DataError("scores", f"have {table.ndim} dimensions", "give (subjects, occasions)")
+        raise DataError("scores", f"got {table.ndim} dimensions", "pass (subjects, occasions)")
     if table.shape[1] < 2:
-        raise DataError("scores", f"are of {table.shape[1]} occasion", "an ICC needs two or more")
+        raise DataError("scores", f"got {table.shape[1]} occasion", "give at least 2")
     kept = table[np.all(np.isfinite(table), axis=1)]
     if len(kept) < 2:
         raise DataError(
-            "scores", f"are complete for {len(kept)} subject", "an ICC needs two or more"
+            "scores", f"are complete for {len(kept)} subject", "give at least 2 such subjects"
         )
     return frozen(kept), len(table) - len(kept)
 
@@ -154,27 +152,26 @@ def complete_rows(scores: ArrayLike) -> tuple[Array, int]:
 def _estimate(squares: MeanSquares, form: Form) -> float:
     r, c, e, _, n, k = squares
     denominator = r + (c - e) / n if form == "A,k" else r + (k - 1) * e + k * (c - e) / n
-    # Where subjects differ less than error makes them differ, the ratio for a mean can lose its
-    # denominator, and with it its meaning.
+    # If subjects differ less than by error alone, the denominator of (A,k) can be negative.
     return float((r - e) / denominator) if denominator > 0 else float("nan")
 
 
 def _generalised(squares: MeanSquares) -> tuple[float, float]:
-    """Tian and Cappelleri's limits of ICC(A,1); the same draws for every table."""
+    """Tian and Cappelleri's limits of ICC(A,1), with a fixed seed."""
     n, k = squares.n, squares.k
     rng = np.random.default_rng(0)
     r, c, e = (
         square / (rng.chisquare(freedom, _DRAWS) / freedom)
         for square, freedom in zip(squares[:3], (n - 1, k - 1, (n - 1) * (k - 1)), strict=True)
     )
-    # Occasions whose variance would be negative have none.
+    # Negative variances of occasions are set to zero.
     drawn = (r - e) / (r + (k - 1) * e + k * np.maximum(c - e, 0.0) / n)
     low, high = percentiles(drawn, _LEVEL)
     return float(low), float(high)
 
 
 def _stepped_up(limit: float, k: int) -> float:
-    """Spearman and Brown; no single score's ICC is below -1/(k-1), where the mean's is -inf."""
+    """Spearman-Brown formula; ICC(A,1) above -1/(k-1), at which ICC(A,k) is -inf."""
     if 1 + (k - 1) * limit <= 0:
         return -np.inf
     return float(k * limit / (1 + (k - 1) * limit))
@@ -192,7 +189,7 @@ def _f_limits(squares: MeanSquares) -> tuple[float, float]:
     freedom = (a * c + b * e) ** 2 / spread
     lower = scipy.stats.f.ppf(tail, n - 1, freedom)
     upper = scipy.stats.f.ppf(tail, freedom, n - 1)
-    if not np.isfinite(lower * upper):  # nearly no degree of freedom: nothing is excluded
+    if not np.isfinite(lower * upper):  # almost no degrees of freedom: no value is excluded
         return -np.inf, 1.0
     rest = k * c + (k * n - k - n) * e
     low = n * (r - lower * e) / (lower * rest + n * r)

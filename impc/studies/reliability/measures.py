@@ -1,22 +1,21 @@
-"""Measures of one trial: root-mean-square about upright, and mean bandpass signal energy (2.1).
+"""Measures of a trial: RMS about upright, bandpass energy (2.1), transfer function.
 
     RMS  = sqrt( mean y^2 )                        about 0, upright: the mean is not removed
     E_mb = df sum_{i = l..h} Phi(f_i)              (2.1), Phi one-sided power spectral density
 
 The passband l..h is the largest contiguous range in which the input's power is above 3 % of its
-peak. A ternary sequence has no power at even harmonics of its period, so that no range of raw
-frequencies is contiguous: it is looked for among the frequencies that the input excites. An input
-that was cut inside a period, or is not periodic, excites all of them, unevenly: its power is then
-averaged over seven neighbours first.
+peak, among the frequencies that the input excites (a ternary sequence has no power at even
+harmonics of its period). If the input is not periodic, or cut inside a period, its power is first
+averaged over seven neighbouring frequencies.
 
-Empirical transfer function estimates from the input to each output, with coherence.
+Empirical transfer function estimates from the input to each output, with coherence:
 
     G(f_k) = Y(f_k) / U(f_k)                                  one trial (ETFE, Ljung 1999)
     G(f_k) = sum_j Y_j conj(U_j) / sum_j |U_j|^2              several trials, H1
     C(f_k) = |sum_j Y_j conj(U_j)|^2 / (sum_j |U_j|^2 sum_j |Y_j|^2)
 
-at the excited frequencies of the passband. The loop is closed, and no obstacle: the torque on the
-seat comes from outside. With trials of one and the same input H1 is the mean of the trials' ETFE.
+at the excited frequencies of the passband. The closed loop causes no bias, because the torque on
+the seat is exogenous. If all trials have the same input, H1 is the mean of their ETFEs.
 """
 
 from __future__ import annotations
@@ -34,37 +33,37 @@ from impc.errors import DataError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# Power below this share of the peak is none: rounding, and what a window leaks.
+# Power below this share of the peak is attributed to rounding and leakage.
 _NOTHING = 1e-6
-# A period's odd harmonics are half of all frequencies.
+# Largest share of excited frequencies in a line spectrum; odd harmonics are half of all.
 _MOST_LINES = 0.6
 _NEIGHBOURS = 7
 
 
 @dataclass(frozen=True)
 class Passband:
-    """Range of frequencies."""
+    """Range of frequencies, ends included."""
 
-    low: float  # Hz, both inside
+    low: float  # Hz
     high: float
-    # Indices (f,) of the excited frequencies inside, on the grid of the input's periodogram
+    # Indices (f,) of the excited frequencies in the input's periodogram
     excited: IntArray
 
 
 def rms(outputs: Array) -> Array:
-    """Root-mean-square about upright of each output (p,), in its unit; outputs (samples, p)."""
+    """Root mean square about zero (upright) of each output (p,); outputs (samples, p)."""
     return np.asarray(np.sqrt(np.mean(np.asarray(outputs) ** 2, axis=0)))
 
 
 def passband(signal: Array, rate: float) -> Passband:
-    """Largest contiguous range of excited frequencies of a `signal` (samples,) at `rate` per s."""
+    """Passband of a `signal` (samples,) sampled at `rate` in Hz."""
     frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
     power[0] = 0.0
     peak = float(power.max(initial=0.0))
     if peak <= 1e-24 * max(float(np.mean(np.asarray(signal) ** 2)), 1e-300) or peak == 0:
         raise DataError("input", "is constant: its passband is empty", "check its column")
     excited = np.flatnonzero(power > _NOTHING * peak)
-    if len(excited) > _MOST_LINES * len(power):  # no line spectrum
+    if len(excited) > _MOST_LINES * len(power):  # not a line spectrum
         power = scipy.ndimage.uniform_filter1d(power, _NEIGHBOURS)
         peak = float(power.max())
     above = power[excited] > 0.03 * peak
@@ -76,15 +75,15 @@ def passband(signal: Array, rate: float) -> Passband:
 
 
 def band_energy(outputs: Array, rate: float, low: float, high: float) -> Array:
-    """(2.1) of outputs (samples, p) at `rate` per s: (p,), in their unit squared."""
+    """Band energy (2.1) of outputs (samples, p) sampled at `rate` in Hz: (p,)."""
     frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=0)
     step = float(frequency[1] - frequency[0])
     rounding = 1e-6 * step
     inside = (frequency >= low - rounding) & (frequency <= high + rounding)
     if not np.any(inside):
         raise DataError(
-            "passband", f"{low:g} to {high:g} Hz holds no frequency of the trial",
-            "give longer trials",
+            "passband", f"{low:g} to {high:g} Hz contains no frequency of the trial",
+            "use longer trials",
         )  # fmt: skip
     return np.asarray(step * np.sum(power[inside], axis=0))
 
@@ -95,28 +94,30 @@ ComplexArray = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 
 @dataclass(frozen=True)
 class TransferFunction:
-    """Estimate at a few frequencies."""
+    """Transfer function estimate with coherence."""
 
     frequency: Array  # Hz (f,)
     response: ComplexArray  # Output over input (f, p)
-    coherence: Array  # (f, p); 1 for a single trial, which cannot say
+    coherence: Array  # (f, p); always 1 for a single trial
 
 
 def transfer_function(
     inputs: Sequence[Array], outputs: Sequence[Array], rate: float, band: Passband
 ) -> TransferFunction:
-    """From trials of one length: inputs (samples,), outputs (samples, p), at `rate` per s."""
+    """Estimate from trials of equal length: inputs (samples,), outputs (samples, p)."""
     if not inputs:
-        raise DataError("transfer function", "has no trial", "give one or more")
+        raise DataError("transfer function", "the list of trials is empty", "pass at least one")
     lengths = {len(item) for item in (*inputs, *outputs)}
     if len(lengths) > 1:
         raise DataError(
-            "trials", f"have {', '.join(map(str, sorted(lengths)))} samples", "cut them alike"
+            "trials", f"have {', '.join(map(str, sorted(lengths)))} samples", "cut to equal length"
         )
     (samples,) = lengths
     chosen = band.excited
     if chosen[-1] > samples // 2:
-        raise DataError("trials", "are shorter than the input of the passband", "cut them alike")
+        raise DataError(
+            "trials", "are shorter than the input of the passband", "cut to equal length"
+        )
     U = np.array([np.fft.rfft(item)[chosen] for item in inputs])
     Y = np.array([np.fft.rfft(item, axis=0)[chosen] for item in outputs])
     power = np.sum(np.abs(U) ** 2, axis=0)[:, None]

@@ -1,4 +1,4 @@
-"""The report of a reliability study: page, tables, result.json, figures."""
+"""Report of a reliability study."""
 
 from __future__ import annotations
 
@@ -40,37 +40,37 @@ if TYPE_CHECKING:
 
 _HERO = Picture(
     "icc", "ICC of every measure with its interval, over bands from poor to excellent",
-    "One is perfect. A measure is reliable where the whole line lies in good or excellent. Blue: "
+    "1 is perfect. A measure is called reliable if its whole interval is good or excellent. Blue: "
     "sway (RMS); grey: energy in the band of the perturbation.",
 )  # fmt: skip
 _BLAND_ALTMAN = Picture(
     "bland-altman", "Bland-Altman plot: difference of first and last visit over their mean",
-    "A dot each person: last visit minus first (upwards) over the mean of both. Line: mean; grey: "
-    "95 % limits of agreement. A change below the smallest detectable change is no more than the "
-    "scatter of the test.",
+    "One dot per person: last visit minus first (vertical) over the mean of both. Line: mean; "
+    "grey: 95 % limits of agreement. A change below the smallest detectable change may be due to "
+    "the error of the test alone.",
 )  # fmt: skip
 _RESPONSES = Picture(
-    "transfer-visits", "Responses of one person at every visit",
-    "One person and condition, each visit, mean over trials. The phase is left out where coherence "
-    "is not above that of chance (95 %).",
+    "transfer-visits", "Responses of one person at all visits",
+    "One person and condition, all visits, mean over trials. The phase is left out if chance alone "
+    "can reach the coherence (95 %).",
 )  # fmt: skip
 _METHODS = (
     "Reliability was assessed on {size} people, visits and trials. The score of a visit is the "
     "mean over its trials of the root mean square of a tilt about upright (sway), or of its energy "
     "from {low} to {high} Hz. Agreement between visits: ICC(A,k) of McGraw and Wong (1996) with "
     "the generalised 95 % interval of Tian and Cappelleri (2004). The smallest detectable change "
-    "(95 %) is of single visits, with Student's t."
+    "(95 %) refers to single visits and uses Student's t distribution."
 )
 
 
 def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
-    """Page, result.json, tables and figures; they name the `command` and its `inputs`."""
+    """Report of `impc reliability`."""
     words, tables, band = trials.words, reliability_findings(trials, result), result.band
     people, visits = len(result.subjects), len(result.visits)
     size = f"{people} × {visits} × {max(map(len, trials.cells.values()))}"
     sways = [item for item in known(result) if item.measure == "rms"]
     keys = [Key(size, "", "people × visits × trials")]
-    copied: Copy | str = "There is no reliability to copy."
+    copied: Copy | str = "There is no text to copy: no ICC could be computed."
     provenance = Provenance(command=command, inputs=inputs)
     ends = {"low": number(band.low), "high": number(band.high)}
     recordings = (
@@ -110,7 +110,7 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
 
 
 def _keys(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Key]:
-    """The lowest ICC, and the smallest change of a person that shows."""
+    """Key numbers: lowest ICC, and smallest detectable change of a person."""
     least = lowest(sways)
     value, _, interval = icc_text(least).removeprefix("ICC ").partition(" ")
     change, _, unit = change_text(sways[0]).partition(" ")
@@ -123,17 +123,17 @@ def _keys(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Key]
 
 
 def _checks(result: Reliability, words: Mapping[str, str]) -> list[Check]:
-    """Missing visits, learning, and what was cut."""
+    """Checks of completeness and learning."""
     notes = dict.fromkeys(note for item in result.measures for note in item.notes)
     lacking = "; ".join([*notes, *result.notes])
     found = [Check(Level.AMBER if lacking else Level.GREEN, "Complete",
-                   f"{lacking or 'Every person has every visit and trial'}.")]  # fmt: skip
+                   f"{lacking or 'All people have all visits and trials'}.")]  # fmt: skip
     tests = [item for item in known(result) if item.measure == "rms" and item.trend is not None]
     if tests:
         p = holm(np.array([item.trend.p for item in tests if item.trend]))
         changed = [f"{measure_name(item, words)}, {item.condition}"
                    for item, one in zip(tests, p, strict=True) if one <= 0.05]  # fmt: skip
-        said = f"Sway neither rises nor falls over the visits (least Holm p {number(min(p), 2)})."
+        said = f"No change of sway over the visits was found (smallest Holm p {number(min(p), 2)})."
         if changed:
             said = f"Sway changes from visit to visit: {'; '.join(changed)}."
         found.append(Check(Level.AMBER if changed else Level.GREEN, "Learning", said))
@@ -155,14 +155,14 @@ def reliability_findings(trials: Trials, result: Reliability) -> dict[str, Findi
 def _table(
     name: str, rows: Sequence[Mapping[str, Any]], caption: str, folded: str = "", **labels: str
 ) -> Finding:
-    """A finding whose code names and empty notes stand in the files alone."""
+    """Finding whose names of outputs and empty notes are in the files only."""
     table = pd.DataFrame(rows)
     hidden = ["output", *(["notes"] if "notes" in table and not table["notes"].any() else [])]
     return Finding(name, table, caption, folded=folded, digits=3, labels=labels, hidden=hidden)
 
 
 def _row(item: MeasureResult, words: Mapping[str, str], **shown: float) -> dict[str, Any]:
-    """Of the columns that all have, and numbers in the unit in which a score is shown."""
+    """Common columns of a row, and numbers in the shown unit of the score."""
     factor, unit = shown_score(item)
     row = {"measure": measure_name(item, words), "output": item.output}
     scaled: dict[str, Any] = {name: factor * value for name, value in shown.items()}
@@ -181,8 +181,8 @@ def _icc(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -
         rows.append(row | {"notes": "; ".join(item.notes)})
     caption = (
         "ICC(A,k), agreement of the mean over visits, with two 95 % intervals: generalised (Tian "
-        "and Cappelleri 2004), which the page goes by, and F (McGraw and Wong 1996), too narrow "
-        "where few visits differ. SEM and smallest detectable change are of a single visit."
+        "and Cappelleri 2004), used on this page, and F (McGraw and Wong 1996), too narrow for few "
+        "and different visits. SEM and smallest detectable change refer to a single visit."
     )
     labels = {"low": "Low (generalised)", "high": "High (generalised)", "low_f": "Low (F)"}
     labels |= {"icc": "ICC", "high_f": "High (F)", "sem": "SEM"}
@@ -209,14 +209,14 @@ def _visits(
             row |= _row(item, words, change_per_visit=slope, low=low, high=high) | {"p_change": p}
         rows.append(row)
     caption = (
-        "Mean and SD of the people; analysis of variance over visits, uncorrected and after "
-        "Greenhouse and Geisser; change per visit with its 95 % CI."
+        "Mean and SD over people; analysis of variance over visits, uncorrected and with the "
+        "Greenhouse-Geisser correction; change per visit with its 95 % CI."
     )
-    return _table(f"visits-{measure}", rows, caption, f"Every visit: {MEASURES[measure]}")
+    return _table(f"visits-{measure}", rows, caption, f"All visits: {MEASURES[measure]}")
 
 
 def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
-    """Every condition against the first, person by person, over all visits."""
+    """Paired comparison of all conditions with the first, means over visits."""
     rows, first = [], result.conditions[0]
     for output in result.outputs:
         items = [one for one in result.measures if (one.measure, one.output) == ("rms", output)]
@@ -232,8 +232,8 @@ def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
     for row, corrected in zip(rows, holm(np.array([row["p"] for row in rows])), strict=True):
         row["p_holm"] = float(corrected)
     caption = (
-        "Sway in each condition minus the first, means over visits, paired t by person with 95 % "
-        "CI; p (Holm) is corrected over all rows."
+        "Sway in each condition minus that in the first, means over visits; paired t-test over "
+        "people with 95 % CI; p (Holm) is corrected over all rows."
     )
     return _table("conditions", rows, caption, p_holm="p (Holm)")
 
@@ -260,8 +260,8 @@ def _correlations(result: Reliability, words: Mapping[str, str]) -> Finding:
             "between_visits": between, "sd_between": sd_between, "undefined": item.undefined,
         })  # fmt: skip
     caption = (
-        "Coefficient of multiple correlation of the responses within and between visits (1: the "
-        "same curves), mean and SD of the people; undefined: people without one."
+        "Coefficient of multiple correlation of the responses within and between visits (1: "
+        "identical curves), mean and SD over people; undefined: number of undefined coefficients."
     )
     return _table("cmc", rows, caption, "Agreement of the responses in numbers")
 

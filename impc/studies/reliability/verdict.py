@@ -1,7 +1,7 @@
-"""Whether a test is reliable, in which measure, and which change of one person is more than chance.
+"""Verdict of a reliability study.
 
-A measure is called reliable where the lower end of its ICC's 95 % interval is good or better by
-Cicchetti's (1994) words, however high the estimate (docs/reliability.md).
+A measure is called reliable if the lower end of the 95 % interval of its ICC is good or better
+after Cicchetti (1994), whatever the estimate (docs/howto/reliability_selection.md).
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
     from impc.studies.reliability.analysis import MeasureResult, Reliability
 
-#: Ends and words of an ICC.
+#: Upper ends and names of the bands of an ICC (Cicchetti 1994).
 BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
 _GOOD = 0.60
 _COUNTS = {2: "both", 3: "all three", 4: "all four"}
 
 
 def interval_band(low: float, high: float) -> str:
-    """The word for an interval from `low` to `high`; those of both ends where they differ."""
+    """Band of an interval from `low` to `high`, for example "good to excellent"."""
     first, last = (
         next((word for most, word in BANDS if end < most), "not defined") for end in (low, high)
     )
@@ -35,18 +35,18 @@ def interval_band(low: float, high: float) -> str:
 
 
 def shown_score(item: MeasureResult) -> tuple[float, str]:
-    """Factor and unit in which a score is shown."""
+    """Factor to the shown unit of a score, and that unit."""
     factor, unit = shown_angle()
     return (factor, unit) if item.measure == "rms" else (factor**2, f"{unit}²")
 
 
 def word_of(output: str, words: Mapping[str, str]) -> str:
-    """An output in words."""
+    """Name of an output in words."""
     return words.get(output, output.replace("_", " "))
 
 
 def measure_name(item: MeasureResult, words: Mapping[str, str]) -> str:
-    """A measure of a signal: the RMS of a tilt is called its sway."""
+    """Name of a measure of a signal; the RMS of a tilt is called sway."""
     signal = word_of(item.output, words)
     if item.measure == "energy":
         return f"band energy of {signal}"
@@ -54,20 +54,20 @@ def measure_name(item: MeasureResult, words: Mapping[str, str]) -> str:
 
 
 def icc_text(item: MeasureResult) -> str:
-    """An ICC with its interval."""
+    """ICC with its interval."""
     assert item.icc is not None
     value, low, high = (f"{end:.2f}".replace("-", "\u2212") for end in item.icc[:3])
     return f"ICC {value} (95 % CI {low} to {high})"
 
 
 def change_text(item: MeasureResult) -> str:
-    """The smallest detectable change of a person, in the shown unit."""
+    """Smallest detectable change of a person in the shown unit."""
     factor, unit = shown_score(item)
     return "-" if item.error is None else f"{number(factor * item.error.mdc)} {unit}"
 
 
 def known(result: Reliability) -> list[MeasureResult]:
-    """Measures with an ICC, the RMS first, those of one signal together."""
+    """Measures with an ICC, RMS first, sorted by signal."""
     found = [item for item in result.measures if item.icc is not None]
     order = result.outputs.index
     return sorted(found, key=lambda item: (item.measure != "rms", order(item.output)))
@@ -79,18 +79,18 @@ def _reaches(item: MeasureResult, *, low: bool = True) -> bool:
 
 
 def reliability_verdict(result: Reliability, words: Mapping[str, str]) -> Verdict:
-    """The verdict of a study."""
+    """Verdict of a reliability study."""
     sways = [item for item in known(result) if item.measure == "rms"]
     people, visits = len(result.subjects), len(result.visits)
     if not sways:
         headline = "These recordings cannot show whether the test is reliable."
-        said = ("No person has a full set of scores at two visits: measure the same people again, "
-                "in the same conditions.")  # fmt: skip
+        said = ("An ICC needs at least two people with scores at all of two or more visits: "
+                "measure the same people again, in the same conditions.")  # fmt: skip
         return Verdict(Level.AMBER, headline, said, badge="Undecided")
     good, least = sum(map(_reaches, sways)), lowest(sways)
     sentence = (
-        "A measure is called reliable where the 95 % CI of its ICC begins at 0.60 or above. The "
-        f"lowest: {icc_text(least)}, {measure_name(least, words)}, {least.condition}."
+        "A measure is called reliable if the 95 % CI of its ICC begins at 0.60 or above. Lowest: "
+        f"{icc_text(least)}, {measure_name(least, words)}, {least.condition}."
     )
     level, badge, headline = Level.AMBER, "Reliable in part", _headline(sways, words)
     if good == len(sways):
@@ -102,22 +102,22 @@ def reliability_verdict(result: Reliability, words: Mapping[str, str]) -> Verdic
         level, badge = Level.RED, "Not reliable"
     bad = [item for item in known(result) if not _reaches(item)]
     alert = Alert(
-        Level.AMBER, "Not every measure is shown to be reliable",
+        Level.AMBER, "Not all measures are shown to be reliable",
         f"In {len(bad)} of {len(known(result))} cases the interval of the ICC begins below 0.60.",
-        "In these the order of the people may be another at the next visit. A wide interval says "
-        f"that {people} people and {visits} visits are too few.",
-        ("Measure more people, or each at more visits.",
-         "Average over more trials or visits before people are compared."),
+        "In these cases the order of the people may differ at the next visit. A wide interval "
+        f"means that {people} people and {visits} visits are too few.",
+        ("Measure more people, or the same people at more visits.",
+         "Average over more trials or visits before you compare people."),
     )  # fmt: skip
-    others = Claim("That the test suits other people, tasks or intervals between visits.",
-                   "An ICC is of these people: it falls where people differ less.")  # fmt: skip
+    others = Claim("That the test is reliable for other people, tasks or times between visits.",
+                   "An ICC is lower in people who differ less from each other.")  # fmt: skip
     may = _claims([item for item in known(result) if _reaches(item)], words)
     alerts = [] if level is Level.GREEN else [alert]
     return Verdict(level, headline, sentence, alerts, may, [*_claims(bad, words), others], badge)
 
 
 def lowest(items: Sequence[MeasureResult]) -> MeasureResult:
-    """The measure whose interval begins lowest."""
+    """Measure whose interval begins lowest."""
     return min(items, key=lambda item: np.nan_to_num(item.icc.low if item.icc else 1, nan=-np.inf))
 
 
@@ -131,7 +131,7 @@ def _by_name(
 
 
 def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
-    """Which signal is reliable in which conditions; the reliable ones first."""
+    """Headline: reliable signals and conditions first."""
     parts: dict[str, list[str]] = {}
     for name, own in _by_name(sways, words).items():
         good = [item.condition for item in own if _reaches(item)]
@@ -149,7 +149,7 @@ def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
 
 
 def _claims(items: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Claim]:
-    """One a measure, with its conditions."""
+    """One claim per measure, with its conditions."""
     found = []
     for name, own in _by_name(items, words).items():
         text = ", ".join([name, *(item.condition for item in own if item.condition)])

@@ -1,15 +1,12 @@
-"""Sensitive parameters of a study (chapter 4): per subject, in common, and for all at once.
+"""Selection of sensitive parameters (chapter 4).
 
-Work on one subject: what its recordings identify of all parameters, then of the chosen ones.
+For each subject: fit of all parameters and Fisher information, then fit of the selected subset,
+bootstrap intervals, and LASSO for comparison.
 
-The steps of chapter 4, as docs/selection.md lists them.
-
-Model-based bootstrap of a subset of parameters: percentile intervals.
-
-fit -> residuals, centred -> drawn again, one by one or in blocks -> added to the fit's outputs ->
-fitted again from the fit -> percentiles. Residuals of people are coloured: drawn one by one they
-give intervals that are too narrow, in blocks they do not (`impc.assess.resampling.block_length`).
-Replicate k draws from the k-th child of the seed. Source: chapter 4; Künsch 1989 for the blocks.
+Bootstrap: fit -> centred residuals -> resampled, singly or in blocks -> added to the fit's outputs
+-> fitted again -> percentiles. For autocorrelated residuals, single draws give intervals that are
+too narrow; blocks do not (`impc.assess.resampling.block_length`). Replicate k uses the k-th child
+of the seed. Sources: chapter 4; Künsch 1989 for the blocks.
 """
 
 from __future__ import annotations
@@ -57,21 +54,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StudySelection:
-    """The study."""
+    """Result of `select_study`."""
 
-    # Subject (and visit) -> all parameters fitted, information, feasible subsets
+    # Subject (and visit) -> fit of all parameters, information, feasible subsets
     nominal: Mapping[str, Nominal]
-    # (5.5): the variance holds for every subject and visit; a sweep
+    # Sweep over bounds with (5.5): largest variance over all subjects and visits
     worst_case: tuple[Selection, ...]
     # Subsets that are among the largest of every subject at the bound (chapter 4)
     intersection: tuple[tuple[int, ...], ...]
-    # The subset that is refitted: the best of the worst case at the bound, or at the first bound of
-    # the sweep that has one; failing that the most frequent of the subjects'
+    # Refitted subset: the best of the worst case at the bound, or at the first bound of the sweep
+    # with a feasible one; otherwise the most frequent subset of the subjects
     free: tuple[int, ...]
-    bound: float  # The largest variance that it keeps
+    bound: float  # Bound of its variance
     chosen: Mapping[str, Chosen]  # Subject -> refit of that subset, intervals, LASSO
-    lasso: tuple[int, ...]  # What the LASSO selects most often
-    # "fim", "lasso" and, when it was asked for, "nelder_mead": time in s, mean over subjects
+    lasso: tuple[int, ...]  # Subset that the LASSO selects most often
+    # Run time of "fim", "lasso" and, if requested, "nelder_mead", s, mean over subjects
     seconds: Mapping[str, float]
 
 
@@ -80,7 +77,7 @@ def select_study(
 ) -> StudySelection:
     """Select sensitive parameters."""
     if not recorded:
-        raise DataError("study", "has no subject", "check where it looks for recordings")
+        raise DataError("study", "has no subject", "check [study] recordings, table or bids")
     trials = {name: tuple(item) for name, item in recorded.items()}
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
     informations = [np.asarray(item.information.F) for item in nominal.values()]
@@ -113,7 +110,7 @@ def select_study(
 def _free(
     at_bound: Selection, worst: tuple[Selection, ...], nominal: Mapping[str, Nominal]
 ) -> tuple[float, tuple[int, ...]]:
-    """The subset that is refitted, and its bound."""
+    """Subset to refit, and its bound."""
     for selection in (at_bound, *worst):
         if selection.subsets:
             return selection.bound, selection.subsets[0]
@@ -128,33 +125,34 @@ def _free(
 
 @dataclass(frozen=True)
 class Nominal:
-    """All parameters of one subject, and what the recordings identify of them."""
+    """Fit of all parameters of one subject, and their identifiability."""
 
-    fit: Estimate  # All parameters fitted
-    information: Information  # At that estimate
+    fit: Estimate  # Fit of all parameters
+    information: Information  # At this fit
     unseen: tuple[NullDirection, ...]
-    scalings: tuple[tuple[str, ...], ...]  # Parameters that may be scaled together unseen
+    # Sets of parameters whose common scaling changes the outputs by less than their noise
+    scalings: tuple[tuple[str, ...], ...]
     sweep: tuple[Selection, ...]
-    seconds: float  # Time of information and sweep, s
+    seconds: float  # Run time of information and sweep, s
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The chosen parameters of one subject, and what the LASSO would have chosen."""
+    """Fits of the selected parameters of one subject, and selection by LASSO."""
 
-    refit: Estimate  # Others exactly at typical values
-    exact: BootstrapIntervals  # Of that
-    known: PriorFit  # Others as they are known: typical, give or take their deviations
+    refit: Estimate  # Other parameters fixed at typical values
+    exact: BootstrapIntervals  # Bootstrap intervals of `refit`
+    known: PriorFit  # Other parameters with a prior: typical values and their SDs
     lasso: Lasso
-    nelder_mead: Lasso | None  # Table C.1, when asked for
-    seconds_lasso: float  # Time of each, s
+    nelder_mead: Lasso | None  # Table C.1, if requested
+    seconds_lasso: float  # Run time, s
     seconds_nelder_mead: float
 
 
 def fit_nominal(
     model: ParametricModel, trials: Sequence[Trial], settings: SelectSettings
 ) -> Nominal:
-    """Fit all parameters; information, rank, unseen directions and feasible subsets."""
+    """Fit all parameters; compute information, null directions and feasible subsets."""
     nominal = multi_start(model, trials, range(model.size), settings.starts, settings.seed)[0]
     started = time.perf_counter()
     found = fisher_information(model, np.array(nominal.theta), trials)
@@ -170,7 +168,7 @@ def fit_chosen(
     settings: SelectSettings,
     chosen: tuple[int, ...],
 ) -> Chosen:
-    """Fit chosen parameters, with intervals; and select by LASSO for comparison."""
+    """Fit the chosen parameters with intervals, and select by LASSO for comparison."""
     refit = estimate(model, trials, chosen, np.array(model.typical))
     draw, noise_of = _DRAW[settings.draw]
     exact = bootstrap_subset(model, trials, refit, settings.replicates, settings.seed, draw)
@@ -185,7 +183,7 @@ def fit_chosen(
 
 @dataclass(frozen=True)
 class BootstrapIntervals(Frozen):
-    """From the 2.5th to the 97.5th percentile of the replicates."""
+    """Intervals from the 2.5th to the 97.5th percentile of the replicates."""
 
     value: Array  # Free parameters (free,), in their units
     low: Array
@@ -194,17 +192,17 @@ class BootstrapIntervals(Frozen):
 
     @property
     def width(self) -> Array:
-        """Of the intervals (free,), in the parameters' units."""
+        """Widths of the intervals (free,), in the parameters' units."""
         return np.asarray(self.high - self.low)
 
 
 def draw_single(parts: list[Array], rng: np.random.Generator) -> list[Array]:
-    """Draw residuals `parts` (samples, p) of each trial again, row by row of all trials."""
+    """Resample rows of the centred residuals `parts` (samples, p), pooled over trials."""
     pooled = np.concatenate([item - np.mean(item, axis=0) for item in parts])
     return [pooled[rng.integers(len(pooled), size=len(item))] for item in parts]
 
 
-# What residuals are taken for: draws of the bootstrap, and the noise beside a prior.
+# Model of the residuals: resampling in the bootstrap, and noise for the fit with a prior.
 _DRAW = {"single": (draw_single, white_noise), "block": (block_residuals, residual_noise)}
 
 
@@ -216,7 +214,7 @@ def bootstrap_subset(
     seed: int,
     draw: Callable[[list[Array], np.random.Generator], list[Array]] = draw_single,
 ) -> BootstrapIntervals:
-    """Intervals of the free parameters of a fit."""
+    """Bootstrap intervals of the free parameters of a fit."""
     theta = np.array(fit.theta)
     left = residuals(model, theta, trials)
     clean = [np.asarray(model.simulate(theta, item.input)) for item in trials]

@@ -1,16 +1,16 @@
-"""Least squares of a model's free parameters over several trials, within bounds (4.3) to (4.5).
+"""Bounded least-squares fit of a model's free parameters to several trials (4.3) to (4.5).
 
-Parameters are normalised; those that are not free stay where they are given. Search by a bounded
-trust region with the model's Jacobian, from one start or several.
+Parameters are normalised; the others are fixed. The search is a bounded trust-region method with
+the model's Jacobian, from one or several starts.
 
-A parameter that is not free is not known either: it is typical, give or take the deviation d
-between people. With that as its prior it is fitted beside the free ones (maximum a posteriori),
+Alternatively the other parameters have a prior, the typical value with the SD d between people,
+and are fitted too (maximum a posteriori):
 
     minimise  |e|^2 / s^2 + sum_q ((t_q - typical_q) / d_q)^2
     cov(t) = H^-1 (cov(J'e) / s^4 + P) H^-1,    H = J'J / s^2 + P,    P = diag(1 / d^2)
 
-where s^2 is the mean variance of the residuals e along the columns of J: for white residuals that
-of each, for coloured ones their long-run variance.
+where s^2 is the mean variance of the residuals e along the columns of J: their variance if they are
+white, their long-run variance if they are autocorrelated.
 """
 
 from __future__ import annotations
@@ -35,38 +35,38 @@ if TYPE_CHECKING:
     from impc.assess.long_run_covariance import ResidualNoise
     from impc.studies.selection.model import ParametricModel, Trial
 
-# Fits with the prior, each with the noise that the one before leaves: it changes by less than 1 %.
+# Fits with the prior, each with the noise of the previous one; it then changes by less than 1 %.
 _ROUNDS = 3
-# Precision of a free parameter in the covariance: one without any effect is not determined.
+# Precision of free parameters in the covariance, which keeps it invertible without any effect.
 _FREE = 1e-6
 
 
 @dataclass(frozen=True)
 class Estimate(Frozen):
-    """A fit."""
+    """Result of a fit."""
 
     theta: Array  # All parameters (k,), in their units
-    free: tuple[int, ...]  # Which of them were fitted
-    misfit: float  # Sum of squares, those of a prior included
-    vaf: Array  # (4.4) over all trials (p,), %
-    at_bound: tuple[int, ...]  # Free parameters that end on a bound
+    free: tuple[int, ...]  # Indices of the fitted parameters
+    misfit: float  # Sum of squares, including the prior
+    vaf: Array  # VAF (4.4) over all trials (p,), %
+    at_bound: tuple[int, ...]  # Free parameters that end at a bound
 
 
 def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...]:
     """Indices of parameters by their `names`."""
     for name in names:
         if name not in model.names:
-            raise InputError(f"parameter {name}", "is not one", f"known: {', '.join(model.names)}")
+            raise InputError(f"parameter {name}", "unknown name", f"use {', '.join(model.names)}")
     return tuple(model.names.index(name) for name in names)
 
 
 @dataclass(frozen=True)
 class PriorFit(Frozen):
-    """A fit of free parameters beside uncertain ones, and 95 % intervals of the free ones."""
+    """Fit of free parameters and of uncertain ones with a prior; 95 % intervals."""
 
     fit: Estimate  # Free parameters first, then the uncertain ones
     value: Array  # Free parameters (free,), in their units
-    low: Array  # Ends of the intervals, at most the bounds
+    low: Array  # 95 % intervals, clipped to the bounds
     high: Array
     variance: Array  # In normalised units (free,)
 
@@ -78,19 +78,19 @@ def estimate(
     start: Array,
     pull: Array | None = None,
 ) -> Estimate:
-    """Fit the free parameters to all trials at once; `start` (k,).
+    """Fit the free parameters to all trials, from `start` (k,).
 
-    `pull` (free,) weighs their distances from typical values, in normalised units, as residuals.
+    `pull` (free,) weighs residuals of their distances from typical values, in normalised units.
     """
     if not trials:
-        raise DataError("trials", "there are none", "give at least one")
+        raise DataError("trials", "the list is empty", "pass at least one trial")
     chosen: IntArray = np.asarray(free, dtype=np.int64)
     base = normalised(model, np.asarray(start, dtype=np.float64))
     weights = np.zeros(len(chosen)) if pull is None else pull
     residual, derivative = _evaluation(model, trials, base, chosen, weights)
     begin = np.clip(base[chosen], -1 + 1e-9, 1 - 1e-9)
     if not np.all(np.isfinite(residual(begin))):
-        raise DataError("model", "is not finite at the start", "start elsewhere")
+        raise DataError("model", "outputs are not finite at the start", "pass another start")
     found = scipy.optimize.least_squares(
         residual, begin, jac=derivative, bounds=(-1.0, 1.0), ftol=1e-10, xtol=1e-10, gtol=1e-12,
         max_nfev=200,
@@ -106,7 +106,7 @@ def estimate(
 def multi_start(
     model: ParametricModel, trials: Sequence[Trial], free: Sequence[int], starts: int, seed: int
 ) -> tuple[Estimate, ...]:
-    """Fits from the typical values and points about them at which it is finite, best first."""
+    """Fits from the typical values and random points around them, best first."""
     rng = np.random.default_rng(seed)
     typical = normalised(model, np.asarray(model.typical))
     found: list[Estimate] = []
@@ -131,10 +131,10 @@ def estimate_with_prior(
     start: Array,
     noise_of: Callable[[list[Array], TrialSpan], ResidualNoise],
 ) -> PriorFit:
-    """Fit the free parameters, the others uncertain by their deviations; `start` (k,)."""
+    """Fit the free parameters, with a prior on the others, from `start` (k,)."""
 
     def noise_along(at: Array) -> tuple[Array, Array]:
-        """R of J = U R, the Jacobian, and the covariance of U'e."""
+        """R of the QR factorisation J = U R of the Jacobian, and the covariance of U'e."""
         errors, J = stacked(model, at, trials, along)
         U, R = np.linalg.qr(J)
         span = TrialSpan(tuple(np.zeros((part.size, 0)) for part in errors), U)
@@ -168,7 +168,7 @@ def estimate_with_prior(
 
 
 def residuals(model: ParametricModel, theta: Array, trials: Sequence[Trial]) -> list[Array]:
-    """Outputs recorded minus simulated at theta (k,): (samples, p) for each trial."""
+    """Recorded minus simulated outputs (samples, p) at theta (k,) for each trial."""
     return [np.asarray(item.outputs - model.simulate(theta, item.input)) for item in trials]
 
 
@@ -182,7 +182,7 @@ def pooled_vaf(model: ParametricModel, theta: Array, trials: Sequence[Trial]) ->
 def _evaluation(
     model: ParametricModel, trials: Sequence[Trial], base: Array, chosen: IntArray, pull: Array
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Residual and Jacobian of the chosen parameters; the last point is not computed twice."""
+    """Residual and Jacobian of the chosen parameters; the last point is cached."""
     last: tuple[bytes, Array, Array] | None = None
     typical = normalised(model, np.asarray(model.typical))[chosen]
     held = pull > 0

@@ -1,20 +1,17 @@
-"""Fisher information of normalised parameters, its rank, and directions it does not see.
+"""Fisher information of normalised parameters, its null directions, and feasible subsets.
 
     F = (1 / sigma^2) sum_k (dy_k/dt)' (dy_k/dt)                 (A.2), (A.6)
 
-F^-1 bounds the covariance of any unbiased estimate (A.5). A singular F says that a combination of
-parameters changes nothing: it is named here before any selection, because a selection from an
-unidentifiable set only hides it.
+F^-1 bounds the covariance of any unbiased estimate (A.5). If F is singular, a combination of
+parameters has no effect on the outputs.
 
-The largest subsets of parameters that are estimated well enough together (C.4).
+Largest subsets s of parameters that can be estimated together (C.4):
 
     maximise |s|  subject to  rcond(F_s) > eps,  max diag F_s^-1 <= v,  |s| >= n_min
 
-F_s is the part of the information of the chosen parameters, the others being known. Taking one
-more parameter never lowers the variance of the others, so that every subset of a feasible set is
-feasible: sets are grown one parameter at a time, and only from feasible ones. With twelve
-parameters that is exhaustive search (4083 subsets of two and more) without the hopeless ones; with
-many it is a branch and bound with the same answer.
+F_s is the submatrix of the chosen parameters; the others are assumed known. An additional parameter
+never lowers the variances of the others, so every subset of a feasible set is feasible: sets are
+grown by one parameter at a time from feasible sets, with the same result as exhaustive search.
 """
 
 from __future__ import annotations
@@ -34,35 +31,35 @@ if TYPE_CHECKING:
 
     from impc.studies.selection.model import ParametricModel, Trial
 
-# Singular values of the sensitivity below this, of the largest, are rounding or as good as that.
+# Relative size below which singular values of the sensitivity count as zero.
 _RANK = 1e-6
 
 
 @dataclass(frozen=True)
 class Information(Frozen):
-    """Information of all trials together."""
+    """Fisher information of all trials."""
 
     F: Array  # (k, k), in normalised units
-    # Singular values, largest first, of the stacked sensitivity by the logarithms of the parameters
-    # over sigma, and right singular vectors, side by side (k, 1 + k). A direction is a scaling.
+    # Column 0: singular values (decreasing) of the sensitivity to the logarithms of the parameters
+    # over sigma; other columns: right singular vectors (k, 1 + k)
     relative: Array
-    variance: float  # sigma^2 of the residual
-    rank: int  # Of the relative sensitivities: singular values above 1e-6 of the largest
+    variance: float  # Residual variance sigma^2
+    rank: int  # Number of singular values above 1e-6 of the largest
 
 
 @dataclass(frozen=True)
 class NullDirection:
-    """A combination of parameters that the outputs do not see."""
+    """Combination of parameters without effect on the outputs."""
 
-    # Parameter -> its part in the direction of relative changes, largest first
+    # Parameter -> component of the direction of relative changes, largest first
     shares: dict[str, float]
-    sentence: str  # The same in words
+    sentence: str  # Description in words
 
 
 def fisher_information(
     model: ParametricModel, theta: Array, trials: Sequence[Trial], variance: float | None = None
 ) -> Information:
-    """Information at a point; `theta` (k,)."""
+    """Fisher information at `theta` (k,)."""
     errors, table = stacked(model, theta, trials)
     squares = sum(float(np.sum(part**2)) for part in errors)
     sigma2 = squares / (len(table) - model.size) if variance is None else variance
@@ -75,16 +72,16 @@ def fisher_information(
 
 
 def common_scaling(model: ParametricModel, found: Information, names: Sequence[str]) -> float:
-    """Change of the outputs when `names` are scaled by e together, in deviations of the noise."""
+    """Change of the outputs if `names` are scaled by e together, in SDs of the noise."""
     together = np.array([float(name in names) for name in model.names])
     values, vectors = found.relative[:, 0], found.relative[:, 1:]
     return float(np.linalg.norm(values * (vectors @ together)))
 
 
 def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[str, ...], ...]:
-    """Sets of parameters of one kind of unit that may be scaled together without any effect.
+    """Sets of parameters whose common scaling changes the outputs by at most the noise SD.
 
-    Units count as one kind when they begin alike: torque gains in N m/rad, N m s/rad.
+    Only parameters whose units begin alike form a set, for example N m/rad and N m s/rad.
     """
     kinds: dict[str, list[str]] = {}
     for name, unit in zip(model.names, model.units, strict=True):
@@ -97,7 +94,7 @@ def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[s
 
 
 def null_directions(model: ParametricModel, found: Information) -> tuple[NullDirection, ...]:
-    """Directions beyond the rank, least seen first, in relative changes of the parameters."""
+    """Null directions in relative changes of the parameters, smallest singular value first."""
     values, vectors = found.relative[:, 0], found.relative[:, 1:]
     nulls = []
     for index in range(model.size - 1, found.rank - 1, -1):
@@ -107,15 +104,16 @@ def null_directions(model: ParametricModel, found: Information) -> tuple[NullDir
         parts = ", ".join(f"{name} {share:+.2f}" for name, share in shares.items())
         seen = float(values[index] / values[0])
         sentence = (
-            f"changing {parts} (relative changes) together changes the outputs by {seen:.0e} of "
-            "what the best seen direction does"
+            f"changing {parts} (relative changes) together changes the outputs by {seen:.0e} times "
+            "the change along the best identified direction"
         )
         nulls.append(NullDirection(shares, sentence))
     return tuple(nulls)
 
 
 _EPS = float(np.finfo(np.float64).eps)
-# Subsets of one size that are looked at, and at a time: a minute, and 0.1 GB for ten parameters.
+# Largest number of subsets of one size (about a minute), and number in memory (0.1 GB for ten
+# parameters).
 _MOST, _AT_ONCE = 1_000_000, 50_000
 
 
@@ -124,27 +122,26 @@ class Selection:
     """Feasible subsets of the largest size for one bound."""
 
     bound: float  # v
-    # Best first: least largest variance. Empty when none of n_min or more is feasible.
+    # Best (smallest largest variance) first; empty if none with n_min or more is feasible
     subsets: tuple[tuple[int, ...], ...]
     variances: tuple[float, ...]  # Largest variance of each
 
     @property
     def size(self) -> int:
-        """Number of parameters in each subset; 0 when there is none."""
+        """Number of parameters in each subset; 0 if there is no subset."""
         return len(self.subsets[0]) if self.subsets else 0
 
 
 def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[int]]) -> Array:
-    """Largest diagonal entry of F_s^-1 for s subsets of one size, worst over all F: (s,).
+    """Largest diagonal entry of F_s^-1 over all `informations` (k, k), for each subset (5.5).
 
-    Infinite where F_s is singular to working precision. (5.5) with several subjects and visits:
-    `informations` (k, k) of each.
+    Infinite if F_s is singular to working precision.
     """
     chosen = np.asarray(subsets, dtype=int)
     worst = np.zeros(len(chosen))
     for F in informations:
         parts = np.asarray(F)[chosen[:, :, None], chosen[:, None, :]]
-        # Scaled to a unit diagonal, so that rcond is that of correlations.
+        # Scaled to a unit diagonal: rcond of the correlations.
         size = np.sqrt(np.einsum("sii->si", parts))
         size = np.where(size > 0, size, 1.0)
         scaled = parts / size[:, :, None] / size[:, None, :]
@@ -159,9 +156,9 @@ def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[i
 
 
 def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
-    """Largest feasible subsets; `informations` (k, k)."""
+    """Largest feasible subsets for `informations` (k, k)."""
     if not informations or not bound > 0:
-        raise InputError("selection", "needs an information and a positive bound", "give both")
+        raise InputError("selection", "needs an information and a positive bound", "pass both")
     count = len(informations[0])
     level = [(index,) for index in range(count)]
     kept = _feasible(informations, level, bound)
@@ -185,7 +182,7 @@ def _selected(bound: float, feasible: list[tuple[tuple[int, ...], float]]) -> Se
 
 
 def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, ...]]:
-    """Subsets of one parameter more, each of whose parts is among the known ones."""
+    """Subsets with one more parameter, all of whose subsets are among the known ones."""
     among = set(known)
     for subset in known:
         for index in range(subset[-1] + 1, count):
@@ -197,7 +194,7 @@ def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, 
 def sweep(
     informations: Sequence[Array], bounds: Sequence[float], least: int = 2
 ) -> tuple[Selection, ...]:
-    """Selections over several bounds, as `largest_subsets`; informations (k, k)."""
+    """`largest_subsets` for several bounds."""
     return tuple(largest_subsets(informations, bound, least) for bound in bounds)
 
 

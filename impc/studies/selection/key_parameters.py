@@ -1,12 +1,11 @@
-"""Key parameters (chapter 5): sensitive, explaining, reliable and of several pathways.
+"""Key parameters (chapter 5): sensitive, well fitting, reliable, of several pathways.
 
-Four filters, one after the other, on the subsets that the information allows for every subject and
-visit together (5.5):
+Four consecutive filters (5.5):
 
     variability        max over subjects and visits of max diag F_s^-1 <= v
     goodness of fit    mean VAF of the refitted subset above a threshold
-    reliability        min over the subset of ICC(A,k) between visits, at least rho (5.6), (5.7)
-    diversity          number of distinct pathways in the subset; the largest is chosen
+    reliability        min over the subset of ICC(A,k) between visits >= rho (5.6), (5.7)
+    diversity          number of distinct pathways in the subset; the largest is selected
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sensitive subset and how it does in the other filters."""
+    """A sensitive subset and its results in the other filters."""
 
     subset: tuple[int, ...]  # Indices of its parameters
-    variance: float  # Largest, over subjects and visits, in normalised units
-    vaf: float  # Mean over subjects and visits, %
-    reliability: float  # Least ICC(A,k) of its parameters; NaN where none is defined
+    variance: float  # Largest variance over subjects and visits, in normalised units
+    vaf: float  # Mean VAF over subjects and visits, %
+    reliability: float  # Smallest ICC(A,k) of its parameters; NaN if undefined
     diversity: int  # Number of pathways
     kept: bool  # Whether it passes goodness of fit and reliability
 
@@ -50,12 +49,12 @@ class KeyParameters(Frozen):
 
     selection: Selection  # Subsets of the first filter
     sweep: tuple[Selection, ...]  # The first filter at other bounds
-    # All of them, best first: kept before not, then diversity, then reliability
+    # Best first: kept ones, then by diversity, then by reliability
     candidates: tuple[Candidate, ...]
-    chosen: tuple[int, ...]  # The first kept one; empty when none is kept
+    chosen: tuple[int, ...]  # First kept subset; empty if none is kept
     # Estimates with all parameters free (parameters, subjects, visits), in physical units
     nominal: Array
-    # Those of the chosen subset alone (chosen, subjects, visits), in physical units
+    # Estimates of the chosen subset (chosen, subjects, visits), in physical units
     estimates: Array
 
 
@@ -63,13 +62,13 @@ class KeyParameters(Frozen):
 class Refits:
     """Fits of several subsets to one subject and visit."""
 
-    fits: tuple[Estimate, ...]  # One a subset, in their order
+    fits: tuple[Estimate, ...]  # One per subset
 
 
 def refit_subsets(
     model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
 ) -> Refits:
-    """Fit each of the `subsets` alone, the other parameters at their typical values."""
+    """Fit each of the `subsets`, the other parameters fixed at their typical values."""
     typical = np.array(model.typical)
     return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
 
@@ -85,7 +84,7 @@ def key_parameters(
     least_reliability: float = 0.75,
     most: int = 20,
 ) -> KeyParameters:
-    """Choose key parameters of a study; `recorded` by (subject, visit)."""
+    """Select key parameters of a study; `recorded` by (subject, visit)."""
     trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
     informations = [np.asarray(item.information.F) for item in nominal.values()]
@@ -97,7 +96,7 @@ def key_parameters(
         fits = [item.fits[place] for item in refits.values()]
         vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
         tables = [between_visits(table) for table in _by_visit(recorded, fits, subset)]
-        # (5.6): the least of the subset's; NaN without several subjects and visits.
+        # (5.6): minimum over the subset; NaN without several subjects and visits.
         reliability = float(np.min([np.nan if one is None else one.value for one in tables]))
         kept = vaf > least_vaf and reliability >= least_reliability
         diversity = len({model.pathways[index] for index in subset})
@@ -122,7 +121,7 @@ def key_parameters(
 def _by_visit(
     keys: Iterable[tuple[str, str]], fits: Sequence[Estimate], subset: Sequence[int]
 ) -> Array:
-    """Estimates of a subset (len(subset), subjects, visits); NaN where a visit is missing."""
+    """Estimates of a subset (len(subset), subjects, visits); NaN if a visit is missing."""
     subjects, visits = (list(dict.fromkeys(one)) for one in zip(*keys, strict=True))
     values = np.full((len(subset), len(subjects), len(visits)), np.nan)
     for (subject, visit), found in zip(keys, fits, strict=bool(subset)):
@@ -132,5 +131,5 @@ def _by_visit(
 
 
 def between_visits(values: Array) -> Icc | None:
-    """ICC(A,k) of a parameter's `values` (subjects, visits); None without several of both."""
+    """ICC(A,k) of a parameter's `values` (subjects, visits); None for one subject or visit."""
     return icc(values, "A,k") if min(values.shape) >= 2 else None

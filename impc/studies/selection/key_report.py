@@ -1,4 +1,4 @@
-"""The report of `impc key-parameters`: page, tables, result.json, the solution space."""
+"""Report of `impc key-parameters`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def key_report(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs
 ) -> Report:
-    """The report of `impc key-parameters`."""
+    """Report of `impc key-parameters`."""
     names, count, subsets = names_of(model, found.chosen), len(found.chosen), found.selection
     best = found.candidates[0] if found.candidates else None
     icc = "-" if best is None else number(best.reliability, 2)
@@ -37,23 +37,24 @@ def key_report(
     filters = (
         f"{len(subsets.subsets)} subsets of {subsets.size} parameters have a variance of {limits} "
         f"(unit: half the search range, squared); {sum(one.kept for one in found.candidates)} of "
-        "those refitted also explain the movement and are reliable between visits."
+        f"the {len(found.candidates)} refitted ones also explain the movement and are reliable "
+        "between visits."
     )
     copied: Copy | str = "There is nothing to copy: no subset passes all filters."
-    headline = "No set of parameters is precise, reliable and explains the movement."
+    headline = "No subset of parameters passes all filters: precision, fit and reliability."
     verdict = Verdict(Level.AMBER, headline, "Report no parameter of this model as reliable.")
     if best is not None and count:
         headline = f"{count} of {model.size} parameters are key parameters"
-        why = "Their values were assumed, and the intervals take them as exact."
+        why = "The other values were assumed, and the intervals treat them as exact."
         verdict = Verdict(
             Level.AMBER, f"{headline}, if the others are as assumed.", f"They are {names}.",
             may=[Claim(f"{names[:1].upper()}{names[1:]} as key parameters.", filters)],
-            may_not=[Claim("The other parameters, or values without the assumed ones.", why)],
+            may_not=[Claim("The other parameters, or estimates without the assumed values.", why)],
         )  # fmt: skip
         copied = Copy(
-            f"Subsets of {model.size} parameters were kept if their variances are {limits}, they "
-            "explain the recordings, and are reliable between visits (ICC(A,k)). The others were "
-            "fixed at assumed values.",
+            f"Subsets of {model.size} parameters were kept if their variances were {limits}, if "
+            "they explained the recordings, and if they were reliable between visits (ICC(A,k)). "
+            "The other parameters were fixed at assumed values.",
             f"Key parameters: {names} (ICC at least {icc}, VAF {number(best.vaf)} %).",
         )
     provenance = Provenance(command=command, inputs=inputs)
@@ -67,7 +68,7 @@ def key_report(
         ],
         meta=["Key parameters", f"{people} subjects", f"{visits} visits", provenance.made[:10]],
         hero=Picture("solution-space", "Subsets by reliability and movement explained",
-                     "Each mark is a subset of parameters; filled: it passes all filters."),
+                     "Each mark is one subset of parameters; filled marks pass all filters."),
         keys=[
             Key(str(count), f"of {model.size}", "key parameters", names),
             Key(str(model.size - count), f"of {model.size}", "parameters fixed", "as assumed"),
@@ -101,7 +102,7 @@ def _candidates(model: ParametricModel, found: KeyParameters) -> Finding:
 
 
 def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
-    """Mean and SD over subjects, in physical units."""
+    """Table of mean and SD over subjects, in physical units."""
     rows: list[dict[str, Any]] = []
     for index in range(model.size):
         fits = [("all", found.nominal[index])]
@@ -117,7 +118,7 @@ def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
             ends = (np.nan,) * 3 if icc is None else (icc.value, icc.low, icc.high)
             rows.append(row | dict(zip(("icc", "icc_low", "icc_high"), ends, strict=True)))
     caption = (
-        "Mean and SD over subjects, with all parameters free and with the chosen ones alone; "
+        "Mean and SD over subjects, with all parameters free and with only the chosen ones free; "
         "ICC(A,k) between visits with its 95 % interval."
     )
     labels = {"icc": "ICC", "icc_low": "95 % CI low", "icc_high": "95 % CI high", "sd": "SD"}

@@ -1,13 +1,13 @@
-"""LASSO selection (C.5): parameters that leave their typical values when that costs.
+"""LASSO selection (C.5) of parameters that differ from their typical values.
 
     min over t in [-1, 1]^k   (1/N) sum e^2 + lambda ||t - t_typ||_1
 
-`proximal_lasso` solves it as it is: Gauss-Newton steps whose quadratic programs keep the absolute
-values and the bounds, so that parameters land exactly on their typical values. `table_c1` is the
-dissertation's: Nelder and Mead with bounds by t = sin(u), a threshold of 0.005, and lambda moved
-until n parameters are beyond it. Both end with the relaxed refit: the chosen ones by plain least
-squares. The scale of the first term is lost; here it is the mean square in the outputs' unit
-squared.
+`proximal_lasso` solves it by Gauss-Newton steps whose quadratic programs include the absolute
+values and the bounds, so that parameters can equal their typical values exactly. `table_c1` is the
+method of the dissertation: Nelder-Mead with bounds by t = sin(u), a threshold of 0.005, and lambda
+adjusted until n parameters are beyond it. Both end with a least-squares refit of the selected
+parameters. The dissertation does not give the scale of the first term; here it is the mean square
+in the outputs' unit squared.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
 
 _THRESHOLD, _FIRST = 0.005, 0.13
 _CHANGES, _ROUNDS, _HALVINGS = 500, 60, 30
-_ROUNDING = 1e-12  # of the steepest slope, in the test of optimality
+_ROUNDING = 1e-12  # Tolerance of the optimality test, relative to the steepest slope
 
 
 @dataclass(frozen=True)
 class Lasso(Frozen):
-    """A selection."""
+    """Selection by LASSO."""
 
     weight: float  # lambda
     t: Array  # Normalised parameters (k,)
-    selected: tuple[int, ...]  # Those away from their typical values
-    refit: Estimate | None  # Of the selected ones; None when none is
+    selected: tuple[int, ...]  # Parameters that differ from their typical values
+    refit: Estimate | None  # Fit of the selected parameters; None if there are none
     objective: float  # (C.5) at t
 
 
@@ -67,7 +67,7 @@ def proximal_lasso(
         gained = current - moved
         t, current = t + share * step, moved
         if share < 1:
-            # Shorter programs next time: only whole steps put parameters on their typical values.
+            # Shorter steps next time: only full steps reach typical values exactly.
             damping *= 10
         if gained < 1e-10 * max(current, 1e-300):
             break
@@ -75,7 +75,7 @@ def proximal_lasso(
 
 
 def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -> Lasso:
-    """The largest selection of at most `count` parameters along lambda, by bisection."""
+    """Largest selection of at most `count` parameters, by bisection of lambda."""
     low, high, solves = 1e-8, 1e3, 0
     best: tuple[float, Array, float] | None = None
     while solves < 40 and high / low >= 1.01:
@@ -99,11 +99,11 @@ def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -
 def table_c1(
     model: ParametricModel, trials: Sequence[Trial], count: int, *, solves: int = 12
 ) -> Lasso:
-    """Table C.1: Nelder and Mead, a threshold of 0.005, lambda moved until `count` are beyond it.
+    """Table C.1: Nelder-Mead, lambda adjusted until `count` parameters exceed the threshold.
 
-    The rule that moves lambda is lost: it is multiplied by 2 when too many parameters moved,
-    divided by 2 when too few, the factor's logarithm halved when the direction changes. At most
-    `solves` problems are solved.
+    The dissertation does not give the rule for lambda: it is multiplied by 2 if too many parameters
+    moved, divided by 2 if too few; the factor's logarithm is halved if the direction changes. At
+    most `solves` problems are solved.
     """
     typical = normalised(model, np.asarray(model.typical))
     weight, factor, before = _FIRST, 2.0, 0
@@ -155,7 +155,7 @@ def _mean_square(model: ParametricModel, trials: Sequence[Trial], t: Array) -> f
 
 
 def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tuple[Array, Array]:
-    """H and g of the mean square about t: g'd + d'Hd/2."""
+    """H and g of the local model g'd + d'Hd/2 of the mean square at t."""
     errors, J = stacked(model, physical(model, t), trials)
     error = np.concatenate([part.ravel() for part in errors])
     return 2 * J.T @ J / len(J), 2 * J.T @ error / len(J)
@@ -164,10 +164,10 @@ def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tup
 def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> Array:
     """argmin over x in [-1, 1]^k of g'(x - t) + (x - t)'H(x - t)/2 + weight |x - typical|_1.
 
-    Primal active-set method from x = t, for positive definite H. Coordinates at a kink (their
-    typical value) or at a bound are held; the others step to the minimum of the quadratic on their
-    side of the kink, as far as the first kink or bound, which then holds the one that met it. At
-    that minimum the held one whose release gains most is let go; none is: x is the answer.
+    Primal active-set method from x = t, for positive definite H. Coordinates at a kink (typical
+    value) or bound are fixed; the others step to the minimum of the quadratic on their side of the
+    kink, at most to the first kink or bound, where that coordinate is fixed. At the minimum, the
+    fixed coordinate with the largest decrease is released; if there is none, x is the solution.
     """
     x, side = t.copy(), np.sign(t - typical)
     held = (side == 0) | (np.abs(x) == 1)
@@ -198,9 +198,9 @@ def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> A
 def _release(
     gradient: Array, x: Array, side: Array, typical: Array, weight: float
 ) -> tuple[Array, Array]:
-    """How steeply the objective falls when a coordinate leaves its kink or bound, and whereto."""
+    """Slope of the objective if a coordinate leaves its kink or bound, and the direction."""
     at_kink = side == 0
     towards = np.where(at_kink, -np.sign(gradient), -np.sign(x))
     steep = np.where(at_kink, np.abs(gradient) - weight, np.sign(x) * (gradient + weight * side))
-    blocked = at_kink & (typical * towards >= 1)  # typical at a bound: not beyond it
+    blocked = at_kink & (typical * towards >= 1)  # typical value at a bound
     return np.where(blocked, 0.0, steep), towards

@@ -4,8 +4,8 @@ The input is held between samples, so that
 
     x+ = Ad x + Bd r,      [Ad Bd; 0 I] = exp( [A B; 0 0] dt )
 
-is exact, however fast a pole is. Derivatives of the exponential are Fréchet derivatives along those
-of A and B, which CasADi gives; with X_i = dx / dtheta_i
+is exact for all poles. Derivatives of the exponential are Fréchet derivatives along those of A and
+B, which CasADi computes; with X_i = dx / dtheta_i
 
     X_i+ = Ad X_i + (dAd/dtheta_i) x + (dBd/dtheta_i) r.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class Discrete(NamedTuple):
-    """Sampled matrices and their derivatives, the parameter's axis first."""
+    """Sampled matrices and their derivatives; the first axis is the parameter."""
 
     A: Array  # (n, n)
     B: Array  # (n, d)
@@ -41,7 +41,7 @@ def linear_functions(
 ) -> tuple[
     Callable[[Array, Array], Array], Callable[[Array, Array, IntArray], tuple[Array, Array]]
 ]:
-    """Simulation and Jacobian of a `ParametricModel` from rest; `dt` in s."""
+    """Functions `simulate` and `jacobian` of a `ParametricModel` from rest; `dt` in s."""
     symbol = ca.SX.sym("theta", matrices.size1_in(0))
     parts = matrices(symbol)
     derivative = ca.Function(
@@ -70,7 +70,7 @@ def linear_functions(
 
 
 def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
-    """Continuous A, B, C and their derivatives, a column a parameter, sampled at `dt`, s."""
+    """Sample continuous A, B, C and their derivatives (one column per parameter) at `dt` s."""
     A, B, C = parts
     n, d = B.shape
     k = derivatives[0].shape[1]
@@ -86,10 +86,10 @@ def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
 
 
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
-    """exp(M) and its Fréchet derivatives (k, N, N) along k directions, all in one call.
+    """exp(M) and its Fréchet derivatives (k, N, N) along k directions.
 
-    exp [[M, L], [0, M]] has the derivative along L in its corner (Higham 2008, chapter 3); L is
-    brought to the size of M, so that it does not decide how often the exponential is squared.
+    The corner of exp [[M, L], [0, M]] is the derivative along L (Higham 2008, chapter 3); L is
+    scaled to the norm of M, so that it does not affect the number of squarings.
     """
     count, size = along.shape[:2]
     length = np.linalg.norm(along, axis=(1, 2), keepdims=True) / max(np.linalg.norm(M), 1e-300)

@@ -1,14 +1,14 @@
-"""A parametric simulation model: any function from parameters and an input to outputs.
+"""Parametric simulation model: a function from parameters and an input to outputs.
 
 Parameters are normalised to [-1, 1] between their bounds (4.2),
 
     t_i = (theta_i - o_i) / g_i,    o_i = (max + min) / 2,   g_i = (max - min) / 2.
 
-People differ in each by a standard deviation that the model states; without one it is a quarter of
-the range, d = 0.5 in t.
+The standard deviation of a parameter between people is stated by the model, or a quarter of its
+range (d = 0.5 in t).
 
-A model may bring its own Jacobian (`impc.studies.selection.linear` makes exact ones for linear
-systems); otherwise central differences of 1e-4 in normalised units are taken, good to about 1e-6.
+A model may have its own Jacobian (`impc.studies.selection.linear` makes exact ones for linear
+systems); otherwise central differences of 1e-4 in normalised units are used (error about 1e-6).
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ class Trial(Frozen):
 
 @dataclass(frozen=True)
 class ParametricModel(Frozen):
-    """The model and what is known of its parameters."""
+    """A simulation model with bounds, typical values and descriptions of its parameters."""
 
     names: tuple[str, ...]  # (k,)
-    low: Array  # Bounds and typical values (k,), in the parameters' units
+    low: Array  # Bounds (k,), in the parameters' units
     high: Array
-    typical: Array
-    deviation: Array  # Standard deviation of each between people (k,)
-    pathways: tuple[str, ...]  # What each belongs to, its unit, and what it is in words (k,)
+    typical: Array  # Typical values (k,)
+    deviation: Array  # SD of each parameter between people (k,)
+    pathways: tuple[str, ...]  # Pathway of each parameter (k,)
     units: tuple[str, ...]
     # (theta (k,), input (samples, d)) -> outputs (samples, p)
     simulate: Callable[[Array, Array], Array]
-    # (theta, input, free) -> (outputs, their derivative (samples, p, f) with respect to the f
-    # parameters whose indices are `free`)
+    # (theta, input, free) -> (outputs, their derivatives (samples, p, f) with respect to the
+    # parameters with indices `free`)
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
     meanings: tuple[str, ...] = ()
 
     @property
     def words(self) -> tuple[tuple[str, str], ...]:
-        """Each parameter that has a meaning, with it, its pathway and unit: for a glossary."""
+        """Glossary: parameters with meaning, pathway and unit."""
         return tuple(
             (name, f"{meaning[0].upper()}{meaning[1:]}{f' ({path})' * bool(path)}, in {unit}.")
             for name, meaning, path, unit in zip(
@@ -92,20 +92,20 @@ def parametric_model(
     deviation: Sequence[float] | None = None,
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None,
 ) -> ParametricModel:
-    """Check and freeze a model; `low, high, typical, deviation` (k,)."""
+    """Check and freeze a model; `low`, `high`, `typical`, `deviation` (k,)."""
     count = len(names)
     spread = [(most - least) / 4 for least, most in zip(low, high, strict=False)]
     spread = spread if deviation is None else [float(value) for value in deviation]
     sized = {"low": low, "high": high, "typical": typical, "deviation": spread}
     for name, values in sized.items():
         if len(values) != count:
-            raise InputError(name, f"has {len(values)} values", f"give {count}, one a parameter")
+            raise InputError(name, f"has {len(values)} values", f"give {count}, one per parameter")
     for name, least, most, value in zip(names, low, high, typical, strict=True):
         if not least < most:
             raise InputError(f"parameter {name}", f"range {least:g} to {most:g}", "give low < high")
         if not least <= value <= most:
             raise InputError(
-                f"parameter {name}", f"typical value {value:g} lies outside its range", "widen it"
+                f"parameter {name}", f"typical value {value:g} is outside its range", "widen it"
             )
     for name, value in zip(names, spread, strict=True):
         if not 0 <= value < np.inf:
@@ -120,19 +120,19 @@ def parametric_model(
 
 
 def normalised(model: ParametricModel, theta: Array) -> Array:
-    """(4.2): parameters theta (k,) in units of half their range about its middle, (k,)."""
+    """Normalise parameters theta (k,) by (4.2)."""
     return np.asarray((theta - (model.high + model.low) / 2) / model.gain)
 
 
 def physical(model: ParametricModel, t: Array) -> Array:
-    """Inverse of `normalised`: t (k,) to parameters in their units, (k,)."""
+    """Inverse of `normalised`: t (k,) to parameters in their units."""
     return np.asarray((model.high + model.low) / 2 + model.gain * t)
 
 
 def sensitivity(
     model: ParametricModel, theta: Array, given: Array, free: IntArray | None = None
 ) -> tuple[Array, Array]:
-    """Outputs at theta (k,), input (samples, d); derivatives by normalised parameters (f,)."""
+    """Outputs at theta (k,) for an input, and derivatives by normalised parameters (f,)."""
     along = np.arange(model.size) if free is None else free
     if model.jacobian is not None:
         outputs, derivative = model.jacobian(theta, given, along)
@@ -149,7 +149,7 @@ def sensitivity(
 def stacked(
     model: ParametricModel, theta: Array, trials: Sequence[Trial], free: IntArray | None = None
 ) -> tuple[list[Array], Array]:
-    """Simulated minus recorded outputs (samples, p) of each trial, and the Jacobian of all."""
+    """Simulated minus recorded outputs (samples, p) by trial, and the stacked Jacobian."""
     pairs = [sensitivity(model, theta, trial.input, free) for trial in trials]
     errors = [outputs - trial.outputs for trial, (outputs, _) in zip(trials, pairs, strict=True)]
     return errors, np.concatenate([part.reshape(-1, part.shape[-1]) for _, part in pairs])

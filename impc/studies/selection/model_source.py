@@ -1,17 +1,18 @@
-"""A model by import path, the recordings of a study for it, and work with it on every subject.
+"""Load a model by import path, read the recordings, and run tasks on all subjects.
 
-The function named returns a mapping (or a `ParametricModel`):
+The function at the import path returns a mapping with
 
-    names, low, high, typical       of the parameters
-    pathways, units, meanings       optional
-    deviation                       optional: standard deviation between people, of each parameter
-    inputs, outputs, rate           signals of a recording by name, samples per second
+    names, low, high, typical       parameters: names, bounds, typical values
+    pathways, units, meanings       optional, per parameter
+    deviation                       optional: SD between people, per parameter
+    inputs, outputs, rate           names of the signals in a recording; samples per second
     simulate                        (theta, input (samples, d)) -> outputs (samples, p), or
-    matrices                        a CasADi function theta -> A, B, C, continuous: its
-                                    sensitivities are exact
-    jacobian                        optional, beside simulate: (theta, input) -> outputs, derivative
+    matrices                        a CasADi function theta -> A, B, C (continuous time), which
+                                    gives exact sensitivities
+    jacobian                        optional with simulate: (theta, input, free) -> outputs,
+                                    derivatives
 
-Workers load the model by its import path; recordings travel with the task.
+Workers load the model by its import path; recordings are part of the task.
 """
 
 from __future__ import annotations
@@ -49,12 +50,12 @@ _NEEDED = ("names", "low", "high", "typical", "inputs", "outputs", "rate")
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model, and how its signals are called in a recording."""
+    """A model and the names of its signals in recordings."""
 
     name: str  # Import path of the function
-    arguments: Mapping[str, Any]  # What it was called with
+    arguments: Mapping[str, Any]  # Arguments of the function
     model: ParametricModel
-    inputs: tuple[str, ...]  # Signals of a recording
+    inputs: tuple[str, ...]  # Names of signals
     outputs: tuple[str, ...]
     rate: float  # Samples per second of the model
 
@@ -70,7 +71,9 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
     lacking = [key for key in _NEEDED if not isinstance(returned, dict) or key not in returned]
     if lacking or not ("matrices" in returned or "simulate" in returned):
         missing = lacking[0] if lacking else "simulate or matrices"
-        raise InputError(f"model {name}", f"lacks {missing}", "see docs/selection.md")
+        raise InputError(
+            f"model {name}", f"lacks {missing}", "see docs/howto/reliability_selection.md"
+        )
     rate = float(returned["rate"])
     simulate, jacobian = returned.get("simulate"), returned.get("jacobian")
     if "matrices" in returned:
@@ -84,8 +87,8 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
 
 
 def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tuple[Trial, ...]]:
-    """Trials of every subject and visit, all conditions together."""
-    # A plant of that many signals: the reader takes names and the rate from it.
+    """Trials of every subject and visit, over all conditions."""
+    # A dummy plant: the reader takes the names of signals and the rate from it.
     d, p = len(source.inputs), len(source.outputs)
     names: dict[str, Any] = {"inputs": ["nothing", *source.inputs], "outputs": source.outputs}
     system = control.ss([[0.5]], np.ones((1, 1 + d)), np.ones((p, 1)), 0, 1 / source.rate, **names)
@@ -102,19 +105,19 @@ def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tupl
 
 
 class Runner(Protocol):
-    """Does the same work for every name of a mapping."""
+    """Runs the same function for all entries of a mapping."""
 
     def __call__(
         self, work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]
     ) -> dict[str, T]:
-        """name -> work(model, *arguments), in the order of `arguments`; `kind` is its dataclass."""
+        """Return name -> work(model, *arguments), a dataclass `kind`, in the given order."""
         ...
 
 
 def on_pool(
     pool: Pool, source: ModelSource, cache: Cache, done: Callable[[Result], None] = lambda _: None
 ) -> Runner:
-    """On the workers of a pool."""
+    """Runner on the workers of a pool."""
     made_of = _made_of(source.name, source.arguments)
     named = source.name, json.dumps(source.arguments), made_of
 
@@ -150,7 +153,7 @@ def _model(name: str, arguments: str, made_of: str) -> ParametricModel:
     if _made_of(name, source.arguments) != made_of:
         raise InputError(
             "worker", "has another model or other versions than this command",
-            "give all machines the same, and start the workers again",
+            "copy the same files and versions to all machines, and restart the workers",
         )  # fmt: skip
     return source.model
 

@@ -1,4 +1,4 @@
-"""The report of a selection: page, tables, result.json, and a forest of all parameters."""
+"""Report of `impc select`."""
 
 from __future__ import annotations
 
@@ -31,43 +31,43 @@ if TYPE_CHECKING:
     from impc.studies.selection.model import ParametricModel
 
 _OPEN = "not determined"
-_POOR, _AT_LIMIT = 50.0, 0.1  # % of the movement; of a range, in the figure
+_POOR, _AT_LIMIT = 50.0, 0.1  # VAF of a poor model, %; distance to a limit in the figure, %
 _BIAS, _WIDTH = "bias_percent_of_the_range", "width_percent_of_the_range"
 _LABELS = {
     "low": "95 % CI low", "high": "95 % CI high", "sd": "SD between people", "value": "Estimate",
     _WIDTH: "95 % CI width (% of range)", _BIAS: "Bias from fixing (% of range)",
 }  # fmt: skip
 _CAPTION = (
-    "Blue: identifiable, with 95 % intervals that allow for people who differ in the others. Grey "
-    "dots: fitted with all others, not identifiable; grey bars: assumed value and SD between "
-    "people. One mark a subject; arrows: at a limit of the search."
+    "Blue: identifiable, with 95 % intervals that allow for the SD between people in the other "
+    "parameters. Grey dots: fit of all parameters, not identifiable; grey bars: assumed value and "
+    "SD between people. One mark per subject; arrows: at a limit of the search."
 )
 _BY_SUBJECT = (
-    "Estimates with 95 % intervals that allow for the SD between people in the fixed parameters; "
-    "others exact: bootstrap intervals as if those were exactly as assumed. Bias: to first order, "
-    "root of the sum of squares over the fixed parameters, each one SD off."
+    "Estimates with 95 % intervals that allow for the SD between people in the fixed parameters. "
+    "Others exact: bootstrap intervals if the fixed parameters equal their assumed values. Bias: "
+    "to first order, root sum of squares over the fixed parameters, each wrong by one SD."
 )
 _METHODS = (
     "A model with {size} parameters was fitted to recordings of {people} subjects by least squares "
-    "within search limits. Chosen was the largest subset whose variances, by the Fisher "
-    "information, are at most {bound:g} in each subject (unit: half the search range, squared). "
-    "The others were fixed at assumed values; 95 % intervals allow for their SD between people."
+    "within search limits. The largest subset whose variances, by the Fisher information, are at "
+    "most {bound:g} in each subject (unit: half the search range, squared) was selected. The "
+    "others were fixed at assumed values; 95 % intervals allow for their SD between people."
 )
 
 
 class _Facts(NamedTuple):
-    """What verdict, checks and the text for a paper share."""
+    """Phrases and numbers shared by verdict, checks and the text for a paper."""
 
-    names: str  # Of the identifiable parameters
-    free: str  # How many they are
-    fixed: int
-    worst: str  # The parameter that fixing the others may bias most
-    bias: str  # By how much, % of its search range
+    names: str  # Names of the identifiable parameters
+    free: str  # Their number in words
+    fixed: int  # Number of fixed parameters
+    worst: str  # Parameter with the largest bias by fixing the others
+    bias: str  # That bias, % of its search range
     shift: str  # Both in words
-    kept: bool  # Whether no interval is wider than required
-    stuck: str  # Which estimates are at a limit of the search; empty where none is
-    vaf: str
-    poor: bool
+    kept: bool  # Whether all variances with the prior stay within the bound
+    stuck: str  # Estimates at a limit of the search; empty if there are none
+    vaf: str  # VAF in words
+    poor: bool  # Whether the model explains less than half
 
 
 def _facts(model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> _Facts:
@@ -95,12 +95,12 @@ def selection_report(
     inputs: Inputs,
     truths: Mapping[str, Array],
 ) -> Report:
-    """The report of `impc select`; `truths` has the parameters (k,) of simulated subjects."""
+    """Report of `impc select`; `truths` are the true parameters (k,) of simulated subjects."""
     table = _intervals(model, found, truths)
     facts, truth = _facts(model, found, table), _truth(table)
     fixed, people, size = facts.fixed, len(found.chosen), model.size
     provenance = Provenance(command=command, inputs=inputs)
-    copied: Copy | str = "There is nothing to copy: the model does not explain the movement."
+    copied: Copy | str = "There is no text to copy: the model does not explain the movement."
     if not facts.poor:
         results = f"{facts.free} were identifiable together ({facts.names}). VAF: {facts.vaf}."
         if fixed:
@@ -111,9 +111,9 @@ def selection_report(
         [
             Section("Parameters", [
                 Finding("parameters", _by_parameter(model, found, table),
-                        "Medians over subjects, and the largest bias.", labels=_LABELS,
+                        "Medians over subjects, and largest bias.", labels=_LABELS,
                         hidden=() if any(model.meanings) else ["symbol"], digits=3),
-                Finding("intervals", table, _BY_SUBJECT, folded="Every subject, in numbers",
+                Finding("intervals", table, _BY_SUBJECT, folded="All subjects in numbers",
                         labels=_LABELS, hidden=["symbol"]),
             ]),
             Section("Checks", [Checks([*_checks(model, found, facts), *truth])]),
@@ -137,27 +137,27 @@ def selection_report(
 def _verdict(facts: _Facts) -> Verdict:
     if facts.poor:
         headline = "The model explains less than half of this movement."
-        return Verdict(Level.RED, headline, "Its parameters say nothing about these subjects.")
+        return Verdict(Level.RED, headline, "Do not interpret its parameters.")
     fixed, kept, stuck = facts.fixed, facts.kept, facts.stuck
     condition = f", if the other {fixed} {'is' if fixed == 1 else 'are'} as assumed" * bool(fixed)
-    shifted = " If a fixed parameter is wrong, so are these." * (not kept)
+    shifted = " If a fixed parameter is wrong, these are biased." * (not kept)
     alert = Alert(
         Level.AMBER, "The estimates depend on parameters that were fixed",
-        f"Fixing the other {fixed} may shift an estimate by up to {facts.shift}.",
-        "A subject who differs from the assumed values gets a wrong estimate. The intervals of "
-        "this page contain this error; those of a fit with exact values do not.",
-        ["Report the assumed values, and the intervals of this page.",
+        f"Fixing the other {fixed} may bias an estimate by up to {facts.shift}.",
+        "If a subject differs from the assumed values, the estimates are biased. The intervals on "
+        "this page include this error; intervals for exactly known values do not.",
+        ["Report the assumed values, and the intervals on this page.",
          "Measure fixed parameters in another experiment, or use a richer movement of the target."],
     )  # fmt: skip
     may = [Claim(f"{facts.free} are identifiable together.", f"{facts.names}."),
            Claim("Their estimates, with the assumed values of the others.",
-                 "With the intervals of this page.")]  # fmt: skip
+                 "With the intervals on this page.")]  # fmt: skip
     may_not = [
         (fixed, "The fixed parameters.", "Their values are assumed, not estimated."),
         (
             not kept,
             "Differences between subjects.",
-            f"Fixing may shift estimates by {facts.shift}.",
+            f"Fixing the others may bias estimates by up to {facts.shift}.",
         ),
         (stuck, "Estimates at a limit of the search.", f"{stuck} subjects."),
         (True, "That other parameters have no effect.", "The recordings cannot separate them."),
@@ -173,17 +173,17 @@ def _verdict(facts: _Facts) -> Verdict:
 def _checks(model: ParametricModel, found: StudySelection, facts: _Facts) -> list[Check]:
     scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
     together = " ".join(
-        f"Scaling {names_of(model, [model.names.index(name) for name in names])} together changes "
-        "the outputs by less than their noise."
+        f"Scaling {names_of(model, [model.names.index(name) for name in names])} together (by a "
+        "factor of e) changes the outputs by less than their noise."
         for names in scalings
     )
     good, doubt = Level.GREEN, Level.AMBER
     return [
         Check(good if facts.kept else doubt, "Bias from fixing",
-              f"Up to {facts.shift}, if each fixed parameter is one SD between people off. The "
-              "intervals allow for it." if facts.fixed else "No parameter is fixed."),
+              f"Up to {facts.shift}, if each fixed parameter is wrong by one SD between people. "
+              "The intervals allow for it." if facts.fixed else "No parameter is fixed."),
         Check(doubt if facts.stuck else good, "Search limits",
-              f"At a limit of the search: {facts.stuck or 'no estimate'}."),
+              f"Estimates at a limit of the search: {facts.stuck or 'none'}."),
         Check(Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
         *([Check(Level.NOTE, "Combinations", together)] if together else []),
         Check(Level.NOTE, "Another method", f"LASSO selects {names_of(model, found.lasso)}."),
@@ -225,7 +225,7 @@ def _intervals(
 
 
 def _bias(model: ParametricModel, found: StudySelection, subject: str) -> Array:
-    """Of each estimate, to first order, if all others are one SD off; % of its range (free,)."""
+    """First-order bias of each estimate if all others are wrong by one SD; % of its range."""
     F, free = np.asarray(found.nominal[subject].information.F), list(found.free)
     rest = [index for index in range(model.size) if index not in free]
     moved = np.linalg.solve(F[np.ix_(free, free)], F[np.ix_(free, rest)])
@@ -233,7 +233,7 @@ def _bias(model: ParametricModel, found: StudySelection, subject: str) -> Array:
 
 
 def _note(model: ParametricModel, index: int, item: PriorFit, low: float, high: float) -> str:
-    """What the search limits of a parameter do to its interval."""
+    """Note on an interval that reaches a search limit; else empty."""
     ends = {"lower": low <= model.low[index], "upper": high >= model.high[index]}
     if all(ends.values()):
         return _OPEN
@@ -242,19 +242,19 @@ def _note(model: ParametricModel, index: int, item: PriorFit, low: float, high: 
 
 
 def read_truths(folder: Path, model: ParametricModel) -> dict[str, Array]:
-    """True parameters (k,) by subject and visit, from the truth.json of a study's `folder`."""
+    """True parameters (k,) by subject and visit from truth.json in `folder`; empty if none."""
     known = truth_beside(folder)
     try:
         return {
             subject: np.array([values[name] for name in model.names], dtype=np.float64)
             for subject, values in known["recordings"].items()
         }
-    except (AttributeError, KeyError, TypeError, ValueError):  # none, or another program's file
+    except (AttributeError, KeyError, TypeError, ValueError):  # none, or not a file of impc
         return {}
 
 
 def _truth(table: pd.DataFrame) -> list[Check]:
-    """How many true values lie inside their intervals, where they are known."""
+    """Check of the number of true values inside their intervals, if known."""
     if "truth" not in table:
         return []
     known = table.dropna(subset=["truth"])
@@ -268,7 +268,7 @@ def _truth(table: pd.DataFrame) -> list[Check]:
 
 
 def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figure:
-    """All parameters in their search ranges, the identifiable ones first."""
+    """Forest plot of all parameters in their search ranges, identifiable ones first."""
     order, people = _ordered(model, found), len(found.chosen)
     figure = new_figure(PHONE if narrow else HALF, 0.8 + (0.47 if narrow else 0.34) * len(order))
     ax = figure.subplots()
@@ -329,11 +329,11 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
 
 
 def said(model: ParametricModel, index: int) -> str:
-    """A parameter in words, or its name."""
+    """Meaning of a parameter in words, or its name."""
     meaning = model.meanings[index] if model.meanings else ""
     return meaning or model.names[index].replace("_", " ")
 
 
 def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
-    """The parameters of a subset in words, with commas."""
+    """Parameters of a subset in words, separated by commas."""
     return ", ".join(said(model, index) for index in subset)

@@ -1,4 +1,4 @@
-"""The [select] table of a study file."""
+"""Settings of a selection: the [select] table of a study file (docs/ref/settings.md)."""
 
 from __future__ import annotations
 
@@ -18,23 +18,45 @@ Count = Annotated[int, Meta(ge=1, le=1000)]
 
 @dataclass(frozen=True)
 class SelectSettings:
-    """Settings of `impc select`."""
+    """Settings of `impc select` and `impc key-parameters`.
 
-    # v, largest variance in normalised units, of the subset that is refitted
+    Attributes
+    ----------
+    bound : float
+        Largest allowed variance of each parameter of the selected subset, in squared halves of its
+        range.
+    bounds : list of float
+        Bounds of the variance in the sweep.
+    least : int
+        Smallest number of parameters in a subset.
+    size : int
+        Largest number of parameters that the LASSO selects.
+    starts : int
+        Number of starts of the fit of all parameters.
+    replicates : int
+        Number of bootstrap replicates.
+    draw : "single" or "block"
+        Resampling of the residuals in the bootstrap: single samples, or moving blocks (for
+        autocorrelated residuals).
+    nelder_mead : bool
+        Whether the dissertation's LASSO by Nelder-Mead (Table C.1) is run too; slow.
+    seed : int
+        Seed of starts and replicates.
+    """
+
     bound: Variance = 0.05
-    # Of the sweep
     bounds: Annotated[list[Variance], Meta(min_length=1)] = field(
         default_factory=lambda: [0.05 + 0.1 * k for k in range(10)]
     )
-    least: Count = 2  # n_min
-    size: Count = 5  # Parameters that the LASSO is to leave
-    starts: Annotated[int, Meta(ge=1, le=100_000)] = 3  # Of the nominal fit
-    replicates: Annotated[int, Meta(ge=2, le=100_000)] = 200  # Of the bootstrap
-    draw: Literal["single", "block"] = "block"  # How the bootstrap draws residuals
-    nelder_mead: bool = False  # Whether Table C.1 is run too: slow
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0  # Of starts and replicates
+    least: Count = 2
+    size: Count = 5
+    starts: Annotated[int, Meta(ge=1, le=100_000)] = 3
+    replicates: Annotated[int, Meta(ge=2, le=100_000)] = 200
+    draw: Literal["single", "block"] = "block"
+    nelder_mead: bool = False
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
 
 
 def select_settings(table: Mapping[str, Any]) -> SelectSettings:
-    """Read the [select] table."""
+    """Read the [select] table of a study file."""
     return read_settings("select", SelectSettings, table)

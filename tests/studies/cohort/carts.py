@@ -1,4 +1,4 @@
-"""A small study for the tests: carts on a falling track, fitted in a tenth of a second."""
+"""A small study for tests: unstable carts, each fitted in 0.1 s."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def subject_trial(seed: int, cost_weight: float = 4.0) -> Recording:
 def write_study(
     folder: Path, subjects: int, visits: int = 1, replicates: int = 0, seed: int = 0
 ) -> Path:
-    """Write a study of one trial a visit; returns study.toml."""
+    """Write a study with one trial per visit; return the path of study.toml."""
     rng = np.random.default_rng(seed)
     people = ["subject,group,drag"]
     for number in range(1, subjects + 1):

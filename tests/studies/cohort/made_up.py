@@ -1,4 +1,4 @@
-"""A study without recordings and its results, made up: what the folder and the pages need."""
+"""Made-up study and results without recordings, for tests of folders and pages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def made_up_study(subjects: int, replicates: int = 0, **labels: str) -> Study:
 
 
 def tasks_of(study: Study) -> dict[str, FitTask]:
-    """A task for each unit, its digest the unit's name turned round."""
+    """A task for each unit; its digest is the reversed name."""
     return {
         unit.name: FitTask((), study.plant, {}, study.configuration, unit.name[::-1])
         for unit in study.units
@@ -35,7 +35,7 @@ def tasks_of(study: Study) -> dict[str, FitTask]:
 
 
 def made_up(item: Assessment, rng: np.random.Generator) -> dict[str, float] | float:
-    """An assessment of the hand of `fit_of`, about 98."""
+    """A made-up VAF of about 98 %."""
     plant = Plant(
         control.ss(
             [[1, 0.1], [0, 1]],
@@ -53,7 +53,7 @@ def made_up(item: Assessment, rng: np.random.Generator) -> dict[str, float] | fl
 
 
 def fit_of(seed: int) -> dict[str, Any]:
-    """What `impc.studies.cohort.tasks.fit_unit` returns."""
+    """Made-up return value of `impc.studies.cohort.tasks.fit_unit`."""
     rng = np.random.default_rng(seed)
     gain = [rng.standard_normal(2).tolist()]
     weights = {"Q": [[1.0, 0.0], [0.0, 2.0]], "dominant": [0.6, 0.8], "angle": 1.0}
@@ -79,7 +79,7 @@ def fit_of(seed: int) -> dict[str, Any]:
 
 
 def replicate_of(seed: int) -> dict[str, Any]:
-    """What `impc.studies.cohort.tasks.replicate_unit` returns."""
+    """Made-up return value of `impc.studies.cohort.tasks.replicate_unit`."""
     rng = np.random.default_rng([seed, 1])
     return {
         "K": [rng.standard_normal(2).tolist()], "parameters": [2.0 + rng.random()],

@@ -1,4 +1,4 @@
-"""Groups and visits compared: against scipy's tests, without what a unit does not say."""
+"""Comparison of groups and visits against SciPy; gains that are not identified."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SETTINGS = FitSettings(horizon=10, u_max=1.0)
 
 
 def table(subjects: int, visits: int, shift: float = 0.0, seed: int = SEED) -> pd.DataFrame:
-    """Scores with subject and visit effects; the second group is shifted."""
+    """Scores with subject and visit effects and a shifted second group."""
     rng = np.random.default_rng(seed)
     rows = []
     for number in range(subjects):
@@ -102,7 +102,7 @@ def test_without_a_difference_p_values_of_fits_are_uniform() -> None:
 
 
 def gains(deviations: dict[int, float]) -> pd.DataFrame:
-    """Ten units with a gain of 700 to 880, and a deviation of 20 unless another is given."""
+    """Ten units with a gain of 700 to 880 and a standard error of 20 by default."""
     rows = [
         (
             str(number), "1", "", "ab"[number % 2], 700.0 + 20 * number,
@@ -142,7 +142,7 @@ def test_nothing_told_is_nothing_compared() -> None:
 
 
 def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
-    """A deviation above the size of every entry is no reason: twenty draws about zero, seed 3."""
+    """Values near zero are kept: twenty draws around zero, seed 3."""
     units = gains({})
     units["K.u.x"] = 20 * np.random.default_rng(3).standard_normal(10)
     assert not_identified(units) == {}

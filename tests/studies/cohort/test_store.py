@@ -1,4 +1,4 @@
-"""What a cohort keeps: right or computed again, whatever happened to the folder."""
+"""Stored results of a cohort: valid or computed again after damage."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
     assert "4 of 6 " in page
     assert "2 failed" in page
     assert (tmp_path / "units" / NAMES[0] / "replicate-0001-failed.json").exists()
-    # Done later: the reason goes.
+    # Success later removes the stored reason.
     again = run_and_report(tmp_path, monkeypatch, refusing, lambda *_: replicate_of(7))
     assert not again
     assert not list(tmp_path.rglob("*failed*"))
@@ -122,7 +122,7 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
 def test_any_file_of_a_folder_may_be_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One of each kind: the run ends with the tables of the first, or is refused for its list."""
+    """One damaged file of each kind: same tables as before, or refused for a damaged list."""
 
     def draw(task: object, fit: object, index: int) -> dict[str, Any]:
         return refusing() if index == 1 else replicate_of(index)
@@ -161,7 +161,7 @@ def test_no_unit_fitted_is_a_report_of_reasons(
 
 @pytest.mark.parametrize("what", ["folder", "pipe", "device"])
 def test_what_stands_in_the_place_of_the_log_is_to_be_moved(what: str, tmp_path: Path) -> None:
-    """Room on the disk would not help, and is not asked for."""
+    """The message does not ask for disk space."""
     path = tmp_path / "cohort.log"
     if what == "folder":
         path.mkdir()
@@ -172,4 +172,7 @@ def test_what_stands_in_the_place_of_the_log_is_to_be_moved(what: str, tmp_path:
     with pytest.raises(OutputError, match=r"cohort\.log: cannot be written") as caught:
         Store(tmp_path, DIGESTS).log("run")
     assert "\n" not in str(caught.value)
-    assert caught.value.remedy == "move what is in its place, or give another folder"
+    assert (
+        caught.value.remedy
+        == "move the existing file or folder of that name, or choose another folder"
+    )

@@ -1,4 +1,4 @@
-"""Reading a study: patterns, tables, BIDS-like names, participants, and what is wrong with them."""
+"""Reading a study: patterns, tables, BIDS names, participants, and error messages."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_table_and_participants(tmp_path: Path) -> None:
         ('recordings = "none-{subject}.csv"', "matches no file"),
         ('recordings = "{subject}.csv"\nparticipants = "missing.csv"', "cannot be read"),
         ('recordings = "{subject}.csv"\nparticipants = "p.csv"', "is not in p.csv"),
-        ('recordings = "{subject}.csv"\nparticipants = "q.csv"', "lacks a subject"),
+        ('recordings = "{subject}.csv"\nparticipants = "q.csv"', "has a row without subject"),
         ('table = "q.csv"', "lacks a column"),
         ('recordings = "{subject}.csv"\nspeed = 1', "unknown field"),
     ],
@@ -117,16 +117,16 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, match: str) -> None:
 
 
 HOSTILE = [
-    ("table = 't.csv'", "file,subject\n1.csv,../../../../evil\n", "begins oddly|has '/' in it"),
-    ("table = 't.csv'", "file,subject\n1.csv,a/b\n", "has '/' in it"),
-    ("table = 't.csv'", "file,subject,visit\n1.csv,a,../..\n", "begins oddly|has '/' in it"),
-    ("table = 't.csv'", "file,subject,trial\n1.csv,a,b/c\n", "has '/' in it"),
-    ("table = 't.csv'", "file,subject\n1.csv,a\\b\n", "in it"),
-    ("table = 't.csv'", "file,subject\n1.csv,=HYPERLINK(1)\n", "has '=' in it"),
-    ("table = 't.csv'", "file,subject\n1.csv,.hidden\n", "begins oddly"),
-    ("table = 't.csv'", "file,subject\n1.csv,\u202eb\n", "in it"),
+    ("table = 't.csv'", "file,subject\n1.csv,../../../../evil\n", "begins with '.'|contains '/'"),
+    ("table = 't.csv'", "file,subject\n1.csv,a/b\n", "contains '/'"),
+    ("table = 't.csv'", "file,subject,visit\n1.csv,a,../..\n", "begins with '.'|contains '/'"),
+    ("table = 't.csv'", "file,subject,trial\n1.csv,a,b/c\n", "contains '/'"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\\b\n", "contains '"),
+    ("table = 't.csv'", "file,subject\n1.csv,=HYPERLINK(1)\n", "contains '='"),
+    ("table = 't.csv'", "file,subject\n1.csv,.hidden\n", "begins with '.'"),
+    ("table = 't.csv'", "file,subject\n1.csv,\u202eb\n", "contains '"),
     ("table = 't.csv'", f"file,subject\n1.csv,{'a' * 300}\n", "has 300 characters"),
-    ("table = 't.csv'", "file,subject\n1.csv,a\0b\n", "has a NUL"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\0b\n", "contains a NUL"),
     ("table = 't.csv'", "file,subject\n", "has no rows"),
     ("table = 't.csv'", "", "has no rows"),
     ("table = 't.csv'", "file,subject,subject\n1.csv,a,b\n", "has 2 columns 'subject'"),
@@ -135,14 +135,14 @@ HOSTILE = [
     ("table = 't.csv'", "file,subject\n1.csv,\n", "without file or subject"),
     ("table = 't.csv'", "file,subject\n1.csv,a\n1.csv,a\n", "twice"),
     ("table = 't.csv'", 'file,subject\n"1.csv,a\n', "no rows|cells"),
-    ("table = '.'", "", "is no ordinary file"),
+    ("table = '.'", "", "is not a regular file"),
     ("table = ''", "", "study.table: is empty"),
     ("bids = ' '", "", "study.bids: is empty"),
     ("recordings = ''", "", "study.recordings: is empty"),
     ('recordings = "{subject}\\u0000.csv"', "", "study.recordings: is empty"),
     ("recordings = '{subject}.csv'\nparticipants = ''", "", "study.participants: is empty"),
     ("recordings = '/nowhere/{subject}.csv'", "", "matches no file"),
-    ("recordings = '**/{subject}.csv'", "", "cannot be"),
+    ("recordings = '**/{subject}.csv'", "", "invalid pattern"),
     ("recordings = '{subject}{trial}{visit}.csv'", "", "nothing between {subject}{trial}"),
     ("recordings = '{subject!r}.csv'", "", "names no subject"),
     ("recordings = '[{subject}.csv'", "", "matches no file"),
@@ -165,16 +165,16 @@ PEOPLE = [
     ("subject;mass;note\n1;70,5;a, b\n", {"mass": 70.5, "note": "a, b"}),
     ("subject,mass,sex\n1,1e2,n/a\n", {"mass": 100.0}),
     ("subject,mass\n1,1_000\n", {"mass": "1_000"}),
-    ("subject;mass\n1;70.5\n2;70,5\n", "points or all with commas"),
-    ('subject,mass\n1,"1,234"\n', "may be thousands"),
-    ("subject;mass\n1;70,500\n", "may be thousands"),
+    ("subject;mass\n1;70.5\n2;70,5\n", "decimal points or only commas"),
+    ('subject,mass\n1,"1,234"\n', "may have a thousands"),
+    ("subject;mass\n1;70,500\n", "may have a thousands"),
     ("subject,mass\n1,nan\n", "leave the cell empty"),
     ("subject,mass\n1,-inf\n", "leave the cell empty"),
     ("subject,mass\n1,1e999\n", "give a finite number"),
     ("subject,mass\n1,70\n1,80\n", "two rows of subject 1"),
     ("subject,mass,mass\n1,70,80\n", "has 2 columns 'mass'"),
     ("subject,mass\n1,70,5\n", "row 2 has 3 cells"),
-    ("subject,group\n1,a/b\n", "has '/' in it"),
+    ("subject,group\n1,a/b\n", "contains '/'"),
     ("subject,mass\n", "has no rows"),
 ]
 
@@ -194,7 +194,7 @@ def test_participants(tmp_path: Path, text: str, expected: str | dict[str, float
 @pytest.mark.parametrize("name", [b"s1\xff.csv", b"s1\n2.csv", b"s1\x1b[2J.csv"])
 def test_file_names_that_are_no_text(tmp_path: Path, name: bytes) -> None:
     (tmp_path / os.fsdecode(name)).write_text("x")
-    with pytest.raises(InputError, match="in it") as caught:
+    with pytest.raises(InputError, match="contains '") as caught:
         read_study(study(tmp_path, 'recordings = "s{subject}.csv"'))
     assert str(caught.value).isprintable()
 
@@ -215,7 +215,7 @@ def test_an_absolute_pattern_and_brackets_in_it(tmp_path: Path) -> None:
 
 
 def test_columns_that_the_plant_does_not_take(tmp_path: Path) -> None:
-    """A column `age` is no argument of the plant: it is left out, and said."""
+    """A column `age` that is not an argument of the plant is reported and not used."""
     touch(tmp_path, "s1.csv")
     (tmp_path / "p.csv").write_text("subject,age,drag\n1,44,0.5\n")
     path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')

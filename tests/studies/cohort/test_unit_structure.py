@@ -1,4 +1,4 @@
-"""A cohort in structured weights: weights of every unit, groups compared in their logarithms."""
+"""Cohort with a structure: weights of each unit, groups compared by logarithms."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STRUCTURE = '[fit.structure]\nQ = ["x[0]", "x[1]"]\n'
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Store]:
-    """Six subjects; the position costs group a 4 and group b 8."""
+    """Six subjects; cost weight of the position 4 in group a and 8 in group b."""
     folder = tmp_path_factory.mktemp("structured")
     path = write_study(folder, 6)
     path.write_text(path.read_text() + STRUCTURE)
@@ -96,7 +96,7 @@ def test_a_unit_without_a_structure_has_no_columns_for_it() -> None:
 
 
 def test_a_structure_that_loses_its_plant_names_why(tmp_path: Path) -> None:
-    """No feature sees the mode that does not decay: the unit fails with the structure's reason."""
+    """No feature observes the marginal mode: the unit fails with the structure's reason."""
     path = write_study(tmp_path, 2)
     path.write_text(path.read_text() + '[fit.structure]\nQ = ["x[2]"]\n')
     study = read_study(path)

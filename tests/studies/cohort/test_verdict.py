@@ -1,4 +1,4 @@
-"""What the page of a cohort says first, of tables of units that are made up."""
+"""Verdict of a cohort for made-up tables of units."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ def test_visits_of_one_group_are_compared() -> None:
 
 def test_no_difference_is_no_claim_that_groups_are_alike() -> None:
     found = cohort_verdict(cohort(0.0))
-    assert found.headline == "No gain differs between the groups."
-    assert any("alike" in claim.text for claim in found.may_not)
+    assert found.headline == "No difference in a gain between the groups was found."
+    assert any("equal" in claim.text for claim in found.may_not)
 
 
 def test_only_what_is_identified_and_usable_is_compared() -> None:
@@ -104,7 +104,7 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
 def test_too_few_gains_are_no_comparison() -> None:
     found = cohort_verdict(cohort(-139.0, wide=tuple(range(9))))
     assert found.level is Level.AMBER
-    assert "too few people are identified" in found.headline
+    assert "identified in too few people" in found.headline
 
 
 def test_no_usable_fit_is_red() -> None:

@@ -1,4 +1,4 @@
-"""What the page of a comparison says, from methods that are made to stay or to fall."""
+"""Report of a comparison for methods that complete or stop early."""
 
 from __future__ import annotations
 
@@ -99,10 +99,10 @@ def test_a_model_that_falls_has_no_number(
     assert row[["vaf_x1", "held_out_vaf_x1", "largest_input_u", "beyond_bound"]].isna().all()
     figure = methods_figure(fell, narrow=False)
     texts = [text.get_text() for ax in figure.axes for text in ax.texts]
-    assert "fell at 5.1 s" in texts
+    assert "stops at 5.1 s" in texts
     assert len(figure.axes[1].containers) == len(by_score(fell)) - 1
     report = compare_report(problem, fell, PROVENANCE)
-    assert "fell at 5.1 s" in shown(report)
+    assert "stops at 5.1 s" in shown(report)
 
 
 def test_when_all_fall_nothing_is_said(problem: Problem, compared: tuple[MethodFit, ...]) -> None:
@@ -138,7 +138,7 @@ def test_a_limit_that_no_model_reaches_decides_nothing(
 ) -> None:
     kept = tuple(replace(fit, exceeded=0.0) for fit in compared)
     verdict = compare_report(problem, kept, PROVENANCE).verdict
-    assert "decides nothing" in verdict.headline
+    assert "does not matter" in verdict.headline
     assert not any("matters" in claim.text for claim in verdict.may)
 
 
@@ -153,4 +153,4 @@ def test_without_trials_left_out_nothing_is_said_of_prediction(
     assert isinstance(checks, Checks)
     levels = {check.name: check.level for check in checks.checks}
     assert levels["Left-out trials"] is Level.NOTE
-    assert levels["Falls"] is Level.GREEN
+    assert levels["Simulations"] is Level.GREEN

@@ -1,4 +1,4 @@
-"""`impc compare`: methods on the cart against truth, and the command from files to files."""
+"""`impc compare`: methods on the cart against the truth, and the command."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_inverse_mpc_finds_the_gain_and_keeps_the_limit(
 def test_left_out_trials(compared: dict[str, MethodFit]) -> None:
     ours = compared["inverse_mpc"]
     assert ours.held_out.shape == (2, 1)
-    # Noise of 20 % leaves 1 / 1.04 to explain.
+    # With noise of 20 %, the largest possible VAF is 1 / 1.04.
     assert np.all(np.abs(ours.held_out - 100 / 1.04) < 1.5)
     assert np.mean(compared["feedback_gain"].held_out) < np.mean(ours.held_out)
 
@@ -91,7 +91,7 @@ def test_exceeding_is_counted_sample_by_sample(compared: dict[str, MethodFit]) -
 
 
 def test_only_samples_that_were_reached_count() -> None:
-    """x+ = 1.5 x + u with |u| <= 0.1 falls from 1: every command until then is at the limit."""
+    """x+ = 1.5 x + u with |u| <= 0.1 diverges from 1, with all commands at the limit."""
     plant = Plant(control.ss([[1.5]], [[1]], [[1]], 0, 1))
     wide = Bounds(plant, u_min=-5, u_max=5)
     run = Controller(plant, Weights(1, 1), wide, 3, terminal_set=False).simulate([1.0], steps=400)
@@ -109,7 +109,7 @@ def test_only_samples_that_were_reached_count() -> None:
 def test_what_the_gain_leaves_too_is_no_fault_of_the_weights(
     compared: dict[str, MethodFit],
 ) -> None:
-    """Of recordings with noise: weights with exactly the gain miss as much as it does."""
+    """With noise: weights with exactly the gain have the misfit of the gain."""
     found = compared["inverse_mpc_reduced"].estimate
     assert found.weights is not None
     assert found.misfit > 0.1
@@ -131,7 +131,7 @@ def test_estimates_go_through_json(compared: dict[str, MethodFit]) -> None:
 
 
 def test_an_interrupted_comparison_goes_on(compared: dict[str, MethodFit], tmp_path: Path) -> None:
-    """Interrupted in the middle: what is done is not done again, and the end is the same."""
+    """Continue after an interruption: finished fits are not repeated, same result."""
     problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], SETTINGS)
     count = 0
 
@@ -214,17 +214,17 @@ def test_a_printed_estimate_says_what_speaks_against_it(
 ) -> None:
     assert "leaves" not in str(compared["inverse_mpc"].estimate).split("noise.", 1)[1]
     clipped = str(compared["inverse_lqr_output"].estimate)
-    assert "But another gain leaves less" in clipped
+    assert "Another gain has a smaller misfit" in clipped
     stopped = replace(compared["inverse_mpc"].estimate, status=Status.STOPPED)
-    assert "was stopped before it ended: the answer may be wrong" in str(stopped)
+    assert "stopped before it converged: the result may be wrong" in str(stopped)
     plant = Plant(yalmip_example())
     still = np.random.default_rng(1).standard_normal((21, 2))
     bounds = Bounds(plant, u_min=-1, u_max=1)
     with caplog.at_level("INFO", logger="impc"):
         found = methods.fit(Problem(plant, bounds, 3, [Recording(plant, still)]))
     assert [item.args for item in caplog.records] == [(found,)]
-    share = found.misfit / np.sqrt(still.size)  # outputs are over their root-mean-square
-    assert f"It leaves {100 * share:.0f} % of the recordings." in str(found)
+    share = found.misfit / np.sqrt(still.size)  # outputs are scaled by their root mean square
+    assert f"The residual is {100 * share:.0f} % of the recordings" in str(found)
 
 
 def test_a_bad_file_ends_in_one_line(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The example: its table, its page and its result.json."""
+"""Report of the example: table, page and result.json."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_the_page_says_who_stays_within_the_limit(
 ) -> None:
     report = example_report([case_a], provenance)
     assert report.verdict.level is Level.NOTE
-    assert "two need no more than was available" in report.verdict.headline
+    assert "two need no more than the limit" in report.verdict.headline
     assert [key.value for key in report.keys] == ["7", "2", "2"]
     assert "up to 1.23" in report.verdict.sentence
     main = report.page().partition("<main")[2].partition("</main>")[0]

@@ -1,4 +1,4 @@
-"""What a fit says where a stage fails, little is explained, or no weights have the gain."""
+"""Report of a fit if a stage fails, the VAF is low, or no weights have the gain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from impc.studies.fit.verdict import WEIGHTS, fit_verdict, forbidden
 
 @cache
 def posed(angle: float, rate: float, noise: float) -> tuple[impc.Problem, impc.FitSettings]:
-    """A stick balanced by a gain, with noise (rad) in its recorder."""
+    """A stick balanced by a gain, with recording noise (rad)."""
     plant, rng = impc.Plant(stick(), ["finger"]), np.random.default_rng(5)
     bounds = impc.Bounds(plant, u_min=-6, u_max=6)
     law = impc.Controller.from_gain(plant, [[angle, rate]], bounds, 5, terminal_set=False)
@@ -57,7 +57,7 @@ def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
 
 
 def test_no_weights_is_said_before_any_weights() -> None:
-    """A gain that no weights have, well recorded, against the gain of a regulator."""
+    """A gain without weights, with little noise, and the gain of a regulator."""
     result = fitted(-60.0, -4.0)
     assert result.weights_test.rejected
     verdict = fit_verdict(result)
@@ -70,16 +70,16 @@ def test_no_weights_is_said_before_any_weights() -> None:
 
 
 def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawn gains, the test of the model and drifts of the horizon fail: the gain is reported."""
+    """Drawn gains, model test, horizons and terminal set fail: the gain is still reported."""
 
     def fails(*_: Any, **__: Any) -> Any:
         raise SolverError("stage", "did not end", "try another")
 
     whole = fitted()
-    for name in ("drawn_gains", "lack_of_fit"):
+    for name in ("drawn_gains", "lack_of_fit", "_terminal_set_difference"):
         monkeypatch.setattr(subject, name, fails)
     result = fitted()
-    assert set(result.failures) == {"drawn gains", "test of the model"}
+    assert set(result.failures) == {"drawn gains", "test of the model", "terminal set"}
     page = fit_report(result, Provenance()).page()
     for stage in result.failures:
         assert f"Not available: {stage}" in page

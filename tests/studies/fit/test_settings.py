@@ -1,4 +1,4 @@
-"""The [fit] table: what it sets, what it refuses, and bounds from the data."""
+"""The [fit] table: settings, error messages, and bounds from the data."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_defaults_and_values() -> None:
         ({"horizon": 2**63}, "horizon: got 9223372036854775808"),
         ({"horizon": 16**5000}, "horizon: got an integer of about 6021 digits"),
         ({"horizons": [10, 2**63]}, "horizons"),
-        ({"horizons": [10, 10]}, "horizons: names 10 twice"),
+        ({"horizons": [10, 10]}, "horizons: contains 10 twice"),
         ({"margin": 1e308}, "margin"),
         ({"margin": float("nan")}, "margin"),
         ({"settle": 1e308}, "settle"),
@@ -59,7 +59,7 @@ def test_defaults_and_values() -> None:
         ({"u_max": [1.0, -1.0]}, "u_max: got -1.0"),
         ({"u_max": 5e-324}, "u_max"),
         ({"bounded_states": {"x": 1e308}}, "bounded_states x"),
-        ({"free": ["mass", "mass"]}, "free: names mass twice"),
+        ({"free": ["mass", "mass"]}, "free: contains mass twice"),
     ],
 )
 def test_what_is_wrong_is_named(table: dict[str, Any], says: str) -> None:
@@ -130,7 +130,7 @@ def test_as_many_limits_as_inputs(seat: Plant) -> None:
 def test_what_a_command_does_not_use_is_refused_by_name(
     table: dict[str, object], used: tuple[str, ...], says: str
 ) -> None:
-    """`impc compare` and `impc cohort` left profiles and horizons out without a word."""
+    """`impc compare` and `impc cohort` reject settings that they do not use."""
     settings = fit_settings(table)
     if not says:
         require_used(settings, used, "compare")
@@ -144,5 +144,5 @@ def test_a_method_of_a_fit_is_one_of_the_registry() -> None:
     assert fit_settings({"methods": ["clipped_lqr"]}).methods == ["clipped_lqr"]
     with pytest.raises(InputError, match="method: got 'inverse_mpc_direct'; choose one of"):
         fit_settings({"methods": ["inverse_mpc_direct"]})
-    with pytest.raises(InputError, match="method: inverse_kkt was removed; take it out"):
+    with pytest.raises(InputError, match="method: inverse_kkt is not part of impc; remove it"):
         fit_settings({"methods": ["inverse_kkt"]})

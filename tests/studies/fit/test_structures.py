@@ -1,4 +1,4 @@
-"""A fit with structures: its first sentences, its table, and what result.json keeps."""
+"""Fit with structures: sentences, tables, and result.json."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def fitted(cross: float) -> FitResult:
 def test_statements_within_a_structure_that_holds() -> None:
     result = fitted(0.0)
     lines = structure_sentences(result)
-    assert lines[0].startswith("The structure “one by one” is not rejected (p")
+    assert lines[0].startswith("The recordings do not reject the structure “one by one” (p")
     assert any("identify 5 combinations" in line for line in lines)
     found = result.structures[0]
     ratio = next(item for item in found.ratios if item.first == "x[0]")
@@ -71,7 +71,7 @@ def test_statements_within_a_structure_that_holds() -> None:
     held = [
         item.holds(np.log(truth[name])) for name, item in zip(truth, found.intervals, strict=True)
     ]
-    assert sum(held) >= 4  # of 95 % each
+    assert sum(held) >= 4  # with a coverage of 95 % each
 
 
 @pytest.mark.full
@@ -84,7 +84,7 @@ def test_a_cost_weight_of_zero_makes_the_intervals_less_sure() -> None:
     cost_weights[3] = -np.inf
     zero = replace(found, estimate=replace(found.estimate, cost_weights=cost_weights))
     lines = structure_sentences(replace(result, structures=(zero, *result.structures[1:])))
-    assert any(line.startswith("Where the best cost weight is zero") for line in lines)
+    assert any(line.startswith("If the best cost weight is zero") for line in lines)
 
 
 @pytest.mark.full
@@ -102,7 +102,7 @@ def test_a_structure_that_does_not_hold_is_rejected_first() -> None:
     result = fitted(0.5)
     assert result.structures[0].refused
     lines = structure_sentences(result)
-    assert lines[0].startswith("The structure “one by one” is rejected")
+    assert lines[0].startswith("The recordings reject the structure “one by one”")
     assert not any("combinations" in line for line in lines)
     assert any(
         "rejects" in one.title or "reject the" in one.title for one in fit_verdict(result).alerts
@@ -142,7 +142,7 @@ def test_settings_name_structures() -> None:
 
 
 def test_the_fit_begins_with_what_is_fitted_without_a_structure() -> None:
-    """The structure adds; it changes nothing of the rest."""
+    """A structure adds results and changes no others."""
     result = fitted(0.0)
     again = fit_controller(result.given)
     np.testing.assert_array_equal(again.gain, result.fitted.gain)

@@ -1,4 +1,4 @@
-"""A subject from recordings to a result: what is in it, remembering, and intent."""
+"""Fit of a subject: result, stored steps, and intent."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_every_reading_has_the_gain_and_the_angle_is_theirs(noisy: FitResult) ->
 
 
 def test_intent_of_known_weights() -> None:
-    """The double integrator with Q = I: the least condition number is 1, whatever v is."""
+    """Double integrator with Q = I: the minimum condition number is 1 for all v."""
     plant = Plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, True))
     weights = Weights(np.diag([4.0, 1.0]), 1)
     found = intent(
@@ -170,7 +170,7 @@ def test_a_plant_of_ones_own_with_one_output(small: tuple[Problem, FitSettings])
     heard: list[str] = []
     result = fit_recordings(*small, FitProgress(heard.append))
     assert len(heard) == stages(small[0], small[1])
-    # Noise of 20 % leaves 1 / 1.04 to explain.
+    # With noise of 20 %, the largest possible VAF is 1 / 1.04.
     assert np.all(np.abs(result.inverse_mpc.vaf - 100 / 1.04) < 1.5)
     assert result.identifiability.rank == 2
     single = replace(small[0], recordings=small[0].recordings[:1])
@@ -246,11 +246,11 @@ def test_a_remembered_controller_is_the_same(
 
 def test_what_cannot_be_fitted_is_said() -> None:
     plant = cart()
-    with pytest.raises(DataError, match="there are none"):
+    with pytest.raises(DataError, match="the list is empty"):
         fit_problem(plant, [], FitSettings())
     with pytest.raises(DataError, match="zero in every trial"):
         fit_problem(plant, [Recording(plant, np.zeros(100))], FitSettings())
-    with pytest.raises(DataError, match="the shortest has 15 samples"):
+    with pytest.raises(DataError, match="the shortest trial has 15 samples"):
         fit_problem(plant, [*cart_trials(1, 0.1, 150), _short()], FitSettings())
 
 
@@ -260,7 +260,7 @@ def _short() -> Recording:
 
 
 def test_a_release_without_disturbance_is_fitted() -> None:
-    """Nothing but the initial states, which are unknown, moves these trials."""
+    """Trials that are driven only by their unknown initial states."""
     plant = cart()
     weights = Weights(np.diag([4.0, 1.0]), 1)
     bounds = Bounds(plant, u_min=-1, u_max=1)
@@ -282,11 +282,11 @@ def test_a_recording_in_which_nothing_moves_is_left_unexplained() -> None:
     outputs = 1e-3 * rng.standard_normal(200)
     outputs[0] = 0.0
     found = fit_controller(fit_problem(plant, [Recording(plant, outputs)], FitSettings(u_max=1.0)))
-    assert "It leaves 100 % of the recordings." in found.doubts
+    assert "The residual is 100 % of the recordings (2-norm)." in found.doubts
 
 
 def test_what_is_kept_has_the_body_that_was_found(tmp_path: Path) -> None:
-    """Of an uncertain body every stage, kept and read again, is what it was."""
+    """All stored stages of a fit with an uncertain body are restored exactly."""
     person = cart_person(1, 99, 0.0)
     assert person is not None
     settings = FitSettings(horizon=10, u_max=0.55, intent_draws=False, methods=["feedback_gain"])

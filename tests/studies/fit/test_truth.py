@@ -1,4 +1,4 @@
-"""What a fit says of the truth that lies beside simulated recordings."""
+"""Comparison of a fit with the truth.json of simulated recordings."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_inside_and_outside_are_counted_and_the_farthest_is_named() -> None:
     identified = truth_sentence(result, beyond)
     assert "0 of the 2 entries" in identified
     assert identified.endswith(
-        f"farthest off is the gain on speed, {speed[0]:.4g} to {speed[1]:.4g} where the truth is "
-        f"{beyond[0, 1]:.4g}."
+        f"The largest deviation is in the gain on speed: interval {speed[0]:.4g} to "
+        f"{speed[1]:.4g}, true value {beyond[0, 1]:.4g}."
     )
     rows = gain_finding(result, np.array([[place[1] + 0.1, np.mean(speed)]])).rows
     assert [row[0] for row in rows] == ["place of the cart", "speed"]

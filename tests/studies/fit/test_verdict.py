@@ -1,4 +1,4 @@
-"""What a fit allows to be said, on its page and in the values behind it."""
+"""Verdict of a fit: statements, warnings, page and figures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SEED = 20264
 
 @cache
 def fitted(limit: float) -> FitResult:
-    """A cart that is pushed, with a little noise in its recorder; the command stops at a limit."""
+    """A perturbed cart with little recording noise and a limited command."""
     cart = control.c2d(control.ss([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0]], [[0, 0]]), 0.1)
     cart = control.ss(
         cart.A, cart.B, cart.C, cart.D, 0.1, states=["place", "speed"], inputs=["pull", "push"],
@@ -64,7 +64,7 @@ def fitted(limit: float) -> FitResult:
 
 
 def explained(limit: float = 1.0) -> FitResult:
-    """A fit that nothing speaks against, whatever the test of the model found."""
+    """A fit without warnings; the result of the model test is dropped."""
     return replace(fitted(limit), lack=(None,))
 
 
@@ -94,7 +94,7 @@ def test_an_error_of_the_model_forbids_gains() -> None:
     report = fit_report(result, Provenance())
     assert isinstance(report.copy, str)
     page = report.page()
-    # The numbers stand in a part that says so, and nowhere before it.
+    # The numbers are only in a folded part that says so.
     assert "(do not report)" in page.partition('id="feedback-gain"')[2][:900]
     assert added_sentence(replace(result, lack=(alarm, None))).startswith("The residuals of a")
 
@@ -119,7 +119,7 @@ def test_a_fall_is_said_and_counted() -> None:
 
 
 def test_a_limit_that_the_recordings_contradict() -> None:
-    """A limit found far from the given one; near it, or within what was stated, it is none."""
+    """A warning if the estimated limit is far from the given one, beyond its uncertainty."""
     alarm = LackOfFit((ModelError("limit", 1e-5, 11.5, -0.3, 0.01),), alarm=True, untestable=())
     result = explained()
     added = replace(result, lack=(alarm, None))
@@ -131,13 +131,17 @@ def test_a_limit_that_the_recordings_contradict() -> None:
         assert ("probably wrong" in found.headline) == (level is Level.AMBER)
     close = FittedParameter(f"u_max.{names[0]}", 1.0, 0.95, 5e-4, 0.05, 0.0)
     assert fit_verdict(replace(result, parameters=(close,))).level is Level.GREEN
+    # Not estimated, but the residuals of the last fit still point to it.
+    doubted = fit_verdict(replace(result, lack=(alarm,)))
+    assert any("u_max" in remedy for remedy in doubted.alerts[0].todo)
+    assert not any("limit" in claim.text for claim in doubted.may)
 
 
 def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
     source = plant_source("plants:seated_balance_for", {"mass": 70.0})
     assert missing(FitSettings(), source) == (
-        "Not given: u_max: without a limit of the command inverse MPC is inverse LQR; "
-        "the subject's own height: the gains are those of height 1.66."
+        "Not given: u_max: without a limit of the command, inverse MPC equals inverse LQR; "
+        "the subject's own height: the gains assume height 1.66."
     )
     assert missing(FitSettings(u_max=6.0, free=["height"]), source) == ""
     cursor = plant_source("plants:cursor_plant", {})
@@ -145,7 +149,7 @@ def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
 
 
 def test_angles_are_shown_as_is_asked() -> None:
-    """In the figures of a fit whose output is an angle."""
+    """Units of angles in the figures of a fit."""
     result = fitted(1.0)
     turned = replace(result.given.plant, units=(("place", "rad"), ("pull", "rad/s^2")))
     shown = replace(result, fitted=replace(
@@ -169,7 +173,7 @@ def test_curves_of_the_page_are_those_of_the_fit() -> None:
     place, pull = trial["panels"]
     assert (place["limits"], pull["limits"]) == ([], [-1, 1])
     recorded, run = result.given.recordings[0].outputs[:, 0], result.inverse_mpc.runs[0]
-    # Five digits are kept.
+    # Curves are rounded to five digits.
     np.testing.assert_allclose(place["curves"][0], recorded, rtol=1e-4)
     np.testing.assert_allclose(place["curves"][1], run.x[:, 0][: len(recorded)], rtol=1e-4)
     assert pull["curves"][0] == [None] * len(recorded)
@@ -199,7 +203,7 @@ def test_little_is_called_little(vaf: float) -> None:
 
 
 def test_every_page_of_a_fit_has_its_parts() -> None:
-    """One heading of the first order, a text for each picture, no address, little weight."""
+    """One h1 heading, a text for each figure, no URLs, small size."""
     page = fit_report(fitted(1.0), Provenance(), np.array([[2.0, 1.0]])).page()
     assert page.count("<h1") == 1
     pictures = re.findall(r"<svg class.*?>(.*?)</title>", page, flags=re.DOTALL)

@@ -1,4 +1,4 @@
-"""Plans: the grid, the person who falls, groups, and fits of simulated recordings."""
+"""Plans: grid of experiments, falls, groups, and fits to simulated recordings."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_the_best_experiment_is_the_one_that_tells_most_without_a_fall() -> None
     plan = make_plan(person(), SETTINGS, perturbation, identified.append)
     assert len(identified) == steps_of(SETTINGS) == 6
     falls = {(item.design.amplitude, item.design.dwell): item.falls for item in plan.outcomes}
-    # A push of 3 against a force of 1: nobody holds that for two seconds.
+    # A push of 3 against a force of 1 for two seconds always ends in a fall.
     assert falls[3.0, 2.0] > 0
     assert falls[0.4, 1.0] == 0
     held = [item for item in plan.outcomes if item.falls == 0]
@@ -85,7 +85,7 @@ def test_the_best_experiment_is_the_one_that_tells_most_without_a_fall() -> None
 
 def test_who_falls_in_every_experiment_is_told_so() -> None:
     settings = replace(SETTINGS, amplitude=[20.0])
-    with pytest.raises(SolverError, match="falls in 100 % of the trials"):
+    with pytest.raises(SolverError, match="falls in at least 100 % of the trials"):
         make_plan(person(), settings, perturbation)
 
 
@@ -102,7 +102,7 @@ def test_power_is_that_of_the_noncentral_t() -> None:
     plan = make_plan(person(), replace(SETTINGS, amplitude=[0.8], dwell=[2.0]), perturbation)
     assert plan.best.expected is not None
     for item, own in zip(plan.groups, plan.best.expected.intervals, strict=True):
-        # An interval of 95 % is 3.92 deviations wide.
+        # A 95 % interval is 3.92 standard errors wide.
         size, deviation = 10, math.hypot((own.high - own.low) / 3.919928, 0.3)
         assert item.deviation == pytest.approx(deviation)
         away = math.log(1.5) / deviation * math.sqrt(size / 2)
@@ -114,7 +114,7 @@ def test_power_is_that_of_the_noncentral_t() -> None:
 
 
 def loosely_known(stated: str = "20 %") -> Person:
-    """The same cart, its force for a command and its limit not known exactly."""
+    """The same cart with uncertain force per command and uncertain limit."""
 
     def made(values: Array) -> Plant:
         system = control.ss(
@@ -148,7 +148,7 @@ def test_a_body_that_is_loosely_known_needs_more_persons_and_is_worth_measuring(
 
 
 def test_trials_that_are_needed_are_enough() -> None:
-    """With as many trials as are said to be needed the answer is yes, with one less it is not."""
+    """The number of trials needed is enough; one trial less is not."""
     noisy = replace(person(), deviation=np.array([0.1]))
     one = replace(SETTINGS, amplitude=[0.8], dwell=[2.0], difference=15.0)
     plan = make_plan(noisy, one, perturbation)
@@ -171,12 +171,12 @@ def test_who_is_compared_by_a_weight_without_an_end_is_told_so() -> None:
     noisy = replace(person(), deviation=np.array([30.0]))
     plan = make_plan(noisy, replace(SETTINGS, amplitude=[0.4], dwell=[1.0]), perturbation)
     assert np.isinf([item.needed for item in plan.groups]).all()
-    assert plan_copy(plan) == "No number of persons would show the difference."
+    assert plan_copy(plan) == "No number of persons would be enough to detect the difference."
     assert plan_verdict(plan).level is Level.RED
 
 
 def test_fits_are_of_bodies_as_uncertain_as_stated() -> None:
-    """Twenty fits, with little noise: of the plant's own body they would hardly scatter."""
+    """Twenty fits with little noise: the scatter comes from the uncertain body."""
     someone = replace(loosely_known("5 %"), deviation=np.array([3e-3]))
     found = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
     assert found.expected is not None
@@ -190,7 +190,7 @@ def test_fits_are_of_bodies_as_uncertain_as_stated() -> None:
 
 
 def test_fits_scatter_as_foreseen() -> None:
-    """Twenty fits: a deviation of 16 % of their own; the noise is that of the recordings."""
+    """Twenty fits: their SD has a relative error of 16 %."""
     someone = replace(person(), root=0.5, deviation=np.array([0.02]))
     identified = try_design(someone, Design(0.8, 2.0), perturbation, trials=1, draws=2)
     assert identified.expected is not None
@@ -242,7 +242,7 @@ def test_prices_and_noise_go_by_their_names() -> None:
     shape = FitSettings(structure=StructureSettings(["x[0]", "x[1]", "x[0] - x[1]"]))
     with pytest.raises(InputError, match="lacks 'x\\[0\\] - x\\[1\\]'"):
         assumed_cost_weights(plant, given, shape)
-    with pytest.raises(InputError, match="products"):
+    with pytest.raises(InputError, match="cross terms"):
         assumed_cost_weights(plant, given, FitSettings(structure=StructureSettings("full")))
     with pytest.raises(InputError, match="lacks position1"):
         noise_deviations(plant, replace(SETTINGS, noise={}))

@@ -15,7 +15,7 @@ SHROUT_FLEISS = np.array(
 
 
 def test_mean_squares_of_shrout_and_fleiss() -> None:
-    """Their table 3."""
+    """Table 3 of Shrout and Fleiss."""
     found = mean_squares(SHROUT_FLEISS)
     assert found.subjects == pytest.approx(11.24, abs=5e-3)
     assert found.within == pytest.approx(6.26, abs=5e-3)
@@ -28,7 +28,7 @@ def test_mean_squares_of_shrout_and_fleiss() -> None:
     [("A,1", 0.29), ("A,k", 0.62)],
 )
 def test_estimates_of_shrout_and_fleiss(form: Form, value: float) -> None:
-    """Their table 4."""
+    """Table 4 of Shrout and Fleiss."""
     assert icc(SHROUT_FLEISS, form).value == pytest.approx(value, abs=5e-3)
 
 
@@ -86,7 +86,7 @@ def test_perfect_agreement_and_no_variance() -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_subjects_that_are_alike_have_no_interval(form: Form) -> None:
-    """Not [1, 1] about 0: who repeats exactly what the others repeat says nothing of others."""
+    """No interval [1, 1] around 0 if all subjects have the same scores."""
     rows = np.tile([1.0, 2.0, 3.0], (5, 1))
     turned = np.array([[1.0, 2.0, 3.0], [3.0, 1.0, 2.0], [2.0, 3.0, 1.0]])
     for scores in (rows, turned):
@@ -104,13 +104,13 @@ def test_agreement_falls_with_a_shift_of_occasions() -> None:
 
 @pytest.mark.parametrize("form", ["1", "k", "C,1", "C,k"])
 def test_other_forms_are_refused(form: str) -> None:
-    with pytest.raises(InputError, match="take 'A,1' or 'A,k'"):
+    with pytest.raises(InputError, match="use 'A,1' or 'A,k'"):
         icc(SHROUT_FLEISS, form)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_limits_lie_about_the_estimate_for_few_subjects(form: Form) -> None:
-    """With three subjects limits of (A,1) pass -1/(k-1), where those of (A,k) are -inf."""
+    """With three subjects limits of (A,1) can be below -1/(k-1); those of (A,k) are -inf."""
     lows = []
     for seed in range(300):
         rng = np.random.default_rng(seed)
@@ -127,7 +127,7 @@ def test_limits_lie_about_the_estimate_for_few_subjects(form: Form) -> None:
 def study(
     rng: np.random.Generator, subjects: int, visits: int, occasion: float, error: float = 0.6
 ) -> np.ndarray:
-    """Scores of subjects of deviation 1 whom every visit moves alike by `occasion`."""
+    """Scores of subjects with SD 1 and a common visit effect of SD `occasion`."""
     return np.asarray(
         rng.standard_normal((subjects, 1))
         + occasion * rng.standard_normal((1, visits))
@@ -136,7 +136,7 @@ def study(
 
 
 def exceeded(subjects: int, visits: int, occasion: float, studies: int, seed: int) -> float:
-    """Share of 10 000 or more retests beyond the MDC of a study of its own size; new visits."""
+    """Share of 10 000 or more retests at new visits beyond the MDC of a study."""
     rng, retests = np.random.default_rng(seed), max(1, 10_000 // studies)
     beyond = 0
     for _ in range(studies):
@@ -155,12 +155,12 @@ def exceeded(subjects: int, visits: int, occasion: float, studies: int, seed: in
 def test_retests_exceed_the_mdc_of_a_usual_study_in_one_of_twenty(
     subjects: int, visits: int, occasion: float
 ) -> None:
-    """10 000 studies with a retest each, seed 6; two deviations of the count are 0.4 %."""
+    """10 000 studies with one retest each, seed 6; two standard errors are 0.4 %."""
     assert 0.04 <= exceeded(subjects, visits, occasion, 10_000, 6) <= 0.06
 
 
 def test_the_error_is_that_of_a_single_score() -> None:
-    """Spread of a subject's scores over all visits, and SD sqrt(1 - ICC(A,1)) in large tables."""
+    """SD of a subject's scores over all visits, and SD sqrt(1 - ICC(A,1)), large tables."""
     scores = study(np.random.default_rng(7), 400, 40, 0.5)
     found = measurement_error(scores)
     assert found.sem == pytest.approx(np.sqrt(np.mean(np.var(scores, axis=1, ddof=1))), rel=1e-12)
@@ -219,7 +219,7 @@ PINGOUIN = {
 
 
 def pingouin_table(n: int, k: int, seed: int) -> np.ndarray:
-    """Subjects of deviation 1, error of 0.6, a shift of 0.3 from one occasion to the next."""
+    """Subjects with SD 1, error SD 0.6, and a shift of 0.3 between occasions."""
     own = np.random.default_rng(seed).standard_normal((n, 1))
     error = 0.6 * np.random.default_rng(seed + 100).standard_normal((n, k))
     return np.round(own + error + 0.3 * np.arange(k), 3)
@@ -228,7 +228,7 @@ def pingouin_table(n: int, k: int, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("size", PINGOUIN, ids=str)
 @pytest.mark.parametrize("form", FORMS)
 def test_pingouin_prints_the_same(size: tuple[int, int, int], form: Form) -> None:
-    """To its printed digits: six of the estimate, two of the ends."""
+    """Compare printed digits: six of the estimate, two of the interval."""
     value, low, high = PINGOUIN[size][form]
     found = icc(pingouin_table(*size), form)
     assert found.value == pytest.approx(value, abs=5e-7)

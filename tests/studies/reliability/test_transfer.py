@@ -47,18 +47,18 @@ def test_passband_of_an_input_that_is_cut_inside_its_period() -> None:
 def test_an_empty_passband_is_a_sentence() -> None:
     with pytest.raises(DataError, match="is constant"):
         passband(np.ones(500), RATE)
-    with pytest.raises(DataError, match="holds no frequency"):
+    with pytest.raises(DataError, match="contains no frequency"):
         band_energy(np.ones((50, 1)), RATE, 0.1, 0.2)
 
 
 def respond(torque: Array) -> Array:
-    """Steady answer of 1 / (s + 2), discretised, to a periodic input: the second period."""
+    """Steady-state response of the discretised 1 / (s + 2) to a periodic input."""
     b, a = [0.01], [1.0, -np.exp(-0.02)]
     return np.asarray(scipy.signal.lfilter(b, a, np.tile(torque, 4))[-len(torque) :])
 
 
 def test_transfer_function_is_the_filter_s() -> None:
-    """Against the filter's own frequency response, without noise: 1e-6."""
+    """Compare with the filter's frequency response without noise: 1e-6."""
     band = passband(TORQUE, RATE)
     found = transfer_function([TORQUE], [respond(TORQUE)[:, None]], RATE, band)
     _, expected = scipy.signal.freqz([0.01], [1.0, -np.exp(-0.02)], found.frequency, fs=RATE)
@@ -83,12 +83,12 @@ def test_trials_must_be_alike() -> None:
     band = passband(TORQUE, RATE)
     with pytest.raises(DataError, match="samples"):
         transfer_function([TORQUE, TORQUE[:-1]], [TORQUE[:, None]] * 2, RATE, band)
-    with pytest.raises(DataError, match="no trial"):
+    with pytest.raises(DataError, match="list of trials is empty"):
         transfer_function([], [], RATE, band)
 
 
 def direct(curves: np.ndarray, between: bool) -> float:
-    """The sums of Kadaba's formula, one term after the other."""
+    """Kadaba's formula as explicit sums."""
     M, N, T = curves.shape
     above = below = 0.0
     for i in range(M):

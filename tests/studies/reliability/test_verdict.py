@@ -1,4 +1,4 @@
-"""What the page of a reliability study says first, and where it says nothing."""
+"""Verdict of a reliability study."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WORDS = {"theta1": "seat tilt", "theta2": "trunk tilt"}
 
 
 def study(*scores: Array) -> Reliability:
-    """RMS in radians, scores (subjects, visits) of one output each."""
+    """RMS in radians; scores (subjects, visits) of each output."""
     subjects, visits = scores[0].shape
     measures = tuple(
         MeasureResult(
@@ -62,7 +62,7 @@ def test_a_reliable_test_is_called_so_with_the_change_that_shows() -> None:
 
 
 def test_the_badge_goes_by_the_lower_end() -> None:
-    """Reliable in one signal; in the other people do not differ."""
+    """Reliable in one signal; no differences between people in the other."""
     found = reliability_verdict(study(scores(30, 3, 0.002), scores(30, 3, 0.02, 0.0)), WORDS)
     assert found.level is Level.AMBER
     assert found.headline.startswith("Seat sway is reliable; trunk sway is not")
@@ -100,4 +100,4 @@ def test_both_intervals_stand_in_columns_of_their_own() -> None:
         expected = icc(made, "A,k", method=method)  # type: ignore[arg-type]
         assert tuple(row[list(ends)]) == pytest.approx((expected.low, expected.high))
     assert "Low (generalised)" in found.heads
-    assert "output" not in found.shown  # its code name
+    assert "output" not in found.shown  # name in code

@@ -1,4 +1,4 @@
-"""A model from another field, as the tutorial of docs/selection.md has it: a drug in the blood.
+"""A model from another field: concentration of a drug in the blood.
 
 dose rate u -> concentration y: absorption ka, elimination ke, volume V. With ka and ke exchanged
 the curve has the same shape and another size: V and the two rates share a direction.
@@ -45,7 +45,7 @@ def blood_model() -> dict[str, Any]:
 
 
 def in_turn(model: ParametricModel) -> Runner:
-    """One subject after the other, in this process; nothing is kept."""
+    """Run subjects one by one in this process without a cache."""
 
     def run(
         work: Callable[..., T], kind: type[T], arguments: Mapping[str, tuple[Any, ...]]

@@ -1,4 +1,4 @@
-"""Bootstrap, LASSO, key parameters, and the commands, with a model from another field too."""
+"""Bootstrap, LASSO, key parameters, and the commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(*arguments: str) -> Result:
 
 
 def line_model() -> ParametricModel:
-    """y = a u1 + b u2 + c u3: least squares and LASSO have textbook answers."""
+    """y = a u1 + b u2 + c u3: closed-form least squares and LASSO."""
 
     def simulate(p: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.asarray(u @ p)[:, None]
@@ -46,7 +46,7 @@ def line_trial(noise: float) -> Trial:
 
 
 def test_bootstrap_of_a_line_is_its_covariance() -> None:
-    """Widths against 3.92 deviations of ordinary least squares, 400 replicates: 15 %."""
+    """Widths against 3.92 standard errors of ordinary least squares, 400 replicates: 15 %."""
     model, trial = line_model(), line_trial(0.5)
     fit = estimate(model, [trial], (0, 1, 2), np.zeros(3))
     found = bootstrap_subset(model, [trial], fit, 400, SEED)
@@ -83,7 +83,7 @@ def test_lasso_of_a_line_is_soft_thresholding() -> None:
 
 
 def test_nelder_mead_finds_the_same_objective() -> None:
-    """Table C.1's search on the line: what moved beyond 0.005 is what the proximal solver moves."""
+    """Table C.1 and the proximal solver select the same parameters of the linear model."""
     model, trial = line_model(), line_trial(0.1)
     found = table_c1(model, [trial], 2, solves=6)
     t, objective = proximal_lasso(model, [trial], found.weight)
@@ -118,7 +118,7 @@ def test_key_parameters_of_a_line() -> None:
 
 @pytest.mark.slow
 def test_widths_of_table_4_3() -> None:
-    """Ten subjects about the FIM column, each with a VAF of its own: docs/selection.md."""
+    """Ten subjects around the FIM column, each with its own VAF."""
     from experiments.selection_claims import bootstrap_widths  # noqa: PLC0415
 
     widths = bootstrap_widths(0.2, 0.6, 60)
@@ -247,7 +247,7 @@ def problem(seed: int) -> tuple[Array, Array, Array, Array, float]:
 
 @pytest.mark.parametrize("seed", range(60))
 def test_the_quadratic_program(seed: int) -> None:
-    """No worse than Clarabel's answer, inside the bounds, and exactly typical where it is."""
+    """Objective not above Clarabel's, inside the bounds, exact typical values."""
     H, g, t, typical, weight = problem(seed)
     x = _box_lasso(H, g, t, typical, weight)
 

@@ -1,4 +1,4 @@
-"""Work on workers gives what it gives here, is kept, and is not done twice."""
+"""Results of workers equal local results, are stored, and are not computed twice."""
 
 from __future__ import annotations
 
@@ -55,5 +55,5 @@ def test_workers_give_the_same_and_it_is_kept(tmp_path: Path) -> None:
 def test_a_fault_on_a_worker_is_its_sentence_and_whose_it_is(tmp_path: Path) -> None:
     source = model_source("tests.studies.selection.dosing:blood_model", {})
     run = on_pool(ThisProcess(), source, Cache(tmp_path))
-    with pytest.raises(DataError, match=r"^a: .*there are none"):
+    with pytest.raises(DataError, match=r"^a: .*the list is empty"):
         run(refit_subsets, Refits, {"a": ((), SUBSETS)})

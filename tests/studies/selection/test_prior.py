@@ -1,4 +1,4 @@
-"""Intervals of chosen parameters, the others uncertain: coverage, closed form, bounds, truth."""
+"""Intervals with a prior on other parameters: coverage, closed form, bounds, truth."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def line(deviation: Array, width: float = RANGE) -> ParametricModel:
 
 
 def person(rng: np.random.Generator, root: float = 0.0) -> tuple[Array, Trial]:
-    """A person drawn from the deviations; inputs alike, so that fixing b and c biases a."""
+    """A random person; correlated inputs, so that fixing b and c biases a."""
     theta = DEVIATION * rng.standard_normal(3)
     u = rng.standard_normal((SAMPLES, 3)) @ np.array([[1, 0.8, 0.7], [0, 0.6, 0], [0, 0, 0.7]])
     noise = np.zeros(SAMPLES)
@@ -44,7 +44,7 @@ def person(rng: np.random.Generator, root: float = 0.0) -> tuple[Array, Trial]:
 
 
 def test_it_is_the_posterior_of_a_linear_model() -> None:
-    """Closed form: flat prior of a, normal ones of b and c, noise as the residuals have it."""
+    """Closed form: flat prior of a, normal priors of b and c, residual variance."""
     _, trial = person(np.random.default_rng(1))
     found = estimate_with_prior(line(DEVIATION), [trial], (0,), np.zeros(3), white_noise)
     left = trial.outputs[:, 0] - trial.input @ found.fit.theta
@@ -60,7 +60,7 @@ def test_it_is_the_posterior_of_a_linear_model() -> None:
 
 @pytest.mark.parametrize(("root", "noise_of"), [(0.0, white_noise), (0.7, residual_noise)])
 def test_intervals_of_people_hold_the_truth(root: float, noise_of: object) -> None:
-    """Seed 2, 100 people: 95 % within three standard errors; exactly typical others hold few."""
+    """Seed 2, 100 people: coverage 95 % within three standard errors; low if others are fixed."""
     rng = np.random.default_rng(2)
     inside = {True: 0, False: 0}
     for _ in range(100):
@@ -91,7 +91,7 @@ def test_without_deviations_it_is_the_fit_of_the_chosen_parameters() -> None:
 
 
 def test_an_estimate_at_its_bound_has_a_one_sided_interval() -> None:
-    """The truth, 1.5, lies beyond the bound of 1; the lower end stays inside the bounds."""
+    """True value 1.5 beyond the bound of 1; the lower end is inside the bounds."""
     rng = np.random.default_rng(4)
     u = rng.standard_normal((SAMPLES, 3))
     trial = Trial(u, (u @ [1.5, 0, 0] + NOISE * rng.standard_normal(SAMPLES))[:, None])
@@ -109,7 +109,7 @@ def test_an_estimate_at_its_bound_has_a_one_sided_interval() -> None:
 
 
 def test_a_parameter_without_effect_is_not_determined() -> None:
-    """c does nothing in these recordings: its interval is its range."""
+    """c has no effect in these recordings: its interval is its range."""
     _, trial = person(np.random.default_rng(5))
     silent = Trial(trial.input * [1, 1, 0], trial.outputs)
     found: PriorFit = estimate_with_prior(
@@ -124,7 +124,7 @@ def test_deviations_are_checked_and_default_to_a_quarter_of_the_range() -> None:
     for wrong in (-1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="deviation"):
             parametric_model(*given, deviation=[wrong])
-    with pytest.raises(InputError, match="one a parameter"):
+    with pytest.raises(InputError, match="one per parameter"):
         parametric_model(*given, deviation=[1.0, 1.0])
 
 
