@@ -30,8 +30,8 @@ SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13)
 # PYTHON=... on the command line or in the environment asks for that Python: an environment made
 # with another version is made again.
 ifneq ($(origin PYTHON),file)
-TELL := import sys; print(*sys.version_info[:2])
-ifneq ($(shell $(PYTHON) -c '$(TELL)' 2>/dev/null),$(shell $(PY) -c '$(TELL)' 2>/dev/null))
+VERSION := import sys; print(*sys.version_info[:2])
+ifneq ($(shell $(PYTHON) -c '$(VERSION)' 2>/dev/null),$(shell $(PY) -c '$(VERSION)' 2>/dev/null))
 $(LOCKED): remake
 endif
 CANDIDATES := $(PYTHON)
@@ -41,32 +41,27 @@ endif
 .PHONY: remake
 
 help:
-	@echo 'make demo    set up .venv, then fit a simulated person: results/fit/report.html'
-	@echo 'make test    set up .venv, then check and pytest: all that matters, about ten minutes'
-	@echo 'make full    the site, pages that run, experiments, studies in full size: half an hour, before a merge'
-	@echo 'make check   ruff check, ruff format --check, mypy --strict'
-	@echo 'make slow    hundreds of recordings, fits and subjects: an hour'
-	@echo 'make coverage  how often printed intervals hold the truth: the table of docs/fitting.md'
-	@echo 'make noisy-people  people who sense with noise: least squares beside the likelihood (hours)'
-	@echo 'make structures  coverage of prices, level and power of the test of a structure (hours)'
-	@echo 'make plans   do plans come true? fits of simulated recordings beside them (a quarter of an hour)'
-	@echo 'make nonlinear  the four systems of docs/nonlinear.md: starts, closed loops, noise (an hour)'
-	@echo 'make nonlinear-seat  people who predict with the full equations: does it matter? (minutes)'
-	@echo 'make default-subjects  is the truth of twenty simulated subjects found? (a quarter of an hour)'
-	@echo 'make search   new examples for the tests by hypothesis, from a seed that is printed'
-	@echo 'make numerics the numerical tests on other processors and dependencies (an hour; needs uv)'
-	@echo 'make docs    build the site in docs/_build/html; warnings are errors, tutorials run (minutes)'
-	@echo 'make architecture  draw docs/images/rooms.svg from the imports of the code'
-	@echo 'make reproduce  write docs/reproduction: the dissertation, line by line (half an hour)'
-	@echo 'make wheel   build a wheel, install it in an empty environment, run impc example there'
-	@echo 'make look    every kind of page at the width of a desk and of a phone (needs chromium)'
-	@echo 'make measure  the sizes of the code base, of its tests and pages: a minute'
-	@echo 'make bench   the benchmarks:                     python -m experiments.benchmarks'
-	@echo 'make fuzz    160 000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
-	@echo 'make lock    compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
-	@echo 'make clean   remove caches and build products; .venv and results stay'
-	@echo 'PYTHON=python3.12 chooses the Python; the one used otherwise is the first of'
-	@echo 'python3, python3.13, python3.12, python3.11 that is of version 3.11 to 3.13.'
+	@echo 'make demo       set up .venv, then fit a simulated person: results/fit/report.html'
+	@echo 'make test       set up .venv, then check and pytest: about ten minutes'
+	@echo 'make full       tests of the site, of all pages, experiments and studies in full size: half an hour'
+	@echo 'make check      ruff check, ruff format --check, mypy --strict'
+	@echo 'make slow       hundreds of recordings, fits and subjects: an hour'
+	@echo 'make docs       build the site in docs/_build/html; warnings are errors, examples run (minutes)'
+	@echo 'make reproduce  write docs/reproduction: every claim of the dissertation (half an hour)'
+	@echo 'make wheel      build a wheel and run it in empty environments of Python 3.11 and 3.13'
+	@echo 'make look       check every kind of report page on desk and phone (needs chromium)'
+	@echo 'make measure    sizes of the code, tests and pages (a minute)'
+	@echo 'make architecture  draw docs/images/layers.svg from the imports'
+	@echo 'make bench      the benchmarks (python -m experiments.benchmarks)'
+	@echo 'make search     new examples for the property tests, from a seed that is printed'
+	@echo 'make numerics   numerical tests on other processors and dependencies (an hour; needs uv)'
+	@echo 'make fuzz       160,000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
+	@echo 'make lock       compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
+	@echo 'make clean      remove caches and build products; .venv and results stay'
+	@echo 'Studies, with their results in experiments/README.md: make coverage, noisy-people, structures,'
+	@echo 'followers, plans, default-subjects, nonlinear, nonlinear-seat (minutes to hours each).'
+	@echo 'PYTHON=python3.12 chooses the Python; otherwise it is the first of python3, python3.13,'
+	@echo 'python3.12, python3.11 with a version from 3.11 to 3.13.'
 
 # A person on a seat: three simulated trials, their fit, and the methods side by side.
 demo: env
@@ -75,9 +70,8 @@ demo: env
 	$(VENV)/bin/impc fit results/subject/trial_1.csv results/subject/trial_2.csv results/subject/trial_3.csv \
 	  --plant seated-balance --config results/subject/subject.toml --out results/fit
 
-# A file of tests stays on one process, in the order of the folders: the longest are first. The loop
-# that they share is compiled on one core while the checks run on the other; the filter of subjects
-# who sense with noise, two minutes more, is for `make full`.
+# Each test file runs in one process, longest folders first. The shared closed loop is compiled on one
+# core while the checks run on the other; the sensory-noise filter (two minutes more) is for `make full`.
 test: $(PROJECT) $(POLYTOPE)
 	@$(PY) -c 'from impc.control.warm import compiled_parts; next(compiled_parts())' & compiled=$$!; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$compiled && exit $$checked
@@ -96,19 +90,23 @@ docs: env
 	@echo 'docs/_build/html/index.html'
 
 architecture: env
-	$(PY) -m docs.rooms
+	$(PY) -m docs.layers
 
 reproduce: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.reproduction
 
-# The wheel, not the checkout: in an environment that has nothing else, from a folder that is not this one.
+# The wheel, not the checkout: in empty environments of the oldest and the newest Python, in another folder.
+WHEEL_PYTHONS ?= python3.11 python3.13
 wheel: env
 	rm -rf build dist
 	$(PY) -m build --no-isolation --wheel --outdir dist
-	rm -rf dist/venv && $(PY) -m venv dist/venv
-	dist/venv/bin/python -m pip --disable-pip-version-check -qq install dist/impc-*.whl
-	cd dist && venv/bin/impc example --case A --out example
-	cd dist && venv/bin/python -c "import impc, plants; assert '/venv/' in impc.__file__, impc.__file__"
+	@cd dist && for python in $(WHEEL_PYTHONS); do \
+	  command -v $$python >/dev/null || { echo "$$python is not on the PATH: not tried"; continue; }; \
+	  rm -rf venv && $$python -m venv venv && \
+	  venv/bin/python -m pip --disable-pip-version-check -qq install impc-*.whl && \
+	  venv/bin/impc example --case A --out example-$$python && \
+	  venv/bin/python -c "import impc, plants; assert '/venv/' in impc.__file__, impc.__file__" || exit 1; \
+	done
 
 slow: env
 	$(PY) -m pytest -m slow
@@ -133,14 +131,14 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 	$(UV) pip install -q --python $(@D) $(if $(findstring oldest,$@),--resolution lowest-direct) -r pyproject.toml --extra dev
 	@touch $@
 
-# Hundreds of simulated subjects: the table of docs/noisy-people.md.
+# Hundreds of simulated subjects: the table of experiments/output_feedback.md.
 PEOPLE = $(PY) -m experiments.noisy_people_study
 noisy-people: env
 	$(PEOPLE) run --subjects 200 --profiles --out results/noisy-people.jsonl
 	$(PEOPLE) run --body seat --subjects 20 --out results/noisy-people.jsonl
 	$(PEOPLE) sum results/noisy-people.jsonl
 
-# Hundreds of simulated subjects: the table of docs/structures.md.
+# Hundreds of simulated subjects: the table of experiments/structures.md.
 STUDY = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.structure_study
 structures: env
 	$(STUDY) run seat --vaf 90 --subjects 200 --out results/structures-seat.jsonl
@@ -150,32 +148,32 @@ structures: env
 	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
 	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
 
-# People who follow a target, and the package lqg beside them: the tables of docs/cursor-tracking.md.
+# Subjects who follow a target, and the package lqg: the tables of experiments/cursor_tracking.md.
 followers: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_people_study
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer SubjectiveActor
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer BoundedActor
 
-# A hundred fits of every experiment: the table of docs/planning.md.
+# A hundred fits of every experiment: the table of experiments/planning.md.
 plans: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study cart --fits 100
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study seat --fits 100
 
-# Twenty subjects of `impc simulate seated-balance`: the figures of docs/nonlinear.md.
+# Twenty subjects of `impc simulate seated-balance`: the figures of experiments/nonlinear.md.
 default-subjects: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.default_subjects --seeds 20
 
-# What a reader's eye would find: cut, pale, unnamed or unexplained.
+# Contrast, names, clipped labels, tab order and size of every kind of report page.
 look: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.look $(PAGES)
 
-# The tables of docs/nonlinear.md: four systems, twenty starts each; closed loops; noise.
+# The tables of experiments/nonlinear.md: four systems, twenty starts each; closed loops; noise.
 nonlinear: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark starts
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark loops
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark noise
 
-# The tables and the figure of docs/nonlinear-seat.md.
+# The tables and the figure of experiments/nonlinear_seat.md.
 nonlinear-seat: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat people
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat prices --amplitudes 5
@@ -220,8 +218,8 @@ $(PROJECT): pyproject.toml $(LOCKED)
 	@$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
-# pytope and pycddlib: optional, built from source. A failure is told in one line, does not stop
-# make, and is tried again next time. Homebrew keeps its headers where no compiler looks.
+# pytope and pycddlib: optional, built from source. A failure is one line, does not stop make, and is
+# tried again next time. Homebrew keeps its headers where no compiler looks.
 $(POLYTOPE): requirements-polytope.lock $(LOCKED)
 	@cc=$${CC:-cc}; has() { printf '#include <%s>\nint main(void) { return 0; }\n' "$$1" | \
 	  $$cc $$CPPFLAGS $$CFLAGS -I"$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("include"))')" \
@@ -249,5 +247,5 @@ lock:
 	  --python-version 3.11 --no-deps --generate-hashes - -o requirements-polytope.lock
 
 clean:
-	rm -rf build dist docs/_build docs/_results docs/_tutorials docs/_api docs/_figures.md *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build dist docs/_build docs/_results docs/_examples docs/_reference *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name $(VENV) -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +

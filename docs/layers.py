@@ -1,9 +1,9 @@
-"""What imports what in impc, read from the code, and the drawing of its rooms.
+"""Import graph of impc, read from the code without importing it, and its drawing.
 
-    python -m docs.rooms      writes docs/images/rooms.svg
+    python -m docs.layers      writes docs/images/layers.svg
 
-A room is a folder of impc/; the modules beside them are the floor below all rooms, and
-`impc/__init__.py` and `impc/__main__.py` the doors above. Nothing is imported to find this out.
+The subpackages are ordered in layers. Modules directly in impc/ are the lowest layer, "base";
+`impc/__init__.py` and `impc/__main__.py` are the highest, "package".
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from collections import Counter
 from html import escape
 from pathlib import Path
 
-__all__ = ["DRAWING", "ROOMS", "drawing", "floors", "imports", "room"]
+__all__ = ["DRAWING", "SUBPACKAGES", "drawing", "imports", "longest_chain", "subpackage"]
 
 ROOT = Path(__file__).parents[1]
-#: Written by this module, shown by docs/architecture.md.
-DRAWING = ROOT / "docs/images/rooms.svg"
-#: From the ground up, with what each holds: a module imports from its own room and those before.
-ROOMS = {
+#: Written by this module, shown by docs/dev/architecture.md.
+DRAWING = ROOT / "docs/images/layers.svg"
+#: From the lowest layer up, with their content: a module imports from its own layer and lower ones.
+SUBPACKAGES = {
     "base": "errors, arrays, checks of arguments",
     "model": "plant, bounds, weights, recording, Riccati",
     "control": "controller, terminal set, closed loop",
     "inverse": "problem, residual, searches, methods",
-    "assess": "what an estimate is worth",
+    "assess": "intervals, model tests, statements",
     "files": "recordings and results in files",
     "reporting": "pages, figures, tables, writing",
     "output_feedback": "optional: subjects with sensory noise",
     "studies": "example, fit, compare, cohorts, ...",
-    "nonlinear": "optional: problems of the user's own",
+    "nonlinear": "optional: nonlinear optimal control",
     "cli": "commands: parse, call, print",
-    "door": "import impc, python -m impc",
+    "package": "import impc, python -m impc",
 }
-#: The one module with arrows up: methods of an estimate call functions of higher rooms when used.
+#: The one module with arrows up: methods of an estimate call functions of higher layers when used.
 RESULT = "inverse.estimates"
 
 
@@ -56,20 +56,21 @@ def imports(typing: bool = True, package: Path = ROOT / "impc") -> dict[str, set
         ]
         found[name] = {_known(item, files) for item in named} - {name}
     if typing and RESULT in found:
-        highest = list(ROOMS).index(room(RESULT))
-        found[RESULT] = {one for one in found[RESULT] if list(ROOMS).index(room(one)) <= highest}
+        order = list(SUBPACKAGES)
+        highest = order.index(subpackage(RESULT))
+        found[RESULT] = {one for one in found[RESULT] if order.index(subpackage(one)) <= highest}
     return found
 
 
-def room(module: str) -> str:
-    """The room of a module of impc, a key of `ROOMS`."""
+def subpackage(module: str) -> str:
+    """The key of `SUBPACKAGES` that a module belongs to."""
     first, _, rest = module.partition(".")
     if first in ("__init__", "__main__"):
-        return "door"
-    return first if rest or first in ROOMS else "base"
+        return "package"
+    return first if rest or first in SUBPACKAGES else "base"
 
 
-def floors(graph: dict[str, set[str]]) -> list[str]:
+def longest_chain(graph: dict[str, set[str]]) -> list[str]:
     """The longest chain of modules of which each imports the next, from the top."""
     longest: dict[str, list[str]] = {}
 
@@ -84,19 +85,19 @@ def floors(graph: dict[str, set[str]]) -> list[str]:
 
 
 def drawing(graph: dict[str, set[str]]) -> str:
-    """The rooms above each other as SVG, with a dot for every pair of which one imports the other.
+    """The layers as SVG, with a dot and the number of imports for each pair of subpackages.
 
-    A room's line goes to the right; a dot, with the number of imports, joins it to the line that
-    goes down into the room that is imported.
+    A dot joins the horizontal line of the importing subpackage to the vertical line of the
+    imported one.
     """
     counts = Counter(
-        (room(name), room(other))
+        (subpackage(name), subpackage(other))
         for name, others in graph.items()
         for other in others
-        if room(name) != room(other)
+        if subpackage(name) != subpackage(other)
     )
-    modules = Counter(map(room, graph))
-    shown = [name for name in reversed(ROOMS) if name != "door"]
+    modules = Counter(map(subpackage, graph))
+    shown = [name for name in reversed(SUBPACKAGES) if name != "package"]
     top = {name: 10 + _STEP * index for index, name in enumerate(shown)}
     rail = {name: 340 + 32 * index for index, name in enumerate(shown[1:])}
     parts = [_box(name, top[name], modules[name]) for name in shown]
@@ -119,7 +120,7 @@ _STEP = 64
 _PAGE = """\
 <svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" \
 font-family="Helvetica, Arial, sans-serif" font-size="14">
-<title>The rooms of impc, and how often each imports from those below it</title>
+<title>The subpackages of impc, and how often each imports from those below it</title>
 <defs><marker id="a" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="8" markerHeight="8" \
 orient="auto"><path d="M0 0 10 5 0 10z"/></marker></defs>
 <rect width="{width}" height="{height}" fill="#fff"/>
@@ -134,7 +135,7 @@ def _box(name: str, top: int, count: int) -> str:
         f'<rect x="10" y="{top}" width="310" height="46" rx="4" fill="#eef4fa" stroke="#222"/>\n'
         f'<text x="20" y="{top + 19}" font-size="16" font-weight="bold">{title}</text>\n'
         f'<text x="310" y="{top + 19}" text-anchor="end">{count} modules</text>\n'
-        f'<text x="20" y="{top + 38}">{escape(ROOMS[name])}</text>'
+        f'<text x="20" y="{top + 38}">{escape(SUBPACKAGES[name])}</text>'
     )
 
 

@@ -1,7 +1,6 @@
-"""The table of sizes that changes of the house are judged by: `make measure`.
+"""Sizes of the code, tests and pages: `make measure`.
 
-Lines are those of files, docstrings and blank lines counted; what shows results is identified by
-the names of its files.
+Lines include docstrings and blank lines. Presentation code is identified by file names.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from docs.rooms import ROOT, floors, imports, room
-from tests.documents.blocks import blocks
+from docs.layers import ROOT, imports, longest_chain, subpackage
+from tests.documents.blocks import PAGES, blocks
 
 _SHOWN = re.compile(
     r"reporting/|/\w*(report|page|figures|tables?|sentences|words|schema|verdict|findings?|charts|"
@@ -96,14 +95,13 @@ def main() -> None:
     shown = [path for path in _files("impc", ".py", ".html", ".css", ".js")
              if _SHOWN.search(str(path.relative_to(ROOT / "impc")))]  # fmt: skip
     inside = {
-        name: {other for other in others if room(other) == "inverse"}
+        name: {other for other in others if subpackage(other) == "inverse"}
         for name, others in run.items()
-        if room(name) == "inverse"
+        if subpackage(name) == "inverse"
     }
-    of_rooms = {name: {other for other in others if room(other) == room(name)}
+    inside_each = {name: {other for other in others if subpackage(other) == subpackage(name)}
                 for name, others in run.items()}  # fmt: skip
-    words = sum(len(path.read_text(encoding="utf-8").split()) for path in
-                [*_files("docs", ".md"), ROOT / "README.md"])  # fmt: skip
+    words = sum(len(path.read_text(encoding="utf-8").split()) for path in PAGES.values())
     ids, share = _share_of_documents()
     rows = {
         "impc/: lines, of them docstrings": f"{_lines(ours):,}, {_docstrings(ours):,}",
@@ -111,8 +109,8 @@ def main() -> None:
         "tests/: lines": f"{_lines(_files('tests', '.py')):,}",
         "docs/ and README: words": f"{words:,}",
         "test ids, of them of documents": f"{ids:,}, {100 * share:.0f} %",
-        "inverse/: modules, import layers": f"{len(inside)}, {len(floors(inside))}",
-        "import circles inside rooms, types counted": f"{_circles(of_rooms)}",
+        "inverse/: modules, import layers": f"{len(inside)}, {len(longest_chain(inside))}",
+        "import circles inside subpackages, types counted": f"{_circles(inside_each)}",
         "presentation (Python, templates, styles, scripts)": f"{len(shown)} files, "
         f"{_lines(shown):,} lines",
         "README's Python example: files, functions, depth": "{}, {}, {}".format(*_followed()),

@@ -15,8 +15,9 @@ ROOT = Path(__file__).parents[2]
 #: README and pages by name; pages that a program writes are not among them.
 PAGES = {
     path.relative_to(ROOT).as_posix(): path
-    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-    if not path.name.startswith(("_", "reproduction"))
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+    if not path.relative_to(ROOT).parts[1:2] or path.relative_to(ROOT).parts[1][0] != "_"
+    if "reproduction" not in path.parts
 }
 _FENCE = re.compile(
     r"^(?P<indent> *)```(?P<language>\S*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$", re.M | re.S

@@ -59,9 +59,6 @@ def run_line(line: str, kept: Path) -> str:
         with contextlib.redirect_stdout(printed):
             runpy.run_path(arguments[0], run_name="__main__")
         return printed.getvalue()
-    if program == "edit":
-        _edit(*arguments)
-        return ""
     done = subprocess.run(line, shell=True, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{line}\n{done.stderr}"
     return done.stdout
@@ -94,10 +91,3 @@ def _once(arguments: list[str], kept: Path) -> str:
 
 def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def _edit(name: str, old: str, new: str) -> None:
-    path = Path(name)
-    text = path.read_text(encoding="utf-8")
-    assert old in text, f"{name} has no {old!r}"
-    path.write_text(text.replace(old, new), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Imports point down, and what pages name is there."""
+"""Imports point down, and files that pages and docstrings name exist."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from functools import cache
 from pathlib import Path
 
 import impc
-from docs.rooms import DRAWING, ROOMS, drawing, imports, room
+from docs.layers import DRAWING, SUBPACKAGES, drawing, imports, subpackage
 from tests.documents.blocks import PAGES, ROOT, blocks
 
-ORDER = list(ROOMS)
-# Files of users that docs/troubleshooting.md speaks of.
+ORDER = list(SUBPACKAGES)
+# Files of users in examples.
 _OF_USERS = {"control.py", "file.py"}
 CODE = [path for folder in ("impc", "plants", "experiments", "tests", "docs")
         for path in sorted((ROOT / folder).rglob("*.py"))
-        if "_tutorials" not in path.parts]  # fmt: skip  # made by the site's build
+        if "_examples" not in path.parts]  # fmt: skip  # written by the site's build
 GRAPH = imports()
 
 
 def upwards(graph: dict[str, set[str]]) -> list[tuple[str, str]]:
-    """Imports from a room that is higher, and those of the doors."""
+    """Imports from a higher layer, and imports of the package itself."""
     return [
         (name, other)
         for name, others in graph.items()
         for other in sorted(others)
-        if ORDER.index(room(other)) > ORDER.index(room(name))
-        or (room(other) == "door" and room(name) != "door")
+        if ORDER.index(subpackage(other)) > ORDER.index(subpackage(name))
+        or (subpackage(other) == "package" and subpackage(name) != "package")
     ]
 
 
 def test_arrows_point_down_and_the_drawing_shows_them() -> None:
-    assert set(map(room, GRAPH)) == set(ROOMS)
+    assert set(map(subpackage, GRAPH)) == set(SUBPACKAGES)
     assert upwards(GRAPH) == []
     # Up to the numbers beside its dots: `make architecture` writes it.
     shown, found = DRAWING.read_text(encoding="utf-8"), drawing(GRAPH)
@@ -106,6 +106,8 @@ def test_every_file_that_a_page_or_a_docstring_names_is_there() -> None:
                     if not (ROOT / name).exists() and Path(name).name not in new}  # fmt: skip
     for code in CODE:
         if code.is_relative_to(ROOT / "impc"):
-            named = re.findall(r"docs/[\w/-]+\.md", code.read_text(encoding="utf-8"))
+            named = re.findall(
+                r"(?:docs|experiments)/[\w/-]+\.md", code.read_text(encoding="utf-8")
+            )
             missing |= {(code.name, name) for name in named if not (ROOT / name).exists()}
     assert missing == set()

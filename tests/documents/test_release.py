@@ -16,4 +16,4 @@ def test_version_licence_and_changelog_agree() -> None:
     assert said["license"] == project["license"] == "BSD-3-Clause"
     assert "BSD 3-Clause" in (ROOT / "LICENSE").read_text(encoding="utf-8")
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert re.findall(r"^## \[(.+?)\]", changes, flags=re.M)[0] == "Unreleased"
+    assert re.findall(r"^## \[(.+?)\]", changes, flags=re.M)[0] == project["version"]
