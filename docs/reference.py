@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import json
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
@@ -54,6 +56,15 @@ _GROUPS = {
     "studies": "Studies and their settings",
     "reporting": "Folders of results",
 }
+_TYPES = {
+    r",? ?\boptional\b": "",
+    r" or None\b": "",
+    r"\bstr\b": "text",
+    r"\bfloat\b": "number",
+    r"\bint\b": "whole number",
+    r"\bbool\b": "true or false",
+    r"\bdict of text to\b": "table of",
+}
 _ERRORS = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
 
 
@@ -86,7 +97,7 @@ def results_page() -> str:
 def _attributes(title: str, kind: type) -> str:
     defaults = {name: _default(field) for name, field in _fields(kind)}
     rows = [
-        (f"`{item.name}`", defaults.get(item.name, ""), item.type, " ".join(item.desc))
+        (f"`{item.name}`", defaults[item.name], _type(item.type), " ".join(item.desc))
         for item in ClassDoc(kind)["Attributes"]
         if item.name in defaults
     ]
@@ -101,10 +112,19 @@ def _fields(kind: type) -> Iterable[tuple[str, Any]]:
 
 
 def _default(field: Any) -> str:
+    """As TOML and JSON write it; a dash if the key has none."""
     if callable(field.default_factory):
-        return f"`{field.default_factory()!r}`"
-    missing = field.default in (dataclasses.MISSING, msgspec.NODEFAULT)
-    return "required" if missing else f"`{field.default!r}`"
+        return f"`{json.dumps(field.default_factory())}`"
+    if field.default in (dataclasses.MISSING, msgspec.NODEFAULT):
+        return "required"
+    return "–" if field.default is None else f"`{json.dumps(field.default, default=str)}`"
+
+
+def _type(text: str) -> str:
+    """A type of Python in the words of users of TOML."""
+    for name, word in _TYPES.items():
+        text = re.sub(name, word, text)
+    return text
 
 
 def _cell(text: str) -> str:
