@@ -117,13 +117,14 @@ class LackOfFit(Frozen):
 
 
 def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
-    """Test the model of a fit; None for an exact fit, gaps or too few samples."""
+    """Test the model on trials without gaps; None for an exact fit or too few samples."""
+    if all(trial.has_gaps for trial in estimate.problem.recordings):
+        return None
     problem, K, S = _some_trials(estimate.problem), np.array(estimate.K), np.array(estimate.S)
     found = evaluate(problem, K, S)
     samples = sum(trial.samples for trial in problem.recordings)
     size = np.linalg.norm(found.residual) / np.sqrt(problem.recorded_numbers)
-    gaps = any(trial.has_gaps for trial in problem.recordings)
-    if found.reason or samples < _FEWEST or size <= _EXACT or gaps:
+    if found.reason or samples < _FEWEST or size <= _EXACT:
         return None
     groups = {name: columns for name, columns in _columns(problem, K, S) if columns.shape[1]}
     widths = [columns.shape[1] for columns in groups.values()]
@@ -148,9 +149,10 @@ def with_culprit(problem: Problem, found: LackOfFit | None) -> Problem | None:
 
 
 def _some_trials(problem: Problem) -> Problem:
-    """Every k-th trial, at most `_MOST`: each trial adds columns, and a few suffice."""
-    every = -(-len(problem.recordings) // _MOST)
-    return replace(problem, recordings=problem.recordings[::every])
+    """Every k-th trial without gaps, at most `_MOST`: each adds columns, and a few suffice."""
+    whole = tuple(trial for trial in problem.recordings if not trial.has_gaps)
+    every = max(-(-len(whole) // _MOST), 1)
+    return replace(problem, recordings=whole[::every])
 
 
 class _Tested:

@@ -133,8 +133,9 @@ def _angle_of_gain(found: WeightsSet, sets: tuple[DrawnSet, ...], sizes: Array) 
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:
-    """Recorded states, then those with the largest costs."""
+    """Recorded states and their rates, then those with the largest costs."""
     cost_weights = np.diag(weights.Q) * np.asarray(sizes) ** 2
-    recorded = [index for index, name in enumerate(plant.states) if name in plant.outputs]
+    known = {*plant.outputs, *(f"{name}_rate" for name in plant.outputs)}
+    recorded = [index for index, name in enumerate(plant.states) if name in known]
     others = [int(index) for index in np.argsort(-cost_weights, kind="stable")]
     return sorted(list(dict.fromkeys([*recorded, *others]))[:_NAMED])

@@ -274,9 +274,9 @@ def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str,
     name = families(controller).names[rows.family[row]]
     stage = int(rows.stage[row])
     if stage < controller.horizon:
-        return f"the bound {name} {stage} samples ahead", remedy
+        return f"the bound {name} at sample {stage} of the horizon", remedy
     return (
-        f"the bound {name} in the terminal set, {stage} samples ahead",
+        f"the bound {name} in the terminal set, at sample {stage} of the horizon",
         f"{remedy}, or set terminal_set=False",
     )
 

@@ -246,7 +246,9 @@ def _parsed(source: str, path: Path) -> dict[str, Any]:
         raise InputError(source, "is not UTF-8 text", "save it as UTF-8") from None
     except ValueError as error:  # an integer of 5000 digits raises no TOMLDecodeError
         raise InputError(
-            source, f"is not TOML ({brief(str(error), 160)})", "correct that line"
+            source,
+            f"is not TOML ({brief(str(error), 160)})",
+            'correct that line: numbers need a point (6.0), text straight quotes ("deg")',
         ) from None
     except RecursionError:
         raise InputError(source, "is nested too deep", "give a plain TOML file") from None

@@ -30,7 +30,7 @@ _CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "second
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
 _HORIZON = 20
-_INPUT = "an input: without this table, or with command = true, a command"
+_INPUT = "a recorded perturbation; delete this table if it was not recorded"
 # Units at the end of names, as in alpha_deg.
 _IN_NAMES = ("deg", "rad", "mm", "cm", "m", "N", "Nm", "V", "mV", "s", "ms")
 _ALIKE = 0.6  # theta1 and theta_2 are alike; push and perturbation are not

@@ -146,6 +146,11 @@ class Recording(Value):
     ) -> None:
         given = _columns(outputs)
         _require_no_end(np.asarray(given))
+        names = plant.outputs
+        if given.ndim == 2 and len(names) not in given.shape:
+            expected = f"expected a column for each of {', '.join(names)}"
+            problem = f"{expected}, got {given.shape[1]} columns"
+            raise DataError("outputs", problem, "select its columns, or change C of the plant")
         y = _with_gaps("outputs", given, (None, len(plant.outputs)))
         if len(y) < 2:
             raise DataError("outputs", f"has {len(y)} samples", "give at least 2")

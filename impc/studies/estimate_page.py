@@ -52,7 +52,7 @@ def report(
     Parameters
     ----------
     estimate : Estimate or OptimalControlEstimate
-        Result of `impc.fit`, `impc.estimate` or `fit_optimal_control`.
+        Result of `impc.fit` or `fit_optimal_control`.
     folder : str or Path
         Output folder. It is created if necessary; an earlier report in it is replaced.
     settings : FitSettings, optional

@@ -151,6 +151,15 @@ def test_of_many_trials_some_are_tested() -> None:
     assert len(module._some_trials(many).recordings) == 10
 
 
+def test_trials_with_gaps_are_left_out_of_the_test() -> None:
+    problem = problem_and_gain()[0]
+    trial = problem.recordings[0]
+    outputs = np.array(trial.outputs)
+    outputs[50:60] = np.nan
+    gapped = replace(trial, outputs=outputs)
+    assert module._some_trials(replace(problem, recordings=(gapped, trial))).recordings == (trial,)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "alarms"),

@@ -89,7 +89,7 @@ def test_an_infeasible_start_names_the_bound_and_the_step(
     boxed = Bounds(example_plant, x_max=1)
     outside = Controller(example_plant, Weights(np.eye(2), 1), boxed, 3)
     run = simulate(outside, scenario(example_plant, [3, 1], 20))
-    with pytest.raises(InfeasibleError, match=r"keeps the bound x\[0\] <= 1 0 samples ahead"):
+    with pytest.raises(InfeasibleError, match=r"keeps the bound x\[0\] <= 1 at sample 0 of"):
         require_complete(outside, run)
 
 

@@ -149,7 +149,7 @@ def test_counters_constants_and_second_clocks_are_no_guesses(tmp_path: Path) -> 
         '# Columns that are not used: "Frame" (a clock or counter), '
         '"EMG time" (a clock or counter), "gain" (constant)'
     ) in text
-    assert "# an input: without this table, or with command = true, a command" in text
+    assert "# a recorded perturbation; delete this table if it was not recorded" in text
 
 
 def test_day_numbers_of_excel_are_a_clock(tmp_path: Path) -> None:

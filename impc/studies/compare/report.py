@@ -269,7 +269,7 @@ def _checks(facts: _Facts, problem: Problem) -> list[Check]:
 
 def _copy(facts: _Facts, count: int) -> Copy:
     best, other = facts.best, facts.other
-    others = ", and to all trials except one, which they then predicted," if facts.held else ""
+    others = ", and to all trials except one, which they then predicted" if facts.held else ""
     results = f"{method_label(best.name)} explained {_share(best)} of the variance in {facts.where}"
     if other is not None:
         results += f"; the {facts.against} explained {_share(other)}"

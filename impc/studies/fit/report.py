@@ -426,7 +426,8 @@ def _limit_check(result: FitResult) -> list[Check]:
 def _model(result: FitResult) -> Check:
     last = result.lack[-1]
     if last is None:
-        return Check(Level.NOTE, "Body model", "Could not be tested.")
+        said = "Not tested: the recordings are too short, exact, or have gaps. Gains may be wrong."
+        return Check(Level.AMBER, "Body model", said)
     least = min((one.probability for one in last.errors), default=1.0)
     if last.alarm:
         return Check(Level.AMBER, "Body model",
