@@ -2,11 +2,13 @@
 
     D = sum over identified directions i of  ((K - K(Q, R)) along i / s_i)^2
 
-K is the best unrestricted gain, K(Q, R) the best one that weights have, s_i the HAC standard
-errors. If the true gain belongs to some weights, D is at most chi-squared with as many degrees of
-freedom as directions. A much larger D rejects all weights, and then no statement about the intent
-holds. If the residuals contradict the model itself, noise is not the only source of gain errors:
-weights are then rejected only if their misfit is also more than 5 % larger.
+K is the best unrestricted gain, K(Q, R) the gain of the fitted weights, s_i the HAC standard
+errors. If the true gain belongs to some weights, D is approximately chi-squared with as many
+degrees of freedom as directions: errors along them may be correlated, and the fitted weights, whose
+condition number is penalised, need not minimise D. A much larger D rejects all weights, and then no
+statement about the intent holds. If the residuals contradict the model itself, noise is not the
+only source of gain errors: weights are then rejected only if their misfit is also more than 5 %
+larger.
 
 Whether weights have K itself is a linear matrix inequality. With one input and an invertible A, the
 return difference of an optimal regulator explains the result (docs/why/theory.md):
@@ -14,8 +16,8 @@ return difference of an optimal regulator explains the result (docs/why/theory.m
     |1 + K (zI - A)^-1 B|^2  >=  R / S  =  det(A - BK) / det A      for all |z| = 1.
 
 The closed loop depends on (Q, R) only through K and S up to scale, so the derivative of the outputs
-by the weights has rank at most n m + m (m + 1)/2 - 1 for any recording (n m + m - 1 for invertible
-A). The condition number fixes the other directions by convention.
+by the weights has rank at most n m + m (m + 1)/2 - 1 for any recording (n m + m - 1 if B has full
+column rank). The condition number fixes the other directions by convention.
 """
 
 from __future__ import annotations
@@ -79,7 +81,7 @@ class WeightsTest:
 
     statistic: float  # D
     freedom: int  # Number of identified directions of the gain
-    p_value: float  # Upper limit, from chi-squared
+    p_value: float  # Approximate, from chi-squared
     more: float  # Misfit of the weights over that of the gain
     contradicted: bool  # Whether the residuals contradict the model
     exist: bool  # Whether positive definite weights have the identified gain exactly
