@@ -144,12 +144,12 @@ class Recording(Value):
         label: Label | None = None,
         findings: tuple[str, ...] = (),
     ) -> None:
-        given = _columns(outputs)
+        given, names = _columns(outputs), plant.outputs
+        shape = np.shape(np.asarray(given))
         _require_no_end(np.asarray(given))
-        names = plant.outputs
-        if given.ndim == 2 and len(names) not in given.shape:
+        if len(shape) == 2 and len(names) not in shape:
             expected = f"expected a column for each of {', '.join(names)}"
-            problem = f"{expected}, got {given.shape[1]} columns"
+            problem = f"{expected}, got {shape[1]} columns"
             raise DataError("outputs", problem, "select its columns, or change C of the plant")
         y = _with_gaps("outputs", given, (None, len(plant.outputs)))
         if len(y) < 2:
