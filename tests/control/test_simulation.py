@@ -59,7 +59,9 @@ def test_every_status_is_said_in_words(status: Status, example_plant: Plant) -> 
 def test_a_first_state_from_which_no_plan_keeps_the_bound_is_named(example_plant: Plant) -> None:
     bounds = Bounds(example_plant, u_min=-1, u_max=1)
     controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, 3)
-    with pytest.raises(InfeasibleError, match=r"x0: .* u\[0\] <= 1 in the terminal set, 3 samples"):
+    with pytest.raises(
+        InfeasibleError, match=r"x0: .* u\[0\] <= 1 in the terminal set, at sample 3"
+    ):
         require_complete(controller, simulate(controller, scenario(example_plant, [90, 3], 5)))
 
 

@@ -217,5 +217,5 @@ def test_what_cannot_be_is_refused_in_one_line() -> None:
             call()
     loose, near = impc.Bounds(law.plant, u_min=-0.5, u_max=0.5), (np.eye(2), 1e-9 * np.ones(2))
     far = impc.Controller(law.plant, weights, loose, 4, terminal_set=near)
-    with pytest.warns(UserWarning, match=r"H\[\d\] x <= 1e-09 in the terminal set, 4 samples"):
+    with pytest.warns(UserWarning, match=r"H\[\d\] x <= 1e-09 in the terminal set, at sample 4"):
         far.simulate([50, 50], steps=1)
