@@ -128,14 +128,15 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
 def _searched(fitted: Estimate, control: int) -> tuple[_Search, GainFit]:
     """Best limit, and the search that found it.
 
-    The search starts at the given limit, or without one at the best of a grid below the largest
-    command of the best regulator. Each round searches near the last limit and refits the controller
+    The search starts at the given limit, or if the command does not reach it at the best of a grid
+    below the largest command. Each round searches near the last limit and refits the controller
     at the limit found, because a gain fitted under a wrong limit is a poor start.
     """
     limit, near = float(fitted.problem.bounds.u_max[control]), fitted
-    if not np.isfinite(limit):
+    peak = _typical_peak(fitted, control)
+    if peak < (1 - 1e-6) * limit:
         search = _Search(fitted, control)
-        limit = search.limit_of(search.best(_typical_peak(fitted, control) * _GRID))
+        limit = search.limit_of(search.best(peak * _GRID))
         near = fit_controller(with_limit(fitted.problem, limit, control))
     for _ in range(_ROUNDS):
         search = _Search(near, control)

@@ -118,26 +118,26 @@ def _fitted(problem: Problem, start: Weights | None) -> Estimate:
         found, more = _weights(free, found.weights)
         spent += more
     if found.misfit > _unlikely(free) * free.misfit and np.any(problem.stated):
-        other, again, more = _from_nominal_body(problem, found.weights)
-        spent += more
-        if again.misfit < found.misfit:
-            free, found = other, again
+        with contextlib.suppress(WeightsError, SolverError):  # it cannot be simulated: skip it
+            other, again = _from_fixed_body(problem, found.weights)
+            spent += again.evaluations
+            if again.misfit < found.misfit:
+                free, found = other, again
     settled = free.problem
     if problem.own_unknowns:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     return _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
 
 
-def _from_nominal_body(problem: Problem, begin: Weights) -> tuple[GainFit, ConditionedFit, int]:
-    """Fit again from the weights of the nominal body.
+def _from_fixed_body(problem: Problem, begin: Weights) -> tuple[GainFit, ConditionedFit]:
+    """Fit again from weights that are fitted with the body as it is posed.
 
-    Gain and uncertain body of `free` can end in a local minimum that no weights explain: 1 of 4
-    pairs of trials of the simulated seat.
+    Unrestricted gain and uncertain body can end together in a local minimum that no weights
+    explain: 1 of 4 pairs of trials of the simulated seat.
     """
-    nominal, spent = _weights(free_gain(problem.with_body_fixed(), begin), begin)
-    free = free_gain(problem, nominal.weights)
-    found, more = _weights(free, nominal.weights)
-    return free, found, spent + more
+    fixed, _ = _weights(free_gain(problem.with_body_fixed(), begin), begin)
+    free = free_gain(problem, fixed.weights)
+    return free, _weights(free, fixed.weights)[0]
 
 
 def free_gain(problem: Problem, begin: Weights) -> GainFit:

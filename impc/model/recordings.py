@@ -145,11 +145,11 @@ class Recording(Value):
         findings: tuple[str, ...] = (),
     ) -> None:
         given, names = _columns(outputs), plant.outputs
-        shape = np.shape(np.asarray(given))
-        _require_no_end(np.asarray(given))
-        if len(shape) == 2 and len(names) not in shape:
+        array = np.asarray(given)
+        _require_no_end(array)
+        if array.ndim == 2 and len(names) not in array.shape:
             expected = f"expected a column for each of {', '.join(names)}"
-            problem = f"{expected}, got {shape[1]} columns"
+            problem = f"{expected}, got {array.shape[1]} columns"
             raise DataError("outputs", problem, "select its columns, or change C of the plant")
         y = _with_gaps("outputs", given, (None, len(plant.outputs)))
         if len(y) < 2:

@@ -74,7 +74,7 @@ def joint_directions(
 ) -> JointLoop:
     """Derivatives of `joint_loop` along k directions; the subject's model follows the plant.
 
-    All but two equations are products, for which a complex step is exact (Squire and Trapp 1998).
+    The equations, except two, are products: a complex step is exact (Squire and Trapp 1998).
     `recorder` (p,); `levels` (k, levels + p).
     """
     count, n, own = len(levels), plant.n, _apart(plant, person)

@@ -33,7 +33,7 @@ _WON = 0.25
 # Close to instability the information of the first state spans 35 digits: adding this share of each
 # diagonal keeps the matrix positive definite.
 _ROUNDING = 1e-12
-# Follow the ridge of all but the noise SDs if the predicted increase is larger than this, nats.
+# Follow the ridge of coordinates that are no noise SDs above this predicted increase, nats.
 _BESIDE = 0.05
 # Difference step of a log noise SD; squared step at which Broyden's update is halved.
 _DIFFERENCE, _DAMPING = 0.1, 0.1
@@ -98,7 +98,7 @@ def _reach(prior: Prior, way: Array) -> Array:
 
 
 def _followed(prior: Prior, here: Place, others: Array, unseen: Array) -> tuple[Place, int]:
-    """Step of all but the noise SDs onto their ridge, along `others` (q, r); evaluations used."""
+    """Step onto the ridge of the coordinates `others` (q, r), not noise SDs; evaluations used."""
     # The ridge bends with the noise SDs, on the seat by many standard errors.
     slope, bend = prior.parabola(here, unseen)
     radius = _STEP * _reach(prior, others)

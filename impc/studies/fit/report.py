@@ -409,9 +409,9 @@ def _limit_check(result: FitResult) -> list[Check]:
         return [Check(Level.NOTE, "Limit", "No limit was given.")]
     if not result.met:
         return [Check(Level.NOTE, "Limit", "Never reached: the recordings cannot check it.")]
-    if result.culprit is not None and result.culprit.name == LIMIT:
-        return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
     if found is None:
+        if result.culprit is not None and result.culprit.name == LIMIT:
+            return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
         if result.curves and all(curve.best == curve.own for curve in result.curves):
             said = f"Given as {limit}; it fits best of all limits of the limit curve."
             return [Check(Level.GREEN, "Limit", said)]

@@ -270,17 +270,12 @@ def _observer(result: FitResult) -> Kind | None:
     )
 
 
-_OTHER_LIMIT = (
-    "Set u_max to the most that the person can produce, or state its uncertainty in "
-    "[plant.uncertainty], and fit again."
-)
-
-
 def _body(result: FitResult) -> Kind | None:
     error = result.culprit
     if error is None or _limit(result) is not None:  # a wrong limit has the same effects
         return None
     reason, of_limit = alternative_reason(result, error), error.name == LIMIT
+    most = "the most that the person can produce, or state its uncertainty in [plant.uncertainty]"
     alert = Alert(
         Level.AMBER,
         "The residual depends on the perturbation",
@@ -291,7 +286,7 @@ def _body(result: FitResult) -> Kind | None:
         "uncertainty may be several times larger.",
         (
             *(("Add [fit.observer] to the settings and fit again.",) if reason else ()),
-            *((_OTHER_LIMIT,) if of_limit else ()),
+            *((f"Set u_max to {most}, and fit again.",) if of_limit else ()),
             "Check body mass, height and sex in the settings, and the dimensions of the device.",
             "State how well they are known in [plant.uncertainty], or fit a doubtful one with "
             "free = [...], and report how much the gains change.",
