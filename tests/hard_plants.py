@@ -112,8 +112,9 @@ def cost_weights(prepared: PreparedLoop, x: np.ndarray) -> np.ndarray:
     count, width = rows.M.shape
     room, lam = min(count, width) + 1, np.zeros(count)
     solve_dual(
-        rows.W, rows.gram, rows.b - rows.T @ x, rows.limit, 1e-13 * rows.b, lam,
-        np.empty(room, dtype=np.int64), np.empty((room, room)), np.empty((room, width)), 0,
+        rows.W, rows.reach, rows.gram, rows.b - rows.T @ x, rows.limit, 1e-13 * rows.b, lam,
+        np.empty(room, dtype=np.int64), np.empty((room, room)), np.zeros((room, width)),
+        np.zeros(1, dtype=np.int64), 0,
     )  # fmt: skip
     for r in np.flatnonzero(lam > 0):
         family, k = rows.family[r], rows.stage[r]

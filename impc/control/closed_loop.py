@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.checking import checked
+from impc.checking import checked, replace
 from impc.control.aims import aim_of
 from impc.control.body_steps import body_tape, pushes
 from impc.control.compiled_kernel import (
+    TOO_SHORT,
     LoopMatrices,
     answer_with,
     deviate,
@@ -51,6 +52,9 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.control.simulation import Scenario
 
+# Longest horizon whose problem is solved as a whole at once, and number of its first stages with
+# which a longer one begins.
+_WHOLE, _STAGES = 100, 50
 # Solver that is tried where the compiled method finds no solution.
 _SECOND = "daqp"
 
@@ -67,6 +71,7 @@ class PreparedLoop:
     matrix_directions: LoopMatrices  # derivatives of plant, gain and metric
     unit: Array  # (m,), nearer bound of each input, the scale of its error
     program: Program | None  # for a CasADi solver
+    stages: int  # number of stages of the problem, all or the first ones
 
 
 @checked
@@ -117,17 +122,24 @@ def simulate_and_differentiate(
 
 
 def prepare_loop(
-    controller: Controller, along: Directions, moves: tuple[Array, Array, Array] | None = None
+    controller: Controller,
+    along: Directions,
+    moves: tuple[Array, Array, Array] | None = None,
+    *,
+    whole: bool = False,
 ) -> PreparedLoop:
     """Build everything that does not depend on the recording, so that trials share it.
 
     `moves`: A (n, n), B (n, m), E (n, d) of the simulated plant, if it differs from the one with
-    which the controller predicts.
+    which the controller predicts. `whole`: the problem has all stages, however many.
     """
     plant = controller.plant
     A, B, E = (plant.A, plant.B, plant.E) if moves is None else moves
-    rows = build_rows(controller)
-    moved = differentiate_rows(controller, along) if along.count else _no_directions(rows)
+    stages = controller.horizon
+    whole = whole or controller.stages is not None or controller.solver != COMPILED
+    if stages > _WHOLE and not whole:
+        stages = _STAGES
+    rows, moved = _rows(controller, along, stages)
     inverse = np.asarray(np.linalg.inv(controller.S), dtype=np.float64)
     return PreparedLoop(
         controller,
@@ -138,55 +150,90 @@ def prepare_loop(
         _writable(along.A, along.B, along.E, along.K, along.S),
         np.minimum(-controller.bounds.u_min, controller.bounds.u_max),
         None if controller.solver == COMPILED else build_program(controller.solver, rows),
+        stages,
     )
 
 
+def _rows(controller: Controller, along: Directions, stages: int) -> tuple[Rows, RowDirections]:
+    rows = build_rows(controller, stages)
+    if along.count:
+        return rows, differentiate_rows(controller, along, stages)
+    h, width = rows.N.shape
+    none = np.zeros((h, rows.T.shape[1], 0)), np.zeros((h, width, 0)), np.zeros((h, 0))
+    return rows, RowDirections(*none)
+
+
+def _with_stages(prepared: PreparedLoop, stages: int) -> PreparedLoop:
+    """The same loop, with more stages in the problem."""
+    stages = min(stages, prepared.controller.horizon)
+    rows, moved = _rows(prepared.controller, prepared.along, stages)
+    return replace(prepared, rows=rows, row_directions=moved, stages=stages)
+
+
 def run_loop(
-    prepared: PreparedLoop, given: Scenario, *, local: bool = False, proved: bool = True
+    prepared: PreparedLoop,
+    given: Scenario,
+    *,
+    local: bool = False,
+    proved: bool = True,
+    seen: Array | None = None,
+    inputs: bool = True,
 ) -> tuple[Simulation, Sensitivity]:
     """Simulate one recording of a prepared loop, with its derivatives.
 
     Samples that are not reached repeat the last state, so that a search can continue. With `local`
     the state at every sample has the directions of the first one: `Sensitivity.u` then holds the
     derivatives of the controller at each sample separately. Without `proved` the simulation ends at
-    the first unsolved sample, without a proof of infeasibility.
+    the first unsolved sample, without a proof of infeasibility. With `seen` (q, n), which saves
+    memory, `Sensitivity.x` has the derivatives of seen x, (steps + 1, q, p), in place of those of
+    all states; without `inputs` those of the inputs are not kept.
     """
     plant, along = prepared.controller.plant, prepared.along
     steps, n, m, p = given.steps, plant.n, plant.m, along.count
     x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
-    dx, du = np.zeros((steps + 1, n, p)), np.zeros((steps, m, p))
+    dx = np.zeros((steps + 1 if seen is None else 2, n, p))
+    du = np.zeros((steps if inputs else 1, m, p))
+    observed = np.zeros((0, n)) if seen is None else np.ascontiguousarray(seen)
+    dy = np.zeros((steps + 1, len(observed), p))
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], dx[0] = given.x0, along.x0
-    multipliers = np.zeros(len(prepared.rows.b))
     program, asked = prepared.program, prepared.program is not None
     aim = aim_of(prepared.controller, given, along)
-    work = workspace(prepared.rows, prepared.row_directions, m)
-    loop = (
-        *(prepared.matrices, prepared.matrix_directions, prepared.rows, prepared.row_directions),
+    drive = (
         body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
         _pushes(prepared, given),
         *(np.array(given.disturbance), aim, _divergence(prepared.matrices.E, given)),
-        *(prepared.unit, work),
     )
-    written = (x, u, dx, du, status, multipliers)
-    t, weakly_active = 0, 0
+    t, weakly_active, work = 0, 0, None
     while True:
-        weak, failed_row = run(*loop, t, *written, asked, local)
+        rows, moved = prepared.rows, prepared.row_directions
+        if work is None:
+            work = workspace(rows, moved, m)
+        loop = (prepared.matrices, prepared.matrix_directions, rows, moved, *drive)
+        written = (x, u, dx, du, status, np.zeros(len(rows.limit)), observed, dy)
+        weak, failed_row = run(*loop, prepared.unit, work, t, *written, asked, local)
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))
-        if t == steps or status[t] == Status.DIVERGED or not (asked or proved):
+        longer = t < steps and status[t] == TOO_SHORT
+        if t == steps or status[t] == Status.DIVERGED or not (asked or proved or longer):
             break
+        if longer or prepared.stages < prepared.controller.horizon:
+            stages = 2 * prepared.stages if longer else prepared.controller.horizon
+            prepared, work = _with_stages(prepared, stages), None
+            status[t] = Status.NOT_REACHED
+            continue
         if program is None:  # second solver for a sample that the compiled method did not solve
-            program = build_program(_SECOND, prepared.rows)
-        away, daway = x[t].copy(), dx[t].copy()
-        deviate(aim, prepared.rows, prepared.row_directions, work, t, away, daway)
-        status[t], weak, row = _ask_solver(prepared, program, work, away, daway, u[t], du[t])
-        return_to(aim, t, u[t], du[t])
+            program = build_program(_SECOND, rows)
+        away, daway, moved_u = x[t].copy(), dx[t % len(dx)].copy(), du[t % len(du)]
+        deviate(aim, rows, moved, work, t, away, daway)
+        status[t], weak, row = _ask_solver(prepared, program, work, away, daway, u[t], moved_u)
+        return_to(aim, t, u[t], moved_u)
         weakly_active += weak
         if status[t] > Status.SOFTENED:
             failed_row = failed_row if row >= 0 and failed_row >= 0 else row
             break
-    return Simulation(plant, x, u, status, weakly_active, failed_row), Sensitivity(dx, du)
+    found = Simulation(plant, x, u, status, weakly_active, failed_row)
+    return found, Sensitivity(dx if seen is None else dy, du)
 
 
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
@@ -239,12 +286,6 @@ def _ask_solver(
 def _writable(*matrices: Array) -> LoopMatrices:
     """Writable copies: for numba read-only arrays are another type and would be recompiled."""
     return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
-
-
-def _no_directions(rows: Rows) -> RowDirections:
-    return RowDirections(
-        np.zeros((*rows.T.shape, 0)), np.zeros((*rows.M.shape, 0)), np.zeros((len(rows.b), 0))
-    )
 
 
 def _divergence(E: Array, given: Scenario) -> float:

@@ -29,6 +29,8 @@ CONVERGED, INCONSISTENT, UNFINISHED = 0, 1, 2
 #: orthogonalised twice, which leaves rounding of 1e-16; neighbouring rows in the terminal sets of
 #: tests/ differ by 1e-5 and more.
 DEPENDENT = 1e-9
+# The factor is computed anew from its rows after this many removals, whose rotations add rounding.
+_WORN = 20
 # Rounding of a slack relative to its largest term; relevant for relaxed rows, whose multipliers are
 # the penalty, 1e6 and more.
 _ROUNDING = 1e-14
@@ -37,6 +39,7 @@ _ROUNDING = 1e-14
 @njit(cache=True)
 def solve_dual(
     whitened: Buffer,
+    reach: Buffer,
     gram: Buffer,
     d: Buffer,
     limit: Buffer,
@@ -45,14 +48,17 @@ def solve_dual(
     free: Buffer,
     factor: Buffer,
     basis: Buffer,
+    worn: Buffer,
     begin: int,
 ) -> tuple[int, int]:
     """Solve the dual, starting from the free rows of a problem with the same rows.
 
-    `whitened` W = M L^-T (r, N m), S = L L'; `gram` W W' (r, r); `d`, `limit`, `tolerance` (r,).
+    `whitened` W = M L^-T (r, N m), S = L L', of which the first `reach` (r,) columns can be
+    nonzero; `gram` W W' (r, r); `d`, `limit`, `tolerance` (r,).
     Written: `lam` (r,), the rows with 0 < lam < limit in `free` (a + 1,), the lower `factor` of
-    their Gram matrix (a + 1, a + 1) and their `basis` (a + 1, N m), a = min(r, N m). On entry
-    `begin` rows of `free` are present with their factor. Returns a status, and the number of free
+    their Gram matrix (a + 1, a + 1) and their `basis` (a + 1, N m), a = min(r, N m); in `worn`
+    (1,) the removals since this factor was computed. On entry `begin` rows of `free` are present
+    with their factor. Returns a status, and the number of free
     rows or the inconsistent row, with the combination of rows that should prove it in `lam`.
     """
     rows = len(d)
@@ -63,11 +69,12 @@ def solve_dual(
     is_free = np.zeros(rows, dtype=np.bool_)
     step = np.empty(len(free))
     lam[:] = 0.0
-    count = _begun(whitened, d, limit, lam, free, factor, basis, begin)
+    count = _begun(whitened, reach, d, limit, lam, free, factor, basis, worn, begin)
     for i in range(count):
         is_free[free[i]] = True
+        line, pull = gram[free[i]], lam[free[i]]
         for r in range(rows):
-            slack[r] += gram[free[i], r] * lam[free[i]]
+            slack[r] += line[r] * pull
     for _ in range(50 * (rows + 10)):
         row, worst = -1, 0.0
         noise = _ROUNDING * _largest_pull(lengths, lam)
@@ -85,7 +92,7 @@ def solve_dual(
             return CONVERGED, count
         sign = -1.0 if at_limit[row] else 1.0
         while True:
-            new = append_row(whitened, row, count, factor, basis)
+            new = append_row(whitened, reach, free, row, count, factor, basis)
             for i in range(count - 1, -1, -1):
                 part = factor[count, i]
                 for k in range(i + 1, count):
@@ -118,8 +125,9 @@ def solve_dual(
             # Row by row of the symmetric matrix, the order of memory.
             change[:] = gram[row]
             for i in range(count):
+                line, share = gram[free[i]], step[i]
                 for r in range(rows):
-                    change[r] -= gram[free[i], r] * step[i]
+                    change[r] -= line[r] * share
             for r in range(rows):
                 slack[r] += sign * length * change[r]
             for i in range(count):
@@ -138,19 +146,21 @@ def solve_dual(
             is_free[leaving] = False
             at_limit[leaving] = -sign * step[blocked] > 0
             lam[leaving] = limit[leaving] if at_limit[leaving] else 0.0
-            count = _remove(whitened, free, count, blocked, factor, basis)
+            count = _remove(reach, free, count, blocked, factor, basis, worn)
     return UNFINISHED, count
 
 
 @njit(cache=True)
 def _begun(
     whitened: Buffer,
+    reach: Buffer,
     d: Buffer,
     limit: Buffer,
     lam: Buffer,
     free: Buffer,
     factor: Buffer,
     basis: Buffer,
+    worn: Buffer,
     count: int,
 ) -> int:
     """Write the multipliers with which some rows are tight; return how many rows remain.
@@ -159,6 +169,12 @@ def _begun(
     solve a problem with only these rows, from which the dual method may continue.
     """
     right = np.empty(count)
+    if count == 0 or worn[0] > _WORN:
+        worn[0] = 0
+        for i in range(count):
+            accept_row(
+                i, append_row(whitened, reach, free, free[i], i, factor, basis), factor, basis
+            )
     while count > 0:
         for i in range(count):
             right[i] = -d[free[i]]
@@ -173,7 +189,7 @@ def _begun(
             for i in range(count):
                 lam[free[i]] = right[i]
             return count
-        count = _remove(whitened, free, count, place, factor, basis)
+        count = _remove(reach, free, count, place, factor, basis, worn)
     return 0
 
 
@@ -188,12 +204,30 @@ def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
 
 @njit(cache=True)
 def _remove(
-    whitened: Buffer, free: Buffer, count: int, place: int, factor: Buffer, basis: Buffer
+    reach: Buffer,
+    free: Buffer,
+    count: int,
+    place: int,
+    factor: Buffer,
+    basis: Buffer,
+    worn: Buffer,
 ) -> int:
-    """Drop the free row at `place` and refactor the rows behind it."""
+    """Drop the free row at `place`; Givens rotations make the factor lower triangular again."""
+    width = furthest(reach, free, count)
     for i in range(place, count - 1):
         free[i] = free[i + 1]
-        accept_row(i, append_row(whitened, free[i], i, factor, basis), factor, basis)
+        factor[i, : i + 2] = factor[i + 1, : i + 2]
+    for i in range(place, count - 1):
+        length = np.hypot(factor[i, i], factor[i, i + 1])
+        cosine, sine = factor[i, i] / length, factor[i, i + 1] / length
+        for k in range(i, count - 1):
+            left, right = factor[k, i], factor[k, i + 1]
+            factor[k, i] = cosine * left + sine * right
+            factor[k, i + 1] = cosine * right - sine * left
+        one, two = basis[i], basis[i + 1]
+        for k in range(width):
+            one[k], two[k] = cosine * one[k] + sine * two[k], cosine * two[k] - sine * one[k]
+    worn[0] += 1
     return count - 1
 
 
@@ -215,26 +249,35 @@ def refine(
     """
     right = np.empty(count)
     for i in range(count):
-        total = -d[free[i]]
-        for r in range(len(d)):
-            if at_limit[r]:
-                total -= gram[free[i], r] * limit[r]
-        right[i] = total
+        right[i] = -d[free[i]]
+    for r in range(len(d)):
+        if at_limit[r]:
+            for i in range(count):
+                right[i] -= gram[r, free[i]] * limit[r]
     substitute(factor, count, right)
     for i in range(count):
         lam[free[i]] = right[i]
 
 
-@njit(cache=True)
-def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Buffer) -> float:
+@njit(cache=True, fastmath={"reassoc"})  # sums in the order of the processor
+def append_row(
+    whitened: Buffer,
+    reach: Buffer,
+    free: Buffer,
+    row: int,
+    count: int,
+    factor: Buffer,
+    basis: Buffer,
+) -> float:
     """Write the coefficients of a row in the basis of the active ones; return the new length.
 
     The new part goes to basis[count], not normalised. Using rows instead of their Gram matrix keeps
     twice as many digits of it.
 
-    `whitened` (r, N m); `factor` (a + 1, a + 1); `basis` (a + 1, N m).
+    `whitened` (r, N m); `reach` (r,); `free` (a + 1,); `factor` (a + 1, a + 1); `basis`
+    (a + 1, N m).
     """
-    width = whitened.shape[1]
+    width = max(reach[row], furthest(reach, free, count))
     new = basis[count]
     new[:] = whitened[row]
     for i in range(count):
@@ -245,12 +288,22 @@ def append_row(whitened: Buffer, row: int, count: int, factor: Buffer, basis: Bu
             for k in range(width):
                 part += basis[i, k] * new[k]
             factor[count, i] += part
+            one = basis[i]
             for k in range(width):
-                new[k] -= part * basis[i, k]
+                new[k] -= part * one[k]
     length = 0.0
     for k in range(width):
         length += new[k] ** 2
     return np.sqrt(length)  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def furthest(reach: Buffer, free: Buffer, count: int) -> int:
+    """Largest `reach` (r,) of the first `count` rows in `free` (a + 1,)."""
+    width = 0
+    for i in range(count):
+        width = max(width, reach[free[i]])
+    return width
 
 
 @njit(cache=True)
@@ -264,7 +317,7 @@ def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None
         basis[count, k] /= length
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"reassoc"})  # sums in the order of the processor
 def substitute(factor: Buffer, count: int, right: Buffer) -> None:
     """Solve L L' x = right in place; `factor` (count, count); `right` (count,)."""
     for i in range(count):

@@ -15,6 +15,7 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.control.compiled_body import BodyTape, move_body
+from impc.control.compiled_borrowed import borrowed
 from impc.control.compiled_dual import (
     DEPENDENT,
     INCONSISTENT,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Values of `simulation.Status` that compiled code returns.
 FREE, ACTIVE, SOFTENED, INFEASIBLE, UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
+#: The solution of a shortened problem does not satisfy, or nearly violates, a later row.
+TOO_SHORT = 7
 #: Largest entry of plant and estimate, of states and of predictions.
 LARGEST = 1e100
 # A row exceeded by less than this share of its bound is satisfied: 100 times the rounding of
@@ -78,7 +81,7 @@ class Aim(NamedTuple):
 class Workspace(NamedTuple):
     """Arrays that are reused from sample to sample."""
 
-    # right sides of the rows at the sample (r,), reduced by the target, and derivatives (r, p)
+    # right sides of the rows at the sample (r,), reduced by the target, and derivatives (h, p)
     right: Buffer
     dright: Buffer
     # of the rows: slack (r,), violation that is accepted (r,), free rows (a + 1,)
@@ -92,7 +95,9 @@ class Workspace(NamedTuple):
     dv0: Buffer  # (m, p), derivatives of the first of them
     T: Buffer  # (n, r), transposed rows
     M: Buffer  # (N m, r), transposed rows
+    first: Buffer  # (N m,), first row with the column: rows are ordered by stage
     active: Buffer  # (1,), number of free rows at the last sample: warm start of the next problem
+    worn: Buffer  # (1,), as in `solve_dual`
 
 
 @njit(cache=True)
@@ -100,7 +105,7 @@ def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
     """Allocate the workspace of `law` for `m` inputs."""
     count, width = rows.M.shape
     p = drows.b.shape[1]
-    room = min(count, width) + 1
+    room = min(len(rows.limit), width) + 1
     # T and M are stored by columns: sums over columns then run over all rows at once.
     return Workspace(
         rows.b.copy(),
@@ -109,12 +114,14 @@ def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
         _KEPT * rows.b,
         np.empty(room, dtype=np.int64),
         np.empty((room, room)),
-        np.empty((room, width)),
+        np.zeros((room, width)),
         np.zeros(width),
         np.empty(width),
         np.zeros((m, p)),
         np.ascontiguousarray(rows.T.T),
         np.ascontiguousarray(rows.M.T),
+        np.searchsorted(rows.stage, np.arange(width) // m),
+        np.zeros(1, dtype=np.int64),
         np.zeros(1, dtype=np.int64),
     )
 
@@ -148,37 +155,49 @@ def run(
     du: Buffer,
     status: Buffer,
     lam: Buffer,
+    seen: Buffer,
+    dy: Buffer,
     gain_only: bool,
     local: bool,
 ) -> tuple[int, int]:
     """Simulate from x[first] and dx[first], with derivatives along p directions (p may be 0).
 
-    `disturbance` (steps, d); `unit` (m,); `x` (steps + 1, n); `u` (steps, m); `dx` (steps +
-    1, n, p); `du` (steps, m, p); `status` (steps,); `lam` (r,).
+    `disturbance` (steps, d); `unit` (m,); `x` (steps + 1, n); `u` (steps, m); `status` (steps,);
+    `lam` (h,). Derivatives: `dx` (steps + 1, n, p) or, to save memory, (2, n, p), where the last
+    samples overwrite earlier ones; `du` (steps, m, p) or (1, m, p); `dy` (steps + 1, q, p) are
+    those of y = `seen` x, `seen` (q, n).
     """
+    loop, dloop, rows, drows, body = borrowed((loop, dloop, rows, drows, body))
+    pushes, disturbance, aim, unit, work = borrowed((pushes, disturbance, aim, unit, work))
+    x, u, dx, du, status = borrowed((x, u, dx, du, status))
+    lam, seen, dy = borrowed((lam, seen, dy))
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
     away, daway = np.empty(x.shape[1]), np.empty(dx.shape[1:])
     for t in range(first, len(u)):
+        at, moved, ahead = dx[t % len(dx)], du[t % len(du)], dx[(t + 1) % len(dx)]
+        _observe(seen, at, dy[t])
         if status[t] > SOFTENED:
-            away[:], daway[:] = x[t], dx[t]
+            away[:], daway[:] = x[t], at
             deviate(aim, rows, drows, work, t, away, daway)
             status[t], near, row = law(
-                loop, dloop, rows, drows, unit, work, away, daway, lam, gain_only, u[t], du[t]
+                loop, dloop, rows, drows, unit, work, away, daway, lam, gain_only, u[t], moved
             )
             if status[t] > SOFTENED:
                 _hold(x, dx, t)
                 return weakly_active, row
-            return_to(aim, t, u[t], du[t])
+            return_to(aim, t, u[t], moved)
             weakly_active += near
         if body.address:
-            move_body(body, x[t], u[t], disturbance[t], dx[t], du[t], x[t + 1], dx[t + 1])
+            move_body(body, x[t], u[t], disturbance[t], at, moved, x[t + 1], ahead)
             if len(pushes):
-                dx[t + 1] += pushes[t]
+                ahead += pushes[t]
         else:
-            _advance(loop, dloop, plant_moves, disturbance[t], x, dx, u[t], du[t], t)
+            _advance(
+                loop, dloop, plant_moves, disturbance[t], x[t], at, u[t], moved, x[t + 1], ahead
+            )
         if local:
-            dx[t + 1] = dx[0]
+            ahead[:] = dx[0]
         size = 0.0
         for i in range(x.shape[1]):
             if not abs(x[t + 1, i]) <= size:  # also true for NaN
@@ -187,7 +206,18 @@ def run(
             status[t] = DIVERGED
             _hold(x, dx, t)
             return weakly_active, -1
+    _observe(seen, dx[len(u) % len(dx)], dy[len(u)])
     return weakly_active, -1
+
+
+@njit(cache=True, inline="always")
+def _observe(seen: Buffer, dx: Buffer, dy: Buffer) -> None:
+    """Compute dy = seen dx."""
+    for i in range(len(seen)):
+        dy[i] = 0.0
+        for j in range(len(dx)):
+            if seen[i, j] != 0.0:
+                _add(seen[i, j], dx[j], dy[i])
 
 
 @njit(cache=True, inline="always")
@@ -202,7 +232,7 @@ def deviate(
     for r in range(len(work.right)):
         at, c = t + min(rows.stage[r], ahead), rows.family[r]
         work.right[r] = rows.b[r] - aim.taken[at, c] - aim.held[t, c]
-        if len(aim.dx):
+        if len(aim.dx) and r < len(drows.b):
             work.dright[r] = drows.b[r] - aim.dtaken[at, c] - aim.dheld[t, c]
     if len(aim.dx):
         dx -= aim.dx[t, :, : dx.shape[1]]
@@ -227,34 +257,35 @@ def _advance(
     dx: Buffer,
     u: Buffer,
     du: Buffer,
-    t: int,
+    following: Buffer,
+    dfollowing: Buffer,
 ) -> None:
-    """Compute x+ = A x + B u + E d and its derivative."""
-    n, p = x.shape[1], dx.shape[2]
+    """Compute x+ = A x + B u + E d, `following`, and its derivative."""
+    n = len(x)
     for i in range(n):
-        x[t + 1, i] = dot(loop.A[i], x[t]) + dot(loop.B[i], u) + dot(loop.E[i], disturbance)
+        following[i] = dot(loop.A[i], x) + dot(loop.B[i], u) + dot(loop.E[i], disturbance)
+        ahead = dfollowing[i]
+        ahead[:] = 0.0
         for j in range(n):
             if loop.A[i, j] != 0.0:
-                for c in range(p):
-                    dx[t + 1, i, c] += loop.A[i, j] * dx[t, j, c]
+                _add(loop.A[i, j], dx[j], ahead)
         for j in range(len(u)):
-            for c in range(p):
-                dx[t + 1, i, c] += loop.B[i, j] * du[j, c]
+            _add(loop.B[i, j], du[j], ahead)
         if plant_moves:
-            for c in range(p):
-                for j in range(n):
-                    dx[t + 1, i, c] += dloop.A[i, j, c] * x[t, j]
-                for j in range(len(u)):
-                    dx[t + 1, i, c] += dloop.B[i, j, c] * u[j]
-                for j in range(len(disturbance)):
-                    dx[t + 1, i, c] += dloop.E[i, j, c] * disturbance[j]
+            for j in range(n):
+                _add(x[j], dloop.A[i, j], ahead)
+            for j in range(len(u)):
+                _add(u[j], dloop.B[i, j], ahead)
+            for j in range(len(disturbance)):
+                _add(disturbance[j], dloop.E[i, j], ahead)
 
 
 @njit(cache=True)
 def _hold(x: Buffer, dx: Buffer, t: int) -> None:
     """Repeat the last state, so that samples that are not reached are finite."""
     x[t + 1 :] = x[t]
-    dx[t + 1 :] = 0.0
+    if len(dx) == len(x):
+        dx[t + 1 :] = 0.0
 
 
 @njit(cache=True, inline="always")
@@ -332,14 +363,16 @@ def _solve(
     """Write v and dv0 of one sample; return status, whether it is weakly active, and a row."""
     code, active = solve_dual(
         rows.W,
+        rows.reach,
         rows.gram,
-        work.slack,
+        work.slack[: len(lam)],
         rows.limit,
-        work.kept,
+        work.kept[: len(lam)],
         lam,
         work.free,
         work.factor,
         work.basis,
+        work.worn,
         begin,
     )
     if code == INCONSISTENT:
@@ -378,7 +411,7 @@ def answer_with(
     fill_slack(work, x)
     for i in range(active):
         work.free[i] = tight[i]
-        new = append_row(rows.W, tight[i], i, work.factor, work.basis)
+        new = append_row(rows.W, rows.reach, work.free, tight[i], i, work.factor, work.basis)
         if not new > DEPENDENT * np.sqrt(rows.gram[tight[i], tight[i]]):
             return UNSOLVED, False
         accept_row(i, new, work.factor, work.basis)
@@ -406,14 +439,12 @@ def _apply(
     du: Buffer,
 ) -> None:
     """Compute u = -K x + v_0 and its derivative."""
-    p = dx.shape[1]
     for i in range(len(u)):
         u[i] = v[i] - dot(loop.K[i], x)
-        for c in range(p):
-            du[i, c] = dv0[i, c]
+        du[i] = dv0[i, : dx.shape[1]]
         for j in range(len(x)):
-            for c in range(p):
-                du[i, c] -= loop.K[i, j] * dx[j, c] + dloop.K[i, j, c] * x[j]
+            _add(-loop.K[i, j], dx[j], du[i])
+            _add(-x[j], dloop.K[i, j], du[i])
 
 
 @njit(cache=True)
@@ -440,9 +471,21 @@ def answer(
         soft, near, solved = _check(loop.K, rows, lam, work, active, x, unit)
     if not solved:
         return UNSOLVED, False
+    if len(lam) < len(work.slack) and not _keeps_later(work, len(lam), rows.b):
+        return TOO_SHORT, False
     if dx.shape[1]:
         _differentiate(loop, dloop, rows, drows, lam, work, active, x, dx)
     return (SOFTENED if soft else ACTIVE), near
+
+
+@njit(cache=True)
+def _keeps_later(work: Workspace, head: int, b: Buffer) -> bool:
+    """Whether v satisfies the rows behind the first `head`, none of them nearly active."""
+    lefts = work.slack[head:].copy()
+    for i in range(len(work.v)):
+        if work.v[i] != 0.0:
+            _add(-work.v[i], work.M[i, head:], lefts)
+    return bool(np.all(lefts > _WEAK * b[head:]))
 
 
 @njit(cache=True)
@@ -453,8 +496,9 @@ def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
     rounding[:] = 0.0
     for r in range(len(lam)):
         if lam[r] != 0.0:
-            for i in range(len(v)):
-                part = lam[r] * rows.N[r, i]
+            N, pull = rows.N[r], lam[r]
+            for i in range(rows.reach[r]):
+                part = pull * N[i]
                 v[i] -= part
                 rounding[i] += _SUM_ROUNDING * abs(part)
 
@@ -471,7 +515,7 @@ def _tighten(rows: Rows, work: Workspace, active: int) -> None:
         column[a] = slack[free[a]] - dot(rows.M[free[a]], v)
     substitute(work.factor, active, column)
     for a in range(active):
-        for i in range(len(v)):
+        for i in range(rows.reach[free[a]]):
             v[i] += column[a] * rows.N[free[a], i]
 
 
@@ -493,15 +537,21 @@ def _check(
     """
     soft, near, m = False, False, len(unit)
     slack, free, factor, v = work.slack, work.free, work.factor, work.v
-    wrong, lefts, sizes = np.empty(len(lam)), slack.copy(), rows.b.copy()
+    wrong, lefts, sizes = np.empty(len(lam)), slack[: len(lam)].copy(), rows.b[: len(lam)].copy()
     for i in range(len(x)):
+        T, at = work.T[i], x[i]
         for r in range(len(lam)):
-            sizes[r] += abs(work.T[i, r] * x[i])
+            sizes[r] += abs(T[r] * at)
     for i in range(len(v)):
-        for r in range(len(lam)):
-            part = work.M[i, r] * v[i]
-            lefts[r] -= part
-            sizes[r] += abs(part)
+        if v[i] == 0.0:  # beyond the last active stage
+            continue
+        first = work.first[i]
+        M, left_i, size_i = work.M[i, first : len(lam)], lefts[first:], sizes[first:]
+        move = v[i]
+        for r in range(len(M)):
+            part = M[r] * move
+            left_i[r] -= part
+            size_i[r] += abs(part)
     for r in range(len(lam)):
         left, bound = lefts[r], rows.b[r]
         wrong[r] = abs(left) + _ROW_ROUNDING * sizes[r]
@@ -515,18 +565,19 @@ def _check(
             return soft, near, False
         # A multiplier moves v by lam N: weak if that is negligible relative to the row's bound.
         near |= abs(left) < _WEAK * bound and pulled < _WEAK * bound
-    column, moved = np.empty(active), np.empty(len(v))
+    columns, moved = np.empty((active, m)), np.empty(len(v))
+    for a in range(active):
+        columns[a] = rows.N[free[a], :m]
+    substitute_all(factor, active, columns)
     for i in range(m):
-        for a in range(active):
-            column[a] = rows.N[free[a], i]
-        substitute(factor, active, column)
         error, size = 0.0, 0.0
         moved[:] = 0.0
         moved[i] = 1.0
         for a in range(active):
-            error += abs(column[a]) * wrong[free[a]]
-            for k in range(len(v)):
-                moved[k] -= column[a] * rows.M[free[a], k]
+            error += abs(columns[a, i]) * wrong[free[a]]
+            line, share = rows.M[free[a]], columns[a, i]
+            for k in range(rows.reach[free[a]]):
+                moved[k] -= line[k] * share
         for k in range(len(v)):
             error += abs(moved[k]) * work.rounding[k]
         for j in range(len(x)):
@@ -555,45 +606,44 @@ def _differentiate(
     q, dlam = np.zeros((width, p)), np.empty((active, p))
     for i in range(width):
         for j in range(m):
-            for c in range(p):
-                q[i, c] += dloop.S[i % len(dloop.S), j, c] * v[i - i % m + j]
-    _add_pulls(rows, drows, lam, m, q)
+            _add(v[i - i % m + j], dloop.S[i % len(dloop.S), j], q[i])
+    _add_pulls(rows, drows, lam, q)
     for a in range(active):
-        r = free[a]
-        for c in range(p):
-            dlam[a, c] = -work.dright[r, c]
+        r, change = free[a], dlam[a]
+        change[:] = 0.0
+        _add(-1.0, work.dright[r], change)
         for i in range(n):
-            for c in range(p):
-                dlam[a, c] += drows.T[r, i, c] * x[i] + rows.T[r, i] * dx[i, c]
-        for i in range(_reach(rows, r, m)):
-            for c in range(p):
-                dlam[a, c] += drows.M[r, i, c] * v[i] - rows.N[r, i] * q[i, c]
+            _add(x[i], drows.T[r, i], change)
+            _add(rows.T[r, i], dx[i], change)
+        for i in range(rows.reach[r]):
+            _add(v[i], drows.M[r, i], change)
+            _add(-rows.N[r, i], q[i], change)
     substitute_all(work.factor, active, dlam)
     for i in range(m):
         for j in range(m):
-            for c in range(p):
-                dv0[i, c] -= loop.S[i, j] * q[j, c]
+            _add(-loop.S[i, j], q[j], dv0[i])
         for a in range(active):
-            for c in range(p):
-                dv0[i, c] -= rows.N[free[a], i] * dlam[a, c]
+            _add(-rows.N[free[a], i], dlam[a], dv0[i])
 
 
 @njit(cache=True, inline="always")
-def _reach(rows: Rows, r: int, m: int) -> int:
-    """Number of columns of M that can be nonzero in row r, by its stage."""
-    return min(rows.M.shape[1], m * (rows.stage[r] + 1))  # type: ignore[no-any-return]
+def _add(share: float, changes: Buffer, total: Buffer) -> None:
+    """Add share times `changes` (p,) to `total` (p,).
+
+    As one line in the loops above, numba would take one number at a time: arrays might overlap.
+    """
+    for c in range(len(total)):
+        total[c] += share * changes[c]
 
 
 @njit(cache=True)
-def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, m: int, q: Buffer) -> None:
+def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, q: Buffer) -> None:
     """Add dM' lam to q, and the effect of the penalty of soft rows."""
     for r in range(len(lam)):
         if lam[r] != 0.0:
-            for i in range(_reach(rows, r, m)):
-                for c in range(q.shape[1]):
-                    q[i, c] += lam[r] * drows.M[r, i, c]
+            for i in range(rows.reach[r]):
+                _add(lam[r], drows.M[r, i], q[i])
             if lam[r] == rows.limit[r]:
                 # The penalty of a soft row is penalty / b: it depends on the bound.
-                for i in range(len(q)):
-                    for c in range(q.shape[1]):
-                        q[i, c] -= rows.M[r, i] * lam[r] / rows.b[r] * drows.b[r, c]
+                for i in range(rows.reach[r]):
+                    _add(-rows.M[r, i] * lam[r] / rows.b[r], drows.b[r], q[i])

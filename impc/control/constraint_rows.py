@@ -10,6 +10,9 @@ row at stage k = N + j, where no v is left: the terminal set depends on K throug
 In short  T x + M v <= b  (docs/why/theory.md, section 3). The rows of a user-supplied terminal set
 are further bounds, E = H and F = 0, at stage N only. If each stage has its own gain, products
 Phi_{k-1} ... Phi_i replace the powers.
+
+A long horizon can be solved with the first a inputs v_i and the rows of the first a stages: if the
+solution satisfies the rows of all later stages as well, it solves the whole problem.
 """
 
 from __future__ import annotations
@@ -32,25 +35,30 @@ if TYPE_CHECKING:
 
 
 class Rows(NamedTuple):
-    """T x + M v <= b, with derived matrices (a named tuple, which compiled code accepts)."""
+    """T x + M v <= b, with derived matrices (a named tuple, which compiled code accepts).
+
+    The first h of the r rows make the problem; those of later stages are only checked. N is the
+    number of stages of the problem; h = r unless it is shortened.
+    """
 
     T: Array  # (r, n)
     M: Array  # (r, N m), the columns of each stage adjacent
-    N: Array  # (r, N m), M S^-1 with the metric S of each stage
-    W: Array  # (r, N m), M L^-T with S = L L': rows in coordinates in which S is the identity
-    gram: Array  # (r, r), W W' = M S^-1 M'
+    N: Array  # (h, N m), M S^-1 with the metric S of each stage
+    W: Array  # (h, N m), M L^-T with S = L L': rows in coordinates in which S is the identity
+    gram: Array  # (h, h), W W' = M S^-1 M'
     b: Array  # (r,)
-    limit: Array  # (r,), largest multiplier: infinite if hard, penalty per unit of excess if soft
+    limit: Array  # (h,), largest multiplier: infinite if hard, penalty per unit of excess if soft
     family: IntArray  # (r,), index of the bound
     stage: IntArray  # (r,), samples ahead
+    reach: IntArray  # (h,), number of columns of M that can be nonzero
 
 
 class RowDirections(NamedTuple):
-    """Derivatives of `Rows` along p directions (last axis)."""
+    """Derivatives of the first h `Rows` along p directions (last axis)."""
 
-    T: Array  # (r, n, p)
-    M: Array  # (r, N m, p)
-    b: Array  # (r, p)
+    T: Array  # (h, n, p)
+    M: Array  # (h, N m, p)
+    b: Array  # (h, p)
 
 
 @dataclass(frozen=True)
@@ -156,37 +164,47 @@ def _stage_directions(stages: FiniteHorizonLqr, *changes: Array) -> dict[str, Ar
     }
 
 
-def build_rows(controller: Controller) -> Rows:
-    """Return the rows of the controller's problem."""
+def build_rows(controller: Controller, stages: int | None = None) -> Rows:
+    """Return the rows of the controller's problem, with the inputs of the first `stages` only."""
+    stages = controller.horizon if stages is None else stages
     bounds = families(controller)
     family, stage = _pairs(controller, bounds)
     if controller.stages is None:
         powers = _powers(controller, bounds, int(stage.max(initial=0)))
         T = powers[stage, family]
-        M = _inputs(controller, family, stage, powers @ controller.plant.B, bounds.F)
+        M = _inputs(stages, family, stage, powers @ controller.plant.B, bounds.F)
     else:
         none = np.zeros((0, *controller.gains.shape))
         T, M, _, _ = _unrolled(controller, bounds, family, stage, none)
-    metrics = controller.metrics
-    by_stage = np.moveaxis(M.reshape(len(M), *metrics.shape[:2]), 0, 2)
+    head = _head(controller, stage, stages)
+    metrics = controller.metrics[:stages]
+    by_stage = np.moveaxis(M[:head].reshape(head, *metrics.shape[:2]), 0, 2)
     W, N = (
-        np.ascontiguousarray(np.moveaxis(np.linalg.solve(part, by_stage), 2, 0)).reshape(M.shape)
+        np.ascontiguousarray(np.moveaxis(np.linalg.solve(part, by_stage), 2, 0)).reshape(
+            M[:head].shape
+        )
         for part in (np.linalg.cholesky(metrics), metrics)
     )
     b = bounds.b[family]
-    soft = bounds.on_state[family] | (stage >= controller.horizon)
-    limit = np.where(soft, controller.penalty / b, np.inf)
-    return Rows(T, M, N, W, W @ W.T, b, limit, family, stage)
+    soft = (bounds.on_state[family] | (stage >= controller.horizon))[:head]
+    limit = np.where(soft, controller.penalty / b[:head], np.inf)
+    reach = np.minimum(controller.plant.m * (stage[:head] + 1), M.shape[1])
+    return Rows(T, M, N, W, W @ W.T, b, limit, family, stage, reach)
 
 
-def differentiate_rows(controller: Controller, along: Directions) -> RowDirections:
-    """Return the derivatives of the rows along the given directions.
+def differentiate_rows(
+    controller: Controller, along: Directions, stages: int | None = None
+) -> RowDirections:
+    """Return the derivatives of the rows along the given directions, `stages` as in `build_rows`.
 
     With G_k = H Phi^k:  dG_{k+1} = dG_k Phi + G_k dPhi,  dPhi = dA - dB K - B dK,  dH = -F dK.
     """
+    stages = controller.horizon if stages is None else stages
     plant, K = controller.plant, controller.K
     bounds = families(controller)
     family, stage = _pairs(controller, bounds)
+    head = _head(controller, stage, stages)
+    family, stage = family[:head], stage[:head]
     fixed = np.zeros((len(bounds.b) - len(along.bounds), along.count))
     db = np.concatenate([along.bounds, fixed])[family]
     if controller.stages is not None:
@@ -204,9 +222,14 @@ def differentiate_rows(controller: Controller, along: Directions) -> RowDirectio
         dpowers[k + 1] = dpowers[k] @ closed + powers[k] @ dclosed
     dresponse = dpowers @ plant.B + powers[:, None] @ dB  # of H Phi^k B, (stage, p, c, m)
     dresponse = np.moveaxis(dresponse, 1, -1)
-    dM = _inputs(controller, family, stage, dresponse, np.zeros_like(dresponse[0]))
+    dM = _inputs(stages, family, stage, dresponse, np.zeros_like(dresponse[0]))
     dT = np.ascontiguousarray(np.moveaxis(dpowers[stage, :, family], 1, -1))
     return RowDirections(dT, dM, db)
+
+
+def _head(controller: Controller, stage: IntArray, stages: int) -> int:
+    """Number of rows of the first `stages`; all rows, terminal set included, if these are all."""
+    return len(stage) if stages == controller.horizon else int(np.sum(stage < stages))
 
 
 def families(controller: Controller) -> BoundRows:
@@ -270,14 +293,13 @@ def _unrolled(
 
 
 def _inputs(
-    controller: Controller, family: IntArray, stage: IntArray, response: Array, direct: Array
+    horizon: int, family: IntArray, stage: IntArray, response: Array, direct: Array
 ) -> Array:
     """Place the response H Phi^j B at column k - 1 - j, and the direct term at column k < N."""
-    horizon, m = controller.horizon, controller.plant.m
     placed = np.zeros((len(family), horizon, *direct.shape[1:]))
     delay = stage[:, None] - 1 - np.arange(horizon)
     row, column = np.nonzero(delay >= 0)
     placed[row, column] = response[delay[row, column], family[row]]
     inside = np.nonzero(stage < horizon)[0]
     placed[inside, stage[inside]] = direct[family[inside]]
-    return placed.reshape(len(family), horizon * m, *direct.shape[2:])
+    return placed.reshape(len(family), horizon * direct.shape[1], *direct.shape[2:])

@@ -19,7 +19,6 @@ from impc.control.closed_loop import (
     prepare_loop,
     run_loop,
     simulate,
-    simulate_and_differentiate,
 )
 from impc.control.constraint_rows import Directions, directions
 from impc.control.simulation import Status
@@ -112,17 +111,19 @@ def evaluate(
     if correction is not None and seen.moves is not None:
         E = np.zeros((n, seen.moves[2].shape[1], layout.count))
         along = replace(along, x0=correction.kept(problem) @ along.x0, E=E)
-    prepared = prepare_loop(controller, along, seen.moves)
+    prepared, outputs = prepare_loop(controller, along, seen.moves), seen.weighting @ plant.C
     residuals, derivatives, reason, active, weakly_active = [], [], "", 0, 0
     for trial, drive in zip(problem.recordings, seen.drives, strict=True):
-        run, sensitivity = run_loop(prepared, drive, proved=False)
+        run, sensitivity = run_loop(
+            prepared, drive, proved=False, seen=outputs, inputs=len(problem.measured) > len(plant.C)
+        )
         weakly_active += run.weakly_active
         active += int(np.count_nonzero(run.status != Status.FREE))
         if not run.complete:
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
         residuals.append(_difference(problem, seen, trial, run).ravel())
         derivatives.append(_slope(problem, seen, trial, run, sensitivity, layout, differential))
-    jacobian = np.concatenate(derivatives)
+    jacobian = np.concatenate(derivatives) if len(derivatives) > 1 else derivatives[0]
     return Evaluation(
         np.concatenate(residuals),
         jacobian[:, layout.gain].reshape(-1, m, n),
@@ -160,10 +161,11 @@ def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
     prepared = prepare_loop(controller, along)
     (trial,) = problem.recordings
     seen = _Seen.of(problem, None)
+    outputs = seen.weighting @ problem.plant.C
 
     def at(x0: Array, offset: Array) -> tuple[Array, Array]:
         moved = replace(trial, offset=frozen(offset))
-        run, sensitivity = run_loop(prepared, drive_of(trial, x0))
+        run, sensitivity = run_loop(prepared, drive_of(trial, x0), seen=outputs)
         slopes = _slope(problem, seen, moved, run, sensitivity, layout, None)
         return _difference(problem, seen, moved, run).ravel(), slopes[:, layout.own]
 
@@ -341,12 +343,14 @@ def measured_slope(
 ) -> Array:
     """Derivative of scaled outputs and commands (samples, q, k); zero for missing values.
 
-    Offset columns follow the initial states, starting at column `own`.
+    `moved.x` are those of the scaled outputs and may be overwritten. Offset columns follow the
+    initial states, starting at column `own`.
     """
     outputs, W = problem.plant.outputs, weighting
-    W, p = np.diag(1 / problem.output_scale) if W is None else W, len(outputs)
-    slope = np.zeros((trial.samples, len(problem.measured), moved.x.shape[2]))
-    slope[:, :p] = (W @ problem.plant.C) @ moved.x
+    W, p, slope = np.diag(1 / problem.output_scale) if W is None else W, len(outputs), moved.x
+    if len(problem.measured) > p:
+        slope = np.zeros((trial.samples, len(problem.measured), moved.x.shape[2]))
+        slope[:, :p] = moved.x
     for place, name in enumerate(problem.offsets if own is not None else ()):
         slope[:, :p, (own or 0) + problem.searched_states + place] += W[:, outputs.index(name)]
     if slope.shape[1] > p:
@@ -357,9 +361,10 @@ def measured_slope(
 
 def residual_along(problem: Problem, controller: Controller, along: Directions) -> Array:
     """Derivative of the residual (r, k) along directions of the controller."""
-    parts = []
+    parts, prepared = [], prepare_loop(controller, along)
+    outputs = problem.plant.C / problem.output_scale[:, None]
     for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        _, moved = simulate_and_differentiate(controller, drive, along)
+        _, moved = run_loop(prepared, drive, seen=outputs)
         parts.append(measured_slope(problem, trial, moved).reshape(-1, along.count))
     return np.concatenate(parts)
 

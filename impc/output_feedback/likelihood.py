@@ -73,7 +73,7 @@ def prepare_filter(
 ) -> PreparedFilter:
     """Build everything that does not depend on a recording; `recorder` (p,)."""
     plant = controller.plant
-    law, clip = _unclipped(prepare_loop(controller, along))
+    law, clip = _unclipped(prepare_loop(controller, along, whole=True))
     count = along.count if np.any(person.share) or clip.used else noise.covariances
     first = [np.moveaxis(part[..., :count], -1, 0) for part in
              (along.A, along.B, along.E, noise.C, noise.levels)]  # fmt: skip

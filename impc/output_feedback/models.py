@@ -187,7 +187,7 @@ def prediction_errors(fit: OutputFeedbackFit, ahead: tuple[int, ...]) -> Array:
     """
     problem, plant = fit.problem, fit.problem.plant
     controller = controller_for(problem, fit.K, fit.S)
-    law = prepare_loop(controller, directions(controller, 0))
+    law = prepare_loop(controller, directions(controller, 0), whole=True)
     joint = joint_loop(plant, fit.observer, fit.recorder)
     farthest = max(ahead)
     quiet = np.zeros((farthest, len(joint.F))), np.zeros((farthest, plant.m))

@@ -81,7 +81,7 @@ def simulate_person(
     start[at : at + n] += given.x0
     noise = rng.standard_normal((given.steps, size)) @ _root(joint.Q).T
     shared = rng.standard_normal((given.steps, m))
-    law = prepare_loop(controller, directions(controller, 0))
+    law = prepare_loop(controller, directions(controller, 0), whole=True)
     aim = aim_of(controller, given, law.along)
     pushes = np.array(given.disturbance)
     z, u, status = run_joint(law, joint, start, pushes, aim, (noise, shared))

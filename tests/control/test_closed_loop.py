@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import control
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
 from impc.checking import replace
-from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.closed_loop import (
+    prepare_loop,
+    run_loop,
+    simulate,
+    simulate_and_differentiate,
+)
 from impc.control.compiled_dual import CONVERGED, INCONSISTENT, solve_dual
 from impc.control.constraint_rows import Directions, directions
 from impc.control.controller import Controller
@@ -18,6 +24,9 @@ from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
 from impc.model.weights import Weights
 from tests.support import random_plant, random_weights
+
+
+dual: Any = solve_dual
 
 
 def moved(
@@ -239,9 +248,9 @@ def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
         W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
         if rng.random() < 0.3:
             W[-1] = -W[0]  # parallel rows, as a lower and an upper bound are
-        lam, free, factor, basis = dual_workspace(rows, width)
+        lam, *room = dual_workspace(rows, width)
         tight = np.full(rows, np.inf), np.full(rows, 1e-12)
-        code, _ = solve_dual(W, W @ W.T, d, *tight, lam, free, factor, basis, 0)
+        code, _ = dual(W, np.full(rows, width), W @ W.T, d, *tight, lam, *room, 0)
         verdict = linprog(np.zeros(width), A_ub=W, b_ub=d, bounds=(None, None), method="highs")
         assert code == (INCONSISTENT if verdict.status == 2 else CONVERGED)
         seen.append(code)
@@ -260,14 +269,14 @@ def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(cost_weigh
     for _ in range(40):
         rows, width = int(rng.integers(3, 16)), int(rng.integers(4, 9))
         W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
-        given = W, W @ W.T, np.full(rows, cost_weight), np.full(rows, 1e-12)
+        given = W, np.full(rows, width), W @ W.T, np.full(rows, cost_weight), np.full(rows, 1e-12)
         warm, count = dual_workspace(rows, width), 0
-        for _ in range(20):
+        for _ in range(60):  # the factor is computed anew on the way
             d = d + 0.1 * rng.normal(size=rows)
             cold = dual_workspace(rows, width)
-            code, _ = solve_dual(*given[:2], d, *given[2:], *cold, 0)
+            code, _ = dual(*given[:3], d, *given[3:], *cold, 0)
             begun += count > 0
-            found, count = solve_dual(*given[:2], d, *given[2:], *warm, count)
+            found, count = dual(*given[:3], d, *given[3:], *warm, count)
             assert found == code
             if code != CONVERGED:
                 count = 0
@@ -284,20 +293,44 @@ def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(cost_weigh
 
 
 def test_dual_solver_begins_anew_where_the_slack_is_no_number() -> None:
-    W, tight = np.eye(2), (np.full(2, np.inf), np.full(2, 1e-12))
-    lam, free, factor, basis = dual_workspace(2, 2)
-    code, count = solve_dual(W, W, np.array([-1.0, -2.0]), *tight, lam, free, factor, basis, 0)
+    W, reach, tight = np.eye(2), np.full(2, 2), (np.full(2, np.inf), np.full(2, 1e-12))
+    lam, *room = dual_workspace(2, 2)
+    code, count = dual(W, reach, W, np.array([-1.0, -2.0]), *tight, lam, *room, 0)
     assert (code, count) == (CONVERGED, 2)
     lost = np.array([np.nan, -2.0])
-    _, count = solve_dual(W, W, lost, *tight, lam, free, factor, basis, count)
+    _, count = dual(W, reach, W, lost, *tight, lam, *room, count)
     assert np.all(np.isfinite(lam[1:]))
-    again, free, factor, basis = dual_workspace(2, 2)
-    assert solve_dual(W, W, lost, *tight, again, free, factor, basis, 0)[1] == count
+    again, *room = dual_workspace(2, 2)
+    assert dual(W, reach, W, lost, *tight, again, *room, 0)[1] == count
     np.testing.assert_array_equal(lam, again)
 
 
-def dual_workspace(rows: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Multipliers, free rows, factor and basis of `solve_dual`."""
+def dual_workspace(rows: int, width: int) -> tuple[np.ndarray, ...]:
+    """Multipliers, free rows, factor, basis and number of removals of `solve_dual`."""
     room = min(rows, width) + 1
     free = np.empty(room, dtype=np.int64)
-    return np.zeros(rows), free, np.empty((room, room)), np.empty((room, width))
+    none = np.zeros(1, dtype=np.int64)
+    return np.zeros(rows), free, np.empty((room, room)), np.zeros((room, width)), none
+
+
+@pytest.mark.parametrize("softening", [1e4, None])
+@pytest.mark.parametrize("position", [0.4, 2.0, 7.0])
+def test_a_long_horizon_is_solved_with_its_first_stages(
+    position: float, softening: float | None
+) -> None:
+    """Against the whole problem: no stage, some, and more than the first 50 are at a limit."""
+    system = control.ss([[0, 1], [0.2, 0]], [[0, 0], [1, 1]], [[1, 0]], 0, inputs=["u", "d"])
+    plant = Plant(control.c2d(system, 0.02), ["u"])
+    bounds = Bounds(plant, u_min=-2.5, u_max=2.5, x_max=[8.0, np.inf])
+    weights = Weights(np.diag([4.0, 1.0]), 0.1)
+    law = Controller(plant, weights, bounds, 150, terminal_set=False, softening=softening)
+    drive = scenario(plant, [position, 0.0], disturbance=np.full((60, 1), 0.3))
+    along = directions(law, 4, K=np.eye(2, 4), x0=np.eye(2, 4, 2))
+    short = prepare_loop(law, along)
+    assert short.stages < 150
+    found, slope = run_loop(short, drive)
+    whole, exact = run_loop(prepare_loop(law, along, whole=True), drive)
+    assert whole.complete
+    assert np.array_equal(found.status, whole.status)
+    for a, b in ((found.x, whole.x), (found.u, whole.u), (slope.x, exact.x), (slope.u, exact.u)):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * max(1.0, float(np.max(np.abs(b)))))
