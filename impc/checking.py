@@ -178,6 +178,8 @@ def _require_sizes(name: str, value: Any, sizes: dict[str, int]) -> None:
 def _sizes_of(value: Any) -> dict[str, int]:
     if isinstance(value, tuple):
         return _sizes_of(value[0]) if value else {}
+    if not isinstance(value, Frozen):
+        return {}
     sizes: dict[str, int] = {}
     for owner in ("fibre", "plant"):
         inner = getattr(value, owner, None)

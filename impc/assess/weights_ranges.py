@@ -24,6 +24,8 @@ from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from impc.arrays import Array
     from impc.assess.bounded_weights import WeightsSet
     from impc.assess.intent_draws import DrawnSet, WeightRange
@@ -73,8 +75,9 @@ def summarise_weights(
     metrics: Array,
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
+    each: Callable[..., Iterable[DrawnSet]] = map,
 ) -> WeightsSummary:
-    """Summarise the set of weights of a gain and of drawn gains."""
+    """Summarise the set of weights of a gain and of drawn gains, which `each` maps."""
     found = weights_set(gain_fibre(plant, gain, metrics), RATIO)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
@@ -83,9 +86,11 @@ def summarise_weights(
     statements = order_statements(found, sizes, names) + sense_statements(
         found, sizes, names, ranges
     )
-    sets = tuple(
-        set_of_gain(plant, item, metrics, RATIO, sizes, names, statements) for item in draws
-    )
+
+    def set_of(drawn: LqrSolution) -> DrawnSet:
+        return set_of_gain(plant, drawn, metrics, RATIO, sizes, names, statements)
+
+    sets = tuple(each(set_of, draws))
     cost_weights = {
         plant.states[k]: (sizes[k] ** 2 * ranges[k, k].low, sizes[k] ** 2 * ranges[k, k].high)
         for k in named
@@ -112,10 +117,11 @@ def weights_summary_or_reason(
     metrics: Array,
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
+    each: Callable[..., Iterable[DrawnSet]] = map,
 ) -> tuple[WeightsSummary | None, str]:
     """Summary and "", or None and the reason."""
     try:
-        return summarise_weights(plant, gain, metrics, sizes, draws=draws), ""
+        return summarise_weights(plant, gain, metrics, sizes, draws, each), ""
     except (WeightsError, SolverError) as error:
         return None, str(error)
 

@@ -29,6 +29,7 @@ from impc.control.body_steps import body_tape, pushes
 from impc.control.compiled_kernel import (
     TOO_SHORT,
     LoopMatrices,
+    Trace,
     answer_with,
     deviate,
     fill_slack,
@@ -135,10 +136,8 @@ def prepare_loop(
     """
     plant = controller.plant
     A, B, E = (plant.A, plant.B, plant.E) if moves is None else moves
-    stages = controller.horizon
-    whole = whole or controller.stages is not None or controller.solver != COMPILED
-    if stages > _WHOLE and not whole:
-        stages = _STAGES
+    whole = whole or controller.stages is not None
+    stages = controller.horizon if whole else first_stages(controller.horizon, controller.solver)
     rows, moved = _rows(controller, along, stages)
     inverse = np.asarray(np.linalg.inv(controller.S), dtype=np.float64)
     return PreparedLoop(
@@ -152,6 +151,11 @@ def prepare_loop(
         None if controller.solver == COMPILED else build_program(controller.solver, rows),
         stages,
     )
+
+
+def first_stages(horizon: int, solver: str) -> int:
+    """Number of stages of the problem with which a simulation begins."""
+    return _STAGES if horizon > _WHOLE and solver == COMPILED else horizon
 
 
 def _rows(controller: Controller, along: Directions, stages: int) -> tuple[Rows, RowDirections]:
@@ -210,8 +214,8 @@ def run_loop(
         if work is None:
             work = workspace(rows, moved, m)
         loop = (prepared.matrices, prepared.matrix_directions, rows, moved, *drive)
-        written = (x, u, dx, du, status, np.zeros(len(rows.limit)), observed, dy)
-        weak, failed_row = run(*loop, prepared.unit, work, t, *written, asked, local)
+        trace = Trace(x, u, dx, du, observed, dy, status, np.zeros(len(rows.limit)))
+        weak, failed_row = run(*loop, prepared.unit, work, t, trace, asked, local)
         weakly_active += weak
         t = int(np.count_nonzero(status <= Status.SOFTENED))
         longer = t < steps and status[t] == TOO_SHORT

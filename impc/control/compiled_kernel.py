@@ -78,6 +78,19 @@ class Aim(NamedTuple):
     dheld: Buffer
 
 
+class Trace(NamedTuple):
+    """What a simulation of some steps writes."""
+
+    x: Buffer  # (steps + 1, n)
+    u: Buffer  # (steps, m)
+    dx: Buffer  # (steps + 1, n, p); or (2, n, p), where the last samples overwrite earlier ones
+    du: Buffer  # (steps, m, p), or (1, m, p)
+    seen: Buffer  # (q, n), given: outputs whose derivatives are kept
+    dy: Buffer  # (steps + 1, q, p), seen dx
+    status: Buffer  # (steps,)
+    lam: Buffer  # (h,), multipliers of the last problem
+
+
 class Workspace(NamedTuple):
     """Arrays that are reused from sample to sample."""
 
@@ -149,28 +162,17 @@ def run(
     unit: Buffer,
     work: Workspace,
     first: int,
-    x: Buffer,
-    u: Buffer,
-    dx: Buffer,
-    du: Buffer,
-    status: Buffer,
-    lam: Buffer,
-    seen: Buffer,
-    dy: Buffer,
+    trace: Trace,
     gain_only: bool,
     local: bool,
 ) -> tuple[int, int]:
-    """Simulate from x[first] and dx[first], with derivatives along p directions (p may be 0).
+    """Simulate from sample `first`, with derivatives along p directions (p may be 0).
 
-    `disturbance` (steps, d); `unit` (m,); `x` (steps + 1, n); `u` (steps, m); `status` (steps,);
-    `lam` (h,). Derivatives: `dx` (steps + 1, n, p) or, to save memory, (2, n, p), where the last
-    samples overwrite earlier ones; `du` (steps, m, p) or (1, m, p); `dy` (steps + 1, q, p) are
-    those of y = `seen` x, `seen` (q, n).
+    `disturbance` (steps, d); `unit` (m,).
     """
     loop, dloop, rows, drows, body = borrowed((loop, dloop, rows, drows, body))
     pushes, disturbance, aim, unit, work = borrowed((pushes, disturbance, aim, unit, work))
-    x, u, dx, du, status = borrowed((x, u, dx, du, status))
-    lam, seen, dy = borrowed((lam, seen, dy))
+    x, u, dx, du, seen, dy, status, lam = borrowed(trace)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
     away, daway = np.empty(x.shape[1]), np.empty(dx.shape[1:])
@@ -198,16 +200,22 @@ def run(
             )
         if local:
             ahead[:] = dx[0]
-        size = 0.0
-        for i in range(x.shape[1]):
-            if not abs(x[t + 1, i]) <= size:  # also true for NaN
-                size = abs(x[t + 1, i])
-        if not size < divergence:
+        if not _largest(x[t + 1]) < divergence:
             status[t] = DIVERGED
             _hold(x, dx, t)
             return weakly_active, -1
     _observe(seen, dx[len(u) % len(dx)], dy[len(u)])
     return weakly_active, -1
+
+
+@njit(cache=True, inline="always")
+def _largest(x: Buffer) -> float:
+    """Largest magnitude of an entry, or NaN."""
+    size = 0.0
+    for i in range(len(x)):
+        if not abs(x[i]) <= size:  # also true for NaN
+            size = abs(x[i])
+    return size
 
 
 @njit(cache=True, inline="always")

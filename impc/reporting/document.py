@@ -6,6 +6,7 @@ whose `format` escapes its arguments.
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from impc.files.spreadsheet import workbook_bytes
 from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
-from impc.reporting.style import inline, written
+from impc.reporting.style import drawn, inline, on_paper
 from impc.reporting.verdict import Alert, Key, Verdict
 
 
@@ -132,7 +133,14 @@ class Report:
 
     def picture(self, shown: Picture) -> Markup:
         """Inline SVG of a figure."""
-        return inline(self.figures[shown.name], shown.name, shown.alternative, phone=shown.phone)
+        draw = self.figures[shown.name]
+        narrow = drawn(draw, "svg", narrow=True) if shown.phone else None
+        return inline(self._wide[shown.name], narrow, shown.name, shown.alternative)
+
+    @functools.cached_property
+    def _wide(self) -> dict[str, bytes]:
+        """Wide figures, drawn once for page and files."""
+        return {name: drawn(draw, "svg") for name, draw in self.figures.items()}
 
     def findings(self) -> list[Finding]:
         """Findings of the page, in page order."""
@@ -156,17 +164,17 @@ class Report:
         }
         found = {item.name: item.data() for item in self.findings()}
         own = {"schema": SCHEMA, **self.provenance.data(), "verdict": self.verdict.data()}
-        drawn = {
-            f"figures/{name}.{kind}": written(draw, kind)
-            for name, draw in self.figures.items()
-            for kind in (("svg", "pdf") if pdf else ("svg",))
-        }
+        figures = {f"figures/{name}.svg": on_paper(svg) for name, svg in self._wide.items()}
+        if pdf:
+            figures |= {
+                f"figures/{name}.pdf": drawn(draw, "pdf") for name, draw in self.figures.items()
+            }
         return {
             "report.html": self.page().encode(),
             "result.json": json_bytes({**own, **self.data, "findings": found}),
             **{f"{name}.csv": csv_bytes(table) for name, table in tables.items()},
             **({"tables.xlsx": workbook_bytes(sheets, self._readme(sheets))} if sheets else {}),
-            **drawn,
+            **figures,
         }
 
     def _readme(self, sheets: Mapping[str, pd.DataFrame]) -> pd.DataFrame:

@@ -103,24 +103,28 @@ def strip(ax: Axes, title: str) -> None:
     ax.axhline(0, color=RULE, linewidth=0.8, zorder=0)
 
 
-def written(draw: Callable[[bool], Figure], kind: str) -> bytes:
-    """Bytes of the wide figure as a "svg" or "pdf" file, without date or program name."""
+def drawn(draw: Callable[[bool], Figure], kind: str, *, narrow: bool = False) -> bytes:
+    """Figure as a "svg" or "pdf" file, without date or program name; the svg is transparent."""
     with page_style():
-        return render(draw(False), kind)
+        return render(draw(narrow), kind, ground="none" if kind == "svg" else PAPER)
 
 
-def inline(draw: Callable[[bool], Figure], name: str, title: str, *, phone: bool) -> Markup:
-    """Inline SVG of a figure; with `phone` also a narrow version, between which CSS chooses."""
+def on_paper(svg: bytes) -> bytes:
+    """Figure of `drawn` on a white ground, for viewers with a dark one."""
+    head, _, rest = svg.partition(b"<defs>")
+    return head + f'<rect width="100%" height="100%" fill="{PAPER}"/>\n <defs>'.encode() + rest
+
+
+def inline(wide: bytes, narrow: bytes | None, name: str, title: str) -> Markup:
+    """Inline SVG of a figure as `drawn`, and of a narrow version, between which CSS chooses."""
     name = re.sub(r"\W+", "-", name)  # in ids of the page
-    with page_style():
-        parts = [_svg(draw(False), f"{name}-w", title, "w" if phone else "")]
-        if phone:
-            parts.append(_svg(draw(True), f"{name}-n", title, "n"))
-    return Markup("").join(parts)
+    if narrow is None:
+        return _svg(wide, f"{name}-w", title, "")
+    return _svg(wide, f"{name}-w", title, "w") + _svg(narrow, f"{name}-n", title, "n")
 
 
-def _svg(figure: Figure, name: str, title: str, kind: str) -> Markup:
-    text = render(figure, "svg", ground="none").decode()
+def _svg(figure: bytes, name: str, title: str, kind: str) -> Markup:
+    text = figure.decode()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r'\bid="([^"]+)"', rf'id="{name}-\1"', text)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.control.closed_loop import first_stages
 from impc.studies.selection.model import sensitivity
 
 if TYPE_CHECKING:
@@ -62,13 +63,15 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
     along = m * n + m**2 + n + len(problem.logarithms)
     horizon = max(problem.horizon, *settings.horizons, 1)
     sides = (problem.bounds.x_min, problem.bounds.x_max, problem.bounds.u_min, problem.bounds.u_max)
-    rows = float(sum(int(np.isfinite(side).sum()) for side in sides) * horizon)
+    stages = first_stages(horizon, problem.solver)
+    families = float(sum(int(np.isfinite(side).sum()) for side in sides))
+    rows = families * stages
     samples = sum(trial.samples for trial in trials)
     longest = max(trial.samples for trial in trials)
-    derivatives = rows * horizon * m * along
-    numbers = derivatives + 4 * rows * horizon * m + rows**2
+    derivatives = rows * stages * m * along
+    numbers = derivatives + 2 * (rows + families * horizon) * stages * m + rows**2
     numbers += 2 * longest * (n + m) * along + 2 * samples * len(plant.outputs) * along
-    once = samples * n * horizon * SECONDS_A_SAMPLE * _SLOWER[problem.solver]
+    once = samples * n * stages * SECONDS_A_SAMPLE * _SLOWER[problem.solver]
     once += derivatives * _A_NUMBER + len(trials) * _A_TRIAL
     left_out = len(trials) if settings.held_out and len(trials) > 1 else 0
     structures = (settings.structure is not None) + len(settings.structures)

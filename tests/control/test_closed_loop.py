@@ -25,7 +25,6 @@ from impc.model.plant import Plant
 from impc.model.weights import Weights
 from tests.support import random_plant, random_weights
 
-
 dual: Any = solve_dual
 
 

@@ -93,7 +93,7 @@ def test_consent(monkeypatch: pytest.MonkeyPatch) -> None:
         require_consent(Effort(60, machine + 1), given=True)
 
 
-@pytest.mark.parametrize("setting", ["replicates = 1000000", "horizon = 5000"])
+@pytest.mark.parametrize("setting", ["replicates = 1000000", 'horizon = 5000\nsolver = "daqp"'])
 def test_a_request_for_hours_or_memory_ends_at_once(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -238,15 +238,15 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     doubted = lack[-1] is not None and lack[-1].alarm
     test = weights_test(fitted, estimate, contradicted=doubted)
 
-    def whole_set() -> tuple[WeightsSummary | None, str]:
+    def whole_set(pool: ThreadPoolExecutor) -> tuple[WeightsSummary | None, str]:
         """Summary of all weights with the fitted gain, or None and the reason."""
         if not usable or test.rejected:
             return None, test.sentence if usable else _UNUSABLE
         drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
         draws = attempt("drawn gains", drawn, ()) if settings.intent_draws else ()
-        return weights_summary_or_reason(plant, K, metrics, sizes, draws)
+        return weights_summary_or_reason(plant, K, metrics, sizes, draws, pool.map)
 
-    methods, held_out, weights_found = _beside_it(
+    methods, held_out, weights_found, curves = _beside_it(
         problem, own, list(found.values())[:-1], settings, progress, attempt, whole_set
     )
     structures = _structures(problem, settings, fitted, progress)
@@ -255,7 +255,6 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     trials = _agreements(known, methods[-1].runs, problem.bounds)
     body_known = replace(fitted, problem=fitted.problem.with_body_fixed())
     person = functools.partial(_person, problem, settings, body_known, progress)
-    curves = attempt("limit curve", functools.partial(_curves, fitted, methods[-1]), ())
     return FitResult(
         settings,
         problem,
@@ -317,10 +316,14 @@ def _estimates(
     problem: Problem, fitted: Estimate, settings: FitSettings, progress: FitProgress
 ) -> dict[str, Estimate]:
     """Estimates of all methods, inverse MPC last; each also tries the solutions of the others."""
-    found = {
-        name: progress.estimate(name, functools.partial(METHODS[name].estimate, problem, fitted))
-        for name in _beside(settings)
-    }
+
+    def estimate(name: str) -> Estimate:
+        compute = functools.partial(METHODS[name].estimate, problem, fitted)
+        return progress.estimate(name, compute)
+
+    names = _beside(settings)
+    with threads(_THREADS) as pool:
+        found = dict(zip(names, pool.map(estimate, names), strict=True))
     return cross_checked(problem, found | {"inverse_mpc": fitted})
 
 
@@ -331,29 +334,37 @@ def _beside_it(
     settings: FitSettings,
     progress: FitProgress,
     attempt: Attempt,
-    whole_set: Callable[[], tuple[WeightsSummary | None, str]],
-) -> tuple[tuple[MethodFit, ...], tuple[HeldOut, ...], tuple[WeightsSummary | None, str]]:
-    """Other methods, left-out trials and the set of weights, computed in parallel."""
+    whole_set: Callable[[ThreadPoolExecutor], tuple[WeightsSummary | None, str]],
+) -> tuple[
+    tuple[MethodFit, ...],
+    tuple[HeldOut, ...],
+    tuple[WeightsSummary | None, str],
+    tuple[LimitCurve, ...],
+]:
+    """Other methods, left-out trials, limit curves and the set of weights, in parallel."""
     methods, held_out = [own], []
     with threads(_THREADS) as pool:
         pending = _left_out(pool, own.estimate, settings, progress)
-        in_background = pool.submit(whole_set)
+        limits = pool.submit(
+            attempt, "limit curve", functools.partial(_curves, own.estimate, own), ()
+        )
         for found in others[::-1]:
             methods.insert(0, evaluate_method(found, problem.bounds))
             progress.done(found.method)
+        found_set = whole_set(pool)
+        progress.done("set of weights")
         for index, other in enumerate(pending):
             predicted = functools.partial(
                 _predicted, other, problem.recordings[index], settings.settle
             )
             held_out.append(attempt(_without(index), predicted, None))
             progress.done(_without(index))
-        found_set = in_background.result()
-        progress.done("set of weights")
+        curves = limits.result()
     if None in held_out:
         held_out = []  # the table has rows for all trials or for none
     if held_out:
         methods[-1] = replace(own, held_out=frozen([item.vaf for item in held_out]))
-    return tuple(methods), tuple(held_out), found_set
+    return tuple(methods), tuple(held_out), found_set, curves
 
 
 def _predicted(other: Future[Estimate], trial: Recording, settle: float) -> HeldOut:
