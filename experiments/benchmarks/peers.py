@@ -13,13 +13,13 @@ from experiments.certificates import weights_from_parameters
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number
+from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from experiments.benchmarks.workloads import Workload
     from impc.arrays import Array
 
-__all__ = ["casadi_loop", "cvxpy_nelder_mead"]
+__all__ = ["casadi_fit", "casadi_loop", "cvxpy_fit"]
 
 _OPTIONS: dict[str, dict[str, Any]] = {
     "daqp": {"error_on_fail": False},
@@ -77,14 +77,32 @@ def casadi_loop(work: Workload, solver: str) -> Any:
     return ca.Function("loop", [K], [states])
 
 
-def cvxpy_nelder_mead(
-    work: Workload, start: Weights, condition_weight: float, budget: int
-) -> tuple[Weights, int]:
-    """Inverse MPC as a plain script: Nelder-Mead over Cholesky entries, cvxpy inside.
+def casadi_fit(work: Workload, loop: Any, begin: Array) -> Array:
+    """Gain (m, n) as a careful user of CasADi fits it: `casadi_loop` under least squares.
 
-    There is no terminal set, because computing one at every iterate would dominate the time. The
-    simplex collapses on the kinks of the objective and is restarted from there until the budget of
-    simulations is spent.
+    Derivatives are finite differences; a gain that CasADi cannot simulate gets a large residual.
+    """
+    recorded, C = work.problem.recordings[0].outputs, work.controller.plant.C
+    shape = work.controller.K.shape
+
+    def residual(k: Array) -> Array:
+        try:
+            states = np.array(loop((begin.ravel() * k).reshape(shape))).T
+        except RuntimeError:
+            return np.full((len(recorded) - 1) * len(C), 1e3)
+        return np.asarray((states @ C.T - recorded[1:]).ravel())
+
+    found = scipy.optimize.least_squares(
+        residual, np.ones(begin.size), method="trf", xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
+    return np.asarray((begin.ravel() * found.x).reshape(shape))
+
+
+def cvxpy_fit(work: Workload, start: Weights) -> tuple[Weights, int]:
+    """Inverse MPC as a plain script: least squares over Cholesky entries of Q, cvxpy inside.
+
+    R is one and there is no terminal set, because computing one at every iterate would dominate the
+    time. Derivatives are finite differences.
 
     Returns
     -------
@@ -96,23 +114,21 @@ def cvxpy_nelder_mead(
     n, horizon = plant.n, problem.horizon
     x0 = cp.Parameter(n)
     u, x = cp.Variable((horizon, 1)), cp.Variable((horizon + 1, n))
-    q, r, p = cp.Parameter((n, n)), cp.Parameter((1, 1)), cp.Parameter((n, n))
+    q, p = cp.Parameter((n, n)), cp.Parameter((n, n))
     cost = cp.sum_squares(x[horizon] @ p)
     constraints = [x[0] == x0, cp.abs(u) <= limit]
     for k in range(horizon):
-        cost += cp.sum_squares(x[k] @ q) + cp.sum_squares(u[k] @ r)
+        cost += cp.sum_squares(x[k] @ q) + cp.sum_squares(u[k])
         constraints.append(x[k + 1] == plant.A @ x[k] + plant.B @ u[k])
     program = cp.Problem(cp.Minimize(cost), constraints)
     count = 0
 
-    def objective(parameters: Array) -> float:
+    def residual(parameters: Array) -> Array:
         nonlocal count
         count += 1
         weights = weights_from_parameters(parameters, n, 1)
-        solution = solve_lqr(plant, weights)
         q.value = np.linalg.cholesky(weights.Q)
-        r.value = np.linalg.cholesky(weights.R)
-        p.value = np.linalg.cholesky(solution.P)
+        p.value = np.linalg.cholesky(solve_lqr(plant, weights).P)
         states = [recorded[0]]
         for _ in range(len(recorded) - 1):
             x0.value = states[-1]
@@ -120,17 +136,8 @@ def cvxpy_nelder_mead(
             if u.value is None:
                 raise SolverError("cvxpy", f"no answer: {program.status}", "start elsewhere")
             states.append(plant.A @ states[-1] + plant.B @ u.value[0])
-        misfit = float(np.linalg.norm(np.array(states) - recorded))
-        return misfit + condition_weight * condition_number(weights)
+        return np.asarray((np.array(states) - recorded).ravel())
 
-    factor = np.linalg.cholesky(start.Q)
-    parameters: Array = np.asarray(factor[np.tril_indices(n)], dtype=np.float64)
-    while count < budget:
-        found = scipy.optimize.minimize(
-            objective,
-            parameters,
-            method="Nelder-Mead",
-            options={"maxfev": budget - count, "xatol": 1e-7, "fatol": 1e-9},
-        )
-        parameters = np.asarray(found.x, dtype=np.float64)
-    return weights_from_parameters(parameters, n, 1), count
+    begin = np.linalg.cholesky(start.Q / float(start.R[0, 0]))[np.tril_indices(n)]
+    found = scipy.optimize.least_squares(residual, begin, diff_step=np.full(len(begin), 1e-5))
+    return weights_from_parameters(np.asarray(found.x, dtype=np.float64), n, 1), count

@@ -74,12 +74,13 @@ def with_horizon(work: Workload, horizon: int) -> Workload:
     return _record(work.weights, controller, work.drives, controller.plant, terminal_set=False)
 
 
-def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
+def chain_of_masses(states: int, steps: int = 3000, seed: int = 0, inputs: int = 1) -> Workload:
     """A chain of masses, springs and dampers whose first mass has a negative spring.
 
     `states` / 2 masses of 1 kg, springs of 40 N/m, dampers of 1 Ns/m between neighbours; the last
     mass is tied to a wall, the first is pushed away from the origin by 5 N/m: one unstable mode. A
-    bounded force acts on the first mass, a random one, held for 0.25 s, on the last.
+    bounded force acts on each of the first `inputs` masses, a random one, held for 0.25 s, on the
+    last.
     """
     masses = states // 2
     laplacian = 2 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
@@ -88,17 +89,18 @@ def chain_of_masses(states: int, steps: int = 3000, seed: int = 0) -> Workload:
     stiffness[0, 0] -= 40.0 / masses + 5.0  # Overcomes the stiffness of the chain: unstable
     eye, zero = np.eye(masses), np.zeros((masses, masses))
     A = np.block([[zero, eye], [-stiffness, -laplacian]])
-    B = np.zeros((states, 2))
-    B[masses, 0] = B[-1, 1] = 1.0
-    system = control.c2d(control.ss(A, B, np.eye(states), 0, inputs=["force", "push"]), 1 / _RATE)
-    plant = Plant(system, ["force"])
-    weights = Weights(np.eye(states), 1e-2)
+    B, forces = np.zeros((states, inputs + 1)), [f"force{k}" for k in range(inputs)]
+    B[masses : masses + inputs, :inputs] = np.eye(inputs)
+    B[-1, inputs] = 1.0
+    continuous = control.ss(A, B, np.eye(states), 0, inputs=[*forces, "push"])
+    plant = Plant(control.c2d(continuous, 1 / _RATE), forces)
+    weights = Weights(np.eye(states), 1e-2 * np.eye(inputs))
     push = np.random.default_rng(seed).choice([-1.0, 0.0, 1.0], size=steps // 25 + 1)
     controller = Controller(plant, weights, Bounds(plant), 20, terminal_set=False)
     drive = scenario(plant, np.zeros(states), disturbance=np.repeat(push, 25)[:steps])
     # About one sample in ten reaches this limit.
     free = require_complete(controller, simulate(controller, drive))
-    limit = float(np.quantile(np.abs(free.u), 0.9))
+    limit = np.quantile(np.abs(free.u), 0.9, axis=0)
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
     return _record(weights, replace(controller, bounds=bounds), [drive], plant, terminal_set=False)
 

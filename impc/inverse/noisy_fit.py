@@ -208,7 +208,8 @@ def _beginnings(free: GainFit, start: Weights | None) -> Iterator[Weights]:
     for regulator in regulators(free.problem)[:_BEGINNINGS]:
         if not free.explained:
             yield regulator.weights
-        yield _nearest(free, regulator)
+        if free.stabilises:  # without bounds a search may end at an unstable gain
+            yield _nearest(free, regulator)
         if free.explained:
             yield regulator.weights
     with contextlib.suppress(WeightsError, SolverError):  # skip this start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import control
 import numpy as np
 import pytest
 
@@ -13,16 +14,22 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.control.closed_loop import simulate
+from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.inverse.coordinates import Coordinates
 from impc.inverse.estimates import Estimate
+from impc.inverse.gain_search import fit_gain
 from impc.inverse.methods import fit
 from impc.inverse.noisy_fit import fit_controller, with_fitted_starts
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
+from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily, plant_at, plant_differential
 from impc.model.recordings import Recording
+from impc.model.riccati import stabilises
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.simulation import simulate_person
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -222,3 +229,15 @@ def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
     usable = np.isfinite(covariance.entries[0])
     assert np.count_nonzero(usable) > 0
     np.testing.assert_allclose(covariance.entries[0][usable], theory[:10][usable], rtol=0.1)
+
+
+def test_weights_are_found_where_the_free_gain_is_unstable() -> None:
+    """Without bounds and with strong noise in the loop the free gain need not stabilise."""
+    pole = control.ss([[0, 1], [9.0, 0]], [[0], [1]], [[1, 0]], 0, states=["x", "v"], inputs=["u"])
+    plant = Plant(control.c2d(pole, 0.02), ["u"])
+    law = Controller.from_gain(plant, [[30.0, 7.0]], Bounds(plant), 5, terminal_set=False)
+    y = simulate_person(law, Observer(plant, motor=4.0), steps=600).outputs
+    trial = Recording(plant, y)
+    problem = Problem(plant, Bounds(plant), 5, (trial,), terminal_set=False, unknown_start=True)
+    assert not fit_gain(problem).stabilises
+    assert stabilises(plant, np.array(fit(problem).gain))
