@@ -48,6 +48,7 @@ help:
 	@echo 'make slow       hundreds of recordings, fits and subjects: an hour'
 	@echo 'make docs       build the site in docs/_build/html; warnings are errors, examples run (minutes)'
 	@echo 'make reproduce  write docs/reproduction: every claim of the dissertation (half an hour)'
+	@echo '                DATA=folder: pages in experiments/ from public recordings (half an hour)'
 	@echo 'make wheel      build a wheel and run it in empty environments of Python 3.11 and 3.13'
 	@echo 'make look       check every kind of report page on desk and phone (needs chromium)'
 	@echo 'make measure    sizes of the code, tests and pages (a minute)'
@@ -92,8 +93,15 @@ docs: env
 architecture: env
 	$(PY) -m docs.layers
 
+# DATA=folder: public recordings that are not part of the project (their pages say where they are).
 reproduce: env
+ifdef DATA
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.rotary_pendulum $(DATA)/rotary-pendulum
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.steering $(DATA)/cphs2017
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.two_link_standing
+else
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.reproduction
+endif
 
 # The wheel, not the checkout: in empty environments of the oldest and the newest Python, in another folder.
 WHEEL_PYTHONS ?= python3.11 python3.13
