@@ -2,15 +2,22 @@
 A bilevel program of your own in CasADi
 =======================================
 
+IPOPT finds the weights behind a recording through a closed loop that is one CasADi function.
+
+.. image:: images/sphx_glr_loop_in_casadi_001.png
+   :alt: recorded states, those of the starting weights, and those of the weights that are found
+
 ``impc.closed_loop_function`` returns a whole closed loop as a ``casadi.Function`` with exact
 derivatives. In the loop the controller solves a quadratic program at each bound. The upper level
-can be any program in CasADi. Here IPOPT estimates the weights behind a recording.
+can be any program in CasADi.
 """
 
 # %%
 # The recording: 20 steps of an unstable plant whose input may not exceed one, under Q = I, R = 1.
 import casadi as ca
+import matplotlib.pyplot as plt
 import numpy as np
+from terminal import RESULTS, show
 
 import impc
 from plants import yalmip_example
@@ -81,6 +88,18 @@ print("Q =", (np.round(weights.Q, 6) + 0.0).tolist())
 # These are the weights that made the recording. The misfit determines the gain, which is two of
 # the three numbers; the condition measure determines the third (:doc:`/why/equivalent_weights`).
 print("residual (3.10) below 1e-6:", impc.weight_error(weights, truth_weights) < 1e-6)
+
+# %%
+# The recording, the loop at the start of the search, and the loop that is found:
+figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
+axes.plot(recorded.x[:, 0], "ko", markersize=4, label="recorded")
+for Q, label in ((np.diag([2, 0.5]), "start"), (weights.Q, "found")):
+    axes.plot(loop(Q, 1, recorded.x[0], np.zeros((20, 0)))[0].full()[:, 0], label=label)
+axes.set(xlabel="sample", ylabel="first state")
+axes.legend()
+RESULTS.mkdir(exist_ok=True)
+figure.savefig(RESULTS / "loop-in-casadi.png")
+show("loop-in-casadi.png")
 
 # %%
 # One step of the controller is a function of the state. It is an ordinary CasADi graph, so it can

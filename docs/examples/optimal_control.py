@@ -2,9 +2,14 @@
 A nonlinear problem of your own, from file to report
 ====================================================
 
-A subject swings up a pole that hangs from a cart. Two masses, the limit of the force and the cost
-weight of the angle are unknown. The recording holds position, angle and force, but no speed. The
-problem is a function in CasADi, and a TOML file says what the columns mean.
+A subject swings up a pole that hangs from a cart, and impc finds masses, limit and cost weight.
+
+.. image:: images/sphx_glr_optimal_control_001.svg
+   :alt: recorded and fitted movement of cart and pole, with the force
+
+Two masses, the limit of the force and the cost weight of the angle are unknown. The recording holds
+position, angle and force, but no speed. The problem is a function in CasADi, and a TOML file says
+what the columns mean.
 """
 
 from terminal import RESULTS, show, terminal, write

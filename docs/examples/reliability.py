@@ -2,8 +2,12 @@
 Reliability of a test
 =====================
 
-How repeatable are the measures of the seated-balance test between visits? The data are four
-simulated subjects, three visits, three conditions and three trials of 29 s.
+Transfer functions of the same subject differ between visits: how repeatable is the test?
+
+.. image:: images/sphx_glr_reliability_001.svg
+   :alt: transfer functions from the push to the angles, one line for each visit
+
+The data are four simulated subjects, three visits, three conditions and three trials of 29 s.
 """
 
 from terminal import show, terminal

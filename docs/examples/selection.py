@@ -2,6 +2,11 @@
 Which parameters of a simulation model can be identified
 ========================================================
 
+Only some parameters of a model can be identified, and the selection finds them.
+
+.. image:: images/sphx_glr_selection_001.svg
+   :alt: estimated parameters with their intervals
+
 The selection works with any function from parameters and an input to outputs. Here the model is a
 drug in the blood, from dose to concentration, with time in hours.
 """

@@ -3,6 +3,10 @@ Motor noise inside the loop
 ===========================
 
 A muscle adds noise to its command, the body moves, and the subject responds to this motion too.
+
+.. image:: images/sphx_glr_sensory_noise_001.png
+   :alt: the same subject and push with and without motor noise
+
 Least squares attributes everything it does not explain to the recorder. Here a simulated subject
 holds a cart in place with a noisy hand, and is fitted by least squares and by maximum likelihood.
 """

@@ -18,10 +18,10 @@ _HEAD = """\
 # The reproduction table
 
 Every equation, table, figure and numerical claim of the dissertation (A. Ramadan, Michigan State
-University, 2018): what it says, what is found here and where, and how it stands. Most of its
+University, 2018): how it stands, what it says, what is found here and where. Most of its
 equations and numbers are lost from the available text; its recordings were never public.
 Written by `make reproduce`, which runs the commands of the package and computes every number in
-the third column.
+the last column.
 
 - **reproduced**: the same statement holds here, checked against something independent.
 - **reproduced in kind**: found on a stand-in or on simulated subjects, or rebuilt from the text
@@ -39,7 +39,7 @@ def page(chapters: Sequence[Chapter]) -> str:
     parts = [_HEAD, f"Of {len(everything)} lines: {counted}.\n"]
     for chapter in chapters:
         parts.append(f"## {chapter.title}\n\n{chapter.stand_in}\n")
-        parts.append("| | the dissertation | here | verdict |\n|---|---|---|---|")
+        parts.append("| verdict | | the dissertation | here |\n|---|---|---|---|")
         parts.extend(_row(entry) for entry in chapter.entries)
         parts.append("")
     parts.append("## Figures beside their counterparts\n")
@@ -55,7 +55,7 @@ def figure_name(entry: Entry) -> str:
 def _row(entry: Entry) -> str:
     where = ", ".join(f"`{name}`" for name in entry.where)
     why = f" {entry.why}" if entry.why else ""
-    cells = (entry.item, entry.says, f"{entry.found} ({where})", f"**{entry.verdict.value}**.{why}")
+    cells = (f"**{entry.verdict.value}**.{why}", entry.item, entry.says, f"{entry.found} ({where})")
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

@@ -18,13 +18,13 @@ PAGE = (FOLDER / "index.md").read_text(encoding="utf-8")
 ROWS = [
     [cell.replace("\\|", "|").strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
     for line in PAGE.splitlines()
-    if line.startswith("| ") and not line.startswith("| |")
+    if line.startswith("| **")
 ]
 TABLES = {"2": 6, "3": 2, "4": 3, "5": 5, "C": 1}
 
 
 def test_every_line_has_a_verdict_and_says_why_where_it_must() -> None:
-    for item, _, _, verdict in ROWS:
+    for verdict, item, _, _ in ROWS:
         word, _, why = verdict.removeprefix("**").partition("**.")
         assert word in {known.value for known in Verdict}, item
         assert word == "reproduced" or why.strip(), f"{item}: {word}, but not why"
@@ -46,7 +46,7 @@ def test_every_figure_is_there() -> None:
 
 
 def test_quick_entries_come_out_as_the_page_says() -> None:
-    shown = {row[0] + row[1]: row[3] for row in ROWS}
+    shown = {row[1] + row[2]: row[0] for row in ROWS}
     for entry in controller_entries():
         says = shown[entry.item + entry.says]
         assert says.startswith(f"**{entry.verdict.value}**"), entry
