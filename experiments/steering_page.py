@@ -44,7 +44,7 @@ trials. The simulation starts at the recorded cursor with the hand at rest. The 
 (`impc.assess.ceiling`) is the part that repeats between the two periods, with a 95 % interval. No \
 bound is set, so inverse MPC differs from LQR only in what is fitted. Classical inverse LQR \
 approximates a gain and not the movement. Where the gain is not identified, a near gain can move \
-differently or have no cost weights. Output feedback is fitted to one trial with a small budget, \
+differently or have no cost weights. Output feedback is fitted to one trial, \
 because of its run time. A VAF far below 0 means that this fit failed, and not that the model is \
 rejected.
 """
@@ -69,8 +69,6 @@ _EXPLAINED = {
     "directions of the gain": "The remaining directions of the gain have no effect on these "
     "recordings.",
     "Another gain has": "The gain that fits best belongs to no cost weights.",
-    "stopped after": "The likelihood search of output feedback has a small budget and did not "
-    "converge: its row is no upper limit of this model.",
     "converged": "The likelihood search of output feedback converged.",
     "smaller misfit here": "The search ended in a local minimum.",
 }
@@ -221,7 +219,7 @@ def table(case: Case) -> str:
             f"| {one.label} | {np.mean(one.train[:, 0]):.1f} | {one.mean:.1f} | {own} | "
             f"{np.mean(one.test[:, 1]):.1f} | {one.seconds:.0f} |"
         )
-    missing = [f"{one.label} has no controller: {one.reason}." for one in case.fits if one.reason]
+    missing = [f"{one.label} has no result: {one.reason}." for one in case.fits if one.reason]
     return "\n".join([f"### {case.title}: {PLANTS[case.kind]}", "", *rows, "", *missing])
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import control
@@ -20,6 +20,9 @@ import scipy.optimize
 import impc
 from impc.arrays import Array
 from impc.model.continuous_gain import continuous_gain
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = [
     "DURATION",
@@ -271,7 +274,7 @@ def fits_of(seed: int, noisy: bool) -> Fits:
         return continuous_gain(plant, np.asarray(estimates[-1].gain))[0]
 
     body = standing(recording[0])
-    runs = {
+    runs: dict[str, Callable[[], Array]] = {
         "feedback_gain": lambda: from_impc("feedback_gain", problem.output_scale),
         "equal": lambda: from_impc("feedback_gain", np.ones(4)),
         "inverse_mpc": lambda: from_impc("inverse_mpc", problem.output_scale),

@@ -126,10 +126,10 @@ def _explained(groups: dict[str, list[Fits]]) -> str:
 
 The true gain, sampled, {says} quadratic weights: `impc.inverse_lqr_lmi` ends with "{true.status}".
 The free gains of {none} of {len(every)} recordings have no weights either. The
-stability margin explains this. An optimal state feedback of the continuous plant stays stable if all its
-gains are multiplied by any factor above 0.5, whatever the weights. The true gain becomes unstable at
-factor {factor:.3f}: its ankle stiffness is {GAIN[0, 0]:.0f} N m/rad, {GAIN[0, 0] / stiffness:.2f}
-times that of gravity ({stiffness:.0f} N m/rad).
+stability margin explains this. An optimal state feedback of the continuous plant stays stable if
+all its gains are multiplied by any factor above 0.5, whatever the weights. The true gain
+becomes unstable at factor {factor:.3f}: its ankle stiffness is {GAIN[0, 0]:.0f} N m/rad,
+{GAIN[0, 0] / stiffness:.2f} times that of gravity ({stiffness:.0f} N m/rad).
 
 `inverse_mpc` must therefore choose another gain. Its median ankle stiffness is {ankle:.0f} N m/rad,
 {ankle / stiffness:.2f} times that of gravity. Its misfit is {ratio:.1f} times that of the free gain
@@ -193,7 +193,7 @@ Each row changes one assumption; the {_GAINS[4]} column is the median signed err
 - One-step regression has noise in its regressors, which biases it on clean recordings too.
 
 impc gave these doubts; the causes are those of this page (unmodelled process noise, linear body,
-held torque, and weights that do not exist):
+held torque, weights that do not exist, and the failed search with equal scales):
 
 {_doubts([one.doubts for one in every])}
 
@@ -217,7 +217,8 @@ def _page(groups: dict[str, list[Fits]], zero: Array, euler: Array) -> str:
     return f"""# Two-link standing: eight gains of Park, Horak and Kuo (2004)
 
 impc `feedback_gain` is {behind[0]} direct collocation on clean recordings (error
-{free[0]:.1f} against {direct[0]:.1f} %) and {behind[1]} it on noisy ones ({free[1]:.1f} against {direct[1]:.1f} %). The
+{free[0]:.1f} against {direct[0]:.1f} %) and {behind[1]} it on noisy ones
+({free[1]:.1f} against {direct[1]:.1f} %). The
 error is the largest of eight gains, median of {len(clean)} recordings. Over the noisy recordings
 the largest error is {most["feedback_gain"]:.0f} % for impc and {most["collocation"]:.0f} % for
 collocation, so {len(noisy)} noisy recordings do not separate the two. Plain shooting has
@@ -247,13 +248,12 @@ Noisy (sensory noise in the loop as well):
 {_table(noisy)}
 
 With equal scales the search of `feedback_gain` ends far from the true gain (above 100 %) in
-{lost} of {len(clean + noisy)} recordings; its largest error is {far:.0f} %. There impc doubts the result
-itself: see the doubts below on the misfit and on identified directions. With its default scales
-impc has no such failure here.
+{lost} of {len(clean + noisy)} recordings; its largest error is {far:.0f} %. The doubts of all fits
+are listed below. With its default scales impc has no such failure here.
 
 Peer A is the formulation of opty: midpoint rule, states of all samples and gains as unknowns, IPOPT
-with exact derivatives. opty itself was not installed, because its interface to IPOPT could not be
-built; the problem is written in CasADi. It starts at the measured states and at zero gains. With
+with exact derivatives. opty itself could not be installed here;
+the problem is written in CasADi. It starts at the measured states and at zero gains. With
 backward Euler instead of the midpoint rule, its largest error on the first clean recording is
 {np.max(np.abs(100 * (euler / GAIN - 1))):.1f} %. Peer B is `scipy.optimize.least_squares` with
 finite differences over a Runge-Kutta simulation. It starts at the LQR gain of unit weights. From
