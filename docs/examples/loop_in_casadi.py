@@ -95,7 +95,7 @@ figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 axes.plot(recorded.x[:, 0], "ko", markersize=4, label="recorded")
 for Q, label in ((np.diag([2, 0.5]), "start"), (weights.Q, "found")):
     axes.plot(loop(Q, 1, recorded.x[0], np.zeros((20, 0)))[0].full()[:, 0], label=label)
-axes.set(xlabel="sample", ylabel="first state")
+axes.set(xlabel="sample (-)", ylabel="first state (-)")
 axes.legend()
 RESULTS.mkdir(exist_ok=True)
 figure.savefig(RESULTS / "loop-in-casadi.png")

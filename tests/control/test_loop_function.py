@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import runpy
 from pathlib import Path
 from typing import Any
@@ -182,9 +183,11 @@ def test_what_is_no_controller_is_nan(example_plant: Plant) -> None:
 
 
 def test_a_bilevel_program_of_ones_own_finds_the_weights(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The example of the dissertation, whose solution is Q = I."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    monkeypatch.setattr(importlib.import_module("terminal"), "RESULTS", tmp_path)
     runpy.run_path(str(ROOT / "docs/examples/loop_in_casadi.py"))
     printed = capsys.readouterr().out
     assert "Q = [[1.0, 0.0], [0.0, 1.0]]\n" in printed
