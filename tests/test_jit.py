@@ -68,8 +68,8 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
     shutil.copytree(ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "impc/__pycache__").write_text("a file, where numba would make a folder")
     code = (
-        "import impc.control.compiled_kernel\n"
-        "loop = impc.control.compiled_kernel\n"
+        "import impc.control.compiled_loop\n"
+        "loop = impc.control.compiled_loop\n"
         "print(type(loop.run._cache).__name__, loop.__file__)\n"
     )
     homeless = {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}
@@ -78,4 +78,4 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
         words, env=os.environ | homeless, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_kernel.py")]
+    assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_loop.py")]

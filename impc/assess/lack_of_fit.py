@@ -289,7 +289,7 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
     closed, dx = A + B @ local, np.zeros((trial.samples, plant.n, every.shape[2]))
     for t in range(len(u)):
         dx[t + 1] = closed[t] @ dx[t] + every[t]
-    seen = plant.C @ dx / problem.output_scale[:, None]
+    seen = problem.scaled_outputs @ dx
     rows = np.zeros((trial.samples, len(problem.measured), every.shape[2]))
     rows[:, : len(plant.outputs)] = seen
     flat = rows.reshape(-1, every.shape[2])

@@ -29,14 +29,13 @@ from impc.control.body_steps import body_tape, pushes
 from impc.control.compiled_kernel import (
     TOO_SHORT,
     LoopMatrices,
-    Trace,
     answer_with,
     deviate,
     fill_slack,
     return_to,
-    run,
     workspace,
 )
+from impc.control.compiled_loop import Trace, run
 from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
 from impc.control.named_solver import (
     COMPILED,

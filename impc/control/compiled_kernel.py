@@ -1,10 +1,8 @@
-"""Compiled code: the constrained controller and its closed loop, with derivatives.
-
-    u = -K x + v_0,    x+ = A x + B u + E d
+"""Compiled code: the constrained controller u = -K x + v_0, with derivatives.
 
 v is zero while the gain satisfies all bounds, else the solution of the least-distance problem
 (`compiled_dual`), which is checked before use. Notation and checks: docs/why/theory.md, section 4;
-equations of the derivatives: `closed_loop`; nonlinear bodies: `compiled_body`.
+equations of the derivatives: `closed_loop`; the loop over samples: `compiled_loop`.
 """
 
 from __future__ import annotations
@@ -14,8 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_body import BodyTape, move_body
-from impc.control.compiled_borrowed import borrowed
 from impc.control.compiled_dual import (
     DEPENDENT,
     INCONSISTENT,
@@ -78,19 +74,6 @@ class Aim(NamedTuple):
     dheld: Buffer
 
 
-class Trace(NamedTuple):
-    """What a simulation of some steps writes."""
-
-    x: Buffer  # (steps + 1, n)
-    u: Buffer  # (steps, m)
-    dx: Buffer  # (steps + 1, n, p); or (2, n, p), where the last samples overwrite earlier ones
-    du: Buffer  # (steps, m, p), or (1, m, p)
-    seen: Buffer  # (q, n), given: outputs whose derivatives are kept
-    dy: Buffer  # (steps + 1, q, p), seen dx
-    status: Buffer  # (steps,)
-    lam: Buffer  # (h,), multipliers of the last problem
-
-
 class Workspace(NamedTuple):
     """Arrays that are reused from sample to sample."""
 
@@ -148,84 +131,14 @@ def dot(a: Buffer, b: Buffer) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)  # held-out trials are fitted in parallel threads
-def run(
-    loop: LoopMatrices,
-    dloop: LoopMatrices,
-    rows: Rows,
-    drows: RowDirections,
-    body: BodyTape,
-    pushes: Buffer,
-    disturbance: Buffer,
-    aim: Aim,
-    divergence: float,
-    unit: Buffer,
-    work: Workspace,
-    first: int,
-    trace: Trace,
-    gain_only: bool,
-    local: bool,
-) -> tuple[int, int]:
-    """Simulate from sample `first`, with derivatives along p directions (p may be 0).
+@njit(cache=True, inline="always")
+def add(share: float, changes: Buffer, total: Buffer) -> None:
+    """Add share times `changes` (p,) to `total` (p,).
 
-    `disturbance` (steps, d); `unit` (m,).
+    Within a longer expression numba would take one number at a time: arrays might overlap.
     """
-    loop, dloop, rows, drows, body = borrowed((loop, dloop, rows, drows, body))
-    pushes, disturbance, aim, unit, work = borrowed((pushes, disturbance, aim, unit, work))
-    x, u, dx, du, seen, dy, status, lam = borrowed(trace)
-    plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
-    weakly_active = 0
-    away, daway = np.empty(x.shape[1]), np.empty(dx.shape[1:])
-    for t in range(first, len(u)):
-        at, moved, ahead = dx[t % len(dx)], du[t % len(du)], dx[(t + 1) % len(dx)]
-        _observe(seen, at, dy[t])
-        if status[t] > SOFTENED:
-            away[:], daway[:] = x[t], at
-            deviate(aim, rows, drows, work, t, away, daway)
-            status[t], near, row = law(
-                loop, dloop, rows, drows, unit, work, away, daway, lam, gain_only, u[t], moved
-            )
-            if status[t] > SOFTENED:
-                _hold(x, dx, t)
-                return weakly_active, row
-            return_to(aim, t, u[t], moved)
-            weakly_active += near
-        if body.address:
-            move_body(body, x[t], u[t], disturbance[t], at, moved, x[t + 1], ahead)
-            if len(pushes):
-                ahead += pushes[t]
-        else:
-            _advance(
-                loop, dloop, plant_moves, disturbance[t], x[t], at, u[t], moved, x[t + 1], ahead
-            )
-        if local:
-            ahead[:] = dx[0]
-        if not _largest(x[t + 1]) < divergence:
-            status[t] = DIVERGED
-            _hold(x, dx, t)
-            return weakly_active, -1
-    _observe(seen, dx[len(u) % len(dx)], dy[len(u)])
-    return weakly_active, -1
-
-
-@njit(cache=True, inline="always")
-def _largest(x: Buffer) -> float:
-    """Largest magnitude of an entry, or NaN."""
-    size = 0.0
-    for i in range(len(x)):
-        if not abs(x[i]) <= size:  # also true for NaN
-            size = abs(x[i])
-    return size
-
-
-@njit(cache=True, inline="always")
-def _observe(seen: Buffer, dx: Buffer, dy: Buffer) -> None:
-    """Compute dy = seen dx."""
-    for i in range(len(seen)):
-        dy[i] = 0.0
-        for j in range(len(dx)):
-            if seen[i, j] != 0.0:
-                _add(seen[i, j], dx[j], dy[i])
+    for c in range(len(total)):
+        total[c] += share * changes[c]
 
 
 @njit(cache=True, inline="always")
@@ -253,47 +166,6 @@ def return_to(aim: Aim, t: int, u: Buffer, du: Buffer) -> None:
         u += aim.u[t]
         if len(aim.dx):
             du += aim.du[t, :, : du.shape[1]]
-
-
-@njit(cache=True, inline="always")
-def _advance(
-    loop: LoopMatrices,
-    dloop: LoopMatrices,
-    plant_moves: bool,
-    disturbance: Buffer,
-    x: Buffer,
-    dx: Buffer,
-    u: Buffer,
-    du: Buffer,
-    following: Buffer,
-    dfollowing: Buffer,
-) -> None:
-    """Compute x+ = A x + B u + E d, `following`, and its derivative."""
-    n = len(x)
-    for i in range(n):
-        following[i] = dot(loop.A[i], x) + dot(loop.B[i], u) + dot(loop.E[i], disturbance)
-        ahead = dfollowing[i]
-        ahead[:] = 0.0
-        for j in range(n):
-            if loop.A[i, j] != 0.0:
-                _add(loop.A[i, j], dx[j], ahead)
-        for j in range(len(u)):
-            _add(loop.B[i, j], du[j], ahead)
-        if plant_moves:
-            for j in range(n):
-                _add(x[j], dloop.A[i, j], ahead)
-            for j in range(len(u)):
-                _add(u[j], dloop.B[i, j], ahead)
-            for j in range(len(disturbance)):
-                _add(disturbance[j], dloop.E[i, j], ahead)
-
-
-@njit(cache=True)
-def _hold(x: Buffer, dx: Buffer, t: int) -> None:
-    """Repeat the last state, so that samples that are not reached are finite."""
-    x[t + 1 :] = x[t]
-    if len(dx) == len(x):
-        dx[t + 1 :] = 0.0
 
 
 @njit(cache=True, inline="always")
@@ -451,8 +323,8 @@ def _apply(
         u[i] = v[i] - dot(loop.K[i], x)
         du[i] = dv0[i, : dx.shape[1]]
         for j in range(len(x)):
-            _add(-loop.K[i, j], dx[j], du[i])
-            _add(-x[j], dloop.K[i, j], du[i])
+            add(-loop.K[i, j], dx[j], du[i])
+            add(-x[j], dloop.K[i, j], du[i])
 
 
 @njit(cache=True)
@@ -492,7 +364,7 @@ def _keeps_later(work: Workspace, head: int, b: Buffer) -> bool:
     lefts = work.slack[head:].copy()
     for i in range(len(work.v)):
         if work.v[i] != 0.0:
-            _add(-work.v[i], work.M[i, head:], lefts)
+            add(-work.v[i], work.M[i, head:], lefts)
     return bool(np.all(lefts > _WEAK * b[head:]))
 
 
@@ -614,34 +486,24 @@ def _differentiate(
     q, dlam = np.zeros((width, p)), np.empty((active, p))
     for i in range(width):
         for j in range(m):
-            _add(v[i - i % m + j], dloop.S[i % len(dloop.S), j], q[i])
+            add(v[i - i % m + j], dloop.S[i % len(dloop.S), j], q[i])
     _add_pulls(rows, drows, lam, q)
     for a in range(active):
         r, change = free[a], dlam[a]
         change[:] = 0.0
-        _add(-1.0, work.dright[r], change)
+        add(-1.0, work.dright[r], change)
         for i in range(n):
-            _add(x[i], drows.T[r, i], change)
-            _add(rows.T[r, i], dx[i], change)
+            add(x[i], drows.T[r, i], change)
+            add(rows.T[r, i], dx[i], change)
         for i in range(rows.reach[r]):
-            _add(v[i], drows.M[r, i], change)
-            _add(-rows.N[r, i], q[i], change)
+            add(v[i], drows.M[r, i], change)
+            add(-rows.N[r, i], q[i], change)
     substitute_all(work.factor, active, dlam)
     for i in range(m):
         for j in range(m):
-            _add(-loop.S[i, j], q[j], dv0[i])
+            add(-loop.S[i, j], q[j], dv0[i])
         for a in range(active):
-            _add(-rows.N[free[a], i], dlam[a], dv0[i])
-
-
-@njit(cache=True, inline="always")
-def _add(share: float, changes: Buffer, total: Buffer) -> None:
-    """Add share times `changes` (p,) to `total` (p,).
-
-    As one line in the loops above, numba would take one number at a time: arrays might overlap.
-    """
-    for c in range(len(total)):
-        total[c] += share * changes[c]
+            add(-rows.N[free[a], i], dlam[a], dv0[i])
 
 
 @njit(cache=True)
@@ -650,8 +512,8 @@ def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, q: Buffer) -> None
     for r in range(len(lam)):
         if lam[r] != 0.0:
             for i in range(rows.reach[r]):
-                _add(lam[r], drows.M[r, i], q[i])
+                add(lam[r], drows.M[r, i], q[i])
             if lam[r] == rows.limit[r]:
                 # The penalty of a soft row is penalty / b: it depends on the bound.
                 for i in range(rows.reach[r]):
-                    _add(-rows.M[r, i] * lam[r] / rows.b[r], drows.b[r], q[i])
+                    add(-rows.M[r, i] * lam[r] / rows.b[r], drows.b[r], q[i])

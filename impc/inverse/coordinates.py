@@ -375,7 +375,7 @@ def start_unit(problem: Problem, gain: Array) -> Array:
     if complete and np.all(np.isfinite(second)) and np.all(np.diag(second) > 0):
         return np.asarray(np.linalg.cholesky(floored_covariance(second, _START_FLOOR)))
     T, _ = natural_coordinates(plant, gain)
-    natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
+    natural = float(np.linalg.norm(problem.scaled_outputs @ T))
     samples = sum(trial.samples for trial in problem.recordings)
     size = recorded_size(problem) / np.sqrt(samples)
     return size / natural * T if size > 0 and natural > 0 else T

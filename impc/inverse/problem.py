@@ -325,6 +325,11 @@ class Problem(Value):
         return self.trial_sizes + ([stated] if stated else [])
 
     @property
+    def scaled_outputs(self) -> Array:
+        """Outputs over their scale, as rows over the states (p, n)."""
+        return self.plant.C / self.output_scale[:, None]
+
+    @property
     def recorded_numbers(self) -> int:
         """Number of recorded values in all trials, missing ones excluded."""
         return sum(int(np.isfinite(recorded(self, trial)).sum()) for trial in self.recordings)

@@ -161,11 +161,10 @@ def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
     prepared = prepare_loop(controller, along)
     (trial,) = problem.recordings
     seen = _Seen.of(problem, None)
-    outputs = seen.weighting @ problem.plant.C
 
     def at(x0: Array, offset: Array) -> tuple[Array, Array]:
         moved = replace(trial, offset=frozen(offset))
-        run, sensitivity = run_loop(prepared, drive_of(trial, x0), seen=outputs)
+        run, sensitivity = run_loop(prepared, drive_of(trial, x0), seen=problem.scaled_outputs)
         slopes = _slope(problem, seen, moved, run, sensitivity, layout, None)
         return _difference(problem, seen, moved, run).ravel(), slopes[:, layout.own]
 
@@ -362,9 +361,8 @@ def measured_slope(
 def residual_along(problem: Problem, controller: Controller, along: Directions) -> Array:
     """Derivative of the residual (r, k) along directions of the controller."""
     parts, prepared = [], prepare_loop(controller, along)
-    outputs = problem.plant.C / problem.output_scale[:, None]
     for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-        _, moved = run_loop(prepared, drive, seen=outputs)
+        _, moved = run_loop(prepared, drive, seen=problem.scaled_outputs)
         parts.append(measured_slope(problem, trial, moved).reshape(-1, along.count))
     return np.concatenate(parts)
 

@@ -115,9 +115,9 @@ def _evaluated(problem: Problem, structure: Structure, y: Array) -> tuple[Array,
     x0 = np.zeros((problem.plant.n, count))
     x0[:searched, q : q + searched] = np.eye(searched)
     prepared = prepare_loop(law, directions(law, count, Q=dQ, R=dR, x0=x0))
-    errors, slopes, outputs = [], [], there.plant.C / there.output_scale[:, None]
+    errors, slopes = [], []
     for trial, drive in zip(there.recordings, scenarios(there), strict=True):
-        run, moved = run_loop(prepared, drive, proved=False, seen=outputs)
+        run, moved = run_loop(prepared, drive, proved=False, seen=there.scaled_outputs)
         error = missed(there, trial, run)
         if not run.complete:
             error[run.reached + 1 :] = far

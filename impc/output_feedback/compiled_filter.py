@@ -55,7 +55,7 @@ class Steady(NamedTuple):
 class FilterParts(NamedTuple):
     """Model of the filter, along q directions of which the first k change covariances."""
 
-    # controller, as in `compiled_kernel.run`, along all q directions; unit (m,)
+    # controller, as in `compiled_loop.run`, along all q directions; unit (m,)
     loop: LoopMatrices
     dloop: LoopMatrices
     rows: Rows
