@@ -21,6 +21,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked, replace
+from impc.control.named_solver import COMPILED
 from impc.errors import ImpcError, SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates, Point, descend
 from impc.inverse.inactive_samples import pair_of_inactive_samples
@@ -218,6 +219,7 @@ def _predictions(problem: Problem, begin: LqrSolution, ratio: float) -> Coordina
         offsets=(),
         family=None,
         logarithms=frozen([]),
+        solver=COMPILED,  # only a start: a solver by name would take minutes
     )
     moved = correction(known, ratio)
     return Coordinates(known, np.array(begin.K), np.array(begin.S), correction=moved)
@@ -280,7 +282,7 @@ def state_sizes(problem: Problem, regulator: LqrSolution) -> Array:
     """Unit of states (n, n) in which the outputs have their recorded size."""
     plant = problem.plant
     T, _ = natural_coordinates(plant, np.array(regulator.K))
-    natural = float(np.linalg.norm(plant.C @ T / problem.output_scale[:, None]))
+    natural = float(np.linalg.norm(problem.scaled_outputs @ T))
     return T * (np.sqrt(len(plant.outputs)) / natural if natural > 0 else 1.0)
 
 
