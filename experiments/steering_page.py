@@ -164,13 +164,13 @@ def verdict(case: Case) -> str:
             f"(95 % interval ± {half:.1f}, {len(free.test)} trials)"
         )
         text += {1: ": better.", 0: ": no clear difference.", -1: ": worse."}[outcome(case)]
-    if free.mean < delayed.mean:
+    if outcome(case) < 0:
         text += f" {why_behind(case)}"
     if case.ceiling is not None:
         top, low, _ = case.ceiling[:, 0]
         gap = f" The ceiling is {top:.1f} %, and {top - best.mean:.1f} points of it"
         if best.mean < low:
-            text += f"{gap} are unexplained by every method: nonlinear, or a change between trials."
+            text += f"{gap} are unexplained by every method."
         elif best.mean < top:
             text += f"{gap} are missing, which is within its 95 % interval."
         else:
