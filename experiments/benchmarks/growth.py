@@ -33,7 +33,7 @@ def growth_rows(runs: int, folder: Path) -> list[Row]:
     sizes = {
         "horizon N (W2)": _measure({h: with_horizon(work, h) for h in _HORIZONS}, runs),
         "states n (chain of masses)": _measure({n: chain_of_masses(n) for n in _STATES}, runs),
-        "inputs m (six masses), without Jacobian": _measure(
+        "inputs m (six masses, no Jacobian)": _measure(
             {m: chain_of_masses(12, inputs=m) for m in _INPUTS}, runs, moving=False
         ),
     }
@@ -65,7 +65,7 @@ def _measure(works: dict[int, Workload], runs: int, *, moving: bool = True) -> d
 
 
 def _plot(sizes: dict[str, dict[int, Timing]], folder: Path) -> None:
-    figure = Figure(figsize=(9.0, 2.8), layout="constrained")
+    figure = Figure(figsize=(10.0, 2.8), layout="constrained")
     for axes, (name, times) in zip(figure.subplots(1, 3), sizes.items(), strict=True):
         medians = np.array([1e3 * item.median for item in times.values()])
         spread = np.array([[1e3 * side for side in item.spread] for item in times.values()]).T
@@ -73,6 +73,7 @@ def _plot(sizes: dict[str, dict[int, Timing]], folder: Path) -> None:
         axes.errorbar(list(times), medians, yerr=errors, marker="o", color="black", capsize=3)
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="ms")
         axes.set_xticks(list(times), [str(size) for size in times])
+        axes.set_yticks([5, 10, 20, 50], ["5", "10", "20", "50"])
         axes.minorticks_off()
         axes.grid(visible=True, alpha=0.3)
     folder.mkdir(parents=True, exist_ok=True)

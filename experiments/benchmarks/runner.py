@@ -47,7 +47,7 @@ class _Ready:
         rng = np.random.default_rng(0)
         numbers = {"seconds": 1e-4, "memory_mb": 400.0, "K": rng.standard_normal((1, 10)).tolist()}
         # A fit of 70 kB, the size for three trials of the seat.
-        fit = dict.fromkeys(("starts", "logarithms", "S", "Q", "R"), numbers["K"])
+        fit = dict.fromkeys(("starts", "logarithms", "offsets", "S", "Q", "R"), numbers["K"])
         self._fit = numbers | fit | {"trajectory": rng.standard_normal((600, 6)).tolist()}
         self._replicate = numbers | {"parameters": [1.0]}
         self._waiting: deque[tuple[int, list[Task]]] = deque()
