@@ -25,7 +25,7 @@ from impc.assess.long_run_covariance import residual_noise, white_noise
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import require_complete, scenario
-from impc.inverse.gain_search import fit_gain
+from impc.inverse.search import fit_gain
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording

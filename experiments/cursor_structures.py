@@ -31,7 +31,7 @@ from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import scenarios
-from impc.inverse.structured_fit import fit_structured
+from impc.inverse.structured import fit_structured
 from impc.model.structure import Structure
 from impc.reporting.rendering import plain
 from impc.reporting.writer import write_files

@@ -28,7 +28,7 @@ from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.closed_loop import simulate
 from impc.control.simulation import require_complete, scenario
 from impc.inverse.methods import fit
-from impc.inverse.noisy_fit import free_gain
+from impc.inverse.search import free_gain
 from impc.inverse.problem import Problem, recorded_size
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording

@@ -31,7 +31,7 @@ from tqdm import tqdm
 import plants
 from impc.arrays import Array
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
-from impc.assess.printed_gain import identified_gain
+from impc.inverse.refit import refit
 from impc.control.controller import Controller
 from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
@@ -97,7 +97,7 @@ def diagnosed(
     """Residual test of one subject with three trials of `duration` s."""
     fitted = fitted_subject(SUBJECTS[name], seed, order, horizon, duration)
     K, S = np.array(fitted.gain), np.array(fitted.metric)
-    return lack_of_fit(identified_gain(fitted.problem, K, S))
+    return lack_of_fit(refit(fitted.problem, K, S))
 
 
 def _weights(plant: Plant) -> Weights:

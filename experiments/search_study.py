@@ -15,7 +15,7 @@ import scipy.stats
 
 from experiments.search_problems import Known, random_problem, stick_problem
 from impc.errors import ImpcError
-from impc.inverse.gain_search import refine_gain
+from impc.inverse.search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import recorded_size
 

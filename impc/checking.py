@@ -431,6 +431,7 @@ _KINDS: dict[str, Kind] = {
     "Mapping[str, Any]": _mapping,
     "Mapping[str, ArrayLike]": _columns,
     "Mapping[str, str]": _mapping_of(_text),
+    "Mapping[str, Sequence[str]]": _mapping_of(_several(_text)),
     "Mapping[str, float]": _mapping,
     "Mapping[int, IntArray]": _mapping,
     "System": _system,

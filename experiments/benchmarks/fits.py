@@ -11,7 +11,7 @@ from experiments.benchmarks.peers import casadi_fit, casadi_loop, cvxpy_fit
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import Timing, side_by_side
 from experiments.benchmarks.workloads import example, seat
-from impc.inverse.gain_search import refine_gain
+from impc.inverse.search import refine_gain
 from impc.inverse.table31 import (
     inverse_mpc,
     inverse_mpc_reduced,

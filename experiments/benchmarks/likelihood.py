@@ -19,7 +19,8 @@ from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
 from experiments.noisy_people import recorded, subject
 from impc.checking import replace
-from impc.inverse.coordinates import Coordinates, Point
+from impc.inverse.coordinates import Coordinates
+from impc.inverse.unknowns import Point
 from impc.inverse.residuals import evaluate
 from impc.output_feedback.start import gain_space
 from impc.output_feedback.unknowns import PersonCoordinates

@@ -105,13 +105,13 @@ def _trial_vaf(problem: Problem, index: int, run: Simulation) -> Array:
     trial = problem.recordings[index]
     if not run.complete:
         return np.full(len(problem.plant.outputs), np.nan)
-    return vaf(trial.without_offset, run.x @ problem.plant.C.T)
+    return vaf(trial.corrected, run.x @ problem.plant.C.T)
 
 
 def _pooled_vaf(problem: Problem, runs: tuple[Simulation, ...]) -> Array:
     if not all(run.complete for run in runs):
         return np.full(len(problem.plant.outputs), np.nan)
-    recorded = np.concatenate([trial.without_offset for trial in problem.recordings])
+    recorded = np.concatenate([trial.corrected for trial in problem.recordings])
     simulated = np.concatenate([run.x @ problem.plant.C.T for run in runs])
     return vaf(recorded, simulated)
 

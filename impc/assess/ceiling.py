@@ -96,7 +96,7 @@ def _repetitions(group: list[Recording], first: int) -> list[Array]:
     """Outputs (samples, p) of each repetition: trials, or periods of all trials."""
     samples = min(trial.samples for trial in group)
     period = _period(_drive(group[0])[:samples])
-    outputs = [trial.without_offset[:samples] for trial in group]
+    outputs = [trial.corrected[:samples] for trial in group]
     if period is None or (samples - first) // period < 2:
         return [part[first:] for part in outputs]
     count = (samples - first) // period

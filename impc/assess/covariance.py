@@ -27,23 +27,21 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
-from impc.inverse.coordinates import metric_directions
+from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED, determined
-from impc.inverse.least_squares import trial_span
+from impc.inverse.laws import metric_directions
 from impc.inverse.problem import noise_of_residual
+from impc.inverse.refit import IDENTIFIED as IDENTIFIED
 from impc.inverse.residuals import evaluate, residual_only, residual_or_reason, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.least_squares import TrialSpan
+    from impc.inverse.columns import TrialSpan
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
 
-#: Largest standard error, in whitened units, of an identified direction. Beyond it the prior of the
-#: search and the curvature of the problem matter.
-IDENTIFIED = 0.2
 #: An entry is individually identified if an error of one whitened unit in all unidentified
 #: directions shifts it by less than this share of its standard error. At shares of 0.2 to 0.25, 90
 #: % of 275 intervals covered the true value (carts with three inputs, VAF 70 %).

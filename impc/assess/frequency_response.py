@@ -68,7 +68,7 @@ def frequency_response(problem: Problem, runs: Sequence[Simulation]) -> Frequenc
     if count < _FEWEST or power[column] == 0:
         return None
     drive = [part[:, column, None] for part in drives]
-    outputs = [one.without_offset for one in trials]
+    outputs = [one.corrected for one in trials]
     model = [run.x[: len(part)] @ plant.C.T for run, part in zip(whole, outputs, strict=True)]
     frequencies = np.asarray(np.fft.rfftfreq(length, plant.dt), np.float64)
     bands = _bands(frequencies)

@@ -27,18 +27,18 @@ from impc.assess.printed_gain import LEVEL
 from impc.checking import replace
 from impc.control.constraint_rows import directions
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import controller_for, simulated
 from impc.inverse.residuals import evaluate, residual_along
+from impc.inverse.search import refine_gain
 from impc.model.bounds import Bounds, bound_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.inverse.estimates import Estimate
-    from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
 
 # Relative accuracy of the limit.
 _RESOLUTION = 1e-4
@@ -125,7 +125,7 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
     )
 
 
-def _searched(fitted: Estimate, control: int) -> tuple[_Search, GainFit]:
+def _searched(fitted: Estimate, control: int) -> tuple[_Search, Fitted]:
     """Best limit, and the search that found it.
 
     The search starts at the given limit, or if the command does not reach it at the best of a grid
@@ -154,9 +154,9 @@ class _Search:
     def __init__(self, fitted: Estimate, control: int) -> None:
         self.fitted, self.control = fitted, control
         self.samples = fitted.problem.recorded_numbers
-        self.tried: dict[float, GainFit | None] = {}
+        self.tried: dict[float, Fitted | None] = {}
 
-    def fit(self, limit: float) -> GainFit:
+    def fit(self, limit: float) -> Fitted:
         found = self._try(limit)
         if found is None:
             raise SolverError(
@@ -170,7 +170,7 @@ class _Search:
         found = self._try(limit)
         return 1e3 * np.sqrt(self.samples) if found is None else found.misfit
 
-    def best(self, grid: Array) -> GainFit:
+    def best(self, grid: Array) -> Fitted:
         """Best of a grid, refined by Brent's method between its neighbours."""
         values = [self.misfit(limit) for limit in grid]
         index = int(np.argmin(values))
@@ -180,7 +180,7 @@ class _Search:
         )
         return self.least()[1]
 
-    def least(self) -> tuple[float, GainFit]:
+    def least(self) -> tuple[float, Fitted]:
         """Best of all finite limits tried."""
         fits = [fit for fit in self.tried.values() if fit is not None]
         finite = [fit for fit in fits if np.isfinite(self.limit_of(fit))]
@@ -191,15 +191,15 @@ class _Search:
         best = min(finite, key=lambda fit: fit.misfit)
         return self.limit_of(best), best
 
-    def limit_of(self, fit: GainFit) -> float:
+    def limit_of(self, fit: Fitted) -> float:
         return float(fit.problem.bounds.u_max[self.control])
 
-    def _try(self, limit: float) -> GainFit | None:
+    def _try(self, limit: float) -> Fitted | None:
         if limit not in self.tried:
             self.tried[limit] = self._fit(limit)
         return self.tried[limit]
 
-    def _fit(self, limit: float) -> GainFit | None:
+    def _fit(self, limit: float) -> Fitted | None:
         """Refit from the nearest previous fit, or from the given one."""
         known = [(key, fit) for key, fit in self.tried.items() if fit is not None]
         near = sorted(known, key=lambda item: abs(min(item[0], 1e9) - min(limit, 1e9)))
@@ -227,7 +227,7 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
     return float(np.quantile(command, 0.995))
 
 
-def _colour_factor(fit: GainFit, limit: float, control: int) -> float:
+def _colour_factor(fit: Fitted, limit: float, control: int) -> float:
     """Variance of the limit for autocorrelated residuals, relative to white ones."""
     problem, K, S = fit.problem, np.array(fit.K), np.array(fit.S)
     found = evaluate(problem, K, S)

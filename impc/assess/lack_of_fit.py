@@ -41,7 +41,7 @@ from impc.checking import replace
 from impc.control.body_steps import slopes_along
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
-from impc.inverse.coordinates import metric_directions
+from impc.inverse.columns import trial_span
 from impc.inverse.further_unknowns import (
     STRENGTH,
     with_delay_unknown,
@@ -49,7 +49,7 @@ from impc.inverse.further_unknowns import (
     with_offsets_unknown,
     with_strength_unknown,
 )
-from impc.inverse.least_squares import trial_span
+from impc.inverse.laws import metric_directions
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
 from impc.inverse.residuals import evaluate, residual_along, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
@@ -57,11 +57,12 @@ from impc.model import plant_family
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
-    from impc.assess.printed_gain import IdentifiedGain
+    from impc.assess.printed_gain import GainEstimate
     from impc.control.controller import Controller
     from impc.control.simulation import Simulation
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
+    from impc.inverse.unknowns import Fitted
     from impc.model.recordings import Recording
 
 #: Probability of any alarm under a correct model, by these distributions. Trials close to a fall
@@ -116,7 +117,7 @@ class LackOfFit(Frozen):
         return self.errors[0] if self.alarm else None
 
 
-def lack_of_fit(estimate: IdentifiedGain) -> LackOfFit | None:
+def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     """Test the model on trials without gaps; None for an exact fit or too few samples."""
     if all(trial.has_gaps for trial in estimate.problem.recordings):
         return None

@@ -11,8 +11,8 @@ from impc.arrays import Array, Frozen, frozen
 from impc.assess.input_limits import with_limit
 from impc.assess.variance_accounted_for import vaf
 from impc.errors import SolverError, WeightsError
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.problem import simulated
+from impc.inverse.search import refine_gain
 
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
@@ -79,7 +79,7 @@ def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
 
 def _unexplained(problem: Problem, gain: Array, metric: Array) -> Array:
     """100 - VAF, % (p,)."""
-    recorded = np.concatenate([trial.without_offset for trial in problem.recordings])
+    recorded = np.concatenate([trial.corrected for trial in problem.recordings])
     runs = simulated(problem, gain, metric)
     modelled = np.concatenate([run.x for run in runs]) @ problem.plant.C.T
     if not all(run.complete for run in runs):

@@ -33,7 +33,7 @@ from impc.arrays import Array, Frozen, frozen
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.least_squares import TrialSpan
+    from impc.inverse.columns import TrialSpan
 
     Taken = tuple[Array, Array]
 

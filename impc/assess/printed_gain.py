@@ -1,15 +1,8 @@
-"""Gain reported with intervals: the weights' gain, updated along identified directions.
+"""Gain reported with intervals: that of the weights, refitted along identified directions.
 
-The gain of fitted weights is biased by the penalty on their condition number, and an unrestricted
-gain drifts along hardly identified directions, often to the edge of stability, where standard
-errors are too small. Therefore the weights' gain is updated by ordinary least squares, jointly with
-S, initial states and parameters, along the identified directions only (`covariance.IDENTIFIED`):
-
-    K = K_weights + sum over identified directions i of  w_i  direction_i    (whitened coordinates)
-
-Directions are recomputed at the new gain until the misfit stays. Along them the estimate is that of
-least squares without a prior, which its covariance describes. Parameters are positive and searched
-in logarithms: their intervals are value * exp(+- z SE). See docs/why/intervals.md.
+Along them the estimate is that of least squares without a prior (`refit`), which its covariance
+describes. Parameters are positive and searched in logarithms: their intervals are
+value * exp(+- z SE). See docs/why/intervals.md.
 """
 
 from __future__ import annotations
@@ -21,16 +14,14 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.checking import replace
-from impc.inverse.coordinates import Coordinates, descend
-from impc.inverse.least_squares import Stop
-from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.minimiser import Ended
+from impc.inverse.refit import refit
 from impc.inverse.residuals import evaluate
 from impc.model.continuous_gain import continuous_gain
 from impc.model.plant import UNKNOWN, gain_unit
-from impc.model.riccati import stabilises
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,116 +30,46 @@ if TYPE_CHECKING:
     from impc.assess.covariance import GainCovariance
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Evaluation
     from impc.model.plant import Plant
 
 
-# Of 60 random plants 51 searches ended after two rounds, 9 after three.
-_ROUNDS = 4
-_EVALUATIONS = 40
-# Nats at which a search, and the iteration of rounds, ends.
-_TOLERANCE = 0.01
-
-
 @dataclass(frozen=True)
-class IdentifiedGain:
-    """Gain that the recordings identify."""
+class GainEstimate:
+    """Identified gain with its covariance."""
 
     problem: Problem  # At the initial states and parameters fitted with this gain
     K: Array  # (m, n); that of the weights along unidentified directions
     S: Array  # (m, m); that of the weights where not identified
     misfit: float  # 2-norm of the residual
-
-    @property
-    def parameters(self) -> Array:
-        """Physical parameters in their units (k,); empty if none are fitted."""
-        family = self.problem.family
-        if family is None:
-            return np.zeros(0)
-        return family.values(np.array(self.problem.logarithms))
-
-
-@dataclass(frozen=True)
-class GainEstimate(IdentifiedGain):
-    """Identified gain with its covariance."""
-
     linear: GainCovariance  # To first order
     covariance: GainCovariance  # HAC covariance with curvature
     # The same with stated uncertainties set to zero; None if there are none
     exact: GainCovariance | None = None
+    ended: Ended = Ended.CONVERGED  # How the search ended, and the decrease that it still promises
+    promised: float = 0.0
+
+    @property
+    def parameters(self) -> Array:
+        """Physical parameters in their units (k,); empty if none are fitted."""
+        return self.problem.parameters
 
 
 def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the identified gain of a fit, and its covariance."""
-    here = _search(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
-    problem, at = here.problem, (frozen(here.K), frozen(here.S))
-    fixed, found = problem.with_body_fixed(), here.evaluation
+    end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
+    problem, at = end.problem, (end.K, end.S)
+    found, fixed = evaluate(problem, *at), problem.with_body_fixed()
     alone = replace(found, dparameters=found.dparameters[:, ~problem.stated])
     return GainEstimate(
         problem,
         *at,
-        here.misfit,
-        here.linear,
+        end.misfit,
+        gain_covariance(problem, *at, evaluation=found),
         gain_covariance(problem, *at, curvature=True, evaluation=found),
         None if fixed is problem else gain_covariance(fixed, *at, curvature=True, evaluation=alone),
+        end.ended,
+        end.promised,
     )
-
-
-def identified_gain(problem: Problem, gain: Array, metric: Array) -> IdentifiedGain:
-    """Estimate the identified gain, starting from a gain near it."""
-    here = _search(problem, gain, metric)
-    return IdentifiedGain(here.problem, frozen(here.K), frozen(here.S), here.misfit)
-
-
-@dataclass(frozen=True)
-class _Here(IdentifiedGain):
-    """Gain of the search with its first-order covariance."""
-
-    evaluation: Evaluation
-    linear: GainCovariance
-
-
-def _search(problem: Problem, gain: Array, metric: Array) -> _Here:
-    here = _described(problem, gain, metric, evaluate(problem, gain, metric))
-    explained = here.misfit <= EXPLAINED * recorded_size(problem)
-    for _ in range(0 if explained else _ROUNDS):
-        there = _round(here)
-        if there is None:  # no covariance there: keep the last gain
-            break
-        before, here = here, there
-        same = np.count_nonzero(here.linear.identified) == np.count_nonzero(
-            before.linear.identified
-        )
-        gained = len(here.evaluation.residual) * np.log(before.misfit / here.misfit)
-        if same and gained < _TOLERANCE:
-            break
-    return here
-
-
-def _described(problem: Problem, gain: Array, metric: Array, evaluation: Evaluation) -> _Here:
-    misfit = float(np.linalg.norm(evaluation.residual))
-    linear = gain_covariance(problem, gain, metric, evaluation=evaluation)
-    return _Here(problem, gain, metric, misfit, evaluation, linear)
-
-
-def _round(here: _Here) -> _Here | None:
-    """Least squares over the identified directions and all unknowns other than the gain.
-
-    The latter keep the prior of any search (`fit_gain`): some of them are not identified.
-    """
-    space = Coordinates(here.problem, here.K, here.S)
-    space.evaluated(space.start, here.evaluation)
-    identified = here.linear.directions[here.linear.identified]
-    beside = int(space.ends[1] - space.ends[0] + space.ends[3] - space.ends[2])
-    along = scipy.linalg.block_diag(identified.T, np.eye(beside))
-    shared = np.concatenate([np.zeros(len(identified)), np.ones(beside)])
-    stop = Stop(_TOLERANCE, 0.0, _EVALUATIONS)
-    z, _, _ = descend(space, space.start, stop, shared=shared, own=1.0, along=along)
-    there = space.unpack(z)
-    plant = there.problem.plant
-    if not stabilises(plant, there.K):
-        return None
-    return _described(there.problem, there.K, there.S, space.evaluated(z)[0])
 
 
 #: Default confidence level.

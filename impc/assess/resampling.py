@@ -6,7 +6,7 @@ process, (6 a^2 / (1 - a^2)^2)^(1/3) T^(1/3), the longest over the outputs. Para
 uncertainty are redrawn about the estimate.
 
 Replicate k uses the k-th child of the seed, so that results do not depend on order or machine. The
-refit starts at the estimate and moves only the gain (`identified_gain`).
+refit starts at the estimate and moves only the gain (`refit`).
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.printed_gain import Interval, entry_names, identified_gain
+from impc.assess.printed_gain import Interval, entry_names
 from impc.checking import replace
 from impc.inverse.problem import modelled, recorded, simulated
+from impc.inverse.refit import refit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 class Replicate(Frozen):
     """Estimates of one replicate."""
 
-    K: Array  # (m, n), see `identified_gain`
+    K: Array  # (m, n), see `refit`
     parameters: Array  # Physical parameters in their units (k,)
 
 
@@ -67,7 +68,7 @@ def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
         commands = new[:, p:] if len(trial.commands) else trial.commands
         trials.append(replace(trial, outputs=frozen(new[:, :p]), commands=frozen(commands)))
     problem = _body_measured_again(model.problem, rng)
-    again = identified_gain(replace(problem, recordings=tuple(trials)), model.K, model.S)
+    again = refit(replace(problem, recordings=tuple(trials)), model.K, model.S)
     return Replicate(again.K, frozen(again.parameters))
 
 

@@ -24,19 +24,18 @@ from impc.assess.long_run_covariance import (
     residual_noise,
     white_noise,
 )
-from impc.inverse.coordinates import metric_directions
+from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED
-from impc.inverse.least_squares import trial_span
+from impc.inverse.laws import metric_directions, regulator_slopes
 from impc.inverse.problem import noise_of_residual
 from impc.inverse.residuals import evaluate, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.structured_search import regulator_slopes
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.least_squares import TrialSpan
+    from impc.inverse.columns import TrialSpan
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
     from impc.model.riccati import LqrSolution

@@ -39,8 +39,7 @@ from impc.assess.variance_accounted_for import (
 from impc.assess.weight_profiles import NearFit, WeightInterval, WeightProfiles
 from impc.control.closed_loop import simulate
 from impc.inverse.problem import EXPLAINED, recorded_size, scenarios
-from impc.inverse.structured_fit import feature_sizes, structured_estimate
-from impc.inverse.structured_search import search_from
+from impc.inverse.structured import feature_sizes, search_from, structured_estimate
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 
@@ -115,7 +114,7 @@ def assess_structure(
     sizes = feature_sizes(there, structure, np.array(found.gain), np.array(found.metric))
     runs = [simulate(found.controller(), drive) for drive in scenarios(there)]
     u = np.concatenate([run.applied for run in runs]) @ structure.input_features[0]
-    recorded = np.concatenate([trial.without_offset for trial in there.recordings])
+    recorded = np.concatenate([trial.corrected for trial in there.recordings])
     left = _left_out(problem, structure, found, settle) if held_out else []
     nothing = np.full(len(problem.plant.outputs), np.nan)
     intervals, ratios = _intervals(at, covariance, sizes)
@@ -152,7 +151,7 @@ def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
 def _left_out(problem: Problem, structure: Structure, end: Estimate, settle: float) -> list[Array]:
     """VAF of each trial under the structure fitted to the others."""
     there = end.problem
-    start, found = problem.at(there.starts, there.logarithms, there.shifts), []
+    start, found = problem.at(there.starts, there.logarithms, there.errors), []
     cost_weights = _moving(np.array(end.cost_weights))
     for index in range(len(problem.recordings) if len(problem.recordings) > 1 else 0):
         others = start.leaving_out(index)

@@ -24,9 +24,10 @@ from impc.assess.long_run_covariance import residual_noise
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.noisy_fit import fit_controller, with_fitted_starts
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import residual_only
+from impc.inverse.search import with_fitted_starts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -125,11 +126,11 @@ def agreement(
 ) -> TrialAgreement:
     """Compare a trial with its simulation over all samples."""
     simulated = run.x @ plant.C.T
-    residual = np.nan_to_num(trial.without_offset - simulated)
+    residual = np.nan_to_num(trial.corrected - simulated)
     lags = min(max(round(1 / plant.dt), _LEAST_LAGS), trial.samples // 5)
     return TrialAgreement(
-        frozen(vaf(trial.without_offset, simulated)),
-        frozen(centred_vaf(trial.without_offset, simulated)),
+        frozen(vaf(trial.corrected, simulated)),
+        frozen(centred_vaf(trial.corrected, simulated)),
         frozen(whiteness(residual, max(lags, 1))),
         frozen(np.sqrt(np.mean(residual**2, axis=0))),
         saturated_share(run.applied, u_min, u_max),
@@ -162,7 +163,7 @@ def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
     if other.problem.unknown_start:
         started = with_fitted_starts(alone, gain, metric, max(first, alone.plant.n))
     run = simulate(controller_for(started, gain, metric), scenarios(started)[0])
-    recorded = started.recordings[0].without_offset[first:]
+    recorded = started.recordings[0].corrected[first:]
     simulated = (run.x @ started.plant.C.T)[first:]
     if not run.complete:
         nothing = frozen(np.full(recorded.shape[1], np.nan))

@@ -34,9 +34,9 @@ from impc.arrays import Array
 from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import tangent
 from impc.errors import WeightsError
+from impc.inverse.laws import regulator_slopes
 from impc.inverse.residuals import scaled_changes
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.structured_search import regulator_slopes
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:

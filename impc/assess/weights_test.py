@@ -31,9 +31,9 @@ import scipy.special
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
+from impc.inverse.columns import triangular_rows
 from impc.inverse.equivalent_weights import other_weights, weights_margin
 from impc.inverse.estimates import ROUNDING
-from impc.inverse.least_squares import triangular_rows
 from impc.inverse.problem import misfit, recorded_size, simulated
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis

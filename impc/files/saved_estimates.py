@@ -27,6 +27,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import plant_at
 from impc.model.recordings import Label, Recording
+from impc.model.signal_errors import KINDS
 from impc.model.structure import Structure
 from impc.model.weights import Weights
 
@@ -122,7 +123,7 @@ def encode_estimate(estimate: Estimate) -> dict[str, Any]:
     problem = estimate.problem
     return kept | {
         "starts": problem.starts.tolist(),
-        "shifts": problem.shifts.tolist(),
+        "errors": problem.errors.tolist(),
         "logarithms": problem.logarithms.tolist(),
         "terminal_set": bool(problem.terminal_set),
     }
@@ -133,12 +134,13 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
     m, n, weights = seen.plant.m, seen.plant.n, kept["weights"]
     sizes = {"K": (m, n), "S": (m, m)}
     posed = replace(seen, terminal_set=kept["terminal_set"])
-    own = (np.array(kept[name], dtype=float) for name in ("starts", "logarithms", "shifts"))
+    own = (np.array(kept[name], dtype=float) for name in ("starts", "logarithms", "errors"))
     numbers = {name: float(kept[name]) for name in ("misfit", "noise", "seconds")}
     if kept["method"] not in METHODS or not isinstance(kept["reason"], str):
         raise ValueError("unknown method, or a reason that is not text")
-    if not set(seen.offsets) <= set(seen.plant.outputs):
-        raise ValueError("an offset of an unknown output")
+    known = {*seen.plant.outputs, *seen.plant.disturbances}
+    if not all(kind in KINDS and name in known for kind, name in seen.signal_errors):
+        raise ValueError("an error of an unknown signal")
     values = dict(kept) | {
         **numbers,
         "evaluations": int(kept["evaluations"]),
@@ -203,7 +205,7 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
             "plant": plant,
             "bounds": Bounds(plant, **kept["bounds"]),
             "recordings": tuple(_recording(item, plant) for item in kept["recordings"]),
-            "offsets": tuple(kept["offsets"]),
+            "signal_errors": tuple((str(kind), name) for kind, name in kept["signal_errors"]),
             "family": family if names else None,
             "structure": None if structure is None else _filled(Structure, _tuples(structure)),
             "feedback_states": tuple(kept["feedback_states"]),

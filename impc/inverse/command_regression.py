@@ -95,7 +95,7 @@ def _driven(problem: Problem, trial: Recording) -> Array:
         for t, push in enumerate(pushes):
             free[t + 1], x[t + 1] = plant.A @ free[t], plant.A @ x[t] + push
     known = np.isfinite(trial.outputs)
-    missed = (trial.without_offset - x @ plant.C.T)[known]
+    missed = (trial.corrected - x @ plant.C.T)[known]
     searched = problem.searched_states
     if searched and np.all(np.isfinite(free)):
         table = (plant.C @ free[..., :searched])[known]

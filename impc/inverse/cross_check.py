@@ -16,10 +16,10 @@ import numpy as np
 
 from impc.checking import replace
 from impc.errors import ImpcError
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.methods import METHODS, of_fitted_gain, output_penalty
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.search import refine_gain
 
 if TYPE_CHECKING:
     from impc.arrays import Array

@@ -15,11 +15,12 @@ import numpy as np
 
 from impc.arrays import Array, BoolArray
 from impc.errors import InputError, SolverError
-from impc.inverse.coordinates import Coordinates, descend
-from impc.inverse.gain_search import regulators
-from impc.inverse.least_squares import Stop
+from impc.inverse.laws import GainLaw
+from impc.inverse.minimiser import PROMISE, Stop
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.starts import regulators
+from impc.inverse.unknowns import Unknowns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,8 +29,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
 
 _SCALES = np.geomspace(1.0, 1e-3, 25)
-# Nats and evaluations at which the search ends.
-_FINE, _EVALUATIONS = 0.01, 60
+_EVALUATIONS = 60
 
 
 def preliminary_gain(problem: Problem, states: Sequence[str]) -> tuple[Array, Problem]:
@@ -45,9 +45,12 @@ def preliminary_gain(problem: Problem, states: Sequence[str]) -> tuple[Array, Pr
         )
     kept: BoolArray = np.isin(names, states)
     gain, centre = _start(loose, kept)
-    space = Coordinates(loose, centre, np.eye(problem.plant.m), _basis(loose.plant, centre, kept))
-    z, _, _ = descend(space, space.at_gain(gain), Stop(_FINE, 0.0, _EVALUATIONS))
-    found = space.unpack(z)
+    basis = _basis(loose.plant, centre, kept)
+    law = GainLaw(loose, centre, np.eye(problem.plant.m), basis)
+    space = Unknowns(loose, law)
+    z = space.start.copy()
+    z[space.controller] = law.at_gain(gain)
+    found = space.search(z, Stop(PROMISE, 0.0, _EVALUATIONS))
     return np.where(kept, found.K, 0.0), found.problem
 
 

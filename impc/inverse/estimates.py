@@ -15,7 +15,7 @@ from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
-from impc.inverse.least_squares import trial_span
+from impc.inverse.columns import trial_span
 from impc.inverse.problem import (
     controller_for,
     explains,

@@ -36,8 +36,8 @@ from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
     from impc.inverse.equivalent_weights import EquivalentWeights
-    from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
     from impc.model.plant import Plant
     from impc.model.weights import Weights
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 class WeightsBehind:
     """Result of `weights_behind`."""
 
-    gain: GainFit  # Fitted gain
+    gain: Fitted  # Fitted gain
     metrics: Array  # Metric, then directions in which it is not identified (k, m, m)
     equivalent: EquivalentWeights | None  # None if there are none
     misfit: float  # 2-norm of the residual of these weights; infinite without
@@ -54,7 +54,7 @@ class WeightsBehind:
     reason: str  # Why there are none, or why they do not explain; otherwise empty
 
 
-def weights_behind(fit: GainFit) -> WeightsBehind:
+def weights_behind(fit: Fitted) -> WeightsBehind:
     """Find the weights of least condition number with the gain and check that they explain."""
     problem = fit.problem
     metrics = np.array(fit.S)[None]
@@ -69,7 +69,7 @@ def weights_behind(fit: GainFit) -> WeightsBehind:
     return WeightsBehind(fit, metrics, equivalent, misfit, explained, reason)
 
 
-def _metrics(fit: GainFit) -> Array:
+def _metrics(fit: Fitted) -> Array:
     """Metric that fits best with the gain, then unidentified directions."""
     plant, K = fit.problem.plant, np.array(fit.K)
     if plant.m == 1:

@@ -25,23 +25,22 @@ from impc.inverse.delayed_feedback import preliminary_gain
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
-from impc.inverse.noisy_fit import fit_controller, free_gain, noise_of, with_fitted_starts
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import require_riccati
 from impc.inverse.proximal_search import auxiliary_weights
+from impc.inverse.search import free_gain, noise_of, refine_gain, with_fitted_starts
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
-from impc.inverse.structured_fit import fit_structured
-from impc.inverse.weight_fit import fit_weights
+from impc.inverse.structured import fit_structured, fit_weights
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr, stabilises
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.inverse.gain_search import GainFit
     from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
     from impc.model.plant import Plant
 
 _LOG = logging.getLogger("impc")
@@ -124,7 +123,7 @@ def feedback_gain(problem: Problem, start: Estimate) -> Estimate:
     return of_fitted_gain(problem, start, _feedback(start))
 
 
-def of_fitted_gain(problem: Problem, start: Estimate, found: GainFit) -> Estimate:
+def of_fitted_gain(problem: Problem, start: Estimate, found: Fitted) -> Estimate:
     """Estimate of a gain without bounds."""
     K, seen = np.array(found.K), found.problem.with_nuisance_fixed()
     evaluations = found.evaluations
@@ -132,7 +131,7 @@ def of_fitted_gain(problem: Problem, start: Estimate, found: GainFit) -> Estimat
 
 
 @functools.lru_cache(maxsize=4)
-def _feedback(start: Estimate) -> GainFit:
+def _feedback(start: Estimate) -> Fitted:
     """Best gain without bounds, shared by five methods.
 
     The search is repeated from its own solution, because the prior is centred at the start. Without
@@ -432,6 +431,6 @@ def _begun(problem: Problem, start: Estimate | Weights | None) -> tuple[Problem,
         return problem, start
     there, same = start.problem, start.problem.starts.shape == problem.starts.shape
     if problem.unknown_start and same and there.logarithms.shape == problem.logarithms.shape:
-        own = (np.array(part) for part in (there.starts, there.logarithms, there.shifts))
+        own = (np.array(part) for part in (there.starts, there.logarithms, there.errors))
         problem = problem.at(*own)
     return problem, start.stage_weights

@@ -21,8 +21,8 @@ import numpy as np
 from impc.arrays import Array, frozen
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
+from impc.inverse.columns import triangular_rows
 from impc.inverse.equivalent_weights import least_condition_weights
-from impc.inverse.least_squares import triangular_rows
 from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import gain_fibre, natural_coordinates, pair_blocks, split_blocks

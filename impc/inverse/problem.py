@@ -25,6 +25,7 @@ from impc.model.bounds import Bounds
 from impc.model.foresight import physical_states
 from impc.model.plant_family import plant_at
 from impc.model.riccati import terminal_matrix
+from impc.model.signal_errors import KINDS, distorted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -71,7 +72,11 @@ class Problem(Value):
     command_scale : array_like of shape (m,), optional
         Likewise for recorded commands; a smaller scale gives the commands more weight.
     offsets : sequence of str, optional
-        See Attributes.
+        Outputs with an unknown offset: short for ``signal_errors={"offset": offsets}``.
+    signal_errors : mapping of str to sequence of str, optional
+        Signals with an unknown error in each trial, by kind: "offset", "drift", "scale" (of the
+        recorded values), "shift" (time of the signal against the clock of the trial) or "clock"
+        (rate of its own clock). See `impc.model.signal_errors`.
 
     Attributes
     ----------
@@ -91,8 +96,8 @@ class Problem(Value):
         Scale of each output in the residual, in its unit.
     command_scale : ndarray of shape (m,)
         Scale of each recorded command in the residual, in its unit.
-    offsets : tuple of str
-        Outputs with an unknown offset that is constant within each trial.
+    signal_errors : tuple of tuple of str
+        Pairs (kind, signal) of the errors that are estimated in each trial.
     unknown_start : bool
         Whether the initial states are estimated, starting from `x0` of the recordings. Default:
         True, unless all states are recorded and follow the plant to rounding.
@@ -146,7 +151,7 @@ class Problem(Value):
     softening: float
     output_scale: Array
     command_scale: Array
-    offsets: tuple[str, ...]
+    signal_errors: tuple[tuple[str, str], ...]
     unknown_start: bool
     family: PlantFamily | None
     logarithms: Array
@@ -168,6 +173,7 @@ class Problem(Value):
         output_scale: ArrayLike | None = None,
         command_scale: ArrayLike | None = None,
         offsets: Sequence[str] = (),
+        signal_errors: Mapping[str, Sequence[str]] | None = None,
         unknown_start: bool | None = None,
         family: PlantFamily | None = None,
         structure: Structure | None = None,
@@ -187,6 +193,9 @@ class Problem(Value):
         for name in sorted(set(offsets) - set(plant.outputs)):
             known = ", ".join(plant.outputs)
             raise InputError("offsets", f"no output is named {name!r}", f"choose from: {known}")
+        pairs = [("offset", name) for name in offsets]
+        pairs += [(kind, name) for kind, names in (signal_errors or {}).items() for name in names]
+        _require_errors(plant, pairs)
         if family is not None:
             if plant_at(family, np.zeros(len(family.names))).states != plant.states:
                 remedy = "pass plant=family.make(family.nominal)"
@@ -207,7 +216,7 @@ class Problem(Value):
             softening=softening,
             output_scale=frozen(_scale("output_scale", output_scale, outputs, len(plant.outputs))),
             command_scale=frozen(_scale("command_scale", command_scale, commands, plant.m)),
-            offsets=tuple(offsets),
+            signal_errors=tuple(dict.fromkeys(pairs)),
             unknown_start=unknown_start,
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
@@ -222,8 +231,13 @@ class Problem(Value):
         return replace(self, bounds=Bounds(self.plant), terminal_set=False)
 
     def with_nuisance_fixed(self) -> Problem:
-        """Copy with initial states, offsets and parameters fixed at their current values."""
-        return replace(self, unknown_start=False, offsets=(), family=None, logarithms=frozen([]))
+        """Copy with initial states, errors and parameters fixed at their current values."""
+        fixed = self.with_parameters_fixed()
+        return replace(fixed, unknown_start=False, signal_errors=())
+
+    def with_parameters_fixed(self) -> Problem:
+        """Copy with the physical parameters fixed at their current values."""
+        return replace(self, family=None, logarithms=frozen([]))
 
     def with_body_fixed(self) -> Problem:
         """Copy with the parameters of stated uncertainty fixed at their current values."""
@@ -237,8 +251,8 @@ class Problem(Value):
         """Copy without one trial, counted from 0."""
         return replace(self, recordings=self.recordings[:trial] + self.recordings[trial + 1 :])
 
-    def at(self, starts: Array, logarithms: Array, shifts: Array | None = None) -> Problem:
-        """Return a copy at other initial states, parameters and offsets.
+    def at(self, starts: Array, logarithms: Array, errors: Array | None = None) -> Problem:
+        """Return a copy at other initial states, parameters and errors of signals.
 
         Parameters
         ----------
@@ -246,13 +260,13 @@ class Problem(Value):
             Initial states.
         logarithms : ndarray of shape (k,)
             Logarithms of the family's parameters over their nominal values.
-        shifts : ndarray of shape (trials, p), optional
-            Offsets of the outputs; unchanged by default.
+        errors : ndarray of shape (trials, kinds, p + d), optional
+            Errors of the signals; unchanged by default.
         """
-        moved = self.shifts if shifts is None else shifts
+        moved = self.errors if errors is None else errors
         recordings = tuple(
-            replace(trial, x0=frozen(x0), offset=frozen(offset))
-            for trial, x0, offset in zip(self.recordings, starts, moved, strict=True)
+            replace(trial, x0=frozen(x0), errors=frozen(error))
+            for trial, x0, error in zip(self.recordings, starts, moved, strict=True)
         )
         plant, bounds = self.plant, self.bounds
         if self.family is not None and not np.array_equal(logarithms, self.logarithms):
@@ -272,9 +286,20 @@ class Problem(Value):
         return frozen([trial.x0 for trial in self.recordings])
 
     @property
-    def shifts(self) -> Array:
-        """Offsets of the outputs of the trials, (trials, p)."""
-        return frozen([trial.offset for trial in self.recordings])
+    def errors(self) -> Array:
+        """Errors of the signals of the trials, (trials, kinds, p + d)."""
+        return frozen([trial.errors for trial in self.recordings])
+
+    @property
+    def offsets(self) -> tuple[str, ...]:
+        """Outputs with an unknown offset in each trial."""
+        return tuple(name for kind, name in self.signal_errors if kind == "offset")
+
+    @property
+    def error_places(self) -> list[tuple[int, int]]:
+        """Row and column in `Recording.errors` of each error that is searched."""
+        signals, kinds = (*self.plant.outputs, *self.plant.disturbances), list(KINDS)
+        return [(kinds.index(kind), signals.index(name)) for kind, name in self.signal_errors]
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -294,14 +319,29 @@ class Problem(Value):
         return physical_states(self.plant) if self.unknown_start else 0
 
     @property
+    def fitted_errors(self) -> list[tuple[str, str, Array]]:
+        """Kind, signal and values (trials,) of each error that is searched, with time in s."""
+        errors, dt = self.errors, self.plant.dt
+        pairs = zip(self.signal_errors, self.error_places, strict=True)
+        return [
+            (kind, name, dt ** KINDS[kind][3] * errors[:, row, column])
+            for (kind, name), (row, column) in pairs
+        ]
+
+    @property
     def own_unknowns(self) -> int:
-        """Number of unknowns of one trial: initial states, then offsets."""
-        return self.searched_states + len(self.offsets)
+        """Number of unknowns of one trial: initial states, then errors of signals."""
+        return self.searched_states + len(self.signal_errors)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the k fitted physical parameters."""
         return () if self.family is None else self.family.names
+
+    @property
+    def parameters(self) -> Array:
+        """Fitted physical parameters in their units (k,)."""
+        return np.zeros(0) if self.family is None else self.family.values(self.logarithms)
 
     @property
     def parameter_units(self) -> Array:
@@ -333,6 +373,21 @@ class Problem(Value):
     def recorded_numbers(self) -> int:
         """Number of recorded values in all trials, missing ones excluded."""
         return sum(int(np.isfinite(recorded(self, trial)).sum()) for trial in self.recordings)
+
+
+def _require_errors(plant: Plant, pairs: Sequence[tuple[str, str]]) -> None:
+    """Require known kinds and signals, and a plant whose disturbances can be moved."""
+    known = (*plant.outputs, *plant.disturbances)
+    for kind, name in pairs:
+        if kind not in KINDS:
+            raise InputError("signal_errors", f"got {kind!r}", f"choose from: {', '.join(KINDS)}")
+        if name not in known:
+            said = f"choose from: {', '.join(known)}"
+            raise InputError("signal_errors", f"no signal is named {name!r}", said)
+        dressed = plant.body is not None or plant.ahead or np.any(plant.observer)
+        if name in plant.disturbances and dressed:
+            problem = f"{name} drives a nonlinear body or is known to the controller"
+            raise InputError("signal_errors", problem, "estimate errors of outputs only")
 
 
 def aims(plant: Plant, recordings: Sequence[Recording]) -> bool:
@@ -367,8 +422,11 @@ def recorded(problem: Problem, trial: Recording) -> Array:
 
 
 def modelled(problem: Problem, trial: Recording, run: Simulation) -> Array:
-    """Simulated counterpart of `recorded` with offsets (samples, q); last command NaN."""
-    outputs = run.x @ problem.plant.C.T + trial.offset
+    """Simulated counterpart of `recorded` with its errors (samples, q); last command NaN."""
+    outputs = run.x @ problem.plant.C.T
+    errors = trial.errors[:, : outputs.shape[1]]
+    if np.any(errors):
+        outputs = distorted(outputs, errors, held=False)[0]
     if len(problem.measured) == outputs.shape[1]:
         return np.asarray(outputs)
     return np.hstack([outputs, np.vstack([run.u, np.full((1, run.u.shape[1]), np.nan)])])
@@ -435,7 +493,11 @@ def scenarios(problem: Problem) -> list[Scenario]:
 
 def drive_of(trial: Recording, x0: Array) -> Scenario:
     """Initial state (n,) and external signals of a trial."""
-    return Scenario(frozen(x0), trial.disturbance[:-1], trial.target, trial.signals)
+    pushes = trial.disturbance[:-1]
+    errors = trial.errors[:, trial.outputs.shape[1] :]
+    if np.any(errors):
+        pushes = frozen(distorted(pushes, errors, held=True)[0])
+    return Scenario(frozen(x0), pushes, trial.target, trial.signals)
 
 
 def recorded_size(problem: Problem) -> float:

@@ -1,31 +1,26 @@
 """Residual of an inverse problem and its exact derivatives.
 
-One pass over each recording gives both (docs/why/theory.md). Columns: gain, metric (with several
-inputs), initial states and offsets of each trial, physical parameters. With a
-`Correction` the residual is that of one-step-ahead predictions.
+One pass over each recording gives both (docs/why/theory.md). Columns of a trial: the controller
+(gain and metric, or cost weights), physical parameters, then the trial's own unknowns: initial
+states and errors of signals. With a `Correction` the residual is that of one-step-ahead
+predictions.
 """
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array
 from impc.checking import checked, replace
-from impc.control.closed_loop import (
-    prepare_loop,
-    run_loop,
-    simulate,
-)
-from impc.control.constraint_rows import Directions, directions
+from impc.control.closed_loop import prepare_loop, run_loop, simulate
+from impc.control.constraint_rows import directions
 from impc.control.simulation import Status
-from impc.errors import ImpcError
+from impc.errors import ImpcError, SolverError
 from impc.inverse.problem import (
     controller_for,
-    drive_of,
     missed,
     modelled,
     recorded,
@@ -36,10 +31,12 @@ from impc.inverse.problem import (
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import stabilises
+from impc.model.signal_errors import distorted, resampled
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterator, Mapping
 
+    from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.control.simulation import Scenario, Sensitivity, Simulation
     from impc.control.terminal_set import TerminalSet
@@ -49,20 +46,36 @@ if TYPE_CHECKING:
     from impc.model.recordings import Recording
     from impc.model.weights import Weights
 
-    OwnResidual = Callable[[Array, Array], tuple[Array, Array]]
-
 # Residual assigned to each sample after an infeasible one, relative to the RMS output.
 _NOT_REACHED = 1e3
 
 
 @dataclass(frozen=True)
+class Linear:
+    """Residual and derivatives at a point, trial by trial."""
+
+    residuals: tuple[Array, ...]  # (rows,) each: (simulated - recorded) / scale
+    tables: tuple[Array, ...]  # (rows, shared + own) each
+    shared: int  # Columns of the controller and the parameters; those of the trial follow
+    reason: str  # Why a simulation stopped; empty if all trials are complete
+    active: int  # Samples with an active bound
+    weakly_active: int  # Samples at which the derivative is one-sided
+    terminal: TerminalSet | None  # Terminal set, reused as a starting point by the next evaluation
+
+    @property
+    def residual(self) -> Array:
+        """Residual of all trials (r,)."""
+        return np.concatenate(self.residuals)
+
+
+@dataclass(frozen=True)
 class Evaluation:
-    """Residual and derivatives at one gain and metric."""
+    """Residual and derivatives at one gain and metric, by their entries."""
 
     residual: Array  # (r,), simulated minus recorded outputs, each divided by its scale
     dK: Array  # (r, m, n)
     dS: Array  # (r, m, m), with respect to the metric scaled as in `Controller`
-    # (r, own), with respect to initial state and offsets of the trial to which the row belongs
+    # (r, own), with respect to the unknowns of the trial to which the row belongs
     own: Array
     # (r, k), with respect to the logarithms of the physical parameters; k may be 0
     dparameters: Array
@@ -81,6 +94,52 @@ class Evaluation:
         return np.asarray(self.dS.reshape(len(self.residual), -1) @ scaled.T)
 
 
+def linearise(
+    problem: Problem,
+    controller: Controller,
+    law: Mapping[str, Array],
+    correction: Correction | None = None,
+) -> Linear:
+    """Residual and derivatives under a controller.
+
+    `law` has the parts of the controller, K and S or Q and R, along the shared columns (last axis);
+    the last k columns are the physical parameters. With a `correction` every gain can be evaluated,
+    but neither parameters nor errors can be searched.
+    """
+    shared = next(iter(law.values())).shape[-1]
+    differential = None
+    if problem.family is not None:
+        differential = plant_differential(problem.family, problem.logarithms)
+    along = _directions(problem, controller, law, differential)
+    seen = _Seen.of(problem, correction)
+    if correction is not None and seen.moves is not None:
+        along = replace(along, x0=correction.kept(problem) @ along.x0)
+    if seen.moves is not None:
+        E = np.zeros((problem.plant.n, seen.moves[2].shape[1], along.count))
+        E[:, : along.E.shape[1]] = along.E
+        _along_pushed(problem, E, shared)
+        along = replace(along, E=E)
+    prepared, outputs = (
+        prepare_loop(controller, along, seen.moves),
+        seen.weighting @ problem.plant.C,
+    )
+    residuals, tables, reason, active, weakly_active = [], [], "", 0, 0
+    commands = len(problem.measured) > len(problem.plant.C)
+    for trial, drive in zip(problem.recordings, seen.drives, strict=True):
+        run, moved = run_loop(prepared, drive, proved=False, seen=outputs, inputs=commands)
+        weakly_active += run.weakly_active
+        active += int(np.count_nonzero(run.status != Status.FREE))
+        difference = seen.off(problem, trial, run)
+        if not run.complete:
+            reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
+            difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
+        residuals.append(difference.ravel())
+        tables.append(_table(problem, seen, trial, run, moved, shared, differential))
+    return Linear(
+        tuple(residuals), tuple(tables), shared, reason, active, weakly_active, controller.terminal
+    )
+
+
 def evaluate(
     problem: Problem,
     gain: Array,
@@ -88,53 +147,60 @@ def evaluate(
     near: TerminalSet | None = None,
     correction: Correction | None = None,
 ) -> Evaluation:
-    """Residual and exact derivatives at a `gain` (m, n) and a `metric` (m, m).
+    """Residual and derivatives by all entries of a `gain` (m, n) and a `metric` (m, m).
 
     A gain that does not stabilise the plant, or a loop that diverges, gives a large finite residual
-    and a reason, so that a search can reject the step. With a `correction` every gain can be
-    evaluated, but parameters cannot be searched. `near` as in `controller_for`.
+    and a reason, so that a search can reject the step. `near` as in `controller_for`, `correction`
+    as in `linearise`.
+    """
+    m, n = gain.shape
+    entries, pairs = m * n, m * (m + 1) // 2 if m > 1 else 0
+    shared = entries + pairs + len(problem.logarithms)
+    try:
+        law = {"K": np.eye(entries, shared).reshape(m, n, shared), "S": np.zeros((m, m, shared))}
+        rows, columns = np.tril_indices(m)
+        if pairs:
+            places = np.arange(entries, entries + pairs)
+            law["S"][rows, columns, places] = law["S"][columns, rows, places] = 1.0
+        controller = stable_controller(problem, gain, metric, near, correction)
+        found = linearise(problem, controller, law, correction)
+    except ImpcError as error:
+        if problem.terminal_weight is not None:
+            raise
+        found = unusable(problem, shared, str(error))
+    table = np.concatenate(found.tables) if len(found.tables) > 1 else found.tables[0]
+    parts = np.split(table, [entries, entries + pairs, shared], axis=1)
+    return Evaluation(
+        found.residual,
+        parts[0].reshape(-1, m, n),
+        _symmetric(parts[1], m),
+        parts[3],
+        parts[2],
+        found.reason,
+        found.active,
+        found.weakly_active,
+        found.terminal,
+    )
+
+
+def stable_controller(
+    problem: Problem,
+    gain: Array,
+    metric: Array,
+    near: TerminalSet | None = None,
+    correction: Correction | None = None,
+) -> Controller:
+    """Controller of a `gain` (m, n) and a `metric` (m, m) that a search may simulate.
+
+    With bounds, unstable gains have spurious local minima: saturation and the end of the recording
+    hide the divergence. Without bounds, or with a `correction`, a search may pass through them.
     """
     require_riccati(problem)
     plant = problem.plant
-    m, n = plant.m, plant.n
-    refused = _refused(problem, gain, correction)
-    if refused:
-        return unusable(problem, refused)
-    try:
-        controller = controller_for(problem, gain, metric, near)
-    except ImpcError as error:
-        return unusable(problem, str(error))
-    layout = _layout(problem)
-    differential = _plant_differential(problem)
-    along = _all_directions(problem, controller, layout, differential)
-    seen = _Seen.of(problem, correction)
-    if correction is not None and seen.moves is not None:
-        E = np.zeros((n, seen.moves[2].shape[1], layout.count))
-        along = replace(along, x0=correction.kept(problem) @ along.x0, E=E)
-    prepared, outputs = prepare_loop(controller, along, seen.moves), seen.weighting @ plant.C
-    residuals, derivatives, reason, active, weakly_active = [], [], "", 0, 0
-    for trial, drive in zip(problem.recordings, seen.drives, strict=True):
-        run, sensitivity = run_loop(
-            prepared, drive, proved=False, seen=outputs, inputs=len(problem.measured) > len(plant.C)
-        )
-        weakly_active += run.weakly_active
-        active += int(np.count_nonzero(run.status != Status.FREE))
-        if not run.complete:
-            reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
-        residuals.append(_difference(problem, seen, trial, run).ravel())
-        derivatives.append(_slope(problem, seen, trial, run, sensitivity, layout, differential))
-    jacobian = np.concatenate(derivatives) if len(derivatives) > 1 else derivatives[0]
-    return Evaluation(
-        np.concatenate(residuals),
-        jacobian[:, layout.gain].reshape(-1, m, n),
-        _symmetric(jacobian[:, layout.metric], m),
-        jacobian[:, layout.own],
-        jacobian[:, layout.parameters],
-        reason,
-        active,
-        weakly_active,
-        controller.terminal,
-    )
+    bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
+    if correction is None and bounded and not stabilises(plant, gain):
+        raise SolverError("gain", "does not stabilise the plant", "use another one")
+    return controller_for(problem, gain, metric, near)
 
 
 def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evaluation:
@@ -153,24 +219,6 @@ def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evalua
     return replace(found, **parts)
 
 
-def own_residual(problem: Problem, gain: Array, metric: Array) -> OwnResidual:
-    """Residual of a one-trial problem as a function of its initial state and offsets."""
-    controller = controller_for(problem, gain, metric)
-    layout = _layout(replace(problem, family=None, logarithms=frozen([])))
-    along = _all_directions(problem, controller, layout, None)
-    prepared = prepare_loop(controller, along)
-    (trial,) = problem.recordings
-    seen = _Seen.of(problem, None)
-
-    def at(x0: Array, offset: Array) -> tuple[Array, Array]:
-        moved = replace(trial, offset=frozen(offset))
-        run, sensitivity = run_loop(prepared, drive_of(trial, x0), seen=problem.scaled_outputs)
-        slopes = _slope(problem, seen, moved, run, sensitivity, layout, None)
-        return _difference(problem, seen, moved, run).ravel(), slopes[:, layout.own]
-
-    return at
-
-
 def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
     """2-norm of the residual and "", or infinity and the reason; faster than `evaluate`."""
     residual, reason = residual_or_reason(problem, gain, metric)
@@ -181,178 +229,170 @@ def residual_or_reason(
     problem: Problem, gain: Array, metric: Array, correction: Correction | None = None
 ) -> tuple[Array, str]:
     """Residual (r,) without derivatives and "", or an empty array and the reason."""
-    refused = _refused(problem, gain, correction)
-    if refused:
-        return np.zeros(0), refused
+    require_riccati(problem)
     try:
-        controller = controller_for(problem, gain, metric)
+        controller = stable_controller(problem, gain, metric, correction=correction)
     except ImpcError as error:
         return np.zeros(0), str(error)
-    seen, parts = _Seen.of(problem, correction), []
-    prepared = prepare_loop(controller, directions(controller, 0), seen.moves)
-    for trial, drive in zip(problem.recordings, seen.drives, strict=True):
-        run, _ = run_loop(prepared, drive, proved=False)
+    return controlled_residual(problem, controller, correction)
+
+
+def controlled_residual(
+    problem: Problem, controller: Controller, correction: Correction | None = None
+) -> tuple[Array, str]:
+    """Residual (r,) under a controller and "", or an empty array and the reason."""
+    parts = []
+    for run, difference in _runs(problem, controller, correction):
         if not run.complete:
             reason = f"sample {run.reached}: {Status(int(run.status[run.reached])).sentence}"
             return np.zeros(0), reason
-        parts.append(seen.off(problem, trial, run).ravel())
+        parts.append(difference.ravel())
     return np.concatenate(parts), ""
 
 
 def residual_only(problem: Problem, gain: Array, metric: Array) -> Array:
-    """Residual without derivatives; raises if the loop cannot be simulated."""
-    controller, seen = controller_for(problem, gain, metric), _Seen.of(problem, None)
-    return np.concatenate(
-        [
-            seen.off(problem, trial, simulate(controller, drive)).ravel()
-            for trial, drive in zip(problem.recordings, seen.drives, strict=True)
-        ]
-    )
+    """Residual without derivatives, of incomplete simulations too."""
+    runs = _runs(problem, controller_for(problem, gain, metric))
+    return np.concatenate([difference.ravel() for _, difference in runs])
 
 
-def _refused(problem: Problem, gain: Array, correction: Correction | None) -> str:
-    """Reason not to simulate a gain, or an empty string.
-
-    With bounds, unstable gains have spurious local minima: saturation and the end of the recording
-    hide the divergence. Without bounds a search may pass through unstable gains.
-    """
-    plant = problem.plant
-    bounded = problem.terminal_set or len(bound_rows(problem.bounds, plant).b) > 0
-    if correction is not None or not bounded or stabilises(plant, gain):
-        return ""
-    return "the gain does not stabilise the plant"
+def _runs(
+    problem: Problem, controller: Controller, correction: Correction | None = None
+) -> Iterator[tuple[Simulation, Array]]:
+    """Simulation and residual (samples, q) of each trial, without derivatives."""
+    seen = _Seen.of(problem, correction, errors=False)
+    prepared = prepare_loop(controller, directions(controller, 0), seen.moves)
+    for trial, drive in zip(problem.recordings, seen.drives, strict=True):
+        run, _ = run_loop(prepared, drive, proved=False)
+        yield run, seen.off(problem, trial, run)
 
 
 @dataclass(frozen=True)
 class _Seen:
     """How the recordings of a problem are simulated and compared with the simulation."""
 
+    # A, B and E of the simulated plant, if they differ from those of the controller's
     moves: tuple[Array, Array, Array] | None
     drives: list[Scenario]
-    weighting: Array
+    weighting: Array  # (p, p), from C x to the residual
+    plain: bool = True  # Whether that only divides by the scales
 
     @classmethod
-    def of(cls, problem: Problem, correction: Correction | None) -> _Seen:
-        if correction is None:
-            return cls(None, scenarios(problem), np.diag(1 / problem.output_scale))
-        return cls(
-            correction.moves(problem), correction.drives(problem), correction.weighting(problem)
-        )
+    def of(cls, problem: Problem, correction: Correction | None, *, errors: bool = True) -> _Seen:
+        """With the derivatives by `errors` of disturbances as further disturbances."""
+        if correction is not None:
+            moves, drives = correction.moves(problem), correction.drives(problem)
+            return cls(moves, drives, correction.weighting(problem), plain=False)
+        plant, weighting = problem.plant, np.diag(1 / problem.output_scale)
+        pushed = _pushed(problem) if errors else []
+        if not pushed:
+            return cls(None, scenarios(problem), weighting)
+        drives = []
+        for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
+            slopes = distorted(trial.disturbance[:-1], trial.errors[:, len(plant.C) :], held=True)[
+                1
+            ]
+            more = [slopes[:, column, kind, None] for _, kind, column in pushed]
+            drives.append(replace(drive, disturbance=np.hstack([drive.disturbance, *more])))
+        E = np.hstack([plant.E, np.zeros((plant.n, len(pushed)))])
+        return cls((plant.A, plant.B, E), drives, weighting)
 
     def off(self, problem: Problem, trial: Recording, run: Simulation) -> Array:
         """(Simulated - recorded) / scale, shape (samples, q); zero for missing values."""
-        if self.moves is None:
+        if self.plain:
             return missed(problem, trial, run)
+        p, W = len(self.weighting), self.weighting
         found = np.nan_to_num(modelled(problem, trial, run) - recorded(problem, trial))
-        p = len(self.weighting)
-        return np.hstack([found[:, :p] @ self.weighting.T, found[:, p:] / problem.scale[p:]])
+        return np.hstack([found[:, :p] @ W.T, found[:, p:] / problem.scale[p:]])
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Column ranges of the derivative: gain, metric, unknowns of one trial, parameters."""
-
-    gain: slice
-    metric: slice
-    own: slice
-    parameters: slice
-
-    @property
-    def count(self) -> int:
-        return int(self.parameters.stop)
+def _pushed(problem: Problem) -> list[tuple[int, int, int]]:
+    """Searched errors of disturbances: place among the errors, kind and disturbance."""
+    p = len(problem.plant.outputs)
+    return [
+        (place, kind, column - p)
+        for place, (kind, column) in enumerate(problem.error_places)
+        if column >= p
+    ]
 
 
-def _layout(problem: Problem) -> _Layout:
-    m, n = problem.plant.m, problem.plant.n
-    sizes = (
-        m * n,
-        m * (m + 1) // 2 if m > 1 else 0,
-        problem.own_unknowns,
-        len(problem.logarithms),
-    )
-    ends = np.cumsum((0, *sizes)).tolist()
-    return _Layout(*(slice(a, b) for a, b in itertools.pairwise(ends)))
+def _along_pushed(problem: Problem, E: Array, shared: int) -> None:
+    """Write the directions of E (n, d + errors, count) that errors of disturbances add."""
+    first = shared + problem.searched_states
+    for further, (place, _, column) in enumerate(_pushed(problem)):
+        E[:, problem.plant.E.shape[1] + further, first + place] = problem.plant.E[:, column]
 
 
-def _plant_differential(problem: Problem) -> PlantDifferential | None:
-    if problem.family is None:
-        return None
-    return plant_differential(problem.family, problem.logarithms)
-
-
-def _all_directions(
+def _directions(
     problem: Problem,
     controller: Controller,
-    layout: _Layout,
+    law: Mapping[str, Array],
     differential: PlantDifferential | None,
 ) -> Directions:
-    (m, n), searched = controller.K.shape, problem.searched_states
-    count = layout.count
-    dK = np.zeros((m * n, count))
-    dK[:, layout.gain] = np.eye(m * n)
-    dS = np.zeros((m, m, count))
-    if m > 1:
-        rows, columns = np.tril_indices(m)
-        at = np.arange(layout.metric.start, layout.metric.stop)
-        dS[rows, columns, at] = dS[columns, rows, at] = 1.0
-    dx0 = np.zeros((n, count))
-    dx0[:searched, layout.own.start : layout.own.start + searched] = np.eye(searched)
-    given = {"K": dK, "S": dS, "x0": dx0}
-    if differential is not None:
+    """Directions of the shared columns `law` (last axis), then those of a trial."""
+    n, searched = problem.plant.n, problem.searched_states
+    shared = next(iter(law.values())).shape[-1]
+    count = shared + problem.own_unknowns
+    given = {name: np.zeros((*part.shape[:-1], count)) for name, part in law.items()}
+    for name, part in law.items():
+        given[name][..., :shared] = part
+    given["x0"] = np.zeros((n, count))
+    given["x0"][:searched, shared : shared + searched] = np.eye(searched)
+    first = shared - len(problem.logarithms)
+    if differential is not None and problem.family is not None:
         for name in ("A", "B", "E", "C", "observer"):
             part = getattr(differential, name)
             given[name] = np.zeros((*part.shape[:-1], count))
-            given[name][..., layout.parameters] = part
-    if differential is not None and problem.family is not None:
+            given[name][..., first:shared] = part
         bounds = bound_rows(controller.bounds, problem.plant)
         given["bounds"] = np.zeros((len(bounds.b), count))
         for place, control in problem.family.limits(problem.plant):
-            given["bounds"][:, layout.parameters.start + place] = bounds.along_limit(control)
+            given["bounds"][:, first + place] = bounds.along_limit(control)
     along = directions(controller, count, **given)
     if differential is None:
         return along
-    return replace(along, bodies=((),) * layout.parameters.start + differential.bodies)
+    return replace(along, bodies=((),) * first + differential.bodies)
 
 
-def _slope(
+def _table(
     problem: Problem,
     seen: _Seen,
     trial: Recording,
     run: Simulation,
     moved: Sensitivity,
-    layout: _Layout,
+    shared: int,
     differential: PlantDifferential | None,
 ) -> Array:
-    """Derivative of `_Seen.off` (samples q, count), including parameters in C."""
-    p = len(problem.plant.outputs)
-    slope = measured_slope(problem, trial, moved, layout.own.start, seen.weighting)
+    """Derivative of `_Seen.off` (samples q, count), parameters in C and errors included."""
+    p, slope = len(problem.plant.outputs), moved.x
     if differential is not None:
         on_outputs = np.tensordot(run.x, differential.C, ((1,), (1,)))  # (samples, p, k)
-        slope[:, :p, layout.parameters] += on_outputs / problem.output_scale[:, None]
+        parameters = slice(shared - on_outputs.shape[2], shared)
+        slope[:, :p, parameters] += on_outputs / problem.output_scale[:, None]
+    slope = measured_slope(problem, trial, moved)
+    if problem.signal_errors:
+        outputs = run.x @ problem.plant.C.T
+        own = distorted(outputs, trial.errors[:, :p], held=False)[1]
+        first = shared + problem.searched_states
+        for place, (kind, column) in enumerate(problem.error_places):
+            if column < p:
+                by = own[:, column, kind, None] * seen.weighting[:, column]
+                slope[:, :p, first + place] += by
         slope[np.isnan(recorded(problem, trial))] = 0.0
-    return slope.reshape(-1, layout.count)
+    return slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
 
 
-def measured_slope(
-    problem: Problem,
-    trial: Recording,
-    moved: Sensitivity,
-    own: int | None = None,
-    weighting: Array | None = None,
-) -> Array:
+def measured_slope(problem: Problem, trial: Recording, moved: Sensitivity) -> Array:
     """Derivative of scaled outputs and commands (samples, q, k); zero for missing values.
 
-    `moved.x` are those of the scaled outputs and may be overwritten. Offset columns follow the
-    initial states, starting at column `own`.
+    `moved.x` are those of the scaled outputs and may be overwritten.
     """
-    outputs, W = problem.plant.outputs, weighting
-    W, p, slope = np.diag(1 / problem.output_scale) if W is None else W, len(outputs), moved.x
+    p, slope = len(problem.plant.outputs), moved.x
+    if np.any(trial.errors[:, :p]):
+        slope = resampled(slope, trial.errors[:, :p])
     if len(problem.measured) > p:
         slope = np.zeros((trial.samples, len(problem.measured), moved.x.shape[2]))
         slope[:, :p] = moved.x
-    for place, name in enumerate(problem.offsets if own is not None else ()):
-        slope[:, :p, (own or 0) + problem.searched_states + place] += W[:, outputs.index(name)]
-    if slope.shape[1] > p:
         slope[:-1, p:] = moved.u / problem.command_scale[:, None]
     slope[np.isnan(recorded(problem, trial))] = 0.0
     return slope
@@ -378,39 +418,19 @@ def _symmetric(columns: Array, m: int) -> Array:
     return dS
 
 
-def _difference(problem: Problem, seen: _Seen, trial: Recording, run: Simulation) -> Array:
-    """Scaled residual (samples, q), set to a large value after the last feasible sample."""
-    difference = seen.off(problem, trial, run)
-    if not run.complete:
-        difference[run.reached + 1 :] = _NOT_REACHED * _scale(problem, trial)
-    return difference
-
-
 def _scale(problem: Problem, trial: Recording) -> float:
     return float(np.sqrt(np.nanmean((trial.outputs / problem.output_scale) ** 2))) or 1.0
 
 
-def unusable(problem: Problem, reason: str) -> Evaluation:
-    """Evaluation with a large finite residual and a reason, so that a search rejects the step."""
-    m, n = problem.plant.m, problem.plant.n
-    residual = np.concatenate(
-        [
-            np.full(size, _NOT_REACHED * _scale(problem, trial))
-            for size, trial in zip(problem.trial_sizes, problem.recordings, strict=True)
-        ]
+def unusable(problem: Problem, shared: int, reason: str) -> Linear:
+    """A large finite residual and a reason, so that a search rejects the step."""
+    sizes, width = problem.trial_sizes, shared + problem.own_unknowns
+    residuals = tuple(
+        np.full(size, _NOT_REACHED * _scale(problem, trial))
+        for size, trial in zip(sizes, problem.recordings, strict=True)
     )
-    size, own = len(residual), problem.own_unknowns
-    return Evaluation(
-        residual,
-        np.zeros((size, m, n)),
-        np.zeros((size, m, m)),
-        np.zeros((size, own)),
-        np.zeros((size, len(problem.logarithms))),
-        reason,
-        0,
-        0,
-        None,
-    )
+    tables = tuple(np.zeros((size, width)) for size in sizes)
+    return Linear(residuals, tables, shared, reason, 0, 0, None)
 
 
 def scaled_changes(metric: Array, changes: Array) -> Array:

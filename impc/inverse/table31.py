@@ -21,7 +21,6 @@ from impc.checking import checked, replace
 from impc.errors import SolverError
 from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import fit_gain, refine_gain, regulators
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
 from impc.inverse.proximal_search import (
@@ -33,6 +32,8 @@ from impc.inverse.proximal_search import (
     definite,
 )
 from impc.inverse.residuals import evaluate
+from impc.inverse.search import fit_gain, refine_gain
+from impc.inverse.starts import regulators
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from impc.arrays import Array, as_numbers, finite_array, frozen, require_finite,
 from impc.checking import Value, checked
 from impc.errors import DataError
 from impc.model.foresight import physical_disturbances, physical_states, with_steps
+from impc.model.signal_errors import DRIFT, KINDS, OFFSET, SCALE
 from impc.model.targets import reference
 
 if TYPE_CHECKING:
@@ -90,8 +91,9 @@ class Recording(Value):
         Signals with a target.
     commands : ndarray of shape (samples, m)
         Recorded commands, the last row NaN; shape (0, m) if there are none.
-    offset : ndarray of shape (p,)
-        Offset in the units of the outputs.
+    errors : ndarray of shape (kinds, p + d)
+        Errors of outputs and disturbances, one row a kind (`impc.model.signal_errors`); zero unless
+        they are fitted (`Problem.signal_errors`).
     label : Label
         Label of the trial.
     findings : tuple of str
@@ -117,7 +119,7 @@ class Recording(Value):
         "x0": "n",
         "target": "* q",
         "commands": "~* m",
-        "offset": "p",
+        "errors": "* *",
     }
 
     outputs: Array
@@ -126,7 +128,7 @@ class Recording(Value):
     target: Array
     signals: tuple[str, ...]
     commands: Array
-    offset: Array
+    errors: Array
     label: Label
     findings: tuple[str, ...]
 
@@ -177,15 +179,22 @@ class Recording(Value):
             target=frozen(values),
             signals=names,
             commands=frozen(_commands(commands, len(y), plant.m)),
-            offset=frozen(np.zeros(y.shape[1]) if offset is None else offset),
+            errors=frozen(_errors(offset, y.shape[1], driven.shape[1])),
             label=label or Label(),
             findings=findings,
         )
 
     @property
-    def without_offset(self) -> Array:
-        """Outputs minus their offset (samples, p)."""
-        return np.asarray(self.outputs - self.offset)
+    def offset(self) -> Array:
+        """Offset (p,) contained in the recorded outputs."""
+        return np.asarray(self.errors[OFFSET, : self.outputs.shape[1]])
+
+    @property
+    def corrected(self) -> Array:
+        """Outputs without offset, drift and scale error (samples, p)."""
+        errors = self.errors[:, : self.outputs.shape[1]]
+        moved = errors[OFFSET] + errors[DRIFT] * np.arange(self.samples)[:, None]
+        return np.asarray((self.outputs - moved) / (1 + errors[SCALE]))
 
     @property
     def has_gaps(self) -> bool:
@@ -210,6 +219,14 @@ def _require_no_end(values: Array) -> None:
             f"are NaN from sample {end} on",
             "cut them there; if simulated, use another initial state or wider bounds",
         )
+
+
+def _errors(offset: ArrayLike | None, outputs: int, disturbances: int) -> Array:
+    """Errors (kinds, p + d) with the given `offset` of the outputs."""
+    errors = np.zeros((len(KINDS), outputs + disturbances))
+    if offset is not None:
+        errors[OFFSET, :outputs] = finite_array("offset", offset, (outputs,))
+    return errors
 
 
 def _with_gaps(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:

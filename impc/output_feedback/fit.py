@@ -10,9 +10,9 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import ImpcError, InputError
-from impc.inverse.coordinates import Point
-from impc.inverse.gain_search import regulators
 from impc.inverse.problem import require_riccati
+from impc.inverse.starts import regulators
+from impc.inverse.unknowns import Point
 from impc.output_feedback.observer import LEVELS
 from impc.output_feedback.prior import Place, Prior
 from impc.output_feedback.search import climb

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.arrays import frozen
-from impc.inverse.coordinates import Point
 from impc.inverse.structured_search import WeightCoordinates
+from impc.inverse.unknowns import Point
 from impc.output_feedback.fit import person_at
 from impc.output_feedback.page import PersonModel
 from impc.output_feedback.start import Asked, gain_space, prior_about

@@ -26,7 +26,7 @@ from impc.output_feedback.unknowns import PersonCoordinates
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.inverse.coordinates import Point
+    from impc.inverse.unknowns import Point
     from impc.output_feedback.observer import Observer
 
 # Assumed shares of the residual: process and motor noise, senses, recording. The one with the

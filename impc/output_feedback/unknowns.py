@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
-    from impc.inverse.coordinates import Coordinates, Point
+    from impc.inverse.coordinates import Coordinates
+    from impc.inverse.unknowns import Point
     from impc.output_feedback.compiled_filter import Likelihood
     from impc.output_feedback.observer import Observer
 

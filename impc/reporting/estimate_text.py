@@ -10,7 +10,8 @@ from markupsafe import escape
 from impc.errors import InputError
 from impc.inverse.methods import METHODS
 from impc.model.plant import gain_unit
-from impc.reporting.shown_units import axis_label, shown_unit
+from impc.model.signal_errors import KINDS
+from impc.reporting.shown_units import axis_label, error_unit, shown_unit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,10 +80,10 @@ def _problem(estimate: Estimate) -> list[str]:
         lines.append(f"Observer:   {', '.join(learned)}")
     if len(problem.measured) > len(plant.outputs):
         lines.append(f"Commands:   recorded, {', '.join(plant.controls)}")
-    for name, values in zip(plant.outputs, problem.shifts.T, strict=True):
-        if np.any(values):
-            listed = ", ".join(f"{value:.4g}" for value in values)
-            lines.append(f"Offsets:    {name} {listed} {plant.unit(name)}, one per trial")
+    for kind, name, values in problem.fitted_errors:
+        factor, unit = error_unit(plant, kind, name)
+        listed = ", ".join(f"{factor * value:.4g}" for value in values)
+        lines.append(f"Errors:     {name} has {KINDS[kind][0]}, {listed} {unit}, one per trial")
     return lines
 
 
@@ -117,7 +118,7 @@ def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any
     if not isinstance(trial, int) or not 0 <= trial < len(problem.recordings):
         last = len(problem.recordings) - 1
         raise InputError("trial", f"got {trial!r:.40}", f"pass an integer from 0 to {last}")
-    run, recorded = estimate.simulations[trial], problem.recordings[trial].without_offset
+    run, recorded = estimate.simulations[trial], problem.recordings[trial].corrected
     count = len(plant.outputs) + plant.m
     if axes is None:
         _, axes = plt.subplots(count, sharex=True, layout="constrained")

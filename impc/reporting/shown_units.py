@@ -12,6 +12,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
 from impc.model.plant import UNKNOWN
+from impc.model.signal_errors import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,6 +46,15 @@ def shown_unit(plant: Plant, name: str) -> tuple[float, str]:
     if unit == UNKNOWN and name.lower().startswith(_ANGLES):
         unit = "rad/s" if name.endswith("_rate") else "rad"
     return shown_as(unit)
+
+
+def error_unit(plant: Plant, kind: str, name: str) -> tuple[float, str]:
+    """Factor from an error of a signal (`Problem.fitted_errors`) to what is shown, and its unit."""
+    _, unit, size, _ = KINDS[kind]
+    if unit.strip() == unit != "":
+        return size, unit
+    factor, own = shown_unit(plant, name)
+    return factor * size, f"{own}{unit.strip()}"
 
 
 def shown_as(unit: str) -> tuple[float, str]:

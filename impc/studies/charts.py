@@ -62,7 +62,7 @@ def _panels(
     plant, bounds, given = problem.plant, problem.bounds, problem.recordings[trial]
     runs = [until_its_end(plant, fit.runs[trial]) for fit in fits]
     unknown = np.full((given.samples, plant.m), np.nan)
-    outputs = [given.without_offset, *(y for y, _ in runs)]
+    outputs = [given.corrected, *(y for y, _ in runs)]
     commands = [given.commands if len(given.commands) else unknown, *(u for _, u in runs)]
     panels = []
     for names, curves, limited in (

@@ -174,7 +174,7 @@ def trajectory_table(
     plant, blocks = problem.plant, []
     for index in trials:
         trial = problem.recordings[index]
-        parts = [np.asarray(trial.without_offset), np.asarray(trial.disturbance)]
+        parts = [np.asarray(trial.corrected), np.asarray(trial.disturbance)]
         for each in runs.values():
             parts += until_its_end(plant, each[index])
         blocks.append(np.hstack([plant.dt * np.arange(trial.samples)[:, None], *parts]))

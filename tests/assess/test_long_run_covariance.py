@@ -14,7 +14,7 @@ from impc.assess.long_run_covariance import (
     spread_of_sum,
     white_noise,
 )
-from impc.inverse.least_squares import trial_span
+from impc.inverse.columns import trial_span
 
 _TRIALS, _SAMPLES, _OUTPUTS, _DRAWS = 2, 400, 2, 60
 

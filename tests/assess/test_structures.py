@@ -21,7 +21,7 @@ from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_only
-from impc.inverse.structured_search import search_from
+from impc.inverse.structured import search_from
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording

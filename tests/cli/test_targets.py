@@ -117,11 +117,13 @@ def test_a_tracked_target_with_all_of_it(
     assert aim["targets"] == ["x"]
     assert aim["commands"] == ["push"]
     assert aim["observer_rate"]["wind"] == pytest.approx(RATE, rel=0.05)
-    assert aim["offsets"]["x"] == pytest.approx([OFFSET], abs=0.002)
+    (error,) = aim["errors"]
+    assert (error["kind"], error["signal"]) == ("offset", "x")
+    assert error["values"] == pytest.approx([OFFSET], abs=0.002)
     table = found["findings"]["command_regression"]["table"]
     assert table["number"] == ["x", "v"]
     assert table["regression"] == pytest.approx(law.K[0], rel=0.02)
-    assert found["findings"]["offsets"]["table"]["unit"] == ["m"]
+    assert found["findings"]["signal_errors"]["table"]["unit"] == ["m"]
     assert found["trials"][0]["missing"] == 17
     page = Path("out/report.html").read_text().replace("\u00a0", " ")
     assert "regulates to the target of x; it assumes that the wind persists and learns it" in page

@@ -149,7 +149,7 @@ def test_gaps_offsets_and_commands_of_a_finite_horizon() -> None:
     found = impc.fit(problem)
     assert found.explained
     assert impc.weight_error(found.stage_weights, truth) < 1e-6
-    assert found.problem.shifts[0, 0] == pytest.approx(0.1, abs=1e-8)
+    assert found.problem.errors[0, 0, 0] == pytest.approx(0.1, abs=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,9 +9,9 @@ import pytest
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.inverse.gain_search import fit_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
+from impc.inverse.search import fit_gain
 from impc.inverse.table31 import inverse_mpc_reduced, table_3_1
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant, change_coordinates

@@ -15,8 +15,8 @@ from experiments.search_study import is_right, warned
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.simulation import scenario
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.search import refine_gain
 from impc.inverse.table31 import inverse_mpc_reduced
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from impc.assess.covariance import gain_covariance
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.problem import Problem
+from impc.inverse.search import refine_gain
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.studies.fit.result import shown_trials

@@ -16,13 +16,14 @@ from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.inverse.coordinates import Coordinates
 from impc.inverse.estimates import Estimate
-from impc.inverse.gain_search import fit_gain
+from impc.inverse.laws import GainLaw
 from impc.inverse.methods import fit
-from impc.inverse.noisy_fit import fit_controller, with_fitted_starts
+from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
+from impc.inverse.search import fit_gain, with_fitted_starts
+from impc.inverse.unknowns import Unknowns
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily, plant_at, plant_differential
@@ -162,7 +163,7 @@ def test_plant_differential_equals_differences() -> None:
 def test_every_column_of_the_search_equals_differences() -> None:
     """Gain, initial states and parameters together, in the coordinates of the search."""
     problem, work = seat_family()
-    space = Coordinates(problem, np.array(work.controller.K), np.eye(1))
+    space = Unknowns(problem, GainLaw(problem, np.array(work.controller.K), np.eye(1)))
     rng = np.random.default_rng(3)
     z = space.start + 0.02 * rng.standard_normal(len(space.start))
     # Compression rotates the residual and keeps its norm: compare gradients of its square.

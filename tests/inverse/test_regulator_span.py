@@ -10,11 +10,12 @@ import scipy.linalg
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.control.controller import Controller
-from impc.inverse.coordinates import Coordinates
+from impc.inverse.laws import GainLaw
 from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.unknowns import Unknowns
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
@@ -166,5 +167,6 @@ def test_the_search_begins_next_to_the_gain_that_is_given() -> None:
     structure = Structure(late_body(), ["p", "v"])
     problem = late_problem(structure=structure)
     gain = weighed(problem.plant, np.random.default_rng(6))
-    space = Coordinates(problem, gain, np.eye(1), spanned(problem.plant, structure, gain))
+    law = GainLaw(problem, gain, np.eye(1), spanned(problem.plant, structure, gain))
+    space = Unknowns(problem, law)
     np.testing.assert_allclose(space.unpack(space.start).K, gain, rtol=1e-8)

@@ -17,16 +17,17 @@ from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import ImpcError
-from impc.inverse.coordinates import Coordinates
 from impc.inverse.equivalent_weights import least_condition_weights, other_weights
 from impc.inverse.explaining_weights import metric_family, weights_behind
-from impc.inverse.gain_search import fit_gain, refine_gain
 from impc.inverse.inactive_samples import pair_of_inactive_samples
+from impc.inverse.laws import GainLaw
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate
+from impc.inverse.search import fit_gain, refine_gain
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.table31 import inverse_mpc_reduced, table_3_1
+from impc.inverse.unknowns import Unknowns
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -246,9 +247,10 @@ def test_two_motors_that_do_the_same(B: list[list[float]]) -> None:
 @pytest.mark.parametrize(("m", "seed"), [(2, 1), (3, 4)])
 def test_coordinates_know_how_gain_and_metric_change(m: int, seed: int) -> None:
     controller, problem = random_problem(seed, m)
-    space = Coordinates(problem, np.array(controller.K), np.array(controller.S))
+    law = GainLaw(problem, np.array(controller.K), np.array(controller.S))
+    space = Unknowns(problem, law)
     z = space.start + 0.1 * np.random.default_rng(seed).standard_normal(len(space.start))
-    dK, dS = space.changes(space.unpack(z), z)
+    dK, dS = space.changes(z)
 
     for index, unit in enumerate(np.eye(len(z))):
 

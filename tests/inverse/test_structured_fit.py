@@ -13,10 +13,11 @@ import plants
 from experiments.printed_intervals import carts, with_noise
 from impc.control.controller import Controller
 from impc.errors import InputError, SolverError
+from impc.inverse.laws import WeightLaw
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason
-from impc.inverse.structured_fit import fit_structure
-from impc.inverse.structured_search import WeightCoordinates, search_from
+from impc.inverse.structured import fit_structure, search_from
+from impc.inverse.unknowns import Unknowns
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
@@ -99,7 +100,7 @@ def test_derivatives_through_the_riccati_equation(family: bool) -> None:
 
     known = {"family": PlantFamily(stronger, ["strength"], [1.0])} if family else {}
     problem = posed(truth, trial, unknown_start=True, **known)
-    space = WeightCoordinates(problem, structure, cost_weights + 0.3)
+    space = Unknowns(problem, WeightLaw(structure, cost_weights + 0.3))
     z = space.start + 0.05
     exact = space.at(z).jacobian.T @ space.at(z).residual
     for index in range(len(z)):

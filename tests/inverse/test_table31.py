@@ -13,11 +13,11 @@ from impc.control.simulation import Status, require_complete, scenario
 from impc.errors import SolverError
 from impc.inverse.equivalent_weights import SLACK, least_condition_weights
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.gain_search import fit_gain
 from impc.inverse.problem import Problem, controller_for
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import evaluate, keeps_hard, residual_only
+from impc.inverse.search import fit_gain
 from impc.inverse.solution_set import gain_fibre
 from impc.inverse.table31 import (
     CONDITION_WEIGHT,
@@ -276,7 +276,7 @@ def test_a_search_steps_back_from_gains_that_do_not_stabilise(
 ) -> None:
     problem = example(example_plant, example_bounds, "A")
     found = evaluate(problem, np.zeros((1, 2)), np.eye(1))
-    assert found.reason == "the gain does not stabilise the plant"
+    assert "does not stabilise the plant" in found.reason
     assert np.all(np.isfinite(found.residual))
     assert np.linalg.norm(found.residual) > 1e3
     assert controller_for(problem, np.array([[1.5, -0.9]]), np.eye(1)).softening is not None

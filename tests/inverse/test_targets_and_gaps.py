@@ -115,10 +115,10 @@ def test_gaps_offsets_and_commands(limit: float) -> None:
     )
     found = impc.fit(problem)
     assert found.gain == pytest.approx(np.array(law.K), abs=1e-6)
-    assert found.problem.shifts[:, 0] == pytest.approx([0.02, 0.04], abs=1e-7)
+    assert found.problem.errors[:, 0, 0] == pytest.approx([0.02, 0.04], abs=1e-7)
     assert found.vaf == pytest.approx([100.0, 100.0], abs=1e-6)
     assert np.all(np.isfinite(found.intervals()[["low", "high"]]))
-    assert "Offsets:    x 0.02, 0.04" in found.summary()
+    assert "Errors:     x has an offset, 0.02, 0.04" in found.summary()
 
 
 @pytest.mark.parametrize("seen", ["x v", "x"])
@@ -167,9 +167,10 @@ def test_slopes_with_gaps_offsets_and_commands_are_differences() -> None:
             for sign in (1, -1)
         ]
         assert found.own[:, place] == pytest.approx((ends[0] - ends[1]) / 2 / h, abs=1e-6)
-    shift = np.array([[0.0, 1.0]])
+    offset = np.zeros_like(problem.errors)
+    offset[0, 0, plant.outputs.index("v")] = 1.0
     ends = [
-        residual_only(problem.at(problem.starts, problem.logarithms, sign * shift), K, S)
+        residual_only(problem.at(problem.starts, problem.logarithms, sign * offset), K, S)
         for sign in (1, -1)
     ]
     assert found.own[:, 2] == pytest.approx((ends[0] - ends[1]) / 2, abs=1e-9)
@@ -223,4 +224,4 @@ def test_a_saved_estimate_keeps_targets_and_offsets(tmp_path: Any) -> None:
     assert again.misfit == found.misfit
     for one, other in zip(again.states, found.states, strict=True):
         assert np.array_equal(one, other)
-    assert np.array_equal(again.problem.shifts, found.problem.shifts)
+    assert np.array_equal(again.problem.errors, found.problem.errors)

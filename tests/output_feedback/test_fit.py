@@ -15,9 +15,9 @@ from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.estimates import Estimate
-from impc.inverse.gain_search import refine_gain
 from impc.inverse.methods import fit
 from impc.inverse.problem import Problem
+from impc.inverse.search import refine_gain
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 from impc.checking import replace
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import fit
-from impc.inverse.structured_fit import fit_structured
+from impc.inverse.structured import fit_structured
 from impc.model.structure import Structure
 from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import fit_output_feedback

@@ -31,7 +31,7 @@ from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.structured_fit import fit_structured
+from impc.inverse.structured import fit_structured
 from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_name
@@ -125,7 +125,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     """Bootstrap replicate `index` of a unit with the stored `fit`."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
-    here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "offsets")))
+    here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "errors")))
     model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
     found = replicate(model, index, settings.seed)
     return _finished({"K": found.K, "parameters": found.parameters}, started)
@@ -225,7 +225,7 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "parameters": dict(zip(known, estimate.parameters, strict=True)),
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
-        "offsets": estimate.problem.shifts,
+        "errors": estimate.problem.errors,
         "findings": [trial.findings for trial in problem.recordings],
         "trajectory": _trajectory(fit),
         "structure": _structure(problem, fitted, settings),
@@ -257,7 +257,7 @@ def _trajectory(fit: MethodFit) -> dict[str, Any]:
     step = max(1, first.samples // 600)
     return {
         "dt": plant.dt * step,
-        "recorded": first.without_offset[::step],
+        "recorded": first.corrected[::step],
         "simulated": (fit.runs[0].x @ plant.C.T)[::step],
     }
 

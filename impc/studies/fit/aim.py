@@ -1,4 +1,4 @@
-"""Targets, learned disturbances, offsets and recorded commands of a fit."""
+"""Targets, learned disturbances, errors of signals and recorded commands of a fit."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.model.foresight import physical_disturbances
+from impc.model.signal_errors import KINDS
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit, signal_name
+from impc.reporting.shown_units import error_unit, signal_name
 from impc.studies.fit.asked import OBSERVER
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def aim_data(result: FitResult) -> dict[str, Any]:
-    """`aim` in result.json: targets, observer rates (1/s), offsets, recorded commands."""
+    """`aim` in result.json: targets, observer rates (1/s), errors of signals, recorded commands."""
     problem = result.fitted.problem
     plant, trials = problem.plant, problem.recordings
     count = physical_disturbances(plant)
@@ -27,10 +28,10 @@ def aim_data(result: FitResult) -> dict[str, Any]:
         "targets": tuple(dict.fromkeys(name for trial in trials for name in trial.signals)),
         "ahead": plant.ahead,
         "observer_rate": {name: float(rate) for name, rate in learned if rate > 0},
-        "offsets": {
-            name: [float(trial.offset[plant.outputs.index(name)]) for trial in trials]
-            for name in problem.offsets
-        },
+        "errors": [
+            {"kind": kind, "signal": name, "values": [float(one) for one in values]}
+            for kind, name, values in problem.fitted_errors
+        ],
         "commands": tuple(np.array(controls)[np.any(recorded, axis=0)].tolist()),
     }
 
@@ -55,11 +56,10 @@ def aim_sentences(result: FitResult) -> list[str]:
             )
             how = f"learns it at a rate of {number(rate, 3)} 1/s{between}"
         said.append(f"it assumes that the {signal_name(plant, name)} persists and {how}")
-    for name, values in aim["offsets"].items():
-        factor, unit = shown_unit(plant, name)
-        low, high = factor * min(values), factor * max(values)
-        words = f"{number(low, 3)} to {number(high, 3)} {unit}"
-        said.append(f"the {signal_name(plant, name)} has an offset in each trial, {words}")
+    for kind, name, values in result.fitted.problem.fitted_errors:
+        factor, unit = error_unit(plant, kind, name)
+        ends = f"{number(factor * min(values), 3)} to {number(factor * max(values), 3)} {unit}"
+        said.append(f"the {signal_name(plant, name)} has {KINDS[kind][0]} in each trial, {ends}")
     if aim["commands"]:
         names = ", ".join(signal_name(plant, name) for name in aim["commands"])
         said.append(f"recorded commands ({names}) are fitted in addition to the outputs")

@@ -30,7 +30,7 @@
     identifiability                          rank, free, chosen (by convention), singular_values of
                                              the weights
     aim                                      targets, samples known ahead, observer rates (1/s),
-                                             offsets (SI), recorded commands
+                                             errors of signals (SI), recorded commands
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           as in every result
     truth                                    K of a truth.json next to the recordings, or null

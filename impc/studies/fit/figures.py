@@ -53,7 +53,7 @@ def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
     modelled = run.x @ plant.C.T
     for column, (ax, name) in enumerate(zip(axes, outputs, strict=False)):
         factor, _ = shown_unit(plant, name)
-        recorded = factor * trial.without_offset[window, column]
+        recorded = factor * trial.corrected[window, column]
         strip(ax, axis_label(plant, name))
         ax.plot(time, recorded, color=RECORDED, linewidth=4.5, label="recorded")
         ax.plot(time, factor * modelled[window, column], color=BLUE, label="model")
@@ -119,7 +119,7 @@ def residual_figure(result: FitResult, narrow: bool) -> Figure:
     plant, trials = result.fitted.problem.plant, result.fitted.problem.recordings
     factor, unit = shown_unit(plant, plant.outputs[0])
     series = [
-        factor * (trial.without_offset - run.x @ plant.C.T)[:, 0]
+        factor * (trial.corrected - run.x @ plant.C.T)[:, 0]
         for trial, run in zip(trials, result.inverse_mpc.runs, strict=True)
     ][:_MOST]
     figure = new_figure(PHONE if narrow else 5.4, 3.5)

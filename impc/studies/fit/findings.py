@@ -14,8 +14,7 @@ from impc.files.disk import truth_beside
 from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import shown_unit, signal_name
-from impc.studies.fit.aim import aim_data
+from impc.reporting.shown_units import error_unit, shown_unit, signal_name
 from impc.studies.fit.facts import gain_rows, named_gains, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.methods_table import trajectory_table, weight_entries
@@ -325,18 +324,17 @@ def agreement_finding(result: FitResult) -> Finding:
     return Finding("agreement", table, caption, labels=labels, digits=4)
 
 
-def offset_findings(result: FitResult) -> list[Finding]:
-    """Table of the fitted offsets of the outputs, if requested."""
-    plant, offsets = result.fitted.problem.plant, aim_data(result)["offsets"]
-    rows = [
-        (trial_name(result, index), signal_name(plant, name), shown_unit(plant, name)[1],
-         shown_unit(plant, name)[0] * value)
-        for name, values in offsets.items()
-        for index, value in enumerate(values)
-    ]  # fmt: skip
-    table = pd.DataFrame(rows, columns=["trial", "output", "unit", "offset"])
-    caption = "Constant offsets of the recorded outputs, estimated with the gain."
-    return [Finding("offsets", table, caption, folded="Offsets of the outputs")] if rows else []
+def error_findings(result: FitResult) -> list[Finding]:
+    """Table of the fitted errors of signals, if requested."""
+    problem, rows = result.fitted.problem, []
+    for kind, name, values in problem.fitted_errors:
+        factor, unit = error_unit(problem.plant, kind, name)
+        signal = signal_name(problem.plant, name)
+        for index, value in enumerate(values):
+            rows.append((trial_name(result, index), signal, kind, unit, factor * value))
+    table = pd.DataFrame(rows, columns=["trial", "signal", "error", "unit", "value"])
+    caption = "Errors of the recorded signals, estimated with the gain in each trial."
+    return [Finding("signal_errors", table, caption, folded="Errors of signals")] if rows else []
 
 
 def command_findings(result: FitResult) -> list[Finding]:

@@ -38,7 +38,7 @@ class FitMemory(Steps):
 
     def about(self, problem: Problem) -> FitMemory:
         """Store for another problem of the same recordings, with one more unknown."""
-        known = digest(self.digest, problem.parameter_names, problem.offsets)
+        known = digest(self.digest, problem.parameter_names, problem.signal_errors)
         return replace(self, digest=known, problem=problem)
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:
@@ -49,7 +49,7 @@ class FitMemory(Steps):
             whole = None if name == _WHOLE else self.cache.find(_WHOLE, self.digest)
             if whole is not None and posed.family is not None:  # the fitted body
                 found = np.array(whole["logarithms"], dtype=float)
-                posed = posed.at(np.array(posed.starts), found, np.array(posed.shifts))
+                posed = posed.at(np.array(posed.starts), found, np.array(posed.errors))
             if len(kept["logarithms"]) < len(posed.logarithms):
                 posed = posed.with_body_fixed()
             return decode_estimate(_seen(posed, name, METHODS[kept["method"]]), kept)

@@ -121,7 +121,7 @@ def _hero(result: FitResult, index: int) -> Picture:
     plant, run = result.fitted.problem.plant, result.inverse_mpc.runs[index]
     trial = result.fitted.problem.recordings[index]
     factor, unit = shown_unit(plant, plant.outputs[0])
-    left = factor * (trial.without_offset - run.x @ plant.C.T)[:, 0]
+    left = factor * (trial.corrected - run.x @ plant.C.T)[:, 0]
     said = with_unit(number(float(np.sqrt(np.nanmean(left**2))), 2), unit)
     limit = "; orange: at the limit" if given_limit(result) else ""
     name = trial_name(result, index)
@@ -245,7 +245,7 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
             [*tables, *filter(None, [parameter_words(result)])],
         ),
         *findings.command_findings(result),
-        *findings.offset_findings(result),
+        *findings.error_findings(result),
     ]
 
 

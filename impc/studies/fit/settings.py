@@ -129,7 +129,10 @@ class FitSettings:
     preview : int
         Number of samples that all targets are known ahead (`with_preview`).
     offsets : list of str
-        Outputs with an unknown constant offset in each trial (`Problem.offsets`).
+        Outputs with an unknown constant offset in each trial.
+    signal_errors : dict of str to list of str
+        Signals with another unknown error in each trial, by kind: "drift", "scale", "shift" (time
+        of a signal against the others; positive: later than recorded) or "clock" (rate).
     feedback_states : list of str
         States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits. Empty: no
         preliminary estimate.
@@ -187,6 +190,7 @@ class FitSettings:
     observer_rate: Rate | dict[str, Rate] | None = None
     preview: Annotated[int, Meta(ge=0, le=1000)] = 0
     offsets: list[str] = field(default_factory=list)
+    signal_errors: dict[str, list[str]] = field(default_factory=dict)
     feedback_states: list[str] = field(default_factory=list)
     settle: Annotated[float, Meta(ge=0, le=1_000_000)] = 1.0
     held_out: bool = True

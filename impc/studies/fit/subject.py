@@ -38,7 +38,7 @@ from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, aims, simulated
-from impc.inverse.structured_fit import fit_structured
+from impc.inverse.structured import fit_structured
 from impc.model.foresight import physical_states
 from impc.studies.fit.asked import (
     fit_bounds,
@@ -180,6 +180,7 @@ def fit_problem(
         terminal_set=None if settings.terminal_set == "auto" else settings.terminal_set,
         output_scale=scale,
         offsets=settings.offsets,
+        signal_errors=settings.signal_errors,
         unknown_start=True,
         family=family,
         structure=next(iter(fit_structures(plant, settings)), None),

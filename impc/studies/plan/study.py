@@ -19,12 +19,11 @@ import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.printed_gain import identified_gain
 from impc.checking import replace
 from impc.errors import ImpcError, SolverError
+from impc.inverse.refit import refit
 from impc.inverse.residuals import verify_hard
-from impc.inverse.structured_fit import structured_estimate
-from impc.inverse.structured_search import search_from
+from impc.inverse.structured import search_from, structured_estimate
 from impc.studies.effort import SECONDS_A_SAMPLE, Effort
 from impc.studies.plan.designs import Design, Outcome, best_of, designs, try_design
 
@@ -200,7 +199,7 @@ def simulated_fits(
             noisy = _measured(person, problem, np.random.default_rng([seed, number]))
             end = search_from(noisy, person.structure, truth)
             fitted = structured_estimate(noisy, person.structure, end)
-            gain = identified_gain(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
+            gain = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
         except ImpcError:  # counted as failed
             return OneFit(frozen([]), frozen([]))
         return OneFit(frozen(end.cost_weights), frozen(gain))

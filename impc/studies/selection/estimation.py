@@ -26,7 +26,7 @@ from impc.assess.covariance import TWO_SIDED
 from impc.assess.long_run_covariance import spread_of_sum
 from impc.assess.variance_accounted_for import vaf as share_explained
 from impc.errors import DataError, InputError
-from impc.inverse.least_squares import TrialSpan
+from impc.inverse.columns import TrialSpan
 from impc.studies.selection.model import normalised, physical, stacked
 
 if TYPE_CHECKING:

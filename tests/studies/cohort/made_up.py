@@ -71,7 +71,7 @@ def fit_of(seed: int) -> dict[str, Any]:
         "saturated": 0.1, "state_sizes": [1.0, 1.0],
         "readings": {"least condition": weights, "analytic centre (no units)": weights},
         "parameters": {"mass": 2.0 + rng.random()}, "starts": [[0.0, 0.0]], "logarithms": [0.0],
-        "offsets": [[0.0]],
+        "errors": [[[0.0]] * 5],
         "findings": [[]],
         "trajectory": {"dt": 0.1, "recorded": [[0.0], [1.0]], "simulated": [[0.0], [0.9]]},
         "seconds": 0.1, "memory_mb": 100.0,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from impc.inverse.least_squares import Prior, Rows, Stop, minimise
+from impc.inverse.minimiser import Ended, Prior, Rows, Stop, minimise
 
 TRIALS, ROWS, SHARED, OWN = 30, 9, 3, 2
 COUNT = TRIALS * ROWS
@@ -66,8 +66,10 @@ def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: fl
     """BFGS from the solution finds no lower value of N log |r|^2 plus prior."""
     model, prior = problem(seed, bent=bent)
     prior = Prior(prior.u, prior.v, np.full(SHARED, weight), weight)
-    u, v, _, converged = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 400))
-    assert converged
+    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 400))
+    u, v = end.u, end.v
+    assert end.ended is Ended.CONVERGED
+    assert end.promised <= 1e-8
 
     def value(z: np.ndarray) -> float:
         u, v = z[:SHARED], z[SHARED:].reshape(TRIALS, OWN)
@@ -85,16 +87,16 @@ def test_an_exact_problem_ends_at_rounding(bent: bool) -> None:
     """Any prior loses its weight as the residual vanishes."""
     model, prior = problem(7, exact=True, bent=bent)
     prior = Prior(prior.u, prior.v, np.full(SHARED, 1.0), 1.0)
-    u, v, _, _ = minimise(model, prior, (prior.u, prior.v), Stop(1e-6, 1e-24, 100))
-    assert model.square(u, v) <= 1e-20
+    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-6, 1e-24, 100))
+    assert model.square(end.u, end.v) <= 1e-20
 
 
 def test_a_column_that_nothing_sees_stays() -> None:
     model, prior = problem(3)
     model.A[..., -1] = 0
-    u, _, _, converged = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 100))
-    assert converged
-    assert u[-1] == prior.u[-1]
+    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-4, 0.0, 100))
+    assert end.converged
+    assert end.u[-1] == prior.u[-1]
 
 
 def test_where_nothing_can_be_evaluated_the_start_is_returned() -> None:
@@ -105,10 +107,43 @@ def test_where_nothing_can_be_evaluated_the_start_is_returned() -> None:
             return None
 
     begin = prior.u, prior.v
-    u, v, spent, converged = minimise(
-        Refuses(model.A, model.B, model.c), prior, begin, Stop(1e-8, 0.0, 100)
-    )
-    np.testing.assert_array_equal(u, prior.u)
-    np.testing.assert_array_equal(v, prior.v)
-    assert spent == 1
-    assert not converged
+    end = minimise(Refuses(model.A, model.B, model.c), prior, begin, Stop(1e-8, 0.0, 100))
+    np.testing.assert_array_equal(end.u, prior.u)
+    np.testing.assert_array_equal(end.v, prior.v)
+    assert end.evaluations == 1
+    assert end.ended is Ended.INFEASIBLE
+
+
+@dataclass
+class Creased(Curved):
+    """A crease in u_0 at c: both sides promise a decrease on the other one, and none has it."""
+
+    def residual(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        away = u[0] - self.c.flat[0]
+        return np.broadcast_to(np.array([[1.0, 1.0 + abs(away)]]), (1, 2)) + 0 * v.sum()
+
+    def rows(self, u: np.ndarray, v: np.ndarray) -> Rows:
+        side = 1.0 if u[0] >= self.c.flat[0] else -1.0
+        shared = np.zeros((1, 2, 1))
+        shared[0, 1, 0] = side
+        return Rows(self.residual(u, v), shared, np.zeros((1, 2, 0)))
+
+
+def test_an_end_at_a_crease_is_no_minimum() -> None:
+    """Every undamped step promises more than it delivers: stuck, and it says how much."""
+    nothing = np.zeros((1, 0))
+    model = Creased(nothing, nothing, np.array([0.3]))
+    model.count = 100
+    prior = Prior(np.zeros(1), nothing, np.zeros(1), 0.0)
+    end = minimise(model, prior, (np.array([1.0]), nothing), Stop(0.01, 0.0, 100))
+    assert end.ended is Ended.STUCK
+    assert end.promised > 1
+    assert not end.converged
+    assert end.u[0] == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_search_that_ran_out_says_what_is_left() -> None:
+    model, prior = problem(3)
+    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 2))
+    assert end.ended is Ended.STOPPED
+    assert end.promised > 1e-8

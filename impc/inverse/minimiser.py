@@ -1,10 +1,14 @@
-"""Nonlinear least squares with a normal prior, for shared and trial-specific unknowns.
+"""Levenberg-Marquardt with a normal prior, for shared and trial-specific unknowns.
 
-    minimise over (u, v)   N log |r(u, v)|^2 + |w_u (u - u_0)|^2 + |w_v (v - v_0)|^2,   r of N rows
+    F(u, v) = N log |r(u, v)|^2 + |w_u (u - u_0)|^2 + |w_v (v - v_0)|^2,   r of N entries
 
-This is the posterior mode for white noise of unknown variance |r|^2 / N. The method is
-Levenberg-Marquardt. Columns of v_i are zero outside trial i, so each v_i is eliminated by a QR
-factorisation of its own trial: time and memory grow linearly with the number of trials.
+F is -2 log posterior for white noise of unknown variance |r|^2 / N, up to a constant. Columns of
+v_i are zero outside trial i, so each v_i is eliminated by a QR factorisation of its own trial: time
+and memory grow linearly with the number of trials.
+
+A search has converged where the undamped Gauss-Newton step promises less than `Stop.promise`. It is
+stuck where steps of any length no longer lower F although more is promised: at a crease, where the
+set of saturated samples changes, or at the end of a bent valley. That is no minimum.
 
 Steps can include geodesic acceleration (Transtrum and Sethna 2012), at the cost of one more
 evaluation without derivatives:
@@ -15,25 +19,38 @@ evaluation without derivatives:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import scipy.linalg
-
-from impc.arrays import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from impc.arrays import Array
 
-_BLOCK = 4096
-# Initial and least damping; its factors after a rejected and after a good step.
-_DAMPING, _LEAST, _UP, _DOWN = 1e-3, 1e-12, 6.0, 0.2
-# A search ends after this many rejected steps in a row.
-_TRIES = 14
+# Initial and least damping; its factors after a rejected or poor and after a good step, by the ratio
+# of gained to predicted decrease.
+_DAMPING, _LEAST, _UP, _DOWN, _GOOD, _POOR = 1e-3, 1e-12, 6.0, 0.2, 0.5, 0.1
+# A search is stuck after this many rejected steps in a row, or if this many accepted ones together
+# lower F by less than `Stop.promise` and than this share of what is still promised.
+_TRIES, _CREEPING, _DELIVERED = 14, 4, 0.01
+# Damping of the step that counts as undamped: directions that nothing identifies stay.
+_NONE = 1e-10
 # Least squared norm of a column in the damping, relative to the largest.
 _FLOOR = 1e-6
 # Probe length h; acceleration above this share of the step means the step is too long.
 _PROBE, _BEND = 0.1, 0.375
+#: Decrease of F that counts as none.
+PROMISE = 0.01
+
+
+class Ended(Enum):
+    """How a search ended."""
+
+    EXACT = "the residual is at rounding level"
+    CONVERGED = "no step promises a lower misfit"
+    STUCK = "no step lowers the misfit, although a lower one is promised"
+    STOPPED = "the largest number of evaluations was reached"
+    INFEASIBLE = "the start cannot be simulated"
 
 
 @dataclass(frozen=True)
@@ -59,20 +76,36 @@ class Prior:
     u: Array  # Mean of u (a,) and of v (trials, n)
     v: Array
     shared: Array  # 1 / SD of u (a,)
-    own: float  # 1 / SD of each entry of v
+    own: Array | float  # 1 / SD of v (n,)
 
     def square(self, u: Array, v: Array) -> float:
         """-2 log density at `u` (a,), `v` (trials, n), up to a constant."""
-        return float(np.sum((self.shared * (u - self.u)) ** 2) + self.own**2 * _square(v - self.v))
+        return _square(self.shared * (u - self.u)) + _square(self.own * (v - self.v))
 
 
 @dataclass(frozen=True)
 class Stop:
     """Stopping rule of a search."""
 
-    nats: float  # Predicted decrease of the objective
+    promise: float  # Decrease of F by an undamped step below which the search has converged
     square: float  # Squared residual at rounding level
     evaluations: int  # Largest number of evaluations with derivatives
+
+
+@dataclass(frozen=True)
+class End:
+    """End of a search."""
+
+    u: Array  # Minimiser (a,), and (trials, n)
+    v: Array
+    evaluations: int  # Evaluations with derivatives
+    ended: Ended
+    promised: float  # Decrease of F that an undamped step from here promises
+
+    @property
+    def converged(self) -> bool:
+        """Whether this is a minimum."""
+        return self.ended in (Ended.EXACT, Ended.CONVERGED)
 
 
 class Model(Protocol):
@@ -92,40 +125,55 @@ class Model(Protocol):
         """J' (r(z + share d) - r(z)) at the last point z of `rows`, d = (`du`, `dv`)."""
 
 
-def minimise(
-    model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop
-) -> tuple[Array, Array, int, bool]:
-    """Minimise over u (a,), v (trials, n): minimiser, evaluations, whether it converged."""
+def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop) -> End:
+    """Minimise F over u (a,), v (trials, n)."""
     u, v = begin
-    here, spent, damping = model.rows(u, v), 1, _DAMPING
+    damping, spent, gains = _DAMPING, 0, [np.inf]
     scale: tuple[Array, Array] = np.zeros(len(u)), np.zeros(v.shape)
-    while here is not None and here.square > stop.square:
+    while True:
+        here, spent = model.rows(u, v), spent + 1
+        if here is None:
+            return End(u, v, spent, Ended.INFEASIBLE, np.inf)
+        if here.square <= stop.square:
+            return End(u, v, spent, Ended.EXACT, 0.0)
         variance = here.square / model.count
         scale = _scaled(here, prior, variance, scale)
+        last = _Step(here, prior, (u, v), variance, _NONE, scale)
+        promised = last.predicted
+        if promised <= stop.promise:
+            if _gained(model, prior, here, (u, v), (last.du, last.dv)) > 0:
+                u, v = u + last.du, v + last.dv
+            return End(u, v, spent, Ended.CONVERGED, promised)
+        if sum(gains[-_CREEPING:]) <= min(stop.promise, _DELIVERED * promised):
+            return End(u, v, spent, Ended.STUCK, promised)
+        if spent >= stop.evaluations:
+            return End(u, v, spent, Ended.STOPPED, promised)
         for _ in range(_TRIES):
             step = _Step(here, prior, (u, v), variance, damping, scale)
-            predicted = step.predicted
             moved = step.bent(model) if here.curved else (step.du, step.dv)
-            gained, there = -np.inf, np.inf
+            gained = -np.inf
             if moved is not None:
-                there = model.square(u + moved[0], v + moved[1])
-                gained = model.count * (np.log(here.square) - np.log(max(there, 1e-300)))
-                gained += prior.square(u, v) - prior.square(u + moved[0], v + moved[1])
+                gained = _gained(model, prior, here, (u, v), moved)
             if gained > 0:
                 break
-            if predicted <= stop.nats:
-                return u, v, spent, True
             damping = max(_UP * damping, 1e-8)
         if moved is None or gained <= 0:
-            return u, v, spent, False
-        damping = max(damping * (_DOWN if gained > predicted / 2 else 1.0), _LEAST)
+            return End(u, v, spent, Ended.STUCK, promised)
+        ratio = gained / step.predicted
+        damping *= _DOWN if ratio > _GOOD else _UP if ratio < _POOR else 1.0
+        damping = max(damping, _LEAST)
         u, v = u + moved[0], v + moved[1]
-        if gained <= stop.nats or there <= stop.square:
-            return u, v, spent, True
-        if spent >= stop.evaluations:
-            return u, v, spent, False
-        here, spent = model.rows(u, v), spent + 1
-    return u, v, spent, here is not None
+        gains.append(gained)
+
+
+def _gained(
+    model: Model, prior: Prior, here: Rows, at: tuple[Array, Array], moved: tuple[Array, Array]
+) -> float:
+    """Decrease of F by a step from `at`."""
+    u, v = at[0] + moved[0], at[1] + moved[1]
+    there = max(model.square(u, v), 1e-300)
+    fallen = model.count * (np.log(here.square) - np.log(there))
+    return float(fallen + prior.square(*at) - prior.square(u, v))
 
 
 def _scaled(
@@ -133,7 +181,7 @@ def _scaled(
 ) -> tuple[Array, Array]:
     """Squared column norms for the damping; a norm shrinks by at most half per step."""
     shared = np.sum(here.shared**2, axis=(0, 1)) + variance * prior.shared**2
-    own = np.sum(here.own**2, axis=1) + variance * prior.own**2
+    own = np.sum(here.own**2, axis=1) + variance * np.square(prior.own)
     floor = _FLOOR * max(np.max(shared, initial=0.0), np.max(own, initial=0.0)) + 1e-300
     return (
         np.maximum(before[0] / 2, np.maximum(shared, floor)),
@@ -159,10 +207,10 @@ class _Step:
         (trials, n), a = at[1].shape, len(at[0])
         self.weights = (
             np.sqrt(variance * prior.shared**2 + damping * scale[0]),
-            np.sqrt(variance * prior.own**2 + damping * scale[1]),
+            np.sqrt(variance * np.square(prior.own) + damping * scale[1]),
         )
         pull_u = variance * prior.shared**2 * (at[0] - prior.u)
-        pull_v = variance * prior.own**2 * (at[1] - prior.v)
+        pull_v = variance * np.square(prior.own) * (at[1] - prior.v)
         table = np.concatenate([here.own, here.shared, here.residual[..., None]], axis=2)
         below = np.zeros((trials, max(n, n + a + 1 - table.shape[1]), n + a + 1))
         below[:, np.arange(n), np.arange(n)] = self.weights[1]
@@ -219,72 +267,3 @@ class _Step:
 
 def _square(values: Array) -> float:
     return float(np.sum(values**2))
-
-
-def triangular_rows(columns: list[Array]) -> Array:
-    """Triangular factor R (w, w) of `columns`, arrays (r, k) side by side, by row blocks.
-
-    R has the norms and inner products of the columns, and fewer rows if r < w. Blocks of a few
-    thousand rows fit into the cache of the processor.
-    """
-    width = sum(part.shape[1] for part in columns)
-    triangle = np.zeros((0, width))
-    for first in range(0, len(columns[0]), _BLOCK):
-        block = np.hstack([part[first : first + _BLOCK] for part in columns])
-        # mode "r" would also copy all rows below the triangle.
-        _, upper = scipy.linalg.qr(np.vstack([triangle, block]), mode="raw", check_finite=False)
-        triangle = np.asarray(upper, dtype=np.float64)
-    return triangle
-
-
-# Columns that the others explain up to this share of their norm count as dependent.
-_ROUNDING = 1e-10
-
-
-@dataclass(frozen=True)
-class TrialSpan:
-    """Orthonormal basis of trial-specific and shared columns."""
-
-    own: tuple[Array, ...]  # Per trial (rows, k), k <= n; zero outside the trial
-    shared: Array  # Remaining columns (r, c), orthogonal to `own`
-
-    def without(self, columns: Array) -> Array:
-        """Residual of `columns` (r, k) after projection on the basis."""
-        left = _without(self.own, columns)
-        return np.asarray(left - self.shared @ (self.shared.T @ left))
-
-    def upper(self, trials: int, rows: int) -> TrialSpan:
-        """Restriction to the first `trials` trials, `rows` rows."""
-        return TrialSpan(self.own[:trials], self.shared[:rows])
-
-    def plus(self, columns: Array) -> TrialSpan:
-        """Basis extended by orthonormal `columns` (r, k) orthogonal to it."""
-        return TrialSpan(self.own, np.hstack([self.shared, columns]))
-
-
-def trial_span(own: Array, sizes: Sequence[int], shared: Array) -> TrialSpan:
-    """Basis of the scaled columns `own` (r, n) by trial and `shared` (r, c), to 1e-10."""
-    parts = np.split(own, np.cumsum(sizes)[:-1])
-    bases = tuple(_basis(_of_length_one(part)) for part in parts)
-    return TrialSpan(bases, _basis(_without(bases, _of_length_one(shared))))
-
-
-def _of_length_one(columns: Array) -> Array:
-    size = np.linalg.norm(columns, axis=0)
-    return np.asarray(columns[:, size > 0] / size[size > 0])
-
-
-def _basis(columns: Array) -> Array:
-    if columns.size == 0:
-        return np.zeros((len(columns), 0))
-    left, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, values > _ROUNDING])
-
-
-def _without(bases: Sequence[Array], columns: Array) -> Array:
-    left, row = np.array(columns), 0
-    for basis in bases:
-        mine = slice(row, row + len(basis))
-        row = mine.stop
-        left[mine] -= basis @ (basis.T @ left[mine])
-    return left

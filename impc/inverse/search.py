@@ -1,0 +1,253 @@
+"""Fit the gain to recordings, with or without bounds.
+
+    a start  ->  least prediction error  ->  initial states  ->  least simulation error
+
+The simulation misfit has local minima, and some gains diverge; the one-step prediction misfit has
+few and exists at every gain (`prediction`). Each search minimises it first. No local method leaves
+a wrong minimum, so starts decide: a regulator by Bryson's rule, then random ones near it, for short
+recordings also screened ones. Starts are added until enough searches from different starts end at
+the same minimum.
+
+Without bounds this is line 1 of Table 3.1; with bounds the reduced form of inverse MPC: the
+recordings determine K and, with several inputs and active bounds, S (docs/why/theory.md).
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.arrays import Array
+from impc.checking import checked, replace
+from impc.control.named_solver import COMPILED
+from impc.errors import ImpcError, SolverError
+from impc.inverse.inactive_samples import pair_of_inactive_samples
+from impc.inverse.laws import FixedLaw, GainLaw
+from impc.inverse.minimiser import PROMISE, Stop
+from impc.inverse.prediction import correction
+from impc.inverse.problem import EXPLAINED, recorded_size, require_riccati
+from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.starts import balanced_regulator, drawn_starts
+from impc.inverse.unknowns import Unknowns
+from impc.model.riccati import solve_lqr, stabilises
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
+    from impc.model.riccati import LqrSolution
+    from impc.model.weights import Weights
+
+#: Largest number of recorded values for which the search is repeated many times.
+FEW = 2000
+# Searches of short recordings that must agree, and of very short ones: three wrong searches agreed
+# in 2 of 80 problems.
+_AGREE, _HANDFUL, _SURE = 3, 200, 5
+# Two ends agree if their gains differ by at most the first in standard errors, and their objectives by
+# at most the second: creases along initial states leave 0.3 between ends of equal gain.
+_SAME, _NEAR = 0.1, 0.5
+# Factor above the best prediction at which a start is dropped.
+_HOPELESS = 30.0
+# Command errors assumed by the filter, in units of the command size: 10 and 1 both find all 67
+# sticks; a fast filter keeps the gains of delays bounded.
+_RATIOS = (10.0, 1.0)
+# 1 / SD of the prior in whitened coordinates for a search without a start.
+_WEAK = 1e-3
+# Largest numbers of evaluations of predictions, of initial states and of simulations; decrease per
+# recorded value at which a prediction ends.
+_PREDICTED, _STATES, _SIMULATED, _ROUGH = 25, 20, 200, 1e-3
+# Promise at which a search of long recordings ends, since it is a start of a refit, and per recorded
+# value of short ones.
+_START, _FINE = 0.5, 1e-6
+# Misfit of rounding relative to the recorded outputs.
+_ROUNDING = 1e-13
+# Factor of each step back towards a stabilising gain.
+_BACK = 0.8
+# Random regulators; for short recordings also rounds of screened ones: rounds, draws per round,
+# evaluations to fit their initial states, and how many are searched from.
+_MORE, _ROUNDS, _DRAWN, _QUICK, _KEPT = 2, 2, 100, 4, 12
+
+
+@checked
+def fit_gain(problem: Problem) -> Fitted:
+    """Fit K, S (several inputs), and unknown initial states, errors and parameters.
+
+    The end of long recordings is that of one search, a start for others (`noisy_fit`).
+    """
+    require_riccati(problem)
+    exact = pair_of_inactive_samples(problem)
+    if exact is not None and not misfit_or_reason(problem, *exact)[1]:
+        first = refine_gain(problem, *exact)
+        if first.explained:
+            return first
+    count = problem.recorded_numbers
+    few = count <= FEW
+    wanted = (_SURE if count <= _HANDFUL else _AGREE) if few else 1
+    ends: list[Fitted] = []
+    spent, predicted, reason = 0, np.inf, ""
+    for attempt, (there, regulator) in enumerate(_starts(problem, few)):
+        try:
+            begin, error = _predicted(there, regulator, _RATIOS[attempt % 2])
+            spent += begin.evaluations
+            if error > _HOPELESS * predicted:
+                continue
+            predicted = min(predicted, error)
+            ends.append(_simulated(there, regulator, begin))
+        except ImpcError as refused:
+            reason = reason or str(refused)
+            continue
+        spent += ends[-1].evaluations
+        best, agreed = best_of(ends)
+        if best.explained or agreed >= wanted:
+            break
+    if not ends:
+        raise SolverError(
+            "gain", f"no start can be simulated: {reason}", "check the plant and the bounds"
+        )
+    best, agreed = best_of(ends)
+    alone = few and agreed == 1 and not best.explained
+    return replace(best, evaluations=spent, unconfirmed=alone)
+
+
+@checked(max_evaluations=1, prior=0)
+def refine_gain(
+    problem: Problem,
+    gain: Array,
+    metric: Array,
+    *,
+    max_evaluations: int = _SIMULATED,
+    prior: float = 0.0,
+) -> Fitted:
+    """Minimise the simulation misfit from one gain and metric."""
+    _, reason = misfit_or_reason(problem, gain, metric)
+    if reason:
+        raise SolverError(
+            "gain",
+            f"the closed loop cannot be simulated at the start ({reason})",
+            "pass a stabilising gain, e.g. that of solve_lqr",
+        )
+    space = Unknowns(problem, GainLaw(problem, gain, metric))
+    count = problem.recorded_numbers
+    promise = min(_FINE * count, PROMISE) if count <= FEW else _START
+    return space.search(
+        space.start, stop_at(problem, promise, max_evaluations), shared=prior, own=prior
+    )
+
+
+def free_gain(problem: Problem, begin: Weights) -> Fitted:
+    """Best unrestricted gain near that of `begin`, with all other unknowns."""
+    solution = solve_lqr(problem.plant, begin)
+    return refine_gain(problem, np.array(solution.K), np.array(solution.S), prior=1.0)
+
+
+def with_fitted_starts(
+    problem: Problem, gain: Array, metric: Array, samples: int | None = None
+) -> Problem:
+    """Fit initial states and errors of each trial to its first samples, all else fixed.
+
+    A normal prior of the size of the states of the trial (`own_unit`) keeps unidentified components
+    at the given values. `gain` (m, n); `metric` (m, m).
+    """
+    fitted = []
+    for trial in problem.recordings:
+        seen = trial.samples if samples is None else min(samples, trial.samples)
+        parts = {name: getattr(trial, name)[:seen] for name in ("outputs", "disturbance", "target")}
+        short = replace(trial, commands=trial.commands[:seen], **parts)
+        one = replace(problem, recordings=(short,), unknown_start=True).with_parameters_fixed()
+        space = Unknowns(one, FixedLaw(gain, metric))
+        end = space.search(space.start, stop_at(one, 1e-3 * PROMISE, _STATES), own=1.0)
+        (found,) = end.problem.recordings
+        fitted.append(replace(trial, x0=found.x0, errors=found.errors))
+    return replace(problem, recordings=tuple(fitted))
+
+
+def stop_at(problem: Problem, promise: float, evaluations: int) -> Stop:
+    """Stopping rule, with the squared residual that is rounding."""
+    return Stop(promise, (_ROUNDING * recorded_size(problem)) ** 2, evaluations)
+
+
+def best_of(ends: list[Fitted]) -> tuple[Fitted, int]:
+    """End of least objective, and the number of ends at the same minimum."""
+    best = min(ends, key=lambda end: end.objective)
+    if best.explained:
+        return best, sum(end.explained for end in ends)
+    near = [end for end in ends if end.objective - best.objective <= _NEAR]
+    if len(near) < 2 or not best.stabilises:
+        return best, len(near)
+    law = GainLaw(best.problem, np.array(best.K), np.array(best.S))
+    space = Unknowns(best.problem, law)
+    seen = space.without_nuisance(space.start)[:, : best.K.size]
+    noise = best.misfit / np.sqrt(best.problem.recorded_numbers)
+    steps = np.array([law.natural(np.array(end.K) - best.K).ravel() for end in near])
+    left, _, _ = np.linalg.svd(seen, full_matrices=False)
+    moved = np.max(np.abs(left.T @ seen @ steps.T), axis=0) / noise
+    return best, int(np.count_nonzero(moved <= _SAME))
+
+
+def _starts(problem: Problem, few: bool) -> Iterator[tuple[Problem, LqrSolution]]:
+    """Starting regulators with initial states; deterministic."""
+    yield problem, balanced_regulator(problem)
+    drawn = drawn_starts(problem)
+    yield from itertools.islice(drawn, _MORE)
+    for _ in range(_ROUNDS if few else 0):
+        yield from _ranked(list(itertools.islice(drawn, _DRAWN)))
+
+
+def _ranked(drawn: list[tuple[Problem, LqrSolution]]) -> list[tuple[Problem, LqrSolution]]:
+    """Best starts by prediction misfit, initial states fitted to each."""
+    ranked = []
+    for place, (problem, regulator) in enumerate(drawn):
+        known = _predictable(problem)
+        law = FixedLaw(np.array(regulator.K), np.array(regulator.S))
+        space = Unknowns(known, law, correction(known, _RATIOS[place % 2]))
+        end = space.search(space.start, stop_at(known, _ROUGH * known.recorded_numbers, _QUICK),
+                           own=_WEAK)  # fmt: skip
+        there = problem.at(np.array(end.problem.starts), np.array(problem.logarithms))
+        ranked.append((end.misfit, place, (there, regulator)))
+    return [pair for _, _, pair in sorted(ranked, key=lambda item: item[:2])[:_KEPT]]
+
+
+def _predicted(problem: Problem, begin: LqrSolution, ratio: float) -> tuple[Fitted, float]:
+    """Minimise the prediction misfit: end, and its misfit."""
+    known = _predictable(problem)
+    law = GainLaw(known, np.array(begin.K), np.array(begin.S))
+    space = Unknowns(known, law, correction(known, ratio))
+    stop = stop_at(known, _ROUGH * known.recorded_numbers, _PREDICTED)
+    end = space.search(space.start, stop, shared=_WEAK, own=_WEAK)
+    return end, end.misfit
+
+
+def _predictable(problem: Problem) -> Problem:
+    """Linear plant without terminal set, only gain and initial states unknown."""
+    return replace(
+        problem.with_parameters_fixed(),
+        plant=problem.plant.linear(),
+        terminal_set=False,
+        signal_errors=(),
+        solver=COMPILED,  # only a start: a solver by name would take minutes
+    )
+
+
+def _simulated(problem: Problem, begin: LqrSolution, predicted: Fitted) -> Fitted:
+    """Minimise the simulation misfit from the end of a prediction search."""
+    K, S = np.array(begin.K), np.array(predicted.S)
+    there = problem.at(np.array(predicted.problem.starts), np.array(problem.logarithms))
+    share, reason = 1.0, ""
+    for _ in range(_PREDICTED):
+        gain = K + share * (predicted.K - K)
+        if stabilises(problem.plant, gain):
+            _, reason = misfit_or_reason(there, gain, S)
+            if not reason:
+                return refine_gain(there, gain, S, prior=_WEAK)
+        share *= _BACK
+    raise SolverError(
+        "gain", reason or "no gain stabilises the plant", "check the plant and the bounds"
+    )
+
+
+def noise_of(free: Fitted) -> float:
+    """Misfit of the unrestricted gain, at least rounding level."""
+    return max(free.misfit, EXPLAINED * recorded_size(free.problem))

@@ -1,0 +1,100 @@
+"""Errors of recorded signals: offset, drift, scale, time shift, and a clock of another rate.
+
+With time in samples, a recorded output y_rec follows the true one y by
+
+    y_rec(t) = (1 + scale) y(t - shift - clock t) + offset + drift t,
+
+and the disturbance d that acts on the plant follows the recorded one d_rec by
+
+    d(t) = (1 + scale) d_rec(t - shift - clock t) + offset + drift t.
+
+A positive shift means later than recorded. The model is moved, never a recorded output. Outputs are
+interpolated linearly between samples; a disturbance is held over its sample, and a moved one is the
+mean over the new sample. A further kind is a row of `KINDS`, an entry of `search_unit` and a term
+of `distorted`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from impc.arrays import Array
+
+#: Words for pages, unit (after that of the signal, if it begins with a space or is empty), its size,
+#: and the power of the sampling interval in it: by name, in the order of the rows of
+#: `Recording.errors`.
+KINDS = {
+    "offset": ("an offset", "", 1, 0),
+    "drift": ("a drift", " /s", 1, -1),
+    "scale": ("an error of scale", "%", 100, 0),
+    "shift": ("a time shift", "ms", 1000, 1),
+    "clock": ("an error of its clock", "%", 100, 0),
+}
+OFFSET, DRIFT, SCALE, SHIFT, CLOCK = range(len(KINDS))
+# Scale of a relative error in a search.
+_SCALE = 0.1
+
+
+def search_unit(kind: int, size: float, samples: int) -> float:
+    """Scale of an error in a search, for a signal of typical `size`."""
+    return (size, size / samples, _SCALE, 1.0, 1 / samples)[kind]
+
+
+def distorted(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array]:
+    """Signal (samples, c) with `errors` (kinds, c), and its derivatives (samples, c, kinds)."""
+    moved, by_shift, by_clock = _moved(signal, errors, held=held)
+    time = np.broadcast_to(np.arange(len(signal))[:, None] + held / 2, moved.shape)
+    gain = 1 + errors[SCALE]
+    slopes = np.ones_like(moved), time, moved, gain * by_shift, gain * by_clock
+    return gain * moved + errors[OFFSET] + errors[DRIFT] * time, np.stack(slopes, axis=2)
+
+
+def resampled(table: Array, errors: Array) -> Array:
+    """Derivatives (samples, c, k) of outputs, overwritten by those of outputs with `errors`."""
+    for column, error in enumerate(errors.T):
+        if error[SHIFT] or error[CLOCK]:
+            place = _places(len(table), error)[:-1]
+            before = _before(place, len(table))
+            share, values = (place - before)[:, None], table[:, column]
+            table[:, column] = (1 - share) * values[before] + share * values[before + 1]
+        if error[SCALE]:
+            table[:, column] *= 1 + error[SCALE]
+    return table
+
+
+def _places(samples: int, error: Array) -> Array:
+    """Places (samples + 1,) in the signal at which it is read."""
+    return np.asarray(np.arange(samples + 1) * (1 - error[CLOCK]) - error[SHIFT])
+
+
+def _before(place: Array, samples: int) -> Array:
+    """Sample before each place; at both ends the first and last intervals continue."""
+    return np.clip(np.floor(place).astype(int), 0, samples - 2)
+
+
+def _moved(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array, Array]:
+    """Signal (samples, c) read at other times, and its derivatives by shift and clock."""
+    moved, by_shift, by_clock = (np.empty_like(signal) for _ in range(3))
+    count = np.arange(len(signal))
+    for column, error in enumerate(errors.T):
+        values, places = signal[:, column], _places(len(signal), error)
+        first, last = places[:-1], places[1:]
+        if held:
+            # The integral of a held signal is piecewise linear.
+            sums = np.concatenate([[0.0], np.cumsum(values)])
+            low, high = _before(first, len(sums)), _before(last, len(sums))
+            width, v, w = last - first, values[low], values[high]
+            mean = (sums[high] + w * (last - high) - sums[low] - v * (first - low)) / width
+            moved[:, column] = mean
+            by_shift[:, column] = (v - w) / width
+            by_clock[:, column] = (mean - (count + 1) * w + count * v) / width
+        else:
+            before = _before(first, len(values))
+            step = values[before + 1] - values[before]
+            moved[:, column] = values[before] + (first - before) * step
+            by_shift[:, column] = -step
+            by_clock[:, column] = -count * step
+    return moved, by_shift, by_clock
