@@ -33,8 +33,6 @@ SUBPACKAGES = {
     "cli": "commands: parse, call, print",
     "package": "import impc, python -m impc",
 }
-#: The one module with arrows up: methods of an estimate call functions of higher layers when used.
-RESULT = "inverse.estimates"
 
 
 def imports(typing: bool = True, package: Path = ROOT / "impc") -> dict[str, set[str]]:
@@ -55,10 +53,6 @@ def imports(typing: bool = True, package: Path = ROOT / "impc") -> dict[str, set
             item for node in _imports(tree.body, typing) for item in _named(node, package.name)
         ]
         found[name] = {_known(item, files) for item in named} - {name}
-    if typing and RESULT in found:
-        order = list(SUBPACKAGES)
-        highest = order.index(subpackage(RESULT))
-        found[RESULT] = {one for one in found[RESULT] if order.index(subpackage(one)) <= highest}
     return found
 
 

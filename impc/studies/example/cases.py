@@ -13,7 +13,7 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.assessments import evaluate_method
-from impc.assess.weights_test import Identifiability, identifiability
+from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.named_solver import COMPILED
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.assess.assessments import MethodFit
+    from impc.inverse.estimates import Identifiability
     from impc.model.plant import Plant
 
 #: Initial states by name.
