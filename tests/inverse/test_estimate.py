@@ -214,5 +214,6 @@ def test_the_declared_methods_are_those_that_are_attached() -> None:
         assert isinstance(function, ast.FunctionDef)
         given = [ast.unparse(one.args).split(", ")[1:] for one in (node, function)]
         assert given[0] == given[1]
-        assert node.returns and function.returns
+        assert node.returns
+        assert function.returns
         assert ast.dump(node.returns) == ast.dump(function.returns)
