@@ -26,7 +26,8 @@ from impc.assess.long_run_covariance import white_noise
 from impc.cli.seat import HORIZON, seat_controller, seat_weights
 from impc.control.casadi_controller import build_mpc, solve_mpc
 from impc.control.closed_loop import simulate
-from impc.control.simulation import require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import scenario
 from impc.inverse.methods import fit
 from impc.inverse.noisy_fit import free_gain
 from impc.inverse.problem import Problem, recorded_size

@@ -17,7 +17,8 @@ import numpy as np
 from llvmlite import ir
 
 from impc.arrays import Array
-from impc.control.compiled_body import BodyTape, move_along, states_along
+from impc.control.compiled_body import move_along, states_along
+from impc.control.compiled_values import BodyTape
 from impc.model.body import OPERATIONS
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from impc.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from impc.control.constraint_rows import Rows
+    from impc.control.compiled_values import Rows
     from impc.control.simulation import Scenario
 
 # Slacks are linear in the cost, so the Hessian is singular, which DAQP does not accept; with its

@@ -7,42 +7,24 @@ with the input u of `compiled_kernel.law`; nonlinear bodies: `compiled_body`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
-
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.control.compiled_body import BodyTape, move_body
+from impc.control.compiled_body import move_body
 from impc.control.compiled_borrowed import borrowed
-from impc.control.compiled_kernel import (
+from impc.control.compiled_kernel import add, deviate, dot, law, return_to
+from impc.control.compiled_values import (
     DIVERGED,
     SOFTENED,
     Aim,
+    BodyTape,
     LoopMatrices,
+    RowDirections,
+    Rows,
+    Trace,
     Workspace,
-    add,
-    deviate,
-    dot,
-    law,
-    return_to,
 )
 from impc.jit import njit
-
-if TYPE_CHECKING:
-    from impc.control.constraint_rows import RowDirections, Rows
-
-
-class Trace(NamedTuple):
-    """What a simulation of some steps writes."""
-
-    x: Buffer  # (steps + 1, n)
-    u: Buffer  # (steps, m)
-    dx: Buffer  # (steps + 1, n, p); or (2, n, p), where the last samples overwrite earlier ones
-    du: Buffer  # (steps, m, p), or (1, m, p)
-    seen: Buffer  # (q, n), given: outputs whose derivatives are kept
-    dy: Buffer  # (steps + 1, q, p), seen dx
-    status: Buffer  # (steps,)
-    lam: Buffer  # (h,), multipliers of the last problem
 
 
 @njit(cache=True, nogil=True)  # held-out trials are fitted in parallel threads

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.attached_methods import attach
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
-from impc.estimate_methods import attach
 from impc.inverse.least_squares import trial_span
 from impc.inverse.problem import (
     controller_for,
@@ -192,7 +192,7 @@ class Estimate(Frozen):
     fit: Goodness
     cost_weights: Array | None = None
 
-    if TYPE_CHECKING:  # attached by `impc.estimate_methods`
+    if TYPE_CHECKING:  # attached by `impc.attached_methods`
 
         @property
         def vaf(self) -> Array: ...

@@ -25,9 +25,10 @@ from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.coordinates import Coordinates, own_unit, with_own
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, simulated_estimate
-from impc.inverse.explaining_weights import metric_family, unidentified_metrics, weights_behind
+from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.gain_search import FEW, GainFit, fit_gain, refine_gain, regulators
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
+from impc.inverse.metric_family import metric_family, unidentified_metrics
 from impc.inverse.natural_search import (
     CONDITION_SHARE,
     best_conditioned,

@@ -9,8 +9,9 @@ import pytest
 from impc.control.casadi_controller import build_mpc, simulate_mpc, solve_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.feasibility import require_complete
 from impc.control.named_solver import SOLVERS
-from impc.control.simulation import Status, require_complete, scenario
+from impc.control.simulation import Status, scenario
 from impc.errors import (
     InfeasibleError,
     PlantError,

@@ -16,8 +16,8 @@ import pytest
 
 import impc
 from experiments.coverage import cart, noisy_trial
+from impc.attached_methods import METHODS, PROPERTIES
 from impc.errors import DataError, InputError
-from impc.estimate_methods import METHODS, PROPERTIES
 from impc.studies.fit.settings import FitSettings
 
 mpl.use("Agg")
@@ -200,17 +200,20 @@ def test_what_drove_a_simulation_drives_its_recording() -> None:
         impc.Recording(bare, np.ones(5), np.ones(5))
 
 
-def test_the_declared_methods_are_those_that_are_attached() -> None:
+@pytest.mark.parametrize("owner", [impc.Controller, impc.Estimate])
+def test_the_declared_methods_are_those_that_are_attached(owner: type) -> None:
     """A type checker reads the declarations in the class; a program calls the functions."""
-    (kind,) = ast.parse(inspect.getsource(impc.Estimate)).body
+    (kind,) = ast.parse(inspect.getsource(owner)).body
     (block,) = [node for node in ast.walk(kind) if isinstance(node, ast.If)
                 and ast.unparse(node.test) == "TYPE_CHECKING"]  # fmt: skip
     declared = {node.name: node for node in block.body if isinstance(node, ast.FunctionDef)}
-    assert list(declared) == list(METHODS)
+    assert list(declared) == list(METHODS[owner.__name__])
     for name, node in declared.items():
-        found = getattr(impc.Estimate, name)
+        found = getattr(owner, name)
         assert isinstance(found, property) == (name in PROPERTIES)
-        (function,) = ast.parse(inspect.getsource(getattr(found, "fget", found))).body
+        (function,) = ast.parse(
+            inspect.getsource(inspect.unwrap(getattr(found, "fget", found)))
+        ).body
         assert isinstance(function, ast.FunctionDef)
         given = [ast.unparse(one.args).split(", ")[1:] for one in (node, function)]
         assert given[0] == given[1]
