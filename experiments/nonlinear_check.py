@@ -19,9 +19,10 @@ from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
 from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
+from experiments.reference_mpc import solve_mpc
 from impc.arrays import Array
 from impc.checking import replace
-from impc.control.casadi_controller import build_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Scenario, scenario

@@ -6,7 +6,8 @@ import control
 import numpy as np
 import pytest
 
-from impc.control.casadi_controller import build_mpc, simulate_mpc, solve_mpc
+from experiments.reference_mpc import simulate_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
