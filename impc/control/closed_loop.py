@@ -30,13 +30,7 @@ from impc.control.compiled_kernel import answer_with, deviate, fill_slack, retur
 from impc.control.compiled_loop import run
 from impc.control.compiled_values import TOO_SHORT, LoopMatrices, RowDirections, Trace
 from impc.control.constraint_rows import build_rows, differentiate_rows, directions
-from impc.control.named_solver import (
-    COMPILED,
-    Program,
-    active_set,
-    build_program,
-    excluded_row,
-)
+from impc.control.named_solver import COMPILED, Program, active_set, build_program, excluded_row
 from impc.control.simulation import Sensitivity, Simulation, Status
 
 if TYPE_CHECKING:

@@ -357,13 +357,7 @@ def _tighten(rows: Rows, work: Workspace, active: int) -> None:
 
 @njit(cache=True)
 def _check(
-    K: Buffer,
-    rows: Rows,
-    lam: Buffer,
-    work: Workspace,
-    active: int,
-    x: Buffer,
-    unit: Buffer,
+    K: Buffer, rows: Rows, lam: Buffer, work: Workspace, active: int, x: Buffer, unit: Buffer
 ) -> tuple[bool, bool, bool]:
     """Return whether a soft row is violated, a row is weakly active, and v is accepted.
 

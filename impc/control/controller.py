@@ -112,11 +112,7 @@ class Controller(Value):
     array([[ 1.494, -0.881]])
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {
-        "K": "m n",
-        "S": "m m",
-        "horizon": (1, LONGEST_HORIZON),
-    }
+    _rules: ClassVar[Mapping[str, Any]] = {"K": "m n", "S": "m m", "horizon": (1, LONGEST_HORIZON)}
 
     plant: Plant
     K: Array

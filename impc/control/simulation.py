@@ -84,11 +84,7 @@ class Scenario(Value):
         Outputs or states with a target, length q.
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {
-        "x0": "n",
-        "disturbance": "* d",
-        "target": "* q",
-    }
+    _rules: ClassVar[Mapping[str, Any]] = {"x0": "n", "disturbance": "* d", "target": "* q"}
 
     x0: Array
     disturbance: Array

@@ -13,11 +13,7 @@ from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
 from impc.control.named_solver import SOLVERS
 from impc.control.simulation import Status, scenario
-from impc.errors import (
-    InfeasibleError,
-    PlantError,
-    SolverError,
-)
+from impc.errors import InfeasibleError, PlantError, SolverError
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
 from impc.model.weights import Weights
