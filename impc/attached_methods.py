@@ -21,6 +21,7 @@ METHODS = {
         "save": "files.saved_estimates:save_estimate",
         "_repr_html_": "reporting.estimate_text:as_html",
     },
+    "OptimalControlEstimate": {"page": "nonlinear.page:estimate_report"},
 }
 #: Those that are read without a call.
 PROPERTIES = {"vaf"}

@@ -18,6 +18,7 @@ import impc
 from experiments.coverage import cart, noisy_trial
 from impc.attached_methods import METHODS, PROPERTIES
 from impc.errors import DataError, InputError
+from impc.nonlinear.fit import OptimalControlEstimate
 from impc.studies.fit.settings import FitSettings
 
 mpl.use("Agg")
@@ -200,7 +201,7 @@ def test_what_drove_a_simulation_drives_its_recording() -> None:
         impc.Recording(bare, np.ones(5), np.ones(5))
 
 
-@pytest.mark.parametrize("owner", [impc.Controller, impc.Estimate])
+@pytest.mark.parametrize("owner", [impc.Controller, impc.Estimate, OptimalControlEstimate])
 def test_the_declared_methods_are_those_that_are_attached(owner: type) -> None:
     """A type checker reads the declarations in the class; a program calls the functions."""
     (kind,) = ast.parse(inspect.getsource(owner)).body
