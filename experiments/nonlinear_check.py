@@ -87,7 +87,7 @@ def _linear_on_nonlinear(controller: Controller, step: Any, drive: Scenario) -> 
     x = np.zeros((drive.steps + 1, controller.plant.n))
     x[0] = drive.x0
     for k in range(drive.steps):
-        command = solve_mpc(mpc, x[k]).u[0]
+        command = solve_mpc(mpc, x[k]).plan[0]
         x[k + 1] = np.asarray(step(x[k], np.append(command, drive.disturbance[k]))).ravel()
     return x
 
