@@ -14,11 +14,12 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check -qq
 UV := $(shell command -v uv 2>/dev/null || echo $(VENV)/bin/uv)
 
-# Four stamps, each written last, so that a half-made environment is never taken as complete.
+# Five stamps, each written last, so that a half-made environment is never taken as complete.
 LOCKED := $(VENV)/.stamp-locked
 PROJECT := $(VENV)/.stamp-project
 POLYTOPE := $(VENV)/.stamp-polytope
 COMPILED := $(VENV)/.stamp-compiled
+FILTER := $(VENV)/.stamp-filter
 POLYTOPE_LOG := $(VENV)/polytope-install.log
 
 # Bytecode is kept whatever the environment says: without it each of the processes that tests start
@@ -72,13 +73,13 @@ demo: env
 	  --plant seated-balance --config results/subject/subject.toml --out results/fit
 
 # Each test file runs in one process, longest folders first. The shared closed loop is compiled on one
-# core while the checks run on the other; the sensory-noise filter (two minutes more) is for `make full`.
+# core while the checks run on the other; no test here uses the filter of sensory noise.
 test: $(PROJECT) $(POLYTOPE)
-	@$(PY) -c 'from impc.control.warm import compiled_parts; next(compiled_parts())' & compiled=$$!; \
+	@$(PY) -c 'from impc.studies.warm import compile_loop; compile_loop()' & compiled=$$!; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$compiled && exit $$checked
 	$(PYTEST) -m "not full and not slow"
 
-full: env
+full: env $(FILTER)
 	$(PYTEST) -m full
 
 check: $(PROJECT)
@@ -116,7 +117,7 @@ wheel: env
 	  venv/bin/python -c "import impc, plants; assert '/venv/' in impc.__file__, impc.__file__" || exit 1; \
 	done
 
-slow: env
+slow: env $(FILTER)
 	$(PY) -m pytest -m slow
 
 coverage: env
@@ -141,7 +142,7 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 
 # Hundreds of simulated subjects: the table of experiments/output_feedback.md.
 PEOPLE = $(PY) -m experiments.noisy_people_study
-noisy-people: env
+noisy-people: env $(FILTER)
 	$(PEOPLE) run --subjects 200 --profiles --out results/noisy-people.jsonl
 	$(PEOPLE) run --body seat --subjects 20 --out results/noisy-people.jsonl
 	$(PEOPLE) sum results/noisy-people.jsonl
@@ -157,7 +158,7 @@ structures: env
 	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
 
 # Subjects who follow a target, and the package lqg: the tables of experiments/cursor_tracking.md.
-followers: env
+followers: env $(FILTER)
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_people_study
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer SubjectiveActor
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer BoundedActor
@@ -199,8 +200,13 @@ fuzz: env
 env: $(PROJECT) $(POLYTOPE) $(COMPILED)
 
 $(COMPILED): $(wildcard impc/*/compiled_*.py) $(PROJECT)
-	@echo 'Compiling, once: some minutes.'
+	@echo 'Compiling, once: about a minute.'
 	@OPENBLAS_NUM_THREADS=1 $(VENV)/bin/impc warm
+	@touch $@
+
+# The filter of sensory noise: compiled once, before several processes use it, and not for `make env`.
+$(FILTER): $(wildcard impc/*/compiled_*.py) $(PROJECT)
+	@OPENBLAS_NUM_THREADS=1 $(VENV)/bin/impc warm --sensory-noise
 	@touch $@
 
 $(LOCKED): requirements.lock

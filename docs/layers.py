@@ -13,7 +13,7 @@ from collections import Counter
 from html import escape
 from pathlib import Path
 
-__all__ = ["DRAWING", "SUBPACKAGES", "drawing", "imports", "longest_chain", "subpackage"]
+__all__ = ["DRAWING", "SUBPACKAGES", "circles", "drawing", "imports", "longest_chain", "subpackage"]
 
 ROOT = Path(__file__).parents[1]
 #: Written by this module, shown by docs/dev/architecture.md.
@@ -33,32 +33,19 @@ SUBPACKAGES = {
     "cli": "commands: parse, call, print",
     "package": "import impc, python -m impc",
 }
-#: The one module with arrows up: methods of an estimate call functions of higher layers when used.
-RESULT = "inverse.estimates"
 
 
-def imports(typing: bool = True, package: Path = ROOT / "impc") -> dict[str, set[str]]:
+def imports(package: Path = ROOT / "impc") -> dict[str, set[str]]:
     """The modules of impc that each module of it imports, by name without `impc.`.
 
-    Parameters
-    ----------
-    typing : bool
-        Whether what is imported for its types alone counts, and what is imported inside a function.
-    package : Path
-        Folder of the package; its name is that of the package.
+    Imports for types alone and inside functions count.
     """
     files = {_name(path, package): path for path in sorted(package.rglob("*.py"))}
     found = {}
     for name, path in files.items():
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        named = [
-            item for node in _imports(tree.body, typing) for item in _named(node, package.name)
-        ]
+        named = [item for node in ast.walk(tree) for item in _named(node, package.name)]
         found[name] = {_known(item, files) for item in named} - {name}
-    if typing and RESULT in found:
-        order = list(SUBPACKAGES)
-        highest = order.index(subpackage(RESULT))
-        found[RESULT] = {one for one in found[RESULT] if order.index(subpackage(one)) <= highest}
     return found
 
 
@@ -68,6 +55,18 @@ def subpackage(module: str) -> str:
     if first in ("__init__", "__main__"):
         return "package"
     return first if rest or first in SUBPACKAGES else "base"
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that reach each other by imports."""
+    reached = {name: set(others) for name, others in graph.items()}
+    for middle in graph:
+        for others in reached.values():
+            if middle in others:
+                others.update(reached[middle])
+    found = {frozenset(other for other in others if name in reached[other])
+             for name, others in reached.items() if name in others}  # fmt: skip
+    return sorted(map(sorted, found))
 
 
 def longest_chain(graph: dict[str, set[str]]) -> list[str]:
@@ -151,20 +150,7 @@ def _name(path: Path, package: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
 
 
-def _imports(body: list[ast.stmt], typing: bool) -> list[ast.stmt]:
-    found: list[ast.stmt] = []
-    for node in body:
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            found.append(node)
-        elif typing:
-            inside = [item for item in ast.walk(node) if isinstance(item, ast.stmt)]
-            found += [item for item in inside if isinstance(item, ast.Import | ast.ImportFrom)]
-        elif isinstance(node, ast.With | ast.Try):
-            found += _imports(node.body, typing)
-    return found
-
-
-def _named(node: ast.stmt, package: str) -> list[str]:
+def _named(node: ast.AST, package: str) -> list[str]:
     """Dotted names that a statement imports from the package, without its name."""
     if isinstance(node, ast.Import):
         names = [item.name for item in node.names]

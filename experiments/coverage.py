@@ -24,7 +24,8 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import residual_noise, white_noise
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import scenario
 from impc.inverse.search import fit_gain
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -25,9 +25,9 @@ import numpy as np
 import plants
 from experiments.cursor_data import RATE, Condition
 from impc.checking import replace
-from impc.inverse.unknowns import Point
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.structured import fit_structured
+from impc.inverse.unknowns import Point
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording

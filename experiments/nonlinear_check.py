@@ -19,9 +19,10 @@ from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
 from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
+from experiments.reference_mpc import solve_mpc
 from impc.arrays import Array
 from impc.checking import replace
-from impc.control.casadi_controller import build_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Scenario, scenario
@@ -86,7 +87,7 @@ def _linear_on_nonlinear(controller: Controller, step: Any, drive: Scenario) -> 
     x = np.zeros((drive.steps + 1, controller.plant.n))
     x[0] = drive.x0
     for k in range(drive.steps):
-        command = solve_mpc(mpc, x[k]).u[0]
+        command = solve_mpc(mpc, x[k]).plan[0]
         x[k + 1] = np.asarray(step(x[k], np.append(command, drive.disturbance[k]))).ravel()
     return x
 

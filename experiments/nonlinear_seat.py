@@ -20,16 +20,18 @@ from tqdm import tqdm
 
 from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
 from experiments.nonlinear_seat_figure import seat_figure
+from experiments.reference_mpc import solve_mpc
 from experiments.seat_problem import DIRECTION, TRUTH, seat_problem
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.cli.seat import HORIZON, seat_controller, seat_weights
-from impc.control.casadi_controller import build_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
-from impc.control.simulation import require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import scenario
 from impc.inverse.methods import fit
-from impc.inverse.search import free_gain
 from impc.inverse.problem import Problem, recorded_size
+from impc.inverse.search import free_gain
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.structure import Structure

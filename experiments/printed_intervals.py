@@ -28,7 +28,8 @@ from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import scenario
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -31,10 +31,10 @@ from tqdm import tqdm
 import plants
 from impc.arrays import Array
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
-from impc.inverse.refit import refit
 from impc.control.controller import Controller
 from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.refit import refit
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording

@@ -15,9 +15,9 @@ import scipy.stats
 
 from experiments.search_problems import Known, random_problem, stick_problem
 from impc.errors import ImpcError
-from impc.inverse.search import refine_gain
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import recorded_size
+from impc.inverse.search import refine_gain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

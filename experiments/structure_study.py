@@ -28,8 +28,7 @@ from impc.assess.structures import structure_test
 from impc.assess.weight_profiles import WeightProfiles
 from impc.control.controller import Controller
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.structured import fit_structure
-from impc.inverse.structured import search_from
+from impc.inverse.structured import fit_structure, search_from
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.structure import Structure

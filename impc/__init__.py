@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from impc.control.closed_loop import simulate_and_differentiate as simulate_and_differentiate
     from impc.control.constraint_rows import directions as directions
     from impc.control.controller import Controller as Controller
+    from impc.control.feasibility import require_complete as require_complete
     from impc.control.loop_function import closed_loop_function as closed_loop_function
     from impc.control.simulation import Simulation as Simulation
     from impc.control.simulation import Status as Status
-    from impc.control.simulation import require_complete as require_complete
     from impc.control.simulation import scenario as scenario
     from impc.control.terminal_set import TerminalSet as TerminalSet
     from impc.control.terminal_set import maximal_invariant_set as maximal_invariant_set
@@ -83,8 +83,9 @@ _NAMES = {
     "control.closed_loop": "simulate_and_differentiate",
     "control.constraint_rows": "directions",
     "control.controller": "Controller",
+    "control.feasibility": "require_complete",
     "control.loop_function": "closed_loop_function",
-    "control.simulation": "Simulation Status require_complete scenario",
+    "control.simulation": "Simulation Status scenario",
     "control.terminal_set": "TerminalSet maximal_invariant_set",
     "errors": "BoundsError DataError ImpcError InfeasibleError InputError OutputError PlantError"
     " SolverError WeightsError",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import logging
 import os
 import stat
 from pathlib import Path
@@ -31,8 +32,7 @@ def njit(**options: Any) -> Callable[[F], F]:
     ignore_settings_files("numba")
     import numba  # noqa: PLC0415  # takes 0.25 s; `keep_caches` does not need it
 
-    if _waiting:
-        _listen()
+    _listen()
 
     def decorate(function: F) -> F:
         make: Any = numba.njit
@@ -48,13 +48,14 @@ def njit(**options: Any) -> Callable[[F], F]:
 
 
 def say_when_compiling(say: Callable[[str], None]) -> None:
-    """Call `say` with a line, once, when code is compiled that is not in the cache."""
+    """Call `say`, in place of the logger, once when code is compiled that is not in the cache."""
     _waiting[:] = [say]
 
 
-_waiting: list[Callable[[str], None]] = []
+_waiting: list[Callable[[str], None]] = [logging.getLogger("impc").info]
 
 
+@functools.cache
 def _listen() -> None:
     """Report once when numba compiles."""
     from numba.core import event  # noqa: PLC0415  # with numba, not before
@@ -62,7 +63,7 @@ def _listen() -> None:
     class Once(event.Listener):
         def on_start(self, _event: Any) -> None:
             while _waiting:
-                _waiting.pop()("compiling once, a minute or two (`impc warm` does it in advance)")
+                _waiting.pop()("compiling once, a minute or two (`impc warm --help`: in advance)")
 
         def on_end(self, _event: Any) -> None:
             """No output."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from docs.layers import ROOT, imports, longest_chain, subpackage
+from docs.layers import ROOT, circles, imports, longest_chain, subpackage
 from tests.documents.blocks import PAGES, blocks
 
 _SHOWN = re.compile(
@@ -43,18 +43,6 @@ def _docstrings(paths: list[Path]) -> int:
                 first = node.body[0]
                 count += (first.end_lineno or first.lineno) - first.lineno + 1
     return count
-
-
-def _circles(graph: dict[str, set[str]]) -> int:
-    """Groups of modules that reach each other by imports."""
-    reached: dict[str, set[str]] = {name: set(others) for name, others in graph.items()}
-    for middle in graph:
-        for name in graph:
-            if middle in reached[name]:
-                reached[name] |= reached[middle]
-    around = {name: {other for other in others if name in reached[other]}
-              for name, others in reached.items()}  # fmt: skip
-    return len({frozenset(others) for others in around.values() if len(others) > 1})
 
 
 def _share_of_documents() -> tuple[int, float]:
@@ -99,8 +87,6 @@ def main() -> None:
         for name, others in run.items()
         if subpackage(name) == "inverse"
     }
-    inside_each = {name: {other for other in others if subpackage(other) == subpackage(name)}
-                for name, others in run.items()}  # fmt: skip
     words = sum(len(path.read_text(encoding="utf-8").split()) for path in PAGES.values())
     ids, share = _share_of_documents()
     rows = {
@@ -110,7 +96,7 @@ def main() -> None:
         "docs/ and README: words": f"{words:,}",
         "test ids, of them of documents": f"{ids:,}, {100 * share:.0f} %",
         "inverse/: modules, import layers": f"{len(inside)}, {len(longest_chain(inside))}",
-        "import circles inside subpackages, types counted": f"{_circles(inside_each)}",
+        "import circles, types counted": f"{len(circles(run))}",
         "presentation (Python, templates, styles, scripts)": f"{len(shown)} files, "
         f"{_lines(shown):,} lines",
         "README's Python example: files, functions, depth": "{}, {}, {}".format(*_followed()),

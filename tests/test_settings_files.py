@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 
 from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
-from impc.control.casadi_controller import build_mpc, solve_mpc
+from experiments.reference_mpc import solve_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import InfeasibleError

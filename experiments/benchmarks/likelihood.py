@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from impc.inverse.coordinates import Coordinates
 
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
 from experiments.noisy_people import recorded, subject
 from impc.checking import replace
-from impc.inverse.coordinates import Coordinates
-from impc.inverse.unknowns import Point
 from impc.inverse.residuals import evaluate
+from impc.inverse.unknowns import Point
 from impc.output_feedback.start import gain_space
 from impc.output_feedback.unknowns import PersonCoordinates
 

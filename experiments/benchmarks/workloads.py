@@ -12,7 +12,8 @@ import plants
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import Scenario, require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import Scenario, scenario
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

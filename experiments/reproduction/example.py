@@ -12,8 +12,9 @@ from experiments.certificates import (
     maximality_violation,
     weights_from_parameters,
 )
+from experiments.reference_mpc import simulate_mpc
 from experiments.reproduction.entry import Entry, Verdict, agrees, kind
-from impc.control.casadi_controller import build_mpc, simulate_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
@@ -78,7 +79,7 @@ def controller_entries() -> list[Entry]:
             " the first input is applied.",
             (
                 "impc.control.controller:Controller",
-                "impc.control.casadi_controller:solve_mpc",
+                "impc.control.casadi_controller:build_mpc",
                 "impc.control.closed_loop:simulate",
             ),
             "The compiled loop and the program solved at every sample differ, over 20 steps of"

@@ -85,6 +85,11 @@ def evaluate_method(estimate: Estimate, bounds: Bounds) -> MethodFit:
     )
 
 
+def estimate_vaf(estimate: Estimate) -> Array:
+    """Variance accounted for (3.24) of each output over all trials, in %, shape (p,)."""
+    return evaluate_method(estimate, estimate.problem.bounds).vaf
+
+
 def _without_gain(estimate: Estimate, bounds: Bounds) -> MethodFit:
     plant, count = estimate.problem.plant, len(estimate.problem.recordings)
     p = len(plant.outputs)

@@ -145,12 +145,26 @@ def _around(value: Array, half: float) -> tuple[float, float]:
 
 
 def interval_table(fitted: Estimate) -> pd.DataFrame:
-    """Intervals of the gain and of fitted parameters, with HAC standard errors."""
+    """Gain entries and free parameters with 95 % intervals, one row each.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Index: name, such as "K.u.x1" for the entry from state x1 to input u. Columns: `unit`,
+        `value`, `low`, `high`, and `identified`, whether the recordings identify this number
+        individually. Values are least-squares estimates along the identified directions and can
+        differ from K, which belongs to weights (docs/why/intervals.md).
+    """
     return _table(gain_estimate(fitted))
 
 
 def continuous_interval_table(fitted: Estimate) -> pd.DataFrame:
-    """`interval_table` for the continuous-time gain, to first order (delta method)."""
+    """Continuous-time gain of which that of `intervals()` is the sampled counterpart.
+
+    For comparison with published gains; columns as in `intervals()`. Intervals are first-order
+    (delta method) at fixed parameters. `Controller.from_continuous_gain` defines and inverts the
+    conversion.
+    """
     found = gain_estimate(fitted)
     K, slopes = continuous_gain(found.problem.plant, found.K)
     entries, foreign = found.covariance.combinations(slopes)

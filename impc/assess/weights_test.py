@@ -28,12 +28,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.special
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.columns import triangular_rows
 from impc.inverse.equivalent_weights import other_weights, weights_margin
-from impc.inverse.estimates import ROUNDING
+from impc.inverse.estimates import ROUNDING, Identifiability, OtherWeights
 from impc.inverse.problem import misfit, recorded_size, simulated
 from impc.inverse.proximal_search import Residual, weight_jacobian
 from impc.inverse.proximal_step import block_basis
@@ -152,32 +152,6 @@ def return_difference(plant: Plant, gain: Array) -> ReturnDifference | None:
 _DETERMINED = 1e-8
 
 
-@dataclass(frozen=True)
-class OtherWeights:
-    """Weights other than the reported ones, with their misfit on the same recordings."""
-
-    weights: Weights
-    condition: float  # kappa(blkdiag(Q, R))
-    misfit: float  # 2-norm of the output residual
-
-
-@dataclass(frozen=True)
-class Identifiability(Frozen):
-    """Result of `identifiability`."""
-
-    # Of the derivative of the outputs by relative changes D of blkdiag(Q, R), dX = L D L' with X =
-    # L L' (s,), largest first
-    singular_values: Array
-    free: int  # Directions of (Q, R) without scale
-    # Number of identified directions: singular values above 1e-8 of the largest and above 1e-10 of
-    # the recorded outputs
-    rank: int
-    chosen: int  # Directions fixed by convention: free - rank
-    tolerance: float  # The threshold 1e-8
-    # Other weights with the same gain; empty if they cannot be computed in double precision
-    others: tuple[OtherWeights, ...]
-
-
 @checked
 def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     """Count the weight directions that the recordings identify.
@@ -226,6 +200,11 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     return Identifiability(
         frozen(values), free, rank, free - rank, _DETERMINED, _others(problem, fibre)
     )
+
+
+def estimate_identifiability(estimate: Estimate) -> Identifiability:
+    """Count the weight directions that the recordings identify; see `impc.identifiability`."""
+    return identifiability(estimate.problem, estimate.stage_weights)
 
 
 def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> Array:

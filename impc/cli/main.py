@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import os
 import sys
 from typing import Any
@@ -83,19 +82,21 @@ def main(context: click.Context) -> None:
 
 
 @click.command("warm")
-def warm() -> None:
-    """Compile the inner loops of all other commands once; takes some minutes.
+@click.option("--sensory-noise", is_flag=True, help="Also compile the filter of sensory noise.")
+def warm(sensory_noise: bool) -> None:
+    """Compile the inner loops of all commands once; takes about a minute.
 
     `make env` calls it; after an installation by pip, call it yourself. Without it, the first
-    command that needs compiled code compiles it and says so.
+    command that needs compiled code compiles it and says so. So does the first fit with sensory
+    noise: its filter is compiled here only with --sensory-noise.
     """
     say_when_compiling(lambda _: None)  # this command prints its own lines
-    from impc.control.warm import compiled_parts  # noqa: PLC0415  # loads numba
+    from impc.studies.warm import compile_bodies, compile_filter, compile_loop  # noqa: PLC0415
 
-    for part in compiled_parts():
-        click.echo(f"compiled: {part}")
-    if importlib.util.find_spec("impc.output_feedback"):
-        from impc.output_feedback.warm import compile_filter  # noqa: PLC0415
-
+    compile_loop()
+    click.echo("compiled: the constrained controller and its closed loop")
+    compile_bodies()
+    click.echo("compiled: nonlinear bodies")
+    if sensory_noise:
         compile_filter()
-        click.echo("compiled: subjects who sense with noise")
+        click.echo("compiled: the filter of sensory noise")

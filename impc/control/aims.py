@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.control.compiled_kernel import Aim
+from impc.control.compiled_values import Aim
 from impc.control.constraint_rows import families
 from impc.errors import InputError
 from impc.model.targets import PlantChange, SteadyStates, expected_disturbance, signal_rows

@@ -17,7 +17,8 @@ import numpy as np
 from llvmlite import ir
 
 from impc.arrays import Array
-from impc.control.compiled_body import BodyTape, move_along, states_along
+from impc.control.compiled_body import move_along, states_along
+from impc.control.compiled_values import BodyTape
 from impc.model.body import OPERATIONS
 
 if TYPE_CHECKING:
@@ -73,17 +74,14 @@ def slopes_along(plant: Plant, x: Array, u: Array, d: Array) -> tuple[Array, Arr
     """Derivatives of the next state by state, input and disturbance, at every sample."""
     n, m, steps = plant.n, plant.m, len(x)
     if plant.body is None:
-        A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in _matrices(plant))
+        parts = (plant.A, plant.B, plant.E)
+        A, B, E = (np.broadcast_to(part, (steps, *part.shape)) for part in parts)
         return A, B, E
     given = n + m + plant.E.shape[1]
     tape = body_tape(plant.body, n, given, moving=True)
     found = np.empty((steps, n, given))
     move_along(tape, np.array(x), np.array(u), np.array(d), found)
     return found[..., :n], found[..., n : n + m], found[..., n + m :]
-
-
-def _matrices(plant: Plant) -> tuple[Array, Array, Array]:
-    return plant.A, plant.B, plant.E
 
 
 _NUMBER, _PLACE = ir.DoubleType(), ir.IntType(64)

@@ -1,7 +1,6 @@
-"""Controller as a CasADi quadratic program that is solved at every sample.
+"""Controller as a CasADi function: the quadratic program of one sample.
 
-This plain implementation is the reference for the fast one in `closed_loop`: the symbolic program
-is solved by a named plugin from scratch at every sample.
+`experiments/reference_mpc.py` solves it at every sample, as the reference for `closed_loop`.
 
     minimise over v_0..v_{N-1} (and slacks s >= 0 of soft rows)   sum v_k'S v_k / 2 + limit's
     subject to   T x + M v <= b + s
@@ -16,27 +15,22 @@ import casadi as ca
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, BoolArray, finite_array
+from impc.arrays import BoolArray
 from impc.checking import checked
-from impc.control.body_steps import next_state
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
-from impc.control.named_solver import PLUGINS, SOLVERS, excluded_row, silent
-from impc.control.simulation import Simulation, Status
+from impc.control.named_solver import PLUGINS, SOLVERS, silent
 from impc.errors import InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.control.constraint_rows import Rows
-    from impc.control.simulation import Scenario
+    from impc.control.compiled_values import Rows
 
 # Slacks are linear in the cost, so the Hessian is singular, which DAQP does not accept; with its
 # proximal iterations it declares feasible programs infeasible. Its slacks get a quadratic cost of
 # this share of their penalty: a relative excess s changes the penalty by 1e-8 s.
 _DAQP_SLACK = 1e-8
-# A row exceeded by more than this share of its bound counts as violated, whatever the solver says.
-_EXCEEDED = 1e-6
+#: A row exceeded by more than this share of its bound counts as violated, whatever the solver says.
+EXCEEDED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -46,25 +40,10 @@ class MpcSolver:
     controller: Controller
     rows: Rows
     name: str  # CasADi plugin
-    # solver with the state as parameter ``p``; rows are divided by their bounds: call it with
-    # ``lbg=-inf, ubg=1`` and slacks >= 0, as `solve_mpc` does
-    function: Any
+    function: Any  # solver with the state as parameter ``p``
+    # Of a call: slacks are not negative, and rows are divided by their bounds
+    limits: dict[str, Any]
     soft: BoolArray  # (r,), which rows have a slack
-
-
-@dataclass(frozen=True)
-class MpcStep:
-    """Solution of one program."""
-
-    u: Array  # (m,), input to apply; if the status is a failure, that of the plain gain
-    plan: Array  # (N, m), planned inputs
-    states: Array  # (N + 1, n), planned states
-    # UNSOLVED: no plan found that satisfies the hard rows; INFEASIBLE: proved that there is none.
-    # The solver's own claim is not used: on unstable plants IPOPT and qpOASES report feasible
-    # programs as infeasible.
-    status: Status
-    excess: float  # largest violation of a hard row relative to its bound, recomputed
-    failed_row: int  # row of `Rows` that is incompatible with the others, or -1
 
 
 @checked
@@ -101,56 +80,9 @@ def build_mpc(controller: Controller, solver: str = "daqp") -> MpcSolver:
         options = {key: value for key, value in options.items() if key != "initialStatusBounds"}
     with silent():
         function = ca.qpsol("mpc", name, program, options)
-    return MpcSolver(controller, rows, solver, function, soft)
-
-
-@checked(x="n")
-def solve_mpc(mpc: MpcSolver, x: ArrayLike) -> MpcStep:
-    """Solve the program at state `x` (n,)."""
-    controller, rows = mpc.controller, mpc.rows
-    state = finite_array("x", x, (controller.plant.n,))
-    width, slacks = rows.M.shape[1], int(mpc.soft.sum())
-    with silent():  # the first call builds the solver
-        answer = mpc.function(
-            p=state,
-            lbx=np.r_[np.full(width, -np.inf), np.zeros(slacks)],
-            ubx=np.inf,
-            lbg=-np.inf,
-            ubg=1,
-        )
-    solved = bool(mpc.function.stats()["success"])
-    decision = np.asarray(answer["x"]).ravel()
-    v = decision[:width] if solved else np.zeros(width)
-    excess = rows.T @ state + rows.M @ v - rows.b
-    hard = excess[~mpc.soft] / rows.b[~mpc.soft]
-    violation = float(np.max(hard, initial=0.0))
-    status = _judge(excess[mpc.soft] / rows.b[mpc.soft], v)
-    row = -1
-    if not solved or violation > _EXCEEDED:
-        row = excluded_row(rows, rows.b - rows.T @ state)
-        status = Status.INFEASIBLE if row >= 0 else Status.UNSOLVED
-    plan, states = _unroll(controller, state, v)
-    return MpcStep(plan[0], plan, states, status, violation, row)
-
-
-@checked
-def simulate_mpc(mpc: MpcSolver, given: Scenario) -> Simulation:
-    """Simulate with a program at every sample; slow counterpart of `closed_loop.simulate`."""
-    plant = mpc.controller.plant
-    if given.signals or np.any(plant.observer):
-        raise InputError("target", "is given, but is not supported here", "use impc.simulate")
-    x, u = np.zeros((given.steps + 1, plant.n)), np.zeros((given.steps, plant.m))
-    status = np.full(given.steps, Status.NOT_REACHED, dtype=np.int8)
-    x[0], failed_row = given.x0, -1
-    for t in range(given.steps):
-        step = solve_mpc(mpc, x[t])
-        status[t] = step.status
-        if step.status > Status.SOFTENED:
-            x[t + 1 :], failed_row = x[t], step.failed_row
-            break
-        u[t] = step.u
-        x[t + 1] = next_state(plant, x[t], u[t], given.disturbance[t])
-    return Simulation(plant, x, u, status, 0, failed_row)
+    least = np.r_[np.full(rows.M.shape[1], -np.inf), np.zeros(int(soft.sum()))]
+    limits = {"lbx": least, "ubx": np.inf, "lbg": -np.inf, "ubg": 1}
+    return MpcSolver(controller, rows, solver, function, limits, soft)
 
 
 @checked
@@ -189,30 +121,12 @@ def mpc_function(controller: Controller) -> ca.Function:
     free = ca.Function("gain", [x], [gain])
     if len(rows.b) == 0:
         return ca.Function("mpc", [x], [free(x)], ["x"], ["u"])
-    least = np.r_[np.full(width, -np.inf), np.zeros(int(mpc.soft.sum()))]
-    v = mpc.function(p=x, lbx=least, ubx=np.inf, lbg=-np.inf, ubg=1)["x"][:width]
+    v = mpc.function(p=x, **mpc.limits)["x"][:width]
     reached = ca.mtimes(ca.DM(rows.T / rows.b[:, None]), x)
     planned = reached + ca.mtimes(ca.DM(rows.M / rows.b[:, None]), v)
     hard = np.flatnonzero(~mpc.soft).tolist()
-    kept = ca.mmax(planned[hard]) <= 1 + _EXCEEDED if hard else ca.MX(1)
+    kept = ca.mmax(planned[hard]) <= 1 + EXCEEDED if hard else ca.MX(1)
     answer = ca.if_else(kept, gain + v[: controller.plant.m], np.nan)
     busy = ca.Function("program", [x], [answer])
     branch = ca.Function.if_else("branch", free, busy)
     return ca.Function("mpc", [x], [branch(ca.mmax(reached) <= 1, x)], ["x"], ["u"])
-
-
-def _judge(soft_excess: Array, v: Array) -> Status:
-    if np.max(soft_excess, initial=0.0) > _EXCEEDED:
-        return Status.SOFTENED
-    return Status.ACTIVE if np.max(np.abs(v), initial=0.0) > 1e-8 else Status.FREE
-
-
-def _unroll(controller: Controller, x: Array, v: Array) -> tuple[Array, Array]:
-    plant, horizon = controller.plant, controller.horizon
-    moves = v.reshape(horizon, plant.m)
-    plan, states = np.zeros((horizon, plant.m)), np.zeros((horizon + 1, plant.n))
-    states[0] = x
-    for k in range(horizon):
-        plan[k] = moves[k] - controller.gains[k] @ states[k]
-        states[k + 1] = plant.A @ states[k] + plant.B @ plan[k]
-    return plan, states

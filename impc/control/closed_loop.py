@@ -26,29 +26,16 @@ from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.control.aims import aim_of
 from impc.control.body_steps import body_tape, pushes
-from impc.control.compiled_kernel import (
-    TOO_SHORT,
-    LoopMatrices,
-    answer_with,
-    deviate,
-    fill_slack,
-    return_to,
-    workspace,
-)
-from impc.control.compiled_loop import Trace, run
-from impc.control.constraint_rows import RowDirections, build_rows, differentiate_rows, directions
-from impc.control.named_solver import (
-    COMPILED,
-    Program,
-    active_set,
-    build_program,
-    excluded_row,
-)
+from impc.control.compiled_kernel import answer_with, deviate, fill_slack, return_to, workspace
+from impc.control.compiled_loop import run
+from impc.control.compiled_values import TOO_SHORT, LoopMatrices, RowDirections, Trace
+from impc.control.constraint_rows import build_rows, differentiate_rows, directions
+from impc.control.named_solver import COMPILED, Program, active_set, build_program, excluded_row
 from impc.control.simulation import Sensitivity, Simulation, Status
 
 if TYPE_CHECKING:
-    from impc.control.compiled_kernel import Workspace
-    from impc.control.constraint_rows import Directions, Rows
+    from impc.control.compiled_values import Rows, Workspace
+    from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.control.simulation import Scenario
 

@@ -7,28 +7,18 @@ by zero gives infinity, and the loop then diverges.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
 from impc.arrays import Buffer
+from impc.control.compiled_values import BodyTape
 from impc.jit import njit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-
-class BodyTape(NamedTuple):
-    """Machine code of a `Body` with its buffers."""
-
-    address: int  # 0 for a linear plant
-    constants: Buffer  # (c,)
-    given: Buffer  # (g,), written at every sample: state, input and disturbance
-    found: Buffer  # (n + n*g,), written by the code: next state, then its slopes
-    slopes: Buffer  # (n, g), view of the slopes in `found`
-    beside: Buffer  # (n, g), slopes of an added linear part; or (n, 0)
 
 
 @njit(cache=True)

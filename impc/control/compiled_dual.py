@@ -204,13 +204,7 @@ def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
 
 @njit(cache=True)
 def _remove(
-    reach: Buffer,
-    free: Buffer,
-    count: int,
-    place: int,
-    factor: Buffer,
-    basis: Buffer,
-    worn: Buffer,
+    reach: Buffer, free: Buffer, count: int, place: int, factor: Buffer, basis: Buffer, worn: Buffer
 ) -> int:
     """Drop the free row at `place`; Givens rotations make the factor lower triangular again."""
     width = furthest(reach, free, count)

@@ -7,8 +7,6 @@ equations of the derivatives: `closed_loop`; the loop over samples: `compiled_lo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
-
 import numpy as np
 
 from impc.arrays import Buffer
@@ -23,15 +21,21 @@ from impc.control.compiled_dual import (
     substitute,
     substitute_all,
 )
+from impc.control.compiled_values import (
+    ACTIVE,
+    FREE,
+    INFEASIBLE,
+    SOFTENED,
+    TOO_SHORT,
+    UNSOLVED,
+    Aim,
+    LoopMatrices,
+    RowDirections,
+    Rows,
+    Workspace,
+)
 from impc.jit import njit
 
-if TYPE_CHECKING:
-    from impc.control.constraint_rows import RowDirections, Rows
-
-#: Values of `simulation.Status` that compiled code returns.
-FREE, ACTIVE, SOFTENED, INFEASIBLE, UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
-#: The solution of a shortened problem does not satisfy, or nearly violates, a later row.
-TOO_SHORT = 7
 #: Largest entry of plant and estimate, of states and of predictions.
 LARGEST = 1e100
 # A row exceeded by less than this share of its bound is satisfied: 100 times the rounding of
@@ -46,54 +50,6 @@ _CHECKED = 1e-9
 _ROW_ROUNDING = 1e-14
 # Rounding of v, relative to the same sum.
 _SUM_ROUNDING = 1e-15
-
-
-class LoopMatrices(NamedTuple):
-    """Plant, gain and inverse metric; or derivatives (of S, not S^-1) along p directions."""
-
-    A: Buffer  # (n, n); derivatives have a further last axis, (n, n, p) and so on
-    B: Buffer  # (n, m)
-    E: Buffer  # (n, d)
-    K: Buffer  # (m, n)
-    S: Buffer  # S^-1 (m, m); derivatives are those of S, (m, m, p)
-
-
-class Aim(NamedTuple):
-    """Set points of the controller, sample by sample; all of length 0 for rest.
-
-    Bounds apply to the deviations, so each is reduced by what the target uses of it.
-    """
-
-    x: Buffer  # (steps, n), target states
-    u: Buffer  # (steps, m), target commands
-    taken: Buffer  # (steps + ahead, c), E x + F u of every bound at the target, previews included
-    held: Buffer  # (steps, c), addition to `taken` by an estimated disturbance
-    dx: Buffer  # (steps, n, p), derivatives along p directions; or of length 0
-    du: Buffer
-    dtaken: Buffer
-    dheld: Buffer
-
-
-class Workspace(NamedTuple):
-    """Arrays that are reused from sample to sample."""
-
-    # right sides of the rows at the sample (r,), reduced by the target, and derivatives (h, p)
-    right: Buffer
-    dright: Buffer
-    # of the rows: slack (r,), violation that is accepted (r,), free rows (a + 1,)
-    slack: Buffer
-    kept: Buffer
-    free: Buffer
-    factor: Buffer  # (a + 1, a + 1), as in `solve_dual`
-    basis: Buffer  # (a + 1, N m), as in `solve_dual`
-    v: Buffer  # (N m,), planned inputs minus those of the gain
-    rounding: Buffer  # (N m,), rounding error of v
-    dv0: Buffer  # (m, p), derivatives of the first of them
-    T: Buffer  # (n, r), transposed rows
-    M: Buffer  # (N m, r), transposed rows
-    first: Buffer  # (N m,), first row with the column: rows are ordered by stage
-    active: Buffer  # (1,), number of free rows at the last sample: warm start of the next problem
-    worn: Buffer  # (1,), as in `solve_dual`
 
 
 @njit(cache=True)
@@ -401,13 +357,7 @@ def _tighten(rows: Rows, work: Workspace, active: int) -> None:
 
 @njit(cache=True)
 def _check(
-    K: Buffer,
-    rows: Rows,
-    lam: Buffer,
-    work: Workspace,
-    active: int,
-    x: Buffer,
-    unit: Buffer,
+    K: Buffer, rows: Rows, lam: Buffer, work: Workspace, active: int, x: Buffer, unit: Buffer
 ) -> tuple[bool, bool, bool]:
     """Return whether a soft row is violated, a row is weakly active, and v is accepted.
 

@@ -3,46 +3,73 @@
     x+ = A x + B u + E d
 
 with the input u of `compiled_kernel.law`; nonlinear bodies: `compiled_body`.
+
+numba counts the users of each array whenever it is taken out of a tuple or passed to a function,
+with a locked addition. In loops that pass dozens of arrays at each sample this is a third of the
+time (`python -m experiments.benchmarks`), so the loop borrows its arrays: they have no counter.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
 from impc.arrays import Buffer
-from impc.control.compiled_body import BodyTape, move_body
-from impc.control.compiled_borrowed import borrowed
-from impc.control.compiled_kernel import (
+from impc.control.compiled_body import move_body
+from impc.control.compiled_kernel import add, deviate, dot, law, return_to
+from impc.control.compiled_values import (
     DIVERGED,
     SOFTENED,
     Aim,
+    BodyTape,
     LoopMatrices,
+    RowDirections,
+    Rows,
+    Trace,
     Workspace,
-    add,
-    deviate,
-    dot,
-    law,
-    return_to,
 )
 from impc.jit import njit
 
 if TYPE_CHECKING:
-    from impc.control.constraint_rows import RowDirections, Rows
+    from collections.abc import Callable
 
 
-class Trace(NamedTuple):
-    """What a simulation of some steps writes."""
+def _borrowed(_context: Any, value: Any) -> Any:
+    """Return an array, or a tuple of arrays and tuples, without counters.
 
-    x: Buffer  # (steps + 1, n)
-    u: Buffer  # (steps, m)
-    dx: Buffer  # (steps + 1, n, p); or (2, n, p), where the last samples overwrite earlier ones
-    du: Buffer  # (steps, m, p), or (1, m, p)
-    seen: Buffer  # (q, n), given: outputs whose derivatives are kept
-    dy: Buffer  # (steps + 1, q, p), seen dx
-    status: Buffer  # (steps,)
-    lam: Buffer  # (h,), multipliers of the last problem
+    The caller must keep the arrays: those that Python passes to a compiled function live until it
+    returns.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _without_owner(context, builder, signature.args[0], given[0])
+
+    return value(value), generate
+
+
+def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Value of the type `kind` in which no array has an owner."""
+    if isinstance(kind, types.BaseTuple):
+        kinds: list[Any] = list(kind)  # type: ignore[call-overload]
+        parts = [
+            _without_owner(context, builder, each, builder.extract_value(value, place))
+            for place, each in enumerate(kinds)
+        ]
+        return context.make_tuple(builder, kind, parts)
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo = _null(array.meminfo.type)
+        array.parent = _null(array.parent.type)
+        return array._getvalue()
+    return value
+
+
+_make: Any = intrinsic
+_null: Any = cgutils.get_null_value
+_borrow: Callable[[Any], Any] = _make(_borrowed)
 
 
 @njit(cache=True, nogil=True)  # held-out trials are fitted in parallel threads
@@ -67,9 +94,9 @@ def run(
 
     `disturbance` (steps, d); `unit` (m,).
     """
-    loop, dloop, rows, drows, body = borrowed((loop, dloop, rows, drows, body))
-    pushes, disturbance, aim, unit, work = borrowed((pushes, disturbance, aim, unit, work))
-    x, u, dx, du, seen, dy, status, lam = borrowed(trace)
+    loop, dloop, rows, drows, body = _borrow((loop, dloop, rows, drows, body))
+    pushes, disturbance, aim, unit, work = _borrow((pushes, disturbance, aim, unit, work))
+    x, u, dx, du, seen, dy, status, lam = _borrow(trace)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
     away, daway = np.empty(x.shape[1]), np.empty(dx.shape[1:])

@@ -18,12 +18,13 @@ solution satisfies the rows of all later stages as well, it solves the whole pro
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, IntArray
 from impc.checking import checked
+from impc.control.compiled_values import RowDirections, Rows
 from impc.errors import DataError, InputError
 from impc.model.bounds import BoundRows, bound_rows
 from impc.model.riccati import finite_horizon_changes
@@ -32,33 +33,6 @@ if TYPE_CHECKING:
     from impc.control.controller import Controller
     from impc.model.body import Body
     from impc.model.riccati import FiniteHorizonLqr
-
-
-class Rows(NamedTuple):
-    """T x + M v <= b, with derived matrices (a named tuple, which compiled code accepts).
-
-    The first h of the r rows make the problem; those of later stages are only checked. N is the
-    number of stages of the problem; h = r unless it is shortened.
-    """
-
-    T: Array  # (r, n)
-    M: Array  # (r, N m), the columns of each stage adjacent
-    N: Array  # (h, N m), M S^-1 with the metric S of each stage
-    W: Array  # (h, N m), M L^-T with S = L L': rows in coordinates in which S is the identity
-    gram: Array  # (h, h), W W' = M S^-1 M'
-    b: Array  # (r,)
-    limit: Array  # (h,), largest multiplier: infinite if hard, penalty per unit of excess if soft
-    family: IntArray  # (r,), index of the bound
-    stage: IntArray  # (r,), samples ahead
-    reach: IntArray  # (h,), number of columns of M that can be nonzero
-
-
-class RowDirections(NamedTuple):
-    """Derivatives of the first h `Rows` along p directions (last axis)."""
-
-    T: Array  # (h, n, p)
-    M: Array  # (h, N m, p)
-    b: Array  # (h, p)
 
 
 @dataclass(frozen=True)

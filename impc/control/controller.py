@@ -11,17 +11,15 @@ terminal weight the same holds with one gain and metric per stage.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, finite_array, frozen, symmetric_matrix
-from impc.checking import Value, checked, replace
-from impc.control.closed_loop import simulate
+from impc.attached_methods import attach
+from impc.checking import Value, checked
 from impc.control.named_solver import COMPILED, require_solver
-from impc.control.simulation import Status, excluded_bound, scenario
 from impc.control.terminal_set import maximal_invariant_set, own_terminal_set
 from impc.errors import InputError
 from impc.model.continuous_gain import held_gain
@@ -114,11 +112,7 @@ class Controller(Value):
     array([[ 1.494, -0.881]])
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {
-        "K": "m n",
-        "S": "m m",
-        "horizon": (1, LONGEST_HORIZON),
-    }
+    _rules: ClassVar[Mapping[str, Any]] = {"K": "m n", "S": "m m", "horizon": (1, LONGEST_HORIZON)}
 
     plant: Plant
     K: Array
@@ -129,6 +123,16 @@ class Controller(Value):
     softening: float | None
     solver: str
     stages: FiniteHorizonLqr | None = None
+
+    if TYPE_CHECKING:  # attached
+
+        def simulate(  # noqa: D102 - its function has the docstring
+            self,
+            x0: ArrayLike,
+            steps: int | None = None,
+            disturbance: ArrayLike | None = None,
+            target: Mapping[str, Any] | None = None,
+        ) -> Simulation: ...
 
     @checked(horizon=(1, LONGEST_HORIZON))
     def __init__(
@@ -295,62 +299,6 @@ class Controller(Value):
         held = held_gain(plant, finite_array("gain", gain, (plant.m, plant.n)))
         return cls.from_gain(plant, held, bounds, horizon, **settings)
 
-    @checked(steps=(1, 10_000_000))
-    def simulate(
-        self,
-        x0: ArrayLike,
-        steps: int | None = None,
-        disturbance: ArrayLike | None = None,
-        target: Mapping[str, Any] | None = None,
-    ) -> Simulation:
-        """Simulate the plant under this controller.
-
-        Parameters
-        ----------
-        x0 : array_like
-            Initial state (n,).
-        steps : int, optional
-            Number of samples; required without a disturbance, whose length is used otherwise.
-        disturbance : array_like, optional
-            Disturbance (steps, d), or (steps,) for a single one.
-        target : mapping, optional
-            Set points of outputs or states by name, in their units: a number, or (steps + 1,).
-
-        Returns
-        -------
-        Simulation
-            Trajectory with a status for each sample. Samples that are not reached, because no input
-            satisfies the bounds or the loop diverges, are NaN, and a warning names the first of
-            them; `require_complete` turns it into an error.
-
-        Raises
-        ------
-        DataError
-            If a value is not finite or of the wrong shape, or `steps` is missing.
-
-        Examples
-        --------
-        >>> import control
-        >>> import impc
-        >>> plant = impc.Plant(control.ss([[0.5]], [[1]], [[1]], 0, 1))
-        >>> law = impc.Controller(plant, impc.Weights(1, 1), impc.Bounds(plant, u_max=1), 3)
-        >>> law.simulate([1.0], steps=4).x.shape
-        (5, 1)
-        """
-        run = simulate(self, scenario(self.plant, x0, steps, disturbance, target))
-        if run.complete:
-            return run
-        end = run.reached
-        status = Status(int(run.status[end]))
-        said = status.sentence
-        if status is Status.INFEASIBLE:
-            bound, remedy = excluded_bound(self, run)
-            said = f"no input sequence keeps {bound} ({remedy})"
-        warnings.warn(f"sample {end}: {said}; later samples are NaN", stacklevel=3)
-        x, u = np.array(run.x), np.array(run.u)
-        x[end + 1 :], u[end:] = np.nan, np.nan
-        return replace(run, x=x, u=u)
-
     @property
     def gains(self) -> Array:
         """Gain of each stage (N, m, n)."""
@@ -374,3 +322,6 @@ class Controller(Value):
         finite = sides[np.isfinite(sides)]
         unit = float(finite.min()) if len(finite) else 1.0
         return self.softening * unit**2
+
+
+attach(Controller)

@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from impc.model.plant import Plant
-    from impc.model.riccati import LqrSolution
-
     Shapes = dict[str, tuple[int, int]]
 
 # CasADi does not keep Python callbacks alive; this list does.
@@ -113,16 +110,14 @@ def closed_loop_function(
             "plant", "has targets that move", "use a plant without observer and preview"
         )
     drive = scenario(plant, np.zeros(plant.n), steps, disturbance).disturbance
-    loop = _loop_of_gain(controller, drive, disturbance is not None)
-    if of == "gain":
-        return loop
-    regulator = _regulator_of_weights(controller.plant)
-    Q, R = ca.MX.sym("Q", plant.n, plant.n), ca.MX.sym("R", plant.m, plant.m)
-    given = {"Q": Q, "R": R, "x0": ca.MX.sym("x0", plant.n)}
+    n, m, steps = plant.n, plant.m, len(drive)
+    inputs: Shapes = {"Q": (n, n), "R": (m, m)} if of == "weights" else {"K": (m, n), "S": (m, m)}
+    inputs["x0"] = (n, 1)
     if disturbance is None:
-        given["disturbance"] = ca.MX.sym("disturbance", *drive.shape)
-    x, u = loop(*regulator(Q, R), *list(given.values())[2:])
-    return ca.Function("closed_loop", [*given.values()], [x, u], [*given], ["x", "u"])
+        inputs["disturbance"] = (steps, drive.shape[1])
+    outputs: Shapes = {"x": (steps + 1, n), "u": (steps, m)}
+    loop = _Loop(controller, drive, of == "weights")
+    return _Matrices("closed_loop", inputs, outputs, loop.value, loop.slopes)
 
 
 class _Matrices(ca.Callback):
@@ -185,28 +180,17 @@ class _Matrices(ca.Callback):
         return _Matrices(name, given, dict(zip(identified, blocks, strict=True)), evaluate)
 
 
-def _loop_of_gain(controller: Controller, given: Array, fixed: bool) -> ca.Function:
-    """Function (K, S, x0) -> (x, u) at a fixed disturbance, or with it as fourth input."""
-    n, m, (steps, d) = controller.plant.n, controller.plant.m, given.shape
-    inputs: Shapes = {"K": (m, n), "S": (m, m), "x0": (n, 1)}
-    if not fixed:
-        inputs["disturbance"] = (steps, d)
-    loop = _GainLoop(controller, given, fixed)
-    outputs: Shapes = {"x": (steps + 1, n), "u": (steps, m)}
-    return _Matrices("closed_loop", inputs, outputs, loop.value, loop.slopes)
+class _Loop:
+    """Values and derivatives at a point: K and S or Q and R, x0, and maybe a disturbance."""
 
-
-class _GainLoop:
-    """Values and derivatives of the loop at a point: K, S, x0 and, if not fixed, a disturbance."""
-
-    def __init__(self, controller: Controller, given: Array, fixed: bool) -> None:
-        self.controller, self.given, self.fixed = controller, given, fixed
+    def __init__(self, controller: Controller, given: Array, of_weights: bool) -> None:
+        self.controller, self.given, self.of_weights = controller, given, of_weights
         self.near = controller.terminal
 
     def value(self, point: list[Array]) -> list[Array]:
         """Compute x (steps + 1, n) and u (steps, m)."""
         plant, steps = self.controller.plant, len(self.given)
-        law = self._law(*point)
+        law = self._law(*self._regulator(*point[:2])[:2], *point[2:])
         if law is None:
             return [np.full((steps + 1, plant.n), np.nan), np.full((steps, plant.m), np.nan)]
         run, _ = run_loop(prepare_loop(law, directions(law, 0)), self._drive(*point[2:]))
@@ -219,37 +203,60 @@ class _GainLoop:
         """Derivatives of both by each part of the point."""
         plant, (steps, d) = self.controller.plant, self.given.shape
         n, m = plant.n, plant.m
-        K, S = slice(n, n + m * n), slice(n + m * n, n + m * n + m * m)
-        local: Array = np.full((steps, m, S.stop), np.nan)
+        count = n + m * n + m * m
+        local: Array = np.full((steps, m, count), np.nan)
         x: Array = np.zeros((steps, n))
         u: Array = np.zeros((steps, m))
         driven = self._drive(*point[2:])
-        law = self._law(*point)
+        K, S, chain = self._regulator(*point[:2])
+        law = self._law(K, S, *point[2:])
         if law is not None:
-            dS = np.zeros((m, m, S.stop))
-            dS[..., S] = _scaled(point[1])
-            along = directions(law, S.stop, x0=np.eye(n, S.stop), K=np.eye(m * n, S.stop, n), S=dS)
+            dS = np.concatenate([np.zeros((m, m, n + m * n)), _scaled(S)], axis=2)
+            along = directions(law, count, x0=np.eye(n, count), K=np.eye(m * n, count, n), S=dS)
             run, moved = run_loop(prepare_loop(law, along), driven, local=True)
             local[: run.reached] = moved.u[: run.reached]
             x, u = run.x[:-1], run.u
         A, B, E = slopes_along(plant, x, u, driven.disturbance)
         L, G = local[..., :n], np.concatenate([np.zeros((steps, m, n)), local[..., n:]], axis=2)
         closed = A + B @ L
-        dx = _passed(closed, np.eye(n, S.stop), lambda t: B[t] @ G[t])
-        found = [
-            [
-                part[..., K].reshape(*part.shape[:2], m, n),
-                part[..., S].reshape(*part.shape[:2], m, m),
-                part[..., :n, None],
-            ]
-            for part in (dx, L @ dx[:-1] + G)
-        ]
-        if not self.fixed:
+        dx = _passed(closed, np.eye(n, count), lambda t: B[t] @ G[t])
+        found = []
+        for part in (dx, L @ dx[:-1] + G):
+            moves = part[..., n:] if chain is None else part[..., n:] @ chain()
+            parts = np.split(moves, [point[0].size], axis=2)
+            pair = zip(parts, point[:2], strict=True)
+            blocks = [one.reshape(*one.shape[:2], *given.shape) for one, given in pair]
+            found.append([*blocks, part[..., :n, None]])
+        if len(point) == 4:
             unit = np.eye(steps * d).reshape(steps, d, steps * d)
             dx = _passed(closed, np.zeros((n, steps * d)), lambda t: E[t] @ unit[t])
             found[0].append(dx.reshape(steps + 1, n, steps, d))
             found[1].append((L @ dx[:-1]).reshape(steps, m, steps, d))
         return found
+
+    def _regulator(
+        self, first: Array, second: Array
+    ) -> tuple[Array, Array, Callable[[], Array] | None]:
+        """K and S, and for weights what computes their derivatives, by columns; NaN if none."""
+        if not self.of_weights:
+            return first, second, None
+        n, m = len(first), len(second)
+        try:
+            found = solve_lqr(
+                self.controller.plant, Weights((first + first.T) / 2, (second + second.T) / 2)
+            )
+        except ImpcError:  # invalid weights or no regulator: the caller returns NaN
+            none = np.zeros((m * n + m * m, n * n + m * m))
+            return np.full((m, n), np.nan), np.full((m, m), np.nan), lambda: none
+
+        def chain() -> Array:
+            units = np.eye(n * n + m * m)
+            dQ, dR = units[:, : n * n].reshape(-1, n, n), units[:, n * n :].reshape(-1, m, m)
+            dQ, dR = (dQ + dQ.swapaxes(1, 2)) / 2, (dR + dR.swapaxes(1, 2)) / 2
+            changes = regulator_changes(found, dQ, dR, np.zeros_like(dQ), np.zeros((len(dQ), n, m)))
+            return np.hstack([part.reshape(len(units), -1) for part in changes]).T
+
+        return found.K, found.S, chain
 
     def _law(self, K: Array, S: Array, *others: Array) -> Controller | None:
         if not all(np.all(np.isfinite(part)) for part in (K, S, *others)):
@@ -294,41 +301,3 @@ def _scaled(S: Array) -> Array:
     symmetric = (units + units.swapaxes(0, 1)) / 2
     along = np.trace(symmetric) / trace
     return np.asarray((symmetric - ((S + S.T) / 2)[..., None] * along) * (m / trace))
-
-
-def _regulator_of_weights(plant: Plant) -> ca.Function:
-    """Function (Q, R) -> (K, S) by the Riccati equation."""
-    n, m = plant.n, plant.m
-
-    def solved(point: list[Array]) -> LqrSolution | None:
-        Q, R = ((part + part.T) / 2 for part in point)
-        try:
-            return solve_lqr(plant, Weights(Q, R))
-        except ImpcError:  # invalid weights or no regulator: the caller returns NaN
-            return None
-
-    def value(point: list[Array]) -> list[Array]:
-        found = solved(point)
-        if found is None:
-            return [np.full((m, n), np.nan), np.full((m, m), np.nan)]
-        return [found.K, found.S]
-
-    def slopes(point: list[Array]) -> list[list[Array]]:
-        found, count = solved(point), n * n + m * m
-        dK: Array = np.full((count, m, n), np.nan)
-        dS: Array = np.full((count, m, m), np.nan)
-        if found is not None:
-            units = np.eye(count)
-            dQ, dR = units[:, : n * n].reshape(-1, n, n), units[:, n * n :].reshape(-1, m, m)
-            dQ, dR = (dQ + dQ.swapaxes(1, 2)) / 2, (dR + dR.swapaxes(1, 2)) / 2
-            still = np.zeros((count, n, n)), np.zeros((count, n, m))
-            dK, dS = regulator_changes(found, dQ, dR, *still)
-        last = [np.moveaxis(part, 0, -1) for part in (dK, dS)]
-        return [
-            [part[..., : n * n].reshape(*part.shape[:2], n, n),
-             part[..., n * n :].reshape(*part.shape[:2], m, m)]
-            for part in last
-        ]  # fmt: skip
-
-    outputs = {"K": (m, n), "S": (m, m)}
-    return _Matrices("regulator", {"Q": (n, n), "R": (m, m)}, outputs, value, slopes)

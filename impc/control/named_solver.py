@@ -31,7 +31,7 @@ from impc.settings_files import IPOPT_ALONE
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from impc.control.constraint_rows import Rows
+    from impc.control.compiled_values import Rows
 
 #: Name of the built-in method, see `compiled_dual`.
 COMPILED = "compiled"

@@ -1,8 +1,7 @@
 """Scenarios, simulations and their status, sample by sample.
 
 A simulation never raises because of its course: it has a `Status` for each sample, and
-`require_complete` turns a failure into an error that names bound and sample. For the loop see
-docs/why/theory.md, section 4.
+`feasibility.require_complete` turns a failure into an error that names bound and sample.
 """
 
 from __future__ import annotations
@@ -15,9 +14,8 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
-from impc.control import compiled_kernel
-from impc.control.constraint_rows import build_rows, families
-from impc.errors import DataError, InfeasibleError, SolverError
+from impc.control import compiled_values
+from impc.errors import DataError
 from impc.model.foresight import physical_disturbances, with_steps
 from impc.model.targets import reference
 
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import ArrayLike
 
-    from impc.control.controller import Controller
     from impc.model.plant import Plant
 
 
@@ -46,12 +43,12 @@ class Status(IntEnum):
     'a bound is active'
     """
 
-    FREE = compiled_kernel.FREE
-    ACTIVE = compiled_kernel.ACTIVE
-    SOFTENED = compiled_kernel.SOFTENED
-    INFEASIBLE = compiled_kernel.INFEASIBLE
-    UNSOLVED = compiled_kernel.UNSOLVED
-    DIVERGED = compiled_kernel.DIVERGED
+    FREE = compiled_values.FREE
+    ACTIVE = compiled_values.ACTIVE
+    SOFTENED = compiled_values.SOFTENED
+    INFEASIBLE = compiled_values.INFEASIBLE
+    UNSOLVED = compiled_values.UNSOLVED
+    DIVERGED = compiled_values.DIVERGED
     NOT_REACHED = 6
 
     @property
@@ -87,11 +84,7 @@ class Scenario(Value):
         Outputs or states with a target, length q.
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {
-        "x0": "n",
-        "disturbance": "* d",
-        "target": "* q",
-    }
+    _rules: ClassVar[Mapping[str, Any]] = {"x0": "n", "disturbance": "* d", "target": "* q"}
 
     x0: Array
     disturbance: Array
@@ -262,73 +255,3 @@ def scenario(
     values, names = reference(plant, target, len(pushes) + 1)
     start, pushes = with_steps(plant, x0, pushes, values, names)
     return Scenario(frozen(start), frozen(pushes), frozen(values), names)
-
-
-def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str, str]:
-    """Bound that made a simulation infeasible, and the remedy, as text."""
-    remedy = "start nearer to the origin, lengthen the horizon, or soften the state bounds"
-    row = simulation.failed_row
-    if row < 0:
-        return "the bounds", remedy
-    rows = build_rows(controller)
-    name = families(controller).names[rows.family[row]]
-    stage = int(rows.stage[row])
-    if stage < controller.horizon:
-        return f"the bound {name} at sample {stage} of the horizon", remedy
-    return (
-        f"the bound {name} in the terminal set, at sample {stage} of the horizon",
-        f"{remedy}, or set terminal_set=False",
-    )
-
-
-@checked
-def require_complete(controller: Controller, simulation: Simulation) -> Simulation:
-    """Return the simulation if every sample was reached, else raise an error.
-
-    Parameters
-    ----------
-    controller : Controller
-        Controller that was simulated.
-    simulation : Simulation
-        Result of `Controller.simulate`.
-
-    Returns
-    -------
-    Simulation
-        The given simulation.
-
-    Raises
-    ------
-    InfeasibleError
-        If no input satisfies the bounds at a sample; names the bound and the sample.
-    SolverError
-        If the loop diverged or the active-set method found no solution.
-
-    Examples
-    --------
-    >>> import warnings
-    >>> import impc
-    >>> from plants import yalmip_example
-    >>> plant = impc.Plant(yalmip_example())
-    >>> bounds = impc.Bounds(plant, u_min=-1, u_max=1)
-    >>> law = impc.Controller(plant, impc.Weights([[1, 0], [0, 1]], 1), bounds, horizon=3)
-    >>> impc.require_complete(law, law.simulate([1, 3], steps=20)).reached
-    20
-    >>> with warnings.catch_warnings(action="ignore"):
-    ...     run = law.simulate([90, 3], steps=20)
-    >>> impc.require_complete(law, run)
-    Traceback (most recent call last):
-        ...
-    impc.errors.InfeasibleError: x0: no input sequence keeps the bound u <= 1 ...
-    """
-    if simulation.complete:
-        return simulation
-    sample = simulation.reached
-    status = Status(int(simulation.status[sample]))
-    if status is Status.INFEASIBLE:
-        bound, remedy = excluded_bound(controller, simulation)
-        where = "x0" if sample == 0 else f"sample {sample}"
-        raise InfeasibleError(where, f"no input sequence keeps {bound}", remedy)
-    raise SolverError(
-        f"sample {sample}", status.sentence, "check the plant, the gain and the bounds"
-    )

@@ -34,7 +34,7 @@ from impc.control.halfspaces import (
     seen_directions,
     with_mirror,
 )
-from impc.errors import BoundsError, InputError, SolverError
+from impc.errors import InputError, SolverError
 from impc.extras import optional
 from impc.model.bounds import BoundRows, bound_rows
 
@@ -160,7 +160,7 @@ class _Loop(Frozen):
     max_steps: int
 
 
-@checked(gain="m n", tolerance=0, max_steps=1)
+@checked(gain="m n", tolerance=(0, 1e-2), max_steps=1)
 def maximal_invariant_set(
     plant: Plant,
     gain: ArrayLike,
@@ -181,7 +181,8 @@ def maximal_invariant_set(
     bounds : Bounds
         Bounds of states and inputs.
     tolerance : float
-        A row is redundant if it exceeds its bound by at most this fraction of the bound.
+        A row is redundant if it exceeds its bound by at most this fraction of the bound, at most
+        0.01.
     max_steps : int
         Largest k* to try.
     near : TerminalSet, optional
@@ -196,7 +197,7 @@ def maximal_invariant_set(
     ------
     PlantError
         If the plant is continuous.
-    DataError, InputError, BoundsError
+    DataError, InputError
         If the gain has the wrong shape or does not stabilise, the bounds do not fit the plant, or a
         setting is out of range.
     SolverError
@@ -214,7 +215,10 @@ def maximal_invariant_set(
     plant.require_discrete()
     K = finite_array("gain", gain, (plant.m, plant.n))
     F = plant.A - plant.B @ K
-    _check(plant, F, bounds, tolerance, max_steps)
+    radius = float(np.max(np.abs(np.linalg.eigvals(F))))
+    if not radius < 1:
+        problem = f"does not stabilise the plant: the spectral radius of A - BK is {radius:.6g}"
+        raise InputError("gain", problem, "give a stabilising gain, such as solve_lqr(...).K")
     rows = bound_rows(bounds, plant)
     loop, families, mirror = _loop((rows.E - rows.F @ K) / rows.b[:, None], F, tolerance, max_steps)
     hints = near.bases if near is not None else {}
@@ -248,19 +252,6 @@ def own_terminal_set(plant: Plant, given: TerminalSet | tuple[ArrayLike, ArrayLi
     rows = BoundRows(H, np.zeros((len(h), plant.m)), h, np.ones(len(h), dtype=bool), names)
     every, gain = np.arange(len(h)), np.zeros((plant.m, plant.n))
     return TerminalSet(H, h, every, 0 * every, 0, 1e-9, gain, plant.A, rows, {}, own=True)
-
-
-def _check(plant: Plant, F: Array, bounds: Bounds, tolerance: float, max_steps: int) -> None:
-    radius = float(np.max(np.abs(np.linalg.eigvals(F))))
-    if not radius < 1:
-        problem = f"does not stabilise the plant: the spectral radius of A - BK is {radius:.6g}"
-        raise InputError("gain", problem, "give a stabilising gain, such as solve_lqr(...).K")
-    if (bounds.x_min.size, bounds.u_min.size) != (plant.n, plant.m):
-        problem = f"are for {bounds.x_min.size} states and {bounds.u_min.size} inputs"
-        raise BoundsError("bounds", problem, f"make Bounds for {plant.n} and {plant.m}")
-    if not 0 <= tolerance <= 1e-2 or max_steps < 1:
-        problem = f"are {tolerance!r} and {max_steps!r}"
-        raise InputError("tolerance, max_steps", problem, "give 0 to 0.01, and at least 1")
 
 
 def _loop(

@@ -43,18 +43,19 @@ _PLAIN: dict[Any, Any] = {"bool": bool, "int": int, "str": str}
 _SAME = 1e-9
 
 
-def save_estimate(estimate: Estimate, path: Path) -> Path:
-    """Write an estimate and its problem into one file, atomically."""
+def save_estimate(estimate: Estimate, path: str | Path) -> Path:
+    """Save the estimate and its problem as JSON; read the file with `impc.load`."""
+    place = Path(path)
     content = {
         "schema": SCHEMA,
         "problem": _encode(estimate.problem),
         "estimate": encode_estimate(estimate),
     }
     try:
-        write_whole(path, json.dumps(content).encode())
+        write_whole(place, json.dumps(content).encode())
     except (OSError, ValueError) as error:
-        raise unwritable(f"file {path}", error, "choose another file") from None
-    return path
+        raise unwritable(f"file {place}", error, "choose another file") from None
+    return place
 
 
 @checked

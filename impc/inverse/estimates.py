@@ -1,16 +1,18 @@
 """Result type of all estimation methods, from a plain feedback gain to inverse MPC."""
 
+# ruff: noqa: D102 - methods declared for type checkers; their functions have the docstrings
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
+from impc.attached_methods import attach
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
@@ -31,10 +33,11 @@ from impc.model.riccati import stabilises
 from impc.model.weights import Weights, normalised
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
     from numpy.typing import ArrayLike
 
-    from impc.assess.weights_test import Identifiability
     from impc.control.simulation import Simulation
     from impc.inverse.problem import Problem
 
@@ -88,6 +91,32 @@ class Goodness:
     unconfirmed: bool = False  # Only one of several searches reached this misfit
     # Method whose solution has a smaller misfit in the model of this one; empty if none
     beaten_by: str = ""
+
+
+@dataclass(frozen=True)
+class OtherWeights:
+    """Weights other than the reported ones, with their misfit on the same recordings."""
+
+    weights: Weights
+    condition: float  # kappa(blkdiag(Q, R))
+    misfit: float  # 2-norm of the output residual
+
+
+@dataclass(frozen=True)
+class Identifiability(Frozen):
+    """Result of `identifiability`."""
+
+    # Of the derivative of the outputs by relative changes D of blkdiag(Q, R), dX = L D L' with X =
+    # L L' (s,), largest first
+    singular_values: Array
+    free: int  # Directions of (Q, R) without scale
+    # Number of identified directions: singular values above 1e-8 of the largest and above 1e-10 of
+    # the recorded outputs
+    rank: int
+    chosen: int  # Directions fixed by convention: free - rank
+    tolerance: float  # The threshold 1e-8
+    # Other weights with the same gain; empty if they cannot be computed in double precision
+    others: tuple[OtherWeights, ...]
 
 
 @dataclass(frozen=True, eq=False)  # identity comparison, so that derived results can be cached
@@ -162,6 +191,18 @@ class Estimate(Frozen):
     seconds: float
     fit: Goodness
     cost_weights: Array | None = None
+
+    if TYPE_CHECKING:  # attached by `impc.attached_methods`
+
+        @property
+        def vaf(self) -> Array: ...
+        def intervals(self) -> pd.DataFrame: ...
+        def continuous_gain(self) -> pd.DataFrame: ...
+        def identifiability(self) -> Identifiability: ...
+        def summary(self) -> str: ...
+        def plot(self, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]: ...
+        def save(self, path: str | Path) -> Path: ...
+        def _repr_html_(self) -> str: ...
 
     def __str__(self) -> str:
         ended = f"{self.reason}." if self.reason else ""
@@ -293,44 +334,6 @@ class Estimate(Frozen):
         found.attrs = frames[0].attrs
         return found
 
-    @property
-    def vaf(self) -> Array:
-        """Variance accounted for (3.24) of each output over all trials, in %, shape (p,)."""
-        from impc.assess.assessments import evaluate_method  # noqa: PLC0415
-
-        return evaluate_method(self, self.problem.bounds).vaf
-
-    def intervals(self) -> pd.DataFrame:
-        """Gain entries and free parameters with 95 % intervals, one row each.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Index: name, such as "K.u.x1" for the entry from state x1 to input u. Columns: `unit`,
-            `value`, `low`, `high`, and `identified`, whether the recordings identify this number
-            individually. Values are least-squares estimates along the identified directions and can
-            differ from K, which belongs to weights (docs/why/intervals.md).
-        """
-        from impc.assess.printed_gain import interval_table  # noqa: PLC0415
-
-        return interval_table(self)
-
-    def continuous_gain(self) -> pd.DataFrame:
-        """Continuous-time gain of which that of `intervals()` is the sampled counterpart.
-
-        For comparison with published gains; columns as in `intervals()`. Intervals are first-order
-        at fixed parameters. `Controller.from_continuous_gain` defines and inverts the conversion.
-        """
-        from impc.assess.printed_gain import continuous_interval_table  # noqa: PLC0415
-
-        return continuous_interval_table(self)
-
-    def identifiability(self) -> Identifiability:
-        """Count the weight directions that the recordings identify; see `impc.identifiability`."""
-        from impc.assess.weights_test import identifiability  # noqa: PLC0415
-
-        return identifiability(self.problem, self.stage_weights)
-
     def simulate(
         self, x0: ArrayLike, steps: int | None = None, disturbance: ArrayLike | None = None
     ) -> Simulation:
@@ -351,37 +354,13 @@ class Estimate(Frozen):
         """
         return self.controller().simulate(x0, steps=steps, disturbance=disturbance)
 
-    def summary(self) -> str:
-        """Text summary: method, problem, fit, qualifications, gain with intervals, and weights."""
-        from impc.reporting.estimate_text import summary  # noqa: PLC0415
-
-        return summary(self)
-
-    def plot(self, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
-        """Plot outputs and inputs of a trial (counted from 0); returns matplotlib axes.
-
-        `axes` is an array of your own axes, one per output and input. To save the figure, use
-        `found.plot()[0].figure.savefig("fit.png")`.
-        """
-        from impc.reporting.estimate_text import plot  # noqa: PLC0415
-
-        return plot(self, trial, axes)
-
-    def save(self, path: str | Path) -> Path:
-        """Save the estimate and its problem as JSON; read the file with `impc.load`."""
-        from impc.files.saved_estimates import save_estimate  # noqa: PLC0415
-
-        return save_estimate(self, Path(path))
-
-    def _repr_html_(self) -> str:
-        from impc.reporting.estimate_text import as_html  # noqa: PLC0415
-
-        return as_html(self)
-
     def _found(self, matrix: Array | None) -> Array:
         if matrix is None:
             raise SolverError(self.method, f"found no gain: {self.reason}", "try another method")
         return matrix
+
+
+attach(Estimate)
 
 
 def simulated_estimate(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, BoolArray
-from impc.inverse.explaining_weights import fitted_metric, metric_family
+from impc.inverse.metric_family import fitted_metric, metric_family
 from impc.inverse.prediction import command_sizes
 from impc.inverse.problem import recorded_states
 

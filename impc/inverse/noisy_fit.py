@@ -22,9 +22,10 @@ from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, simulated_estimate
-from impc.inverse.explaining_weights import metric_family, unidentified_metrics, weights_behind
+from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.laws import GainLaw
+from impc.inverse.metric_family import metric_family, unidentified_metrics
 from impc.inverse.natural_search import (
     CONDITION_SHARE,
     best_conditioned,

@@ -233,9 +233,7 @@ def _matrices(system: Any) -> dict[str, Array]:
     if not all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt", "input_labels")):
         kind = type(system).__name__
         raise PlantError(
-            "plant",
-            f"expected a control.StateSpace, got {kind}",
-            "pass control.ss(A, B, C, D, dt)",
+            "plant", f"expected a control.StateSpace, got {kind}", "pass control.ss(A, B, C, D, dt)"
         )
     matrices = {name: frozen(getattr(system, name)) for name in "ABCD"}
     for name, matrix in matrices.items():

@@ -166,11 +166,7 @@ class Recording(Value):
             start = np.nan_to_num(y[0]) if full else np.zeros(physical_states(plant))
         values, names = reference(plant, target, len(y))
         begin, driven = with_steps(
-            plant,
-            start,
-            finite_array("disturbance", d, (len(y), width)),
-            values,
-            names,
+            plant, start, finite_array("disturbance", d, (len(y), width)), values, names
         )
         self._fill(
             outputs=frozen(y),

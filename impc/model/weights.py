@@ -52,10 +52,7 @@ class Weights(Value):
     array([[1.]])
     """
 
-    _rules: ClassVar[Mapping[str, Any]] = {
-        "Q": "n n",
-        "R": "m m",
-    }
+    _rules: ClassVar[Mapping[str, Any]] = {"Q": "n n", "R": "m m"}
 
     Q: Array
     R: Array

@@ -20,7 +20,7 @@ from impc.errors import SolverError
 from impc.nonlinear.plan import Plan, nearby_plan, solved_plan
 
 if TYPE_CHECKING:
-    from impc.nonlinear.problem import OptimalControlProblem
+    from impc.nonlinear.expressions import Stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ def closed_loop_from(
 
 
 @functools.lru_cache(maxsize=16)
-def _slopes(problem: OptimalControlProblem) -> Any:
+def _slopes(problem: Stages) -> Any:
     """The next state, and its derivative by (x, u, theta)."""
     f = problem.functions[0]
     x, u, d, theta = (ca.SX.sym("s", f.numel_in(index)) for index in range(4))

@@ -3,9 +3,12 @@
 Every function has the arguments (x, u, d, theta) and is expanded to SX, which evaluates fastest.
 """
 
+# ruff: noqa: D102 - members of `Stages` are described in `OptimalControlProblem`
+
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Hashable
+from typing import TYPE_CHECKING, Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -14,6 +17,28 @@ from impc.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+
+
+class Stages(Hashable, Protocol):
+    """What plans, loops and recordings read of an `OptimalControlProblem`."""
+
+    @property
+    def horizon(self) -> int: ...
+    @property
+    def n(self) -> int: ...
+    @property
+    def m(self) -> int: ...
+    @property
+    def disturbance_count(self) -> int: ...
+    @property
+    def parameter_names(self) -> tuple[str, ...]: ...
+    @property
+    def rows(self) -> tuple[str, ...]: ...
+    @property
+    def terminal_rows(self) -> tuple[str, ...]: ...
+    @property
+    def functions(self) -> tuple[Any, ...]: ...
+
 
 _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR)
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, IntArray
+from impc.attached_methods import attach
 from impc.checking import checked
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
 from impc.nonlinear.combinations import Combinations, combinations, interval
@@ -71,13 +72,9 @@ class OptimalControlEstimate(Frozen):
     evaluations: int  # number of evaluations of all recordings with derivatives
     seconds: float  # run time of the search in s
 
-    def page(self, provenance: Provenance) -> Report:
-        """Report, tables and figures, for `impc.report`."""
-        from impc.nonlinear.page import OptimalFit, optimal_report  # noqa: PLC0415 - import cycle
+    if TYPE_CHECKING:  # attached
 
-        names = tuple(f"recording {index + 1}" for index in range(len(self.recordings)))
-        fit = OptimalFit(self, names, ((),) * len(names), self.problem.dt)
-        return optimal_report(fit, provenance)
+        def page(self, provenance: Provenance) -> Report: ...  # noqa: D102 - at its function
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return the interval of each parameter by name, at a `level` between 0 and 1.
@@ -92,6 +89,9 @@ class OptimalControlEstimate(Frozen):
             name: interval(value, float(deviation), not positive, level)
             for (name, value), (deviation, positive) in zip(self.theta.items(), rows, strict=True)
         }
+
+
+attach(OptimalControlEstimate)
 
 
 @checked(evaluations=1, starts=(1, 1000))

@@ -121,6 +121,13 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def estimate_report(estimate: OptimalControlEstimate, provenance: Provenance) -> Report:
+    """Report, tables and figures of an estimate from Python, for `impc.report`."""
+    names = tuple(f"recording {index + 1}" for index in range(len(estimate.recordings)))
+    fit = OptimalFit(estimate, names, ((),) * len(names), estimate.problem.dt)
+    return optimal_report(fit, provenance)
+
+
 def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
     """Report, result.json, tables of parameters, products and samples, and the figure."""
     estimate, problem = fit.estimate, fit.estimate.problem

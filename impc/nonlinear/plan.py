@@ -31,7 +31,7 @@ from impc.settings_files import IPOPT_ALONE
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from impc.nonlinear.problem import OptimalControlProblem
+    from impc.nonlinear.expressions import Stages
 
 # Tolerance of the gradient relative to the largest multiplier, and of c and h + s.
 _TOLERANCE = 1e-10
@@ -77,7 +77,7 @@ class Program:
     x_0 is an unknown fixed by an equation, and stages are consecutive, as fatrop requires.
     """
 
-    def __init__(self, problem: OptimalControlProblem) -> None:
+    def __init__(self, problem: Stages) -> None:
         f, cost, e, h, h_end = problem.functions
         n, m, N = problem.n, problem.m, problem.horizon
         x0, d = ca.SX.sym("x0", n), ca.SX.sym("d", problem.disturbance_count, N)
@@ -145,7 +145,7 @@ class Program:
 
 
 @functools.lru_cache(maxsize=64)
-def program_of(problem: OptimalControlProblem) -> Program:
+def program_of(problem: Stages) -> Program:
     """Program of a problem, cached."""
     return Program(problem)
 
@@ -154,7 +154,7 @@ def program_of(problem: OptimalControlProblem) -> Program:
 class Plan(Frozen):
     """A solution of the relaxed conditions, with its derivatives by theta and x_0."""
 
-    problem: OptimalControlProblem
+    problem: Stages
     p: Array  # x_0, disturbances and parameters
     w: Array  # states and inputs, x_0, u_0, x_1, ...
     y: Array  # multipliers of equations and rows
@@ -193,7 +193,7 @@ class Plan(Frozen):
 
 
 def solve_plan(
-    problem: OptimalControlProblem,
+    problem: Stages,
     theta: Array,
     x0: Array,
     *,
@@ -220,7 +220,7 @@ def solve_plan(
 
 
 def solved_plan(
-    problem: OptimalControlProblem,
+    problem: Stages,
     theta: Array,
     d: Array,
     x: Array,
@@ -256,7 +256,7 @@ def _stages(x: Array, u: Array) -> Array:
     return np.concatenate([np.hstack([x[:-1], u]).ravel(), x[-1]])
 
 
-def _states_and_inputs(problem: OptimalControlProblem, w: Array) -> tuple[Array, Array]:
+def _states_and_inputs(problem: Stages, w: Array) -> tuple[Array, Array]:
     """Split stages (N (n + m) + n, ...) into (N + 1, n, ...) and (N, m, ...)."""
     n = problem.n
     stages = w[:-n].reshape(problem.horizon, n + problem.m, *w.shape[1:])
@@ -264,7 +264,7 @@ def _states_and_inputs(problem: OptimalControlProblem, w: Array) -> tuple[Array,
 
 
 def _first(
-    problem: OptimalControlProblem,
+    problem: Stages,
     p: Array,
     w: Array,
     y: Array | None,
@@ -281,7 +281,7 @@ def _first(
     return None
 
 
-def _ended(problem: OptimalControlProblem, p: Array, w: Array, y: Array, mu: float) -> Plan | None:
+def _ended(problem: Stages, p: Array, w: Array, y: Array, mu: float) -> Plan | None:
     """Plan from a solver's result w, y by Newton steps on the conditions; None if they fail."""
     program = program_of(problem)
     rows, y, s = ~program.equal, y.copy(), np.zeros(0)
@@ -317,7 +317,7 @@ def _ended(problem: OptimalControlProblem, p: Array, w: Array, y: Array, mu: flo
     return None
 
 
-def _flat(problem: OptimalControlProblem, p: Array, w: Array, y: Array, s: Array) -> str:
+def _flat(problem: Stages, p: Array, w: Array, y: Array, s: Array) -> str:
     """Description of where the second derivative along the dynamics is not positive, or "".
 
     It is positive if the Riccati recursion over the stages has positive pivots; rows enter with
@@ -340,9 +340,7 @@ def _flat(problem: OptimalControlProblem, p: Array, w: Array, y: Array, s: Array
     return ""
 
 
-def _require_finite_start(
-    problem: OptimalControlProblem, theta: Array, d: Array, x: Array, u: Array
-) -> None:
+def _require_finite_start(problem: Stages, theta: Array, d: Array, x: Array, u: Array) -> None:
     """Require that every function is finite along a guess x (N + 1, n), u (N, m)."""
     stages = zip(x, [*u, np.zeros(problem.m)], [*d, np.zeros(d.shape[1])], strict=True)
     for k, stage in enumerate(stages):
@@ -355,7 +353,7 @@ def _require_finite_start(
                 )  # fmt: skip
 
 
-def _no_plan(problem: OptimalControlProblem, p: Array, w: Array) -> InfeasibleError | SolverError:
+def _no_plan(problem: Stages, p: Array, w: Array) -> InfeasibleError | SolverError:
     """Error without a plan: the row with the largest excess at minimum total excess, or cost."""
     program = program_of(problem)
     rows, nlp = np.flatnonzero(~program.equal), program.nlp

@@ -19,6 +19,7 @@ import numpy as np
 from impc.arrays import Array, BoolArray, Frozen, finite_array
 from impc.checking import checked
 from impc.errors import InputError
+from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
 from impc.nonlinear.expressions import (
     function_of,
     names_of,
@@ -26,14 +27,11 @@ from impc.nonlinear.expressions import (
     stacked,
     symbols_of,
 )
-from impc.nonlinear.recordings import optimal_recording
+from impc.nonlinear.plan import Plan, solve_plan
+from impc.nonlinear.recordings import OptimalRecording, optimal_recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from impc.nonlinear.closed_loop import ClosedLoop
-    from impc.nonlinear.plan import Plan
-    from impc.nonlinear.recordings import OptimalRecording
 
 _LONGEST = 10_000  # stages; the size of the program is proportional
 
@@ -269,8 +267,6 @@ class OptimalControlProblem(Frozen):
         `solver` is "ipopt" or "fatrop"; mu is that of the relaxed conditions lam g = -mu. Raises
         InfeasibleError or SolverError if there is no plan.
         """
-        from impc.nonlinear.plan import solve_plan  # noqa: PLC0415 - import cycle
-
         start = finite_array("x0", x0, (self.n,))
         return solve_plan(self, self.values(theta), start, solver=solver, mu=mu)
 
@@ -290,8 +286,6 @@ class OptimalControlProblem(Frozen):
         Disturbances d (steps, d) act on the plant and are unknown to the controller; theta, x0
         (n,), solver and mu as in `plan`.
         """
-        from impc.nonlinear.closed_loop import closed_loop_from  # noqa: PLC0415 - import cycle
-
         shape = (steps, self.disturbance_count)
         known = finite_array("d", np.zeros(shape) if d is None else d, shape)
         first = self.plan(theta, x0, solver=solver, mu=mu)

@@ -11,14 +11,14 @@ from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen, with_sh
 from impc.errors import DataError
 
 if TYPE_CHECKING:
-    from impc.nonlinear.problem import OptimalControlProblem
+    from impc.nonlinear.expressions import Stages
 
 
 @dataclass(frozen=True, eq=False)
 class OptimalRecording(Frozen):
     """States and inputs over T samples; NaN where they are not measured."""
 
-    problem: OptimalControlProblem
+    problem: Stages
     x: Array  # (steps + 1, n), states
     u: Array  # (steps, m), inputs
     d: Array  # (steps, d), disturbances
@@ -28,7 +28,7 @@ class OptimalRecording(Frozen):
 
 
 def optimal_recording(
-    problem: OptimalControlProblem,
+    problem: Stages,
     x: Any,
     u: Any = None,
     *,

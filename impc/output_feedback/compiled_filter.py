@@ -19,19 +19,16 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.control.compiled_dual import substitute_all
-from impc.control.compiled_kernel import (
+from impc.control.compiled_kernel import LARGEST, deviate, law, return_to, workspace
+from impc.control.compiled_values import (
     DIVERGED,
-    LARGEST,
     SOFTENED,
     Aim,
     LoopMatrices,
+    RowDirections,
+    Rows,
     Workspace,
-    deviate,
-    law,
-    return_to,
-    workspace,
 )
-from impc.control.constraint_rows import RowDirections, Rows
 from impc.jit import njit
 from impc.output_feedback.compiled_clip import Clip, Clipped, clipped
 from impc.output_feedback.joint_loop import JointLoop

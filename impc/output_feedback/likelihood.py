@@ -23,7 +23,7 @@ import numpy as np
 
 from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
-from impc.control.constraint_rows import RowDirections, Rows
+from impc.control.compiled_values import RowDirections, Rows
 from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows

@@ -14,18 +14,16 @@ from impc.arrays import Array, Buffer, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
-from impc.control.compiled_kernel import (
+from impc.control.compiled_kernel import LARGEST, deviate, law, return_to, workspace
+from impc.control.compiled_values import (
     DIVERGED,
-    LARGEST,
     SOFTENED,
     Aim,
     LoopMatrices,
-    deviate,
-    law,
-    return_to,
-    workspace,
+    RowDirections,
+    Rows,
 )
-from impc.control.constraint_rows import RowDirections, Rows, directions
+from impc.control.constraint_rows import directions
 from impc.control.simulation import Status, scenario
 from impc.jit import njit
 from impc.output_feedback.joint_loop import JointLoop, joint_loop

@@ -27,7 +27,7 @@ _SMALL = 4
 
 
 def summary(estimate: Estimate) -> str:
-    """Method, problem, VAF and doubts, then gain with intervals, and weights."""
+    """Text summary: method, problem, fit, qualifications, gain with intervals, and weights."""
     lines = [METHODS[estimate.method].label, "=" * _WIDTH, *_problem(estimate)]
     if estimate.K is None:
         return "\n".join([*lines, "-" * _WIDTH, estimate.status.sentence, estimate.reason])
@@ -111,7 +111,11 @@ def gain_table(plant: Plant, gain: Array) -> pd.DataFrame:
 
 
 def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
-    """Plot recorded and simulated outputs, and inputs with their bounds, of one trial."""
+    """Plot outputs and inputs of a trial (counted from 0); returns matplotlib axes.
+
+    `axes` is an array of your own axes, one per output and input. To save the figure, use
+    `found.plot()[0].figure.savefig("fit.png")`.
+    """
     import matplotlib.pyplot as plt  # noqa: PLC0415  # a second
 
     problem, plant = estimate.problem, estimate.problem.plant

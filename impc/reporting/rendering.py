@@ -7,16 +7,13 @@ import functools
 import hashlib
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from impc.reporting.glossary import Glossary
-
-if TYPE_CHECKING:
-    from impc.reporting.document import Report
 
 _HERE = Path(__file__).parent
 #: Plotting library; its licence is in `vendor`.
@@ -33,8 +30,8 @@ _ICONS = {
 }
 
 
-def render_page(report: Report, charts: bool) -> str:
-    """Render the page of a report; all texts are escaped."""
+def render_page(report: object, charts: bool) -> str:
+    """Render the page of a `document.Report` by the template; all texts are escaped."""
     environment = Environment(
         loader=FileSystemLoader(_HERE),
         autoescape=True,

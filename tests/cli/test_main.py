@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,17 @@ def test_bad_arguments_get_one_line(arguments: tuple[str, ...], names: str) -> N
     result = run(*arguments)
     check_one_line(result, 2)
     assert names in result.stderr
+
+
+@pytest.mark.parametrize(("more", "count"), [((), 2), (("--sensory-noise",), 3)])
+def test_the_filter_of_sensory_noise_compiles_only_on_request(
+    monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...], count: int
+) -> None:
+    compiled: list[str] = []
+    for part in ("loop", "bodies", "filter"):
+        monkeypatch.setattr(f"impc.studies.warm.compile_{part}", partial(compiled.append, part))
+    assert len(run("warm", *more).stdout.splitlines()) == count
+    assert compiled == ["loop", "bodies", "filter"][:count]
 
 
 @pytest.mark.full

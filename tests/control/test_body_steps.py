@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import scipy.integrate
 
+from experiments.reference_mpc import simulate_mpc
 from impc.arrays import Array
 from impc.checking import replace
 from impc.cli.seat import seat_controller
 from impc.control.body_steps import address, body_tape, next_state, slopes_along
-from impc.control.casadi_controller import build_mpc, simulate_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.compiled_body import states_along
 from impc.control.constraint_rows import directions

@@ -6,16 +6,14 @@ import control
 import numpy as np
 import pytest
 
-from impc.control.casadi_controller import build_mpc, simulate_mpc, solve_mpc
+from experiments.reference_mpc import simulate_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.feasibility import require_complete
 from impc.control.named_solver import SOLVERS
-from impc.control.simulation import Status, require_complete, scenario
-from impc.errors import (
-    InfeasibleError,
-    PlantError,
-    SolverError,
-)
+from impc.control.simulation import Status, scenario
+from impc.errors import InfeasibleError, PlantError, SolverError
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
 from impc.model.weights import Weights

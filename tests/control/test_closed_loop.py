@@ -10,12 +10,7 @@ import pytest
 from scipy.optimize import linprog
 
 from impc.checking import replace
-from impc.control.closed_loop import (
-    prepare_loop,
-    run_loop,
-    simulate,
-    simulate_and_differentiate,
-)
+from impc.control.closed_loop import prepare_loop, run_loop, simulate, simulate_and_differentiate
 from impc.control.compiled_dual import CONVERGED, INCONSISTENT, solve_dual
 from impc.control.constraint_rows import Directions, directions
 from impc.control.controller import Controller

@@ -13,7 +13,8 @@ import pytest
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import Scenario, Status, require_complete
+from impc.control.feasibility import require_complete
+from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

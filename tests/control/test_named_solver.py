@@ -151,7 +151,8 @@ def test_a_solver_that_casadi_lacks_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
 _EVERY_SOLVER = """
 import warnings, numpy as np, plants
-from impc.control.casadi_controller import build_mpc, solve_mpc
+from impc.control.casadi_controller import build_mpc
+from experiments.reference_mpc import solve_mpc
 from impc.control.controller import Controller
 from impc.control.named_solver import SOLVERS
 from impc.model.bounds import Bounds

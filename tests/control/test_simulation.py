@@ -8,7 +8,8 @@ import pytest
 
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import Simulation, Status, require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import Simulation, Status, scenario
 from impc.errors import DataError, InfeasibleError, SolverError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.workloads import seat
-from impc.control.casadi_controller import build_mpc, simulate_mpc
+from experiments.reference_mpc import simulate_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import Scenario, Simulation, Status, scenario

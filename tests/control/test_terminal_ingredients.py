@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import impc
-from impc.control.casadi_controller import build_mpc, simulate_mpc
+from experiments.reference_mpc import simulate_mpc
+from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.simulation import Scenario, Simulation, Status
 from tests.independent_mpc import first_input

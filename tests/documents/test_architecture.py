@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import impc
-from docs.layers import DRAWING, SUBPACKAGES, drawing, imports, subpackage
+from docs.layers import DRAWING, SUBPACKAGES, circles, drawing, imports, subpackage
 from tests.documents.blocks import PAGES, ROOT, blocks
 
 ORDER = list(SUBPACKAGES)
@@ -40,6 +40,10 @@ def test_arrows_point_down_and_the_drawing_shows_them() -> None:
     assert pair[0] == pair[1]
 
 
+def test_no_modules_import_each_other() -> None:
+    assert circles(GRAPH) == []
+
+
 def test_an_arrow_that_points_up_is_found(tmp_path: Path) -> None:
     for folder in ("impc/model", "impc/cli"):
         (tmp_path / folder).mkdir(parents=True)
@@ -51,7 +55,7 @@ def test_an_arrow_that_points_up_is_found(tmp_path: Path) -> None:
         "def late():\n    from impc import Plant\n"
     )
     (tmp_path / "impc/__init__.py").write_text("")
-    found = imports(package=tmp_path / "impc")
+    found = imports(tmp_path / "impc")
     assert upwards(found) == [("model.plant", "__init__"), ("model.plant", "cli.fit")]
 
 

@@ -32,7 +32,8 @@ def public_names() -> Iterator[tuple[str, Any]]:
             continue
         place = f"{value.__module__}:{value.__name__}"
         yield place, value
-        for member, found in vars(value).items() if inspect.isclass(value) else ():
+        for member in vars(value) if inspect.isclass(value) else ():
+            found = getattr(value, member)
             method = getattr(found, "__func__", getattr(found, "fget", found))
             method = getattr(method, "func", method)  # of a cached property
             default = member in vars(value).get("__annotations__", {})  # of a field

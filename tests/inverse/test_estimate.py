@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import logging
 from pathlib import Path
@@ -14,7 +16,9 @@ import pytest
 
 import impc
 from experiments.coverage import cart, noisy_trial
+from impc.attached_methods import METHODS, PROPERTIES
 from impc.errors import DataError, InputError
+from impc.nonlinear.fit import OptimalControlEstimate
 from impc.studies.fit.settings import FitSettings
 
 mpl.use("Agg")
@@ -195,3 +199,25 @@ def test_what_drove_a_simulation_drives_its_recording() -> None:
     bare = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
     with pytest.raises(DataError, match="the plant has none; name its controls"):
         impc.Recording(bare, np.ones(5), np.ones(5))
+
+
+@pytest.mark.parametrize("owner", [impc.Controller, impc.Estimate, OptimalControlEstimate])
+def test_the_declared_methods_are_those_that_are_attached(owner: type) -> None:
+    """A type checker reads the declarations in the class; a program calls the functions."""
+    (kind,) = ast.parse(inspect.getsource(owner)).body
+    (block,) = [node for node in ast.walk(kind) if isinstance(node, ast.If)
+                and ast.unparse(node.test) == "TYPE_CHECKING"]  # fmt: skip
+    declared = {node.name: node for node in block.body if isinstance(node, ast.FunctionDef)}
+    assert list(declared) == list(METHODS[owner.__name__])
+    for name, node in declared.items():
+        found = getattr(owner, name)
+        assert isinstance(found, property) == (name in PROPERTIES)
+        (function,) = ast.parse(
+            inspect.getsource(inspect.unwrap(getattr(found, "fget", found)))
+        ).body
+        assert isinstance(function, ast.FunctionDef)
+        given = [ast.unparse(one.args).split(", ")[1:] for one in (node, function)]
+        assert given[0] == given[1]
+        assert node.returns
+        assert function.returns
+        assert ast.dump(node.returns) == ast.dump(function.returns)

@@ -18,9 +18,10 @@ from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import ImpcError
 from impc.inverse.equivalent_weights import least_condition_weights, other_weights
-from impc.inverse.explaining_weights import metric_family, weights_behind
+from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.laws import GainLaw
+from impc.inverse.metric_family import metric_family
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate

@@ -9,7 +9,8 @@ from experiments.certificates import cholesky_parameters, weights_from_parameter
 from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import Status, require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import Status, scenario
 from impc.errors import SolverError
 from impc.inverse.equivalent_weights import SLACK, least_condition_weights
 from impc.inverse.explaining_weights import weights_behind

@@ -12,7 +12,7 @@ import impc
 from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import SolverError
-from impc.inverse.explaining_weights import metric_family
+from impc.inverse.metric_family import metric_family
 from impc.inverse.residuals import evaluate, residual_only
 from impc.model.plant import Plant
 from impc.model.structure import Structure

@@ -13,11 +13,12 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.assessments import evaluate_method
-from impc.assess.weights_test import Identifiability, identifiability
+from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
+from impc.control.feasibility import require_complete
 from impc.control.named_solver import COMPILED
-from impc.control.simulation import Simulation, require_complete, scenario
+from impc.control.simulation import Simulation, scenario
 from impc.inverse.problem import Problem, misfit
 from impc.inverse.proximal_search import AUXILIARY_CONDITION_WEIGHT
 from impc.inverse.table31 import CONDITION_WEIGHT, table_3_1
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.assess.assessments import MethodFit
+    from impc.inverse.estimates import Identifiability
     from impc.model.plant import Plant
 
 #: Initial states by name.

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
-    from impc.assess.weights_test import Identifiability, WeightsTest
-    from impc.inverse.estimates import Estimate
+    from impc.assess.weights_test import WeightsTest
+    from impc.inverse.estimates import Estimate, Identifiability
     from impc.inverse.problem import Problem
     from impc.output_feedback.page import PersonReport
     from impc.studies.fit.settings import FitSettings

@@ -11,7 +11,8 @@ import numpy as np
 from experiments.coverage import cart
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import require_complete, scenario
+from impc.control.feasibility import require_complete
+from impc.control.simulation import scenario
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights

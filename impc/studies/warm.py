@@ -1,0 +1,78 @@
+"""Compile the numba code of simulations and fits in advance (docs/howto/speed.md).
+
+A cart is simulated in each way that has its own compiled code: with and without derivatives, with
+a named solver, with a nonlinear body, and with sensory noise.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import control
+import numpy as np
+
+from impc.checking import replace
+from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
+from impc.control.simulation import scenario
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
+
+if TYPE_CHECKING:
+    from impc.control.simulation import Scenario
+
+_LIMIT, _STEPS = 0.8, 40
+
+
+def compile_loop() -> None:
+    """Compile the constrained controller and its closed loop."""
+    law, drive = _cart()
+    simulate_and_differentiate(law, drive, directions(law, 2, x0=np.eye(2)))
+    simulate(replace(law, solver="daqp"), drive)
+
+
+def compile_bodies() -> None:
+    """Compile the loop with a nonlinear body."""
+    x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
+    moved = ca.vertcat(x[0] + 0.1 * ca.sin(x[1]), x[1] + 0.1 * (w[0] + w[1]))
+    law, drive = _cart(ca.Function("body", [x, w], [moved]))
+    simulate_and_differentiate(law, drive, directions(law, 2, x0=np.eye(2)))
+
+
+def compile_filter() -> None:
+    """Compile the simulation and the likelihood of subjects with sensory noise."""
+    from impc.output_feedback import likelihood as filtering  # noqa: PLC0415  # optional
+    from impc.output_feedback.observer import Observer  # noqa: PLC0415
+    from impc.output_feedback.simulation import simulate_person  # noqa: PLC0415
+
+    law, drive = _cart()
+    plant, recorder = law.plant, np.array([0.02])
+    person = Observer(plant, ["x", "v"], motor=0.3, sensory=[0.1, 0.2])
+    trial = simulate_person(law, person, drive.disturbance, recorder=0.02, seed=1)
+    levels = np.zeros((len(person.levels) + 1, 2))
+    noise = filtering.NoiseDirections(np.zeros((1, 2, 2)), levels, 0)
+    along = directions(law, 2, x0=np.eye(2))
+    prepared = filtering.prepare_filter(law, person, recorder, along, noise)
+    recording = Recording(plant, trial.outputs, drive.disturbance, [0.5, 0.0])
+    filtering.joint_likelihoods(prepared, [recording])
+
+
+def _cart(body: ca.Function | None = None) -> tuple[Controller, Scenario]:
+    """A controlled cart, and a scenario in which its command reaches the limit."""
+    system = control.ss(
+        [[1, 0.1], [0, 1]],
+        [[0, 0], [0.1, 0.1]],
+        [[1, 0]],
+        0,
+        0.1,
+        states=["x", "v"],
+        inputs=["u", "d"],
+        outputs=["y"],
+    )
+    plant = Plant(system, ["u"], body=body)
+    bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
+    law = Controller.from_gain(plant, [[8.0, 4.0]], bounds, 5, terminal_set=False)
+    return law, scenario(plant, [0.5, 0.0], disturbance=np.full((_STEPS, 1), 0.1))
