@@ -9,15 +9,23 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
-from impc.errors import ImpcError, InputError
+from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.problem import require_riccati
 from impc.output_feedback.observer import LEVELS
-from impc.output_feedback.search import climb
-from impc.output_feedback.unknowns import Place, Request, Unknowns, likeliest_start, starting_points
+from impc.output_feedback.search import maximise
+from impc.output_feedback.unknowns import (
+    Iterate,
+    Request,
+    Unknowns,
+    gain_space,
+    starting_points,
+    suggested,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from impc.inverse.coordinates import Point
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.output_feedback.observer import Observer
@@ -26,6 +34,10 @@ if TYPE_CHECKING:
 # Evaluations of the first stage, in which the gain is fixed: with noise SDs far off, the best gain
 # lies on the stability boundary, where 3 of 21 searches ended.
 _FIRST = 10
+# Assumed shares of the residual: process and motor noise, senses, recording. The one with the
+# highest likelihood is taken. For a seat whose recording noise is 1/30 of the residual, a single
+# start had not converged after 40 steps.
+_SHARES = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
 # If a round moves the gain farther than this (in standard deviations of the prior), coordinates and
 # prior are recomputed there; second: evaluations per round.
 _NEAR, _ROUND = 0.5, 30
@@ -150,11 +162,11 @@ def fit_output_feedback(
     begun, reasons = [], []
     for points, cost_weights in starting_points(found, problem, request):
         try:
-            space, theta = likeliest_start(points, cost_weights, request)
+            space, theta = _likeliest_start(points, cost_weights, request)
             # First stage: the gain is fixed.
             rest, none = np.eye(len(theta))[:, space.gain :], np.zeros(len(theta))
             budget = min(_FIRST, max_evaluations)
-            begun.append(_End(space, *climb(space, space.at(theta), budget, rest, none)))
+            begun.append(_End(space, *maximise(space, space.at(theta), budget, rest, none)))
         except ImpcError as error:
             reasons.append(error)
     if not begun:
@@ -162,7 +174,7 @@ def fit_output_feedback(
     spent, ends = sum(one.spent for one in begun), []
     for start in sorted(begun, key=lambda one: -one.place.identified.value):
         end = _searched(start, max_evaluations - spent)
-        ends.append(_looked_beside(end, max_evaluations - spent - end.spent))
+        ends.append(_retried(end, max_evaluations - spent - end.spent))
         spent += ends[-1].spent
         if ends[-1].settled and found.cost_weights is None:
             break
@@ -183,24 +195,63 @@ def _require_plain(problem: Problem) -> None:
             raise InputError("problem", f"has {what}, which this fit does not support", remedy)
 
 
+def _likeliest_start(
+    points: Sequence[Point], cost_weights: Array | None, request: Request
+) -> tuple[Unknowns, Array]:
+    """Unknowns about the likeliest of some points, and their likeliest start (q,)."""
+    found, highest, reason = None, -np.inf, "no number"
+    for point in points:
+        try:
+            space = Unknowns(gain_space(point, cost_weights), request)
+            guesses = _guesses(space)
+            value = space.value(guesses[0])
+        except ImpcError as error:
+            reason = str(error)
+            continue
+        if value > highest:
+            found, highest = (space, guesses), value
+    if found is None:
+        raise SolverError("observer", f"no start has a likelihood: {reason}", "set other noise SDs")
+    space, guesses = found
+    return space, max(guesses, key=lambda theta: _value(space, theta))
+
+
+def _guesses(space: Unknowns) -> list[Array]:
+    """Possible starting points (q,): shares of the residual, then the given noise SDs."""
+    guesses, size, request = [], space.size, space.request
+    for inside, sensed, recorded in _SHARES if request.recorder is None else ():
+        levels = suggested(request.observer, size, inside, sensed)
+        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
+        guesses.append(np.concatenate([space.space.start, log]))
+    return [*guesses, space.start]
+
+
+def _value(space: Unknowns, theta: Array) -> float:
+    """Log-likelihood at theta (q,); minus infinity if undefined."""
+    try:
+        return space.value(theta)
+    except ImpcError:
+        return -np.inf
+
+
 class _End(NamedTuple):
     """End of a search from one start."""
 
     space: Unknowns
-    place: Place
+    place: Iterate
     unseen: Array
     spent: int
     settled: bool
 
 
-def _looked_beside(end: _End, budget: int) -> _End:
+def _retried(end: _End, budget: int) -> _End:
     """Higher of two ends: of a search, and of one from there with sensory noise reset."""
     space, theta = end.space, end.place.theta.copy()
     theta[space.senses] = space.scales[space.senses - space.own]
     there = space.tried(theta) if len(space.senses) and budget > _LOOK else None
     if there is None:
         return end
-    there, unseen, spent, _ = climb(space, there, _LOOK, unseen=end.unseen)
+    there, unseen, spent, _ = maximise(space, there, _LOOK, unseen=end.unseen)
     if there.value <= end.place.value + _HIGHER:
         return end._replace(spent=end.spent + spent)
     beside = _searched(_End(space, there, unseen, 0, False), budget - spent)
@@ -212,19 +263,19 @@ def _searched(start: _End, budget: int) -> _End:
     space, place, spent = start.space, start.place, 0
     while spent < budget:
         none, part = np.zeros(len(place.theta)), min(_ROUND, budget - spent + 1)
-        place, _, more, _ = climb(space, place, part, unseen=none)
+        place, _, more, _ = maximise(space, place, part, unseen=none)
         spent += more - 1
         moved = np.linalg.norm((place.theta - space.center)[: space.gain])
         if moved <= _NEAR * space.request.spread:
             break
         space = space.about(place.theta)
         place, spent = space.at(space.start), spent + 1
-    place, unseen, more, settled = climb(space, place, budget - spent + 1)
+    place, unseen, more, settled = maximise(space, place, budget - spent + 1)
     return _End(space, place, unseen, spent + more - 1, settled)
 
 
 def person_at(
-    space: Unknowns, place: Place, unseen: Array, settled: bool, spent: int
+    space: Unknowns, place: Iterate, unseen: Array, settled: bool, spent: int
 ) -> OutputFeedbackFit:
     """Fit at the current iterate; `unseen` (q,)."""
     point, observer, recorder = space.unpack(place.theta)

@@ -35,7 +35,7 @@ from impc.errors import InputError
 
 if TYPE_CHECKING:
     from impc.output_feedback.fit import OutputFeedbackFit
-    from impc.output_feedback.unknowns import Place, Unknowns
+    from impc.output_feedback.unknowns import Iterate, Unknowns
 
 # Predicted increase in nats below which a search has converged: a hundredth of a standard error in
 # any direction without prior, a tenth with it, as the gradient of the REML term is inexact.
@@ -71,13 +71,13 @@ _LONGEST, _TRIES, _BUDGET = 2.0, 12, 25
 _WIDEST = 1e3
 
 
-def climb(
+def maximise(
     space: Unknowns,
-    begin: Place,
+    begin: Iterate,
     budget: int,
     along: Array | None = None,
     unseen: Array | None = None,
-) -> tuple[Place, Array, int, bool]:
+) -> tuple[Iterate, Array, int, bool]:
     """Best iterate, its REML gradient `unseen` (q,), evaluations used, and whether converged.
 
     `along` (q, r): directions of the search, by default all; with `unseen` (q,) given, the REML
@@ -96,13 +96,13 @@ def climb(
     while True:
         gradient, curvature = space.parabola(here, unseen)
         down, curvature = way.T @ gradient, way.T @ curvature @ way
-        promised = boxed_step(down, curvature, np.inf)[1]
+        predicted = boxed_step(down, curvature, np.inf)[1]
         if here is best:
-            left = promised
-        if promised < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
+            left = predicted
+        if predicted < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
             if best.value <= known + _WON or spent >= budget or not differences:
                 return best, unseen, spent, left < _ROUGH
-            here, unseen, known = best, unseen_slope(space, best), best.value
+            here, unseen, known = best, reml_slope(space, best), best.value
             # One or two evaluations per noise SD.
             radius, spent, stale = _STEP, spent + len(space.scales), 0
             continue
@@ -121,7 +121,7 @@ def climb(
             radius = min(max(radius, 2 * length), _STEP)
         stale = 0 if there.value > best.value + progress else stale + 1
         best = there if there.value > best.value else best
-        unseen, here = learned_slope(space, unseen, here, there), there
+        unseen, here = updated_slope(space, unseen, here, there), there
 
 
 def _reach(space: Unknowns, way: Array) -> Array:
@@ -129,13 +129,13 @@ def _reach(space: Unknowns, way: Array) -> Array:
     return np.where(np.any(way[space.shared : space.after] != 0, axis=0), _AFAR, 1.0)
 
 
-def _followed(space: Unknowns, here: Place, others: Array, unseen: Array) -> tuple[Place, int]:
+def _followed(space: Unknowns, here: Iterate, others: Array, unseen: Array) -> tuple[Iterate, int]:
     """Step onto the ridge of the coordinates `others` (q, r), not noise SDs; evaluations used."""
     # The ridge bends with the noise SDs, on the seat by many standard errors.
     slope, bend = space.parabola(here, unseen)
     radius = _STEP * _reach(space, others)
-    step, promised = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
-    if promised < _BESIDE:
+    step, predicted = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
+    if predicted < _BESIDE:
         return here, 0
     there = space.tried(here.theta + others @ step)
     if there is None or there.value + there.lost < here.value + here.lost:
@@ -156,7 +156,7 @@ def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tupl
     return step, float(gradient @ step - step @ curvature @ step / 2)
 
 
-def unseen_slope(space: Unknowns, here: Place) -> Array:
+def reml_slope(space: Unknowns, here: Iterate) -> Array:
     """Gradient of the REML term (q,) in nats, by differences.
 
     Along each noise SD all else moves on its ridge; zero where the objective is undefined.
@@ -174,7 +174,7 @@ def unseen_slope(space: Unknowns, here: Place) -> Array:
     return slope
 
 
-def learned_slope(space: Unknowns, slope: Array, here: Place, there: Place) -> Array:
+def updated_slope(space: Unknowns, slope: Array, here: Iterate, there: Iterate) -> Array:
     """REML gradient (q,) after a step, by Broyden's update, damped for short steps.
 
     `slope` (q,).
@@ -228,7 +228,7 @@ def fallen(fit: OutputFeedbackFit, along: Array, value: float) -> float:
     """
     space, unseen = fit.space.freed(along), np.array(fit.unseen)
     top = space.placed(np.array(fit.theta), fit.identified)
-    found = held_person(space, top, along, value - float(along @ top.theta), unseen)
+    found = profile_point(space, top, along, value - float(along @ top.theta), unseen)
     return np.inf if found is None else top.value - found[0].value
 
 
@@ -247,7 +247,7 @@ def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
         goal = side * min(side * goal, side * value + _LONGEST, side * begin + FARTHEST)
         if not side * inside < side * goal < side * outside:
             goal = (inside + outside) / 2 if np.isfinite(outside) else inside + side * _LONGEST
-        found = held_person(space, here, along, goal - value, unseen)
+        found = profile_point(space, here, along, goal - value, unseen)
         if found is None:  # undefined: treat as beyond the end
             outside = goal
             continue
@@ -264,9 +264,9 @@ def _end(fit: OutputFeedbackFit, along: Array, side: int) -> float:
     return outside
 
 
-def held_person(
-    space: Unknowns, here: Place, along: Array, off: float, unseen: Array, budget: int = _BUDGET
-) -> tuple[Place, Array] | None:
+def profile_point(
+    space: Unknowns, here: Iterate, along: Array, off: float, unseen: Array, budget: int = _BUDGET
+) -> tuple[Iterate, Array] | None:
     """Maximise the objective with along'theta shifted by `off` and fixed."""
     # Start on the ridge of the local quadratic, or along the direction itself if that is higher: a
     # straight ridge may leave the stabilising gains, and moves a very small noise SD too far.
@@ -282,7 +282,7 @@ def held_person(
     turned = np.zeros((len(along), len(mine) - 1))
     turned[mine] = scipy.linalg.null_space(along[None, mine])
     across = np.hstack([np.delete(np.eye(len(along)), mine, axis=1), turned])
-    found, unseen, _, _ = climb(space, begin, budget, across, unseen)
+    found, unseen, _, _ = maximise(space, begin, budget, across, unseen)
     return found, unseen
 
 

@@ -59,10 +59,6 @@ _BARRIER = 0.5
 # Nats per factor of e by which a noise SD differs from its expected size. With 1 nat, simulated
 # subjects with almost no sensory noise got some: 2 SDs too much on the cart.
 _UNLIKE = 0.25
-# Assumed shares of the residual: process and motor noise, senses, recording. The one with the
-# highest likelihood is taken. For a seat whose recording noise is 1/30 of the residual, a single
-# start had not converged after 40 steps.
-_SHARES = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
 # Noise-free recordings have no residual: noise SDs start at this share of the outputs.
 _LEAST = 1e-6
 # Increase of the log cost weights at the second start: a low cost weight and noisy senses both
@@ -93,7 +89,7 @@ class LikelihoodTerms:
     trials: list[Likelihood]
 
 
-class Place(NamedTuple):
+class Iterate(NamedTuple):
     """Iterate of a search."""
 
     theta: Array  # (q,)
@@ -127,10 +123,10 @@ class Unknowns:
         self.own = len(space.start)
         #: Indices of the unknowns that are sensory noise SDs.
         self.senses = self.own + np.flatnonzero([kinds[k] == "sensory" for k in self.moving])
-        #: Expected log noise SDs; whether there is a prior.
-        alone = np.concatenate([_suggested(observer, size, 1.0, 1.0), size.recorder])
+        #: Expected log noise SDs; whether there is a prior; sizes of noise.
+        alone = np.concatenate([suggested(observer, size, 1.0, 1.0), size.recorder])
         self.scales, self.used = np.log(alone[self.moving]), bool(np.isfinite(request.spread))
-        self._unlikely, self._size = np.full(len(self.scales), _UNLIKE * self.used), size
+        self._unlikely, self.size = np.full(len(self.scales), _UNLIKE * self.used), size
         #: Mean and inverse covariance (q, q) of the normal prior.
         self.center = self.start.copy()
         self.weights = np.diag(np.where(np.arange(len(self.start)) < self.own,
@@ -249,16 +245,16 @@ class Unknowns:
         lasting = NoiseDirections(noise, along(levels, self.own), max(count - starts, 0))
         return directions(controller, count, **given), lasting
 
-    def at(self, theta: Array) -> Place:
+    def at(self, theta: Array) -> Iterate:
         """Evaluate the objective at theta (q,)."""
         return self.placed(theta, self.identified(theta))
 
-    def placed(self, theta: Array, identified: LikelihoodTerms) -> Place:
+    def placed(self, theta: Array, identified: LikelihoodTerms) -> Iterate:
         """Evaluate the objective at theta (q,) with a known likelihood."""
         lost = self.lost(theta, identified)
-        return Place(theta, identified, identified.value + self.log_prior(theta) - lost, lost)
+        return Iterate(theta, identified, identified.value + self.log_prior(theta) - lost, lost)
 
-    def tried(self, theta: Array) -> Place | None:
+    def tried(self, theta: Array) -> Iterate | None:
         """Evaluate the objective at theta (q,); None if it is undefined or not finite."""
         try:
             there = self.at(theta)
@@ -272,7 +268,7 @@ class Unknowns:
         freed._unlikely = self._unlikely * (1 - np.abs(along[self.own :]))
         return freed
 
-    def parabola(self, here: Place, unseen: Array) -> tuple[Array, Array]:
+    def parabola(self, here: Iterate, unseen: Array) -> tuple[Array, Array]:
         """Gradient (q,) and negative Hessian (q, q), positive definite, of the objective.
 
         `unseen` (q,): gradient of the REML term.
@@ -373,46 +369,7 @@ def starting_points(
     return [(first, found.cost_weights), *larger]
 
 
-def likeliest_start(
-    points: Sequence[Point], cost_weights: Array | None, request: Request
-) -> tuple[Unknowns, Array]:
-    """Unknowns about the likeliest of some points, and their likeliest start (q,)."""
-    found, highest, reason = None, -np.inf, "no number"
-    for point in points:
-        try:
-            space = Unknowns(gain_space(point, cost_weights), request)
-            guesses = _guesses(space)
-            value = space.value(guesses[0])
-        except ImpcError as error:
-            reason = str(error)
-            continue
-        if value > highest:
-            found, highest = (space, guesses), value
-    if found is None:
-        raise SolverError("observer", f"no start has a likelihood: {reason}", "set other noise SDs")
-    space, guesses = found
-    return space, max(guesses, key=lambda theta: _value(space, theta))
-
-
-def _guesses(space: Unknowns) -> list[Array]:
-    """Possible starting points (q,): shares of the residual, then the given noise SDs."""
-    guesses, size, request = [], space._size, space.request
-    for inside, sensed, recorded in _SHARES if request.recorder is None else ():
-        levels = _suggested(request.observer, size, inside, sensed)
-        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
-        guesses.append(np.concatenate([space.space.start, log]))
-    return [*guesses, space.start]
-
-
-def _value(space: Unknowns, theta: Array) -> float:
-    """Log-likelihood at theta (q,); minus infinity if undefined."""
-    try:
-        return space.value(theta)
-    except ImpcError:
-        return -np.inf
-
-
-class _Sizes(NamedTuple):
+class Sizes(NamedTuple):
     """Noise SDs each of which alone would explain the size of the residuals."""
 
     motor: Array  # (m,)
@@ -421,7 +378,7 @@ class _Sizes(NamedTuple):
     recorder: Array  # (p,)
 
 
-def _sizes(point: Point) -> _Sizes:
+def _sizes(point: Point) -> Sizes:
     plant, scale = point.problem.plant, point.problem.output_scale
     residual = residual_only(point.problem, point.K, point.S).reshape(-1, len(plant.outputs))
     recorder = scale * np.maximum(np.sqrt(np.mean(residual**2, axis=0)), _LEAST)
@@ -432,10 +389,10 @@ def _sizes(point: Point) -> _Sizes:
     seen = np.einsum("pi,kij,pj->kp", plant.C, spread, plant.C) / scale**2
     each = target / np.sqrt(np.maximum(np.mean(seen, axis=1), 1e-300))
     sensed = np.mean(each[: plant.m, None, None] ** 2 * spread[: plant.m], axis=0)
-    return _Sizes(each[: plant.m], each[plant.m :], sensed, recorder)
+    return Sizes(each[: plant.m], each[plant.m :], sensed, recorder)
 
 
-def _suggested(observer: Observer, size: _Sizes, inside: float, sensed: float) -> Array:
+def suggested(observer: Observer, size: Sizes, inside: float, sensed: float) -> Array:
     """Noise SDs of the observer's kinds that together explain the residuals."""
     _, signal, process, _, walk = observer.by_kind
     share = inside / np.sqrt(max(int(np.any(observer.motor)) + int(np.any(process)), 1))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace as replaced
 
+import control
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -17,15 +19,16 @@ from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.gain_search import refine_gain
 from impc.inverse.methods import fit
 from impc.inverse.structured_fit import fit_structured
+from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily
 from impc.model.structure import Structure
 from impc.output_feedback import likelihood
 from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.models import decode_model, encode_model
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.page import PersonModel
-from impc.output_feedback.search import person_covariance, unseen_slope
+from impc.output_feedback.search import person_covariance, reml_slope
 from impc.output_feedback.unknowns import Unknowns
-from tests.inverse.test_regulator_span import late_body, late_problem
 from tests.output_feedback.fits import cart, fitted, law, least_squares, posed
 from tests.support import extrapolated_slope
 
@@ -38,9 +41,8 @@ def unknowns() -> Unknowns:
     return fit_output_feedback(first, person, max_evaluations=1).space
 
 
-def check_slope(value: object, gradient: Array, theta: Array, seed: int = 1) -> None:
-    assert callable(value)
-    for step in np.random.default_rng(seed).normal(size=(2, len(theta))):
+def check_slope(value: Callable[[Array], float], gradient: Array, theta: Array) -> None:
+    for step in np.random.default_rng(1).normal(size=(2, len(theta))):
 
         def moved(t: float, step: Array = step) -> Array:
             return np.array([value(theta + t * step)])
@@ -49,11 +51,30 @@ def check_slope(value: object, gradient: Array, theta: Array, seed: int = 1) -> 
         assert gradient @ step == pytest.approx(slope, rel=1e-6)
 
 
-def test_the_gradient_is_that_of_the_likelihood() -> None:
-    space = unknowns()
+def unknowns_with_a_free_parameter() -> Unknowns:
+    """The same, and friction, on which the subject's filter depends as well."""
+
+    def make(values: Array) -> Plant:
+        system = control.ss(
+            [[1, 0.05], [0, 1 - float(values[0])]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
+            states=["x", "v"], inputs=["u", "d"], outputs=["x"],
+        )  # fmt: skip
+        return Plant(system, ["u"])
+
+    first = least_squares("limited")[1]
+    family = PlantFamily(make, ["friction"], [0.02])
+    posed = replace(first.problem, family=family, logarithms=np.zeros(1))
+    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02, walk=0.2)
+    return fit_output_feedback(replace(first, problem=posed), person, max_evaluations=1).space
+
+
+@pytest.mark.parametrize("make", [unknowns, unknowns_with_a_free_parameter])
+def test_the_gradient_is_that_of_likelihood_and_prior(make: Callable[[], Unknowns]) -> None:
+    space = make()
     identified = space.identified(space.start)
     assert identified.value == pytest.approx(space.value(space.start), rel=1e-12)
     check_slope(space.value, identified.gradient, space.start)
+    check_slope(space.log_prior, space.slopes(space.start)[0], space.start)
 
 
 def test_the_barrier_is_how_far_noise_drives_the_loop() -> None:
@@ -96,7 +117,7 @@ def test_a_person_is_found_and_told_better_than_without_the_noise() -> None:
     # With prior and REML term, the gradient is zero to 0.1 standard errors.
     space, theta = found.space, np.array(found.theta)
     slope, bend = space.slopes(theta)
-    gradient = found.identified.gradient + slope + unseen_slope(space, space.at(theta))
+    gradient = found.identified.gradient + slope + reml_slope(space, space.at(theta))
     assert gradient @ np.linalg.solve(found.identified.information + bend, gradient) < 1e-2
 
 
@@ -158,17 +179,7 @@ def test_what_cannot_be_estimated_is_an_error() -> None:
         fit_output_feedback(first, person, counted=400)
 
 
-def of_any_gain() -> OutputFeedbackFit:
-    return fitted("limited")
-
-
-def of_a_gain_of_a_structure() -> OutputFeedbackFit:
-    problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
-    person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
-    return fit_output_feedback(fit(problem), person, max_evaluations=30)
-
-
-def of_cost_weights() -> OutputFeedbackFit:
+def test_prices_of_a_structure_are_searched_and_stored() -> None:
     person, first = least_squares("limited")
     structure = Structure(cart(), ["x", "v"])
     problem = replace(first.problem, structure=structure)
@@ -180,15 +191,16 @@ def of_cost_weights() -> OutputFeedbackFit:
     np.testing.assert_allclose(there.K, found.K, rtol=1e-9)
     # In two trials of 20 s cost weights are known to within a factor of two.
     assert np.all(np.abs(np.array(found.cost_weights) - np.log([8.0, 1.0])) < 1.0)
-    return found
+    check_stored(found)
 
 
-@pytest.mark.parametrize("make", [of_any_gain, of_a_gain_of_a_structure, of_cost_weights])
-def test_a_stored_fit_is_the_one_that_was_fitted(make: object) -> None:
-    assert callable(make)
-    fit = make()
+def test_a_stored_fit_is_the_one_that_was_fitted() -> None:
+    check_stored(fitted("limited"))
+
+
+def check_stored(fit: OutputFeedbackFit) -> None:
     kept = json.loads(json.dumps(encode_model(PersonModel("one", fit, ""))))
-    again = decode_model("one", fit.problem, fit.observer, kept).fit
+    again = decode_model("one", fit.problem, fit.space.request.observer, kept).fit
     assert again is not None
     for name in ("K", "S", "recorder", "theta", "unseen"):
         assert_array_equal(getattr(again, name), getattr(fit, name))

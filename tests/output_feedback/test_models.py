@@ -18,6 +18,7 @@ from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
 from tests.inverse.test_regulator_span import late_body, late_problem
 from tests.output_feedback.fits import cart, fitted, least_squares, posed
+from tests.output_feedback.test_fit import check_stored
 
 pytestmark = pytest.mark.full
 
@@ -72,6 +73,7 @@ def test_a_structure_is_set_beside_any_gain() -> None:
     assert -0.5 < free.log_likelihood - kept.log_likelihood < 6
     assert report.covariance is not None
     assert np.all(report.covariance.entries < person_covariance(free).entries)
+    check_stored(kept)
 
 
 def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> None:

@@ -20,16 +20,16 @@ from impc.output_feedback.fit import fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.search import (
     boxed_step,
-    climb,
     confusion,
     entry_intervals,
     fallen,
-    learned_slope,
     level_interval,
     level_intervals,
+    maximise,
     person_covariance,
     profile,
-    unseen_slope,
+    reml_slope,
+    updated_slope,
 )
 from impc.output_feedback.unknowns import Unknowns
 from tests.output_feedback.fits import cart, fitted, posed, unknown_truth
@@ -42,27 +42,27 @@ def test_a_step_is_the_best_of_its_box(seed: int) -> None:
     rng = np.random.default_rng(seed)
     root, gradient = rng.normal(size=(6, 6)), 3 * rng.normal(size=6)
     curvature, bound = root @ root.T + 0.1 * np.eye(6), float(rng.uniform(0.1, 1.0))
-    step, promised = boxed_step(gradient, curvature, bound)
+    step, predicted = boxed_step(gradient, curvature, bound)
     found = np.zeros(6)
     for _ in range(2000):  # Coordinate search: each coordinate at its best in turn.
         for k in range(6):
             rest = gradient[k] - curvature[k] @ found + curvature[k, k] * found[k]
             found[k] = np.clip(rest / curvature[k, k], -bound, bound)
     np.testing.assert_allclose(step, found, atol=1e-9)
-    assert promised == pytest.approx(gradient @ found - found @ curvature @ found / 2, abs=1e-9)
+    assert predicted == pytest.approx(gradient @ found - found @ curvature @ found / 2, abs=1e-9)
 
 
 def test_levels_that_slide_do_not_hold_back_the_rest() -> None:
     """Regression: a step scaled as a whole took more than 30 evaluations here, 100 on the seat."""
     found = fitted("sliding")
     space = found.space
-    _, _, spent, settled = climb(space, space.at(space.start), 100)
+    _, _, spent, settled = maximise(space, space.at(space.start), 100)
     assert settled
     assert found.converged
     assert spent < 40
     truth = unknown_truth(found, [0.4, 0.002, 0.004, 0.01], 0.9)
     assert found.log_likelihood > space.value(truth)
-    place, _, spent, settled = climb(space, space.at(space.start), 2)
+    place, _, spent, settled = maximise(space, space.at(space.start), 2)
     assert (spent, settled) == (2, False)
     assert place.identified.value == space.value(place.theta) < found.log_likelihood
 
@@ -78,7 +78,7 @@ def test_the_prior_bends_as_it_says() -> None:
     nothing = Unknowns(own, dataclasses.replace(request, spread=np.inf), found.space.first)
     assert nothing.log_prior(theta) == nothing.lost(theta, found.identified) == 0.0
     assert not np.any(nothing.slopes(theta)[1])
-    assert not np.any(unseen_slope(nothing, nothing.at(theta)))
+    assert not np.any(reml_slope(nothing, nothing.at(theta)))
 
 
 def test_initial_states_are_as_any_other_state() -> None:
@@ -106,7 +106,7 @@ def test_what_levels_lose_is_that_of_the_gain_integrated_out() -> None:
     for factor in (1.0, 2.0):
         theta = np.array(fit.theta)
         theta[2] += np.log(factor)
-        here, _, _, _ = climb(space, space.at(theta), 30, np.eye(len(theta))[:, :2])
+        here, _, _, _ = maximise(space, space.at(theta), 30, np.eye(len(theta))[:, :2])
         root = np.linalg.cholesky(np.linalg.inv(here.identified.information[:2, :2]))
         top, total = here.identified.value + space.log_prior(here.theta), 0.0
         for first, second in itertools.product(steps, steps):
@@ -124,12 +124,12 @@ def test_the_slope_of_what_levels_lose_follows_the_ridge() -> None:
     """Against searches over all else with a noise SD a little lower and higher."""
     fit = fitted("sliding")
     space, theta, own = fit.space, np.array(fit.theta), fit.space.own
-    found, others, step = unseen_slope(space, space.at(theta)), np.eye(len(theta))[:, :own], 0.05
+    found, others, step = reml_slope(space, space.at(theta)), np.eye(len(theta))[:, :own], 0.05
     for index in (own, own + 3):  # The identified ones: motor and recording noise.
         lost = []
         for sign in (-1, 1):
             there = space.at(theta + sign * step * np.eye(len(theta))[index])
-            place, _, _, settled = climb(space, there, 30, others, np.array(fit.unseen))
+            place, _, _, settled = maximise(space, there, 30, others, np.array(fit.unseen))
             assert settled
             lost.append(place.lost)
         # Measured: .05 apart, for the first is a step of a tenth to one side.
@@ -139,7 +139,7 @@ def test_the_slope_of_what_levels_lose_follows_the_ridge() -> None:
     theta[own] += 2.0
     theta[0] += 0.1
     there = space.at(theta)
-    learned = learned_slope(space, slope, here, there)
+    learned = updated_slope(space, slope, here, there)
     assert learned[own] == pytest.approx(np.clip((here.lost - there.lost) / 2, 0, own), rel=0.05)
     np.testing.assert_array_equal(np.delete(learned, own), np.delete(slope, own))
 
@@ -162,7 +162,7 @@ def test_at_its_end_the_likelihood_has_fallen(weights: tuple[float, ...], end: i
     across = scipy.linalg.null_space(along[None])
     information = across.T @ (fit.identified.information + 0.1 * np.eye(len(along))) @ across
     ways = across @ np.linalg.inv(np.linalg.cholesky(information)).T  # steps of one are deviations
-    unseen = unseen_slope(space, space.at(start))
+    unseen = reml_slope(space, space.at(start))
 
     def climbed(steps: Array) -> tuple[float, Array]:
         here = space.at(start + ways @ steps)
