@@ -34,8 +34,7 @@ from impc.model.recordings import Recording
 from impc.model.structure import Structure
 from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.start import gain_space
-from impc.output_feedback.unknowns import PersonCoordinates
+from impc.output_feedback.unknowns import NoisyUnknowns, Request, gain_space
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
@@ -151,9 +150,8 @@ def judged(follower: Follower, condition: Condition, which: IntArray) -> OutputF
     there = other.at(np.array(other.starts), np.array(fit.problem.logarithms))
     posed = replace(there, structure=fit.problem.structure)
     cost_weights = gain_space(Point(np.array(fit.K), np.array(fit.S), posed), fit.cost_weights)
-    space = PersonCoordinates(
-        cost_weights, fit.observer, np.array(fit.recorder), counted=fit.space.counted
-    )
+    asked = Request(fit.observer, np.array(fit.recorder), counted=fit.space.request.counted)
+    space = NoisyUnknowns(cost_weights, asked)
     identified = space.identified(space.start)
     return dataclasses.replace(
         fit, problem=there, identified=identified, log_likelihood=identified.value

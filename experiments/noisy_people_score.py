@@ -10,18 +10,16 @@ import numpy as np
 
 from impc.assess.covariance import gain_covariance
 from impc.inverse.methods import fit
-from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import fit_output_feedback
-from impc.output_feedback.prior import IDENTIFIED
-from impc.output_feedback.profile import fallen
+from impc.output_feedback.search import IDENTIFIED, fallen, person_covariance
 from impc.output_feedback.simulation import simulate_person
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Recorded, Subject
     from impc.arrays import Array
-    from impc.output_feedback.covariance import PersonCovariance
     from impc.output_feedback.fit import OutputFeedbackFit
     from impc.output_feedback.observer import Observer
+    from impc.output_feedback.search import PersonCovariance
 
 __all__ = [
     "FALLEN",
@@ -162,7 +160,7 @@ def blind(who: Subject) -> Observer:
 
 def above_truth(likely: OutputFeedbackFit, who: Subject) -> float:
     """Objective of the search at the fit minus that at the true subject, nats."""
-    return likely.value - likely.prior.at(true_unknowns(likely, who)).value
+    return likely.value - likely.space.at(true_unknowns(likely, who)).value
 
 
 def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:

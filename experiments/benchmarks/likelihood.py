@@ -13,17 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from impc.inverse.coordinates import Coordinates
 
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import seat
 from experiments.noisy_people import recorded, subject
 from impc.checking import replace
+from impc.inverse.laws import GainLaw
 from impc.inverse.residuals import evaluate
-from impc.inverse.unknowns import Point
-from impc.output_feedback.start import gain_space
-from impc.output_feedback.unknowns import PersonCoordinates
+from impc.inverse.unknowns import Point, Unknowns
+from impc.output_feedback.unknowns import NoisyUnknowns, Request, gain_space
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +39,7 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     law, problem = who.controller, recorded(who, 0).problem
     given = problem, np.array(law.K), np.array(law.S)
     kept = _at_the_truth(who, problem)
-    free = PersonCoordinates(Coordinates(*given), who.person, who.recorder)
+    free = NoisyUnknowns(Unknowns(problem, GainLaw(*given)), Request(who.person, who.recorder))
     known = np.array(work.controller.K), np.array(work.controller.S)
     far = subject("seat", 0, "both", 90.0, 70.0)
     free_of_limits = _at_the_truth(far, recorded(far, 0).problem)
@@ -69,10 +68,10 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     ]  # fmt: skip
 
 
-def _at_the_truth(who: Subject, problem: Problem) -> PersonCoordinates:
+def _at_the_truth(who: Subject, problem: Problem) -> NoisyUnknowns:
     """Coordinates at the truth, restricted to gains that cost weights can have."""
     point = Point(np.array(who.controller.K), np.array(who.controller.S), problem)
-    return PersonCoordinates(gain_space(point, None), who.person, who.recorder)
+    return NoisyUnknowns(gain_space(point, None), Request(who.person, who.recorder))
 
 
 if __name__ == "__main__":

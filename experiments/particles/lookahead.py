@@ -21,7 +21,7 @@ import numpy as np
 from experiments.particles.clipped_regulator import ClippedRegulator
 from impc.arrays import Buffer
 from impc.jit import njit
-from impc.output_feedback.compiled_clip import Clip, clipped
+from impc.output_feedback.compiled_filter import Clip, clipped
 
 __all__ = ["Twist", "twist"]
 

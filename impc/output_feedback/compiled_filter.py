@@ -9,10 +9,16 @@ covariance P|t,
 as in `kalman`: g minimises P|t, so that dg does not enter dP+. F includes the command's slope. Of
 the q directions only the first k change covariances; k is the first axis of their derivatives.
 Away from bounds the covariance soon becomes stationary.
+
+The cost of a plan is convex in its first input: with one input it is that of the program without
+bounds at the present sample, clipped. If that has mean g and standard deviation s, the moments of
+min(max(g + s xi, low), high), xi normal, follow from the normal distribution (statistical
+linearisation): `clipped`.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +36,6 @@ from impc.control.compiled_values import (
     Workspace,
 )
 from impc.jit import njit
-from impc.output_feedback.compiled_clip import Clip, Clipped, clipped
 from impc.output_feedback.joint_loop import JointLoop
 
 # The covariance counts as stationary if no entry differs by more than the first tolerance, in the
@@ -39,14 +44,32 @@ _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
 # The initial state is forgotten once no direction of it moves an innovation by more than this, in
 # its standard deviation.
 _FORGOTTEN = 1e-9
+# Bounds beyond this many standard deviations are ignored (normal tail probability 1e-13).
+_FAR, _EXACT = 7.5, 1e-12
 
 
-class Steady(NamedTuple):
-    """Stationary filter without active bounds, and its derivatives along k directions."""
+class Clip(NamedTuple):
+    """Clipping of the command by its bounds at the present sample."""
 
-    P: Buffer  # (z, z), covariance of z given all earlier outputs
-    dP: Buffer  # (k, z, z)
-    known: bool  # whether it exists
+    used: bool  # whether to clip; with several inputs the law and its slope are used as they are
+    low: float  # bounds of the input, in its unit
+    high: float
+    unit: float  # s below 1e-12 of this counts as zero
+
+
+class Clipped(NamedTuple):
+    """Moments of the clipped command, and their derivatives."""
+
+    beyond: int  # 1 if g itself is beyond a bound, else 0
+    near: bool  # whether a bound is near; otherwise nothing is clipped
+    value: float  # mean; its derivative with respect to g is `inside`
+    value_s: float  # derivative of the mean with respect to s
+    inside: float  # probability of no active bound, by which slopes are multiplied
+    inside_g: float
+    inside_s: float
+    variance: float  # variance that the slope does not explain
+    variance_g: float
+    variance_s: float
 
 
 class FilterParts(NamedTuple):
@@ -63,7 +86,9 @@ class FilterParts(NamedTuple):
     djoint: JointLoop
     moving: bool  # whether any direction changes B, C, E or G
     turning: Buffer  # (k,), which directions change F or Q
-    steady: Steady
+    known: bool  # whether a stationary covariance exists
+    P: Buffer  # (z, z), the stationary covariance of z given all earlier outputs
+    dP: Buffer  # (k, z, z)
     at: int  # first index of the estimate in z
     lasting: int  # number of leading directions that change more than the initial state
 
@@ -77,7 +102,6 @@ class Likelihood(NamedTuple):
     innovations: Buffer  # (samples, p), recorded minus predicted outputs
     spreads: Buffer  # (samples, p, p), covariances of the innovations
     filtered: Buffer  # (samples, z), mean of z given all outputs up to the sample
-    u: Buffer  # (samples, m), expected command
     status: Buffer  # (samples,), `Status`
     counted: int  # first sample in the log-likelihood; earlier ones are conditioned on
 
@@ -85,6 +109,26 @@ class Likelihood(NamedTuple):
     def value(self) -> float:
         """Log-likelihood, nats."""
         return float(np.sum(self.identified))
+
+
+class Belief(NamedTuple):
+    """Moments of z given all earlier outputs, with derivatives; the filter overwrites them."""
+
+    z: Buffer  # (z,)
+    dz: Buffer  # (z, q)
+    P: Buffer  # (z, z)
+    dP: Buffer  # (k, z, z)
+
+
+class _Command(NamedTuple):
+    """Expected command, its slope by the estimate, and its own noise, with derivatives."""
+
+    u: Buffer  # (m,)
+    du: Buffer  # (m, q)
+    slope: Buffer  # (m, n)
+    dslope: Buffer  # (k, m, n)
+    noise: Buffer  # (m,), variance of each command in addition to motor noise
+    dnoise: Buffer  # (k, m)
 
 
 class _Weighed(NamedTuple):
@@ -107,10 +151,7 @@ def run_filter(
     outputs: Buffer,
     disturbance: Buffer,
     aim: Aim,
-    z: Buffer,
-    dz: Buffer,
-    P: Buffer,
-    dP: Buffer,
+    belief: Belief,
     result: Likelihood,
     first: int,
 ) -> int:
@@ -118,11 +159,11 @@ def run_filter(
 
     It stops after the last sample; at a sample whose status is set, where the law has no solution
     or the state diverges; and at the first sample at which the initial state is forgotten, from
-    where `lasting` directions suffice. z, dz, P and dP are those before that sample.
-    `outputs` (samples, p); `disturbance` (samples, d), with an aim per sample; `z` (z,);
-    `dz` (z, q); `P` (z, z); `dP` (k, z, z).
+    where `lasting` directions suffice. `belief` is that before this sample.
+    `outputs` (samples, p); `disturbance` (samples, d), with an aim per sample.
     """
-    joint, djoint, steady, at = parts.joint, parts.djoint, parts.steady, parts.at
+    z, dz, P, dP = belief
+    joint, djoint, at = parts.joint, parts.djoint, parts.at
     (m, n), q, k, rows = parts.loop.K.shape, dz.shape[1], len(dP), parts.rows
     work, lam = workspace(rows, parts.drows, m), np.zeros(len(rows.b))
     u, du = np.empty(m), np.empty((m, q))
@@ -132,7 +173,7 @@ def run_filter(
     for t in range(first, len(outputs)):
         if quiet > 2 * len(z) and q > parts.lasting:
             return t
-        quiet = quiet + 1 if _update(parts, known, outputs[t], z, dz, result, t) else 0
+        quiet = quiet + 1 if _update(parts, known, outputs[t], belief, result, t) else 0
         x, dx = z[at : at + n].copy(), dz[at : at + n].copy()
         deviate(aim, rows, parts.drows, work, t, x, dx)
         status, _, _ = law(
@@ -144,13 +185,11 @@ def run_filter(
             return t
         return_to(aim, t, u, du)
         slope, dslope = _slope_of_law(parts, work, plain)
-        noise, dnoise = np.zeros(m), np.zeros((k, m))
+        command = _Command(u, du, slope, dslope, np.zeros(m), np.zeros((k, m)))
         if parts.clip.used:
-            found = _clip_command(parts, known, dP, u, du, slope, dslope, dnoise)
-            noise[0] = found.variance
-            near = near or found.near
-            result.status[t] = max(status, found.beyond)
-        result.u[t] = u
+            beyond, clipping = _clip_command(parts, known, dP, command)
+            near = near or clipping
+            result.status[t] = max(status, beyond)
         moved = joint.F @ z + joint.B @ u + joint.E @ disturbance[t]
         dmoved = joint.F @ dz + joint.B @ du
         dmoved[:, :k] += _times(djoint.F[:k], z)
@@ -161,10 +200,10 @@ def run_filter(
             result.status[t] = DIVERGED
             return t
         if not settled or near:
-            _advance(parts, known, P, dP, u, du, slope, dslope, noise, dnoise)
-            settled = steady.known and not near and _is_near(P, dP, steady)
+            _advance(parts, known, belief, command)
+            settled = parts.known and not near and _is_steady(parts, P, dP)
             if settled:
-                P[:], dP[:] = steady.P, steady.dP[:k]
+                P[:], dP[:] = parts.P, parts.dP[:k]
             known = _weigh(parts, P, dP)
     return len(outputs)
 
@@ -203,20 +242,14 @@ def _weigh(parts: FilterParts, P: Buffer, dP: Buffer) -> _Weighed:
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _update(
-    parts: FilterParts,
-    known: _Weighed,
-    output: Buffer,
-    z: Buffer,
-    dz: Buffer,
-    result: Likelihood,
-    t: int,
+    parts: FilterParts, known: _Weighed, output: Buffer, belief: Belief, result: Likelihood, t: int
 ) -> bool:
     """Log-likelihood and score of one sample; condition z and dz on it.
 
     Returns whether directions from `lasting` on change neither the innovation nor its covariance.
     """
     C, S, inverse, dS, k = parts.joint.C, known.S, known.inverse, known.dS, len(known.dS)
-    p, lasting = len(C), parts.lasting
+    z, dz, p, lasting = belief.z, belief.dz, len(C), parts.lasting
     e, de = output - C @ z, -(C @ dz)
     if parts.moving:
         de[:, :k] -= _times(parts.djoint.C[:k], z)
@@ -285,16 +318,10 @@ def _slope_of_law(parts: FilterParts, work: Workspace, plain: Buffer) -> tuple[B
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 def _clip_command(
-    parts: FilterParts,
-    known: _Weighed,
-    dP: Buffer,
-    u: Buffer,
-    du: Buffer,
-    slope: Buffer,
-    dslope: Buffer,
-    dnoise: Buffer,
-) -> Clipped:
-    """Replace command and slope by the moments of the clipped command; see `Clip`."""
+    parts: FilterParts, known: _Weighed, dP: Buffer, command: _Command
+) -> tuple[int, bool]:
+    """Replace a command by the moments of the clipped one; return `beyond` and `near`."""
+    u, du, slope, dslope, noise, dnoise = command
     C, at, n, k = parts.joint.C, parts.at, slope.shape[1], len(dslope)
     seen = np.zeros(len(known.left))
     seen[at : at + n] = slope[0]
@@ -302,7 +329,7 @@ def _clip_command(
     s = np.sqrt(max(np.dot(seen, weighed), 0.0))
     found = clipped(parts.clip, u[0], s)
     if not found.near:
-        return found
+        return found.beyond, False
     ds, along = np.zeros(k), du[0, :k].copy()
     if found.inside_g != 0.0 or found.inside_s != 0.0:
         # Derivative of seen' P|t seen: d(P|t) = (I - g C) dP (I - g C)' + g dR g' minus dC terms.
@@ -314,6 +341,7 @@ def _clip_command(
             if parts.moving:
                 ds[c] -= 2 * np.dot(answer, parts.djoint.C[c] @ weighed)
             ds[c] = ds[c] / (2 * s) + np.dot(dslope[c, 0], weighed[at : at + n]) / s
+    noise[0] = found.variance
     dnoise[:, 0] = found.variance_g * along + found.variance_s * ds
     turned = found.inside_g * along + found.inside_s * ds
     for c in range(k):
@@ -322,26 +350,14 @@ def _clip_command(
     du[0, :k] += found.value_s * ds
     u[0] = found.value
     slope *= found.inside
-    return found
+    return found.beyond, True
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _advance(
-    parts: FilterParts,
-    known: _Weighed,
-    P: Buffer,
-    dP: Buffer,
-    u: Buffer,
-    du: Buffer,
-    slope: Buffer,
-    dslope: Buffer,
-    noise: Buffer,
-    dnoise: Buffer,
-) -> None:
-    """Predict P and dP for the next sample.
-
-    `noise` (m,) and `dnoise` (k, m): variance of each command in addition to motor noise.
-    """
+def _advance(parts: FilterParts, known: _Weighed, belief: Belief, command: _Command) -> None:
+    """Predict P and dP for the next sample."""
+    P, dP = belief.P, belief.dP
+    u, du, slope, dslope, noise, dnoise = command
     joint, djoint, at, B, Gm = parts.joint, parts.djoint, parts.at, parts.joint.B, parts.joint.G
     (m, n), size, k, p, C = slope.shape, len(P), len(dP), len(joint.C), joint.C
     F = joint.F.copy()
@@ -380,10 +396,43 @@ def _advance(
 
 
 @njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-def _is_near(P: Buffer, dP: Buffer, steady: Steady) -> bool:
+def _is_steady(parts: FilterParts, P: Buffer, dP: Buffer) -> bool:
     """Whether covariance and derivatives are stationary within tolerance."""
-    deviations = np.sqrt(np.diag(steady.P))
+    deviations = np.sqrt(np.diag(parts.P))
     unit = np.outer(deviations, deviations)
-    if not np.all(np.abs(P - steady.P) <= _STEADY * unit):
+    if not np.all(np.abs(P - parts.P) <= _STEADY * unit):
         return False
-    return bool(np.all(np.abs(dP - steady.dP[: len(dP)]) <= _STEADY_SLOPE * unit))
+    return bool(np.all(np.abs(dP - parts.dP[: len(dP)]) <= _STEADY_SLOPE * unit))
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def clipped(clip: Clip, g: float, s: float) -> Clipped:
+    """Moments of the clipped command with mean g and standard deviation s."""
+    low, high = clip.low - g, clip.high - g
+    if low < -_FAR * s and high > _FAR * s:
+        return Clipped(0, False, g, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    beyond = 0 if low < 0 < high else 1
+    if not s > _EXACT * clip.unit:
+        value = min(max(g, clip.low), clip.high)
+        return Clipped(beyond, True, value, 0.0, 1.0 - beyond, 0.0, 0.0, 0.0, 0.0, 0.0)
+    first, second = _tail(low / s, s), _tail(-high / s, s)
+    inside = 1.0 - first[0] - second[0]
+    bell, lever = first[1] - second[1], first[2] + second[2]
+    mean = first[3] - second[3] + s * bell
+    square = first[4] + second[4] + s**2 * (inside + lever)
+    variance = max(square - mean**2 - (inside * s) ** 2, 0.0)
+    variance_g = 2 * (s * bell * (1 - inside) - mean * inside)
+    variance_s = 2 * (s * (inside + lever) - mean * bell - inside * s * lever - inside**2 * s)
+    return Clipped(
+        beyond, True, g + mean, bell, inside, bell / s, lever / s, variance, variance_g, variance_s
+    )
+
+
+@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
+    """For a standard normal number below a: probability, density, a density, s a p, (s a)^2 p."""
+    if a == -np.inf:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    below = math.erfc(-a / np.sqrt(2.0)) / 2
+    density = np.exp(-(a**2) / 2) / np.sqrt(2 * np.pi)
+    return below, density, a * density, s * a * below, (s * a) ** 2 * below

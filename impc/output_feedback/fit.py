@@ -9,33 +9,35 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
-from impc.errors import ImpcError, InputError
+from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.problem import require_riccati
-from impc.inverse.starts import regulators
-from impc.inverse.unknowns import Point
 from impc.output_feedback.observer import LEVELS
-from impc.output_feedback.prior import Place, Prior
-from impc.output_feedback.search import climb
-from impc.output_feedback.start import (
-    Asked,
-    cost_weights_at,
+from impc.output_feedback.search import maximise
+from impc.output_feedback.unknowns import (
+    Iterate,
+    NoisyUnknowns,
+    Request,
     gain_space,
-    likeliest_start,
-    prior_about,
+    starting_points,
+    suggested,
 )
-from impc.output_feedback.unknowns import PersonCoordinates
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Point
     from impc.output_feedback.observer import Observer
     from impc.output_feedback.unknowns import LikelihoodTerms
 
 # Evaluations of the first stage, in which the gain is fixed: with noise SDs far off, the best gain
 # lies on the stability boundary, where 3 of 21 searches ended.
 _FIRST = 10
+# Assumed shares of the residual: process and motor noise, senses, recording. The one with the
+# highest likelihood is taken. For a seat whose recording noise is 1/30 of the residual, a single
+# start had not converged after 40 steps.
+_SHARES = ((0.7, 0.5, 0.3), (0.3, 0.3, 0.9), (0.7, 0.1, 0.3), (0.1, 0.1, 1.0))
 # If a round moves the gain farther than this (in standard deviations of the prior), coordinates and
 # prior are recomputed there; second: evaluations per round.
 _NEAR, _ROUND = 0.5, 30
@@ -43,10 +45,6 @@ _NEAR, _ROUND = 0.5, 30
 # it gains this much, in nats: from four ends 18 to 90 nats too low, ten evaluations were enough.
 # The likelihood has jumps of that size.
 _LOOK, _HIGHER = 15, 0.5
-# Increase of the log cost weights at the second start: a low cost weight and noisy senses both
-# delay the response, and a search from least squares, which assumes exact senses, may end at the
-# first.
-_FAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -67,12 +65,7 @@ class OutputFeedbackFit(Frozen):
     theta: Array  # (count,), unknowns in the coordinates of `space`
     identified: LikelihoodTerms  # likelihood with derivatives at `theta`
     unseen: Array  # (q,), gradient of the correction for the noise SDs, nats
-    prior: Prior  # prior of the fit
-
-    @property
-    def space(self) -> PersonCoordinates:
-        """Coordinates of the search."""
-        return self.prior.space
+    space: NoisyUnknowns  # coordinates and prior of the search
 
     @property
     def levels(self) -> Array:
@@ -165,32 +158,28 @@ def fit_output_feedback(
     if counted >= shortest:
         left = f"got {counted}, but the shortest trial has {shortest} samples"
         raise InputError("counted", left, "use a smaller value")
-    asked = Asked(observer, recorder, held, spread, counted)
-    first = [Point(np.array(found.gain), np.array(found.metric), problem)]
-    starts: list[tuple[list[Point], Array | None]] = [(first, found.cost_weights)]
-    if found.cost_weights is None:
-        begun_at = [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)]
-        starts.append((begun_at, None))
-    elif observer.estimates:
-        starts.append((first, np.array(found.cost_weights) + _FAR))
+    request = Request(observer, recorder, held, spread, counted)
     begun, reasons = [], []
-    for points, cost_weights in starts:
+    for points, cost_weights in starting_points(found, problem, request):
         try:
-            prior, theta = likeliest_start(points, cost_weights, asked)
-            begun.append(_levelled(prior, theta, min(_FIRST, max_evaluations)))
+            space, theta = _likeliest_start(points, cost_weights, request)
+            # First stage: the gain is fixed.
+            rest, none = np.eye(len(theta))[:, space.gain :], np.zeros(len(theta))
+            budget = min(_FIRST, max_evaluations)
+            begun.append(_End(space, *maximise(space, space.at(theta), budget, rest, none)))
         except ImpcError as error:
             reasons.append(error)
     if not begun:
         raise reasons[0]
     spent, ends = sum(one.spent for one in begun), []
     for start in sorted(begun, key=lambda one: -one.place.identified.value):
-        end = _searched(start, asked, max_evaluations - spent)
-        ends.append(_looked_beside(end, asked, max_evaluations - spent - end.spent))
+        end = _searched(start, max_evaluations - spent)
+        ends.append(_retried(end, max_evaluations - spent - end.spent))
         spent += ends[-1].spent
         if ends[-1].settled and found.cost_weights is None:
             break
     end = max(ends, key=lambda one: one.place.identified.value)
-    return person_at(end.prior, end.place, end.unseen, end.settled, spent)
+    return person_at(end.space, end.place, end.unseen, end.settled, spent)
 
 
 def _require_plain(problem: Problem) -> None:
@@ -198,7 +187,7 @@ def _require_plain(problem: Problem) -> None:
     gaps = any(trial.has_gaps for trial in problem.recordings)
     for there, what, remedy in (
         (gaps, "outputs with missing samples", "cut the trials there"),
-        (bool(problem.offsets), "unknown offsets", "remove them from the recordings"),
+        (bool(problem.signal_errors), "unknown errors of signals", "correct the recordings"),
         (len(problem.measured) > len(problem.plant.outputs), "commands", "leave them out"),
         (problem.plant.ahead > 0, "targets known in advance", "use a plant without preview"),
     ):
@@ -206,71 +195,98 @@ def _require_plain(problem: Problem) -> None:
             raise InputError("problem", f"has {what}, which this fit does not support", remedy)
 
 
+def _likeliest_start(
+    points: Sequence[Point], cost_weights: Array | None, request: Request
+) -> tuple[NoisyUnknowns, Array]:
+    """NoisyUnknowns about the likeliest of some points, and their likeliest start (q,)."""
+    found, highest, reason = None, -np.inf, "no number"
+    for point in points:
+        try:
+            space = NoisyUnknowns(gain_space(point, cost_weights), request)
+            guesses = _guesses(space)
+            value = space.value(guesses[0])
+        except ImpcError as error:
+            reason = str(error)
+            continue
+        if value > highest:
+            found, highest = (space, guesses), value
+    if found is None:
+        raise SolverError("observer", f"no start has a likelihood: {reason}", "set other noise SDs")
+    space, guesses = found
+    return space, max(guesses, key=lambda theta: _value(space, theta))
+
+
+def _guesses(space: NoisyUnknowns) -> list[Array]:
+    """Possible starting points (q,): shares of the residual, then the given noise SDs."""
+    guesses, size, request = [], space.size, space.request
+    for inside, sensed, recorded in _SHARES if request.recorder is None else ():
+        levels = suggested(request.observer, size, inside, sensed)
+        log = np.log(np.concatenate([levels, recorded * size.recorder])[space.moving])
+        guesses.append(np.concatenate([space.space.start, log]))
+    return [*guesses, space.start]
+
+
+def _value(space: NoisyUnknowns, theta: Array) -> float:
+    """Log-likelihood at theta (q,); minus infinity if undefined."""
+    try:
+        return space.value(theta)
+    except ImpcError:
+        return -np.inf
+
+
 class _End(NamedTuple):
     """End of a search from one start."""
 
-    prior: Prior
-    place: Place
+    space: NoisyUnknowns
+    place: Iterate
     unseen: Array
     spent: int
     settled: bool
 
 
-def _levelled(prior: Prior, theta: Array, budget: int) -> _End:
-    """First stage of the search from theta (q,), with the gain fixed."""
-    rest, none = np.eye(len(theta))[:, prior.space.gain :], np.zeros(len(theta))
-    return _End(prior, *climb(prior, prior.at(theta), budget, rest, none))
-
-
-def _looked_beside(end: _End, asked: Asked, budget: int) -> _End:
+def _retried(end: _End, budget: int) -> _End:
     """Higher of two ends: of a search, and of one from there with sensory noise reset."""
-    prior, theta = end.prior, end.place.theta.copy()
-    senses = prior.space.senses
-    theta[senses] = prior.scales[senses - prior.space.own]
-    there = prior.tried(theta) if len(senses) and budget > _LOOK else None
+    space, theta = end.space, end.place.theta.copy()
+    theta[space.senses] = space.scales[space.senses - space.own]
+    there = space.tried(theta) if len(space.senses) and budget > _LOOK else None
     if there is None:
         return end
-    there, unseen, spent, _ = climb(prior, there, _LOOK, unseen=end.unseen)
+    there, unseen, spent, _ = maximise(space, there, _LOOK, unseen=end.unseen)
     if there.value <= end.place.value + _HIGHER:
         return end._replace(spent=end.spent + spent)
-    beside = _searched(_End(prior, there, unseen, 0, False), asked, budget - spent)
+    beside = _searched(_End(space, there, unseen, 0, False), budget - spent)
     return beside._replace(spent=end.spent + spent + beside.spent)
 
 
-def _searched(start: _End, asked: Asked, budget: int) -> _End:
+def _searched(start: _End, budget: int) -> _End:
     """Search in rounds, recomputing coordinates and prior after large moves, then to the end."""
-    prior, place, spent = start.prior, start.place, 0
+    space, place, spent = start.space, start.place, 0
     while spent < budget:
         none, part = np.zeros(len(place.theta)), min(_ROUND, budget - spent + 1)
-        place, _, more, _ = climb(prior, place, part, unseen=none)
+        place, _, more, _ = maximise(space, place, part, unseen=none)
         spent += more - 1
-        if np.linalg.norm((place.theta - prior.center)[: prior.space.gain]) <= _NEAR * asked.spread:
+        moved = np.linalg.norm((place.theta - space.center)[: space.gain])
+        if moved <= _NEAR * space.request.spread:
             break
-        there, cost_weights = (
-            prior.space.unpack(place.theta),
-            cost_weights_at(prior.space, place.theta),
-        )
-        own = gain_space(there.point, cost_weights)
-        parts = there.observer, there.recorder, asked.held, asked.counted
-        prior = prior_about(PersonCoordinates(own, *parts), asked)
-        place, spent = prior.at(prior.space.start), spent + 1
-    place, unseen, more, settled = climb(prior, place, budget - spent + 1)
-    return _End(prior, place, unseen, spent + more - 1, settled)
+        space = space.about(place.theta)
+        place, spent = space.at(space.start), spent + 1
+    place, unseen, more, settled = maximise(space, place, budget - spent + 1)
+    return _End(space, place, unseen, spent + more - 1, settled)
 
 
 def person_at(
-    prior: Prior, place: Place, unseen: Array, settled: bool, spent: int
+    space: NoisyUnknowns, place: Iterate, unseen: Array, settled: bool, spent: int
 ) -> OutputFeedbackFit:
     """Fit at the current iterate; `unseen` (q,)."""
-    space = prior.space
-    person, cost_weights = space.unpack(place.theta), cost_weights_at(space, place.theta)
+    point, observer, recorder = space.unpack(place.theta)
+    weights = space.cost_weights_at(place.theta)
     return OutputFeedbackFit(
-        frozen(person.point.K),
-        frozen(person.point.S),
-        person.point.problem,
-        person.observer,
-        person.recorder,
-        None if cost_weights is None else frozen(cost_weights),
+        frozen(point.K),
+        frozen(point.S),
+        point.problem,
+        observer,
+        recorder,
+        None if weights is None else frozen(weights),
         place.identified.value,
         place.value,
         len(place.theta),
@@ -279,5 +295,5 @@ def person_at(
         frozen(place.theta),
         place.identified,
         frozen(unseen),
-        prior,
+        space,
     )

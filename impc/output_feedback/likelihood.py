@@ -8,7 +8,7 @@ With z of `joint_loop` (plant and estimate) and the innovation e_t = y_t - C z_t
 
 with u_t = MPC(H z_t|t) and D_t its slope there: H selects the estimate from z. Away from bounds the
 system is linear and the likelihood exact; near them the moments of the clipped command are used
-with one input (`Clip`), and an extended Kalman filter with several (docs/why/output_feedback.md).
+with one input (`clipped`), an extended Kalman filter with several (docs/why/output_feedback.md).
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ from impc.control.compiled_values import RowDirections, Rows
 from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
-from impc.output_feedback.compiled_clip import Clip
-from impc.output_feedback.compiled_filter import FilterParts, Likelihood, Steady, run_filter
-from impc.output_feedback.joint_loop import PlantMoves, joint_directions, joint_loop
-from impc.output_feedback.kalman import filter_changes, stationary_filter
+from impc.output_feedback.compiled_filter import Belief, Clip, FilterParts, Likelihood, run_filter
+from impc.output_feedback.joint_loop import joint_directions, joint_loop
+from impc.output_feedback.observer import Body, filter_changes, stationary_filter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,14 +72,13 @@ def prepare_filter(
 ) -> PreparedFilter:
     """Build everything that does not depend on a recording; `recorder` (p,)."""
     plant = controller.plant
-    law, clip = _unclipped(prepare_loop(controller, along, whole=True))
+    law, clip = unclipped(prepare_loop(controller, along, whole=True))
     count = along.count if np.any(person.share) or clip.used else noise.covariances
-    first = [np.moveaxis(part[..., :count], -1, 0) for part in
-             (along.A, along.B, along.E, noise.C, noise.levels)]  # fmt: skip
+    given = (along.A, along.B, along.E, noise.C, noise.levels)
+    *first, levels = (np.moveaxis(part[..., :count], -1, 0) for part in given)
     joint = joint_loop(plant, person, recorder)
-    moves = joint_directions(plant, person, recorder, PlantMoves(*first[:4]), first[4])
+    moves = joint_directions(plant, person, recorder, Body(*first), levels)
     at = plant.n if person.estimates else 0
-    steady = _steady(controller, joint, moves, along.K[..., :count], at)
     parts = FilterParts(
         law.matrices,
         law.matrix_directions,
@@ -92,7 +90,7 @@ def prepare_filter(
         moves,
         any(bool(np.any(part)) for part in (moves.B, moves.C, moves.E, moves.G)),
         np.any(moves.F, axis=(1, 2)) | np.any(moves.Q, axis=(1, 2)),
-        steady,
+        *_stationary(controller, joint, moves, along.K[..., :count], at),
         at,
         noise.covariances,
     )
@@ -108,46 +106,31 @@ def joint_likelihoods(
 
 
 def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likelihood:
-    """Likelihood of one recording.
-
-    After its first state is forgotten the filter continues along the remaining directions.
-    """
+    """Likelihood of one recording; its first state forgotten, along the other directions."""
     law, parts = prepared.law, prepared.parts
-    plant, q, count = law.controller.plant, law.along.count, trial.samples
-    joint, size, p = parts.joint, len(parts.joint.F), len(law.controller.plant.C)
+    plant, q, N = law.controller.plant, law.along.count, trial.samples
+    size, p, start = len(parts.joint.F), len(plant.C), slice(parts.at, parts.at + plant.n)
     z, dz = np.zeros(size), np.zeros((size, q))
-    z[parts.at : parts.at + plant.n] = trial.x0
-    dz[parts.at : parts.at + plant.n] = law.along.x0
-    result = Likelihood(
-        np.zeros(count),
-        np.zeros((count, q)),
-        np.zeros((q, q)),
-        np.zeros((count, p)),
-        np.zeros((count, p, p)),
-        np.zeros((count, size)),
-        np.zeros((count, plant.m)),
-        np.full(count, Status.NOT_REACHED, dtype=np.int8),
-        counted,
-    )
+    z[start], dz[start] = trial.x0, law.along.x0
+    status = np.full(N, Status.NOT_REACHED, dtype=np.int8)
+    shapes = (N,), (N, q), (q, q), (N, p), (N, p, p), (N, size)
+    result = Likelihood._make([*map(np.zeros, shapes), status, counted])
     outputs, disturbance = np.array(trial.outputs), np.array(trial.disturbance)
     drive = Scenario(trial.x0, trial.disturbance, trial.target, trial.signals)
     aim = aim_of(law.controller, drive, law.along)
-    P, dP, first = joint.P0.copy(), parts.djoint.P0.copy(), 0
-    while first < count and result.status[first] not in _FAILED:
-        first = run_filter(parts, outputs, disturbance, aim, z, dz, P, dP, result, first)
+    P, dP, first = parts.joint.P0.copy(), parts.djoint.P0.copy(), 0
+    while first < N and status[first] not in _FAILED:
+        belief = Belief(z, dz, P, dP)
+        first = run_filter(parts, outputs, disturbance, aim, belief, result, first)
         dz, dP = np.ascontiguousarray(dz[:, : parts.lasting]), dP[: parts.lasting]
-    failed = np.flatnonzero(np.isin(result.status, _FAILED))
+    failed = np.flatnonzero(np.isin(status, _FAILED))
     if len(failed):
-        status = Status(int(result.status[failed[0]]))
-        raise SolverError(
-            f"sample {failed[0]}",
-            f"{status.sentence}, in the prediction of the filter",
-            "use another starting point",
-        )
+        why = f"{Status(int(status[failed[0]])).sentence}, in the prediction of the filter"
+        raise SolverError(f"sample {failed[0]}", why, "use another starting point")
     return result
 
 
-def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
+def unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
     """With one input, split the law into one without present bounds, and the clip; else as is."""
     controller, rows, moved = law.controller, law.rows, law.row_directions
     low, high = (float(side[0]) for side in (controller.bounds.u_min, controller.bounds.u_max))
@@ -158,26 +141,23 @@ def _unclipped(law: PreparedLoop) -> tuple[PreparedLoop, Clip]:
     inner = Rows._make(part[kept] for part in rows)
     inner = inner._replace(gram=np.ascontiguousarray(inner.gram[:, kept]))
     others = RowDirections._make(part[kept] for part in moved)
-    return (
-        dataclasses.replace(law, rows=inner, row_directions=others),
-        Clip(used=True, low=low, high=high, unit=min(-low, high)),
-    )
+    inside = dataclasses.replace(law, rows=inner, row_directions=others)
+    return inside, Clip(used=True, low=low, high=high, unit=min(-low, high))
 
 
-def _steady(
+def _stationary(
     controller: Controller, joint: JointLoop, moves: JointLoop, dK: Array, at: int
-) -> Steady:
-    """Stationary filter without bounds, if it exists."""
+) -> tuple[bool, Array, Array]:
+    """Whether a stationary filter without bounds exists, its covariance and derivatives."""
     K, estimate = controller.K, slice(at, at + controller.plant.n)
-    if np.any(joint.share):
-        return Steady(joint.P0, moves.P0, known=False)
-    F = np.array(joint.F)
+    F, dF = np.array(joint.F), np.array(moves.F)
     F[:, estimate] -= joint.B @ K
-    dF = np.array(moves.F)
     dF[:, :, estimate] -= moves.B @ K + joint.B @ np.moveaxis(dK, -1, 0)
+    if np.any(joint.share):
+        return False, joint.P0, moves.P0
     try:
         found = stationary_filter(F, joint.C, joint.Q, joint.R)
     except SolverError:  # the gain does not stabilise: the covariance diverges
-        return Steady(joint.P0, moves.P0, known=False)
-    changes = filter_changes(found, (F, joint.C), dF, moves.C, moves.Q, moves.R)
-    return Steady(np.ascontiguousarray(found.P), np.ascontiguousarray(changes.P), known=True)
+        return False, joint.P0, moves.P0
+    changes = filter_changes(found, (F, joint.C), (dF, moves.C, moves.Q, moves.R))
+    return True, np.ascontiguousarray(found.P), np.ascontiguousarray(changes.P)

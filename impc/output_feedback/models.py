@@ -1,4 +1,8 @@
-"""Fit competing sensorimotor models to the same recordings and compare them by AIC."""
+"""Fit competing sensorimotor models to the same recordings, for a comparison by AIC.
+
+A fit is stored as the start of its coordinates and its final unknowns: evaluating the likelihood
+once reproduces it to the last digit.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +22,13 @@ from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, drive_of
 from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
-from impc.output_feedback import profile
-from impc.output_feedback.covariance import confusion, person_covariance
-from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
+from impc.output_feedback import search
+from impc.output_feedback.fit import fit_output_feedback, person_at
 from impc.output_feedback.joint_loop import joint_loop
-from impc.output_feedback.kept import decode_model, encode_model
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.page import PersonModel, PersonReport
 from impc.output_feedback.simulation import run_joint
+from impc.output_feedback.unknowns import Request, space_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
+    from impc.output_feedback.fit import OutputFeedbackFit
 
 # Horizons in s at which predictions are evaluated; largest number of starts in a trial.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
@@ -66,49 +70,36 @@ def person_report(
     `walk` (d,); `remember` (name, compute, encode, decode).
     """
     models: list[PersonModel] = []
-    problem = found.problem
-    for name, posed, person in persons(problem, asked, walk):
-        budget = _BESIDE if models else _ASKED
-        first = replace(found, problem=posed)
+    for name, posed, person in persons(found.problem, asked, walk):
+        first, budget = replace(found, problem=posed), _BESIDE if models else _ASKED
         fit_one = functools.partial(_model, name, first, person, budget)
         decode = functools.partial(decode_model, name, posed, person)
         models.append(remember(name, fit_one, encode_model, decode))
         done(name)
-    fit = models[0].fit
-    if fit is None:
-        done("intervals of the person")
-        return _nothing(tuple(models), found, profiled=profiled)
-    covariance = person_covariance(fit)
-    levels, entries = covariance.level_intervals(fit.levels), covariance.entry_intervals(fit.K)
-    if profiled:
-        levels = profile.level_intervals(fit, covariance)
-        entries = profile.entry_intervals(fit, covariance)
+    fit, plant, none = models[0].fit, found.problem.plant, frozen(np.zeros((0, 2)))
+    report = PersonReport(
+        tuple(models), plant, found.gain, fit, None, profiled, none, none, np.nan,
+        frozen([np.nan] * len(plant.outputs)), (), frozen([[]]),
+    )  # fmt: skip
+    if fit is not None:
+        covariance = search.person_covariance(fit)
+        levels, entries = covariance.level_intervals(fit.levels), covariance.entry_intervals(fit.K)
+        if profiled:
+            levels = search.level_intervals(fit, covariance)
+            entries = search.entry_intervals(fit, covariance)
+        ahead = tuple(sorted({1 + round(time / plant.dt) for time in _AHEAD}))
+        report = replace(
+            report,
+            covariance=covariance,
+            levels=levels,
+            entries=entries,
+            confusion=search.confusion(fit),
+            whiteness=frozen(_white(fit)),
+            ahead=ahead,
+            errors=frozen(prediction_errors(fit, ahead)),
+        )
     done("intervals of the person")
-    ahead = tuple(sorted({1 + round(time / problem.plant.dt) for time in _AHEAD}))
-    return PersonReport(
-        tuple(models),
-        problem.plant,
-        found.gain,
-        fit,
-        covariance,
-        profiled,
-        levels,
-        entries,
-        confusion(fit),
-        frozen(_white(fit)),
-        ahead,
-        frozen(prediction_errors(fit, ahead)),
-    )
-
-
-def _nothing(models: tuple[PersonModel, ...], found: Estimate, *, profiled: bool) -> PersonReport:
-    """Report if the likelihood of the requested model is undefined."""
-    none = frozen(np.zeros((0, 2)))
-    plant = found.problem.plant
-    white = frozen([np.nan] * len(plant.outputs))
-    return PersonReport(
-        models, plant, found.gain, None, None, profiled, none, none, None, white, (), frozen([[]])
-    )
+    return report
 
 
 def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonModel:
@@ -116,6 +107,30 @@ def _model(name: str, first: Estimate, person: Observer, budget: int) -> PersonM
         return PersonModel(name, fit_output_feedback(first, person, max_evaluations=budget), "")
     except ImpcError as error:
         return PersonModel(name, None, str(error))
+
+
+def encode_model(model: PersonModel) -> dict[str, Any]:
+    """JSON values of a model, fitted or not."""
+    fit = model.fit
+    if fit is None:
+        return {"fit": None, "reason": model.reason}
+    names = ("theta", "unseen", "converged", "evaluations")
+    kept = fit.space.origin | {name: getattr(fit, name) for name in names}
+    values = {name: np.asarray(one).tolist() for name, one in kept.items()}
+    return {"fit": values, "reason": model.reason}
+
+
+def decode_model(
+    name: str, problem: Problem, observer: Observer, kept: dict[str, Any]
+) -> PersonModel:
+    """Rebuild the model."""
+    given = kept["fit"]
+    if given is None:
+        return PersonModel(name, None, kept["reason"])
+    space = space_at(problem, Request(observer), given)
+    place, unseen = space.at(np.array(given["theta"])), np.array(given["unseen"])
+    fit = person_at(space, place, unseen, given["converged"], given["evaluations"])
+    return PersonModel(name, fit, kept["reason"])
 
 
 def asked_observer(
@@ -171,12 +186,10 @@ def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, P
 
 def _white(fit: OutputFeedbackFit) -> Array:
     """Whiteness p-values of the standardised innovations of all trials, concatenated."""
-    lags = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt))
-    rows = []
-    for trial in fit.identified.trials:
-        deviations = np.sqrt(np.einsum("tpp->tp", trial.spreads))
-        rows.append(trial.innovations / deviations)
-    joined = np.concatenate(rows)
+    lags, trials = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt)), fit.identified.trials
+    joined = np.concatenate(
+        [one.innovations / np.sqrt(np.einsum("tpp->tp", one.spreads)) for one in trials]
+    )
     return whiteness(joined, min(lags, len(joined) - 1))
 
 

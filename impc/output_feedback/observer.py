@@ -1,4 +1,4 @@
-"""The sensorimotor model: sensed signals, sensory noise, and noise that moves the body.
+"""The sensorimotor model: sensed signals, sensory noise, noise that moves the body, the filter.
 
     body       x+ = A x + B (u + w) + E d + p,   w ~ N(0, motor^2 + (share u)^2)
                                                  p ~ N(0, process^2)
@@ -8,24 +8,32 @@
 All noise is white and independent; its standard deviations are per sample. A perturbation is known,
 dh = d, or assumed to follow d+ = r d + n with steps n of SD `walk`, and estimated:
 dh+ = r dh + L_d (s - C_s xh), with r = 1 for a random walk and a `persistence` r < 1 for one that
-decays. L is the stationary Kalman gain for plant and noise; signal-dependent noise is left out of
-it, so that it stays constant. Without sensed signals every state is observed exactly, xh = x
-(docs/why/output_feedback.md).
+decays. Without sensed signals every state is observed exactly, xh = x.
+
+L is the stationary Kalman gain; signal-dependent noise is left out, so that it stays constant. With
+w ~ N(0, Q) and e ~ N(0, R) in z+ = F z + w, y = C z + e, and P the covariance of z given earlier y,
+
+    P = F P F' + Q - L S L',    S = C P C' + R,    L = F P C' S^-1
+
+This is the regulator's equation with F', C' for A, B, and likewise stationary in L, so that its
+differential does not contain dL: with G = F - L C and dG = dF - L dC,
+
+    dP = G dP G' + dG P G' + G P dG' + dQ + L dR L'
+    dL = (dF P C' + F dP C' + F P dC' - L dS) S^-1,    dS = C dP C' + dC P C' + C P dC' + dR
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from impc.arrays import Array, as_numbers, finite_array, frozen
 from impc.checking import Value, add_value, checked, replace
-from impc.errors import InputError
+from impc.errors import InputError, SolverError
 from impc.model.combinations import linear_combination
-from impc.output_feedback.kalman import stationary_filter
+from impc.model.riccati import is_stable, lyapunov_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,12 +41,16 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from impc.model.plant import Plant
-    from impc.output_feedback.kalman import StationaryFilter
 
 add_value("Observer", "Observer(plant, ...)")
 
 #: Kinds of noise SDs, in the order of the unknowns.
 LEVELS = ("motor", "share", "process", "sensory", "walk")
+# Doublings: 2^40 samples exceed the memory of any filter that is stable in double precision.
+_DOUBLINGS = 40
+_SETTLED = 1e-16
+# Entries beyond this count as divergent; their square is still finite.
+_LARGEST = 1e100
 
 
 @dataclass(frozen=True, init=False)
@@ -158,46 +170,133 @@ class Observer(Value):
     @property
     def levels(self) -> Array:
         """All noise SDs (l,), in the order of `LEVELS`."""
-        return np.concatenate([self.level(name) for name in LEVELS])
+        return np.concatenate(self.by_kind)
+
+    @property
+    def by_kind(self) -> list[Array]:
+        """Noise SDs of each of `LEVELS`; (0,) for a walk of None."""
+        found = (getattr(self, name) for name in LEVELS)
+        return [frozen([]) if one is None else np.asarray(one) for one in found]
+
+    @property
+    def kinds(self) -> list[str]:
+        """Kind of each noise SD, length l."""
+        both = zip(LEVELS, self.by_kind, strict=True)
+        return [kind for kind, values in both for _ in values]
 
     def with_levels(self, levels: Array) -> Observer:
         """Return the same model with other noise SDs, `levels` (l,)."""
-        sizes = [len(self.level(name)) for name in LEVELS]
-        parts = np.split(levels, np.cumsum(sizes)[:-1])
+        parts = np.split(levels, np.cumsum([len(values) for values in self.by_kind])[:-1])
         found = {name: frozen(part) for name, part in zip(LEVELS, parts, strict=True)}
         return replace(self, **{**found, "walk": None if self.walk is None else found["walk"]})
 
     def names(self, plant: Plant) -> tuple[str, ...]:
         """Names of the noise SDs: kind and signal."""
         signals = (plant.controls, plant.controls, plant.states, self.sensed, plant.disturbances)
-        return tuple(
-            f"{kind} {signal}"
-            for kind, each in zip(LEVELS, signals, strict=True)
-            for signal in each[: len(self.level(kind))]
-        )
-
-    def level(self, name: str) -> Array:
-        """Noise SDs of the kind `name`, one of `LEVELS`; (0,) for a walk of None."""
-        found = getattr(self, name)
-        return frozen([]) if found is None else np.asarray(found)
+        used = zip(signals, self.by_kind, strict=True)
+        each = [signal for given, values in used for signal in given[: len(values)]]
+        return tuple(f"{kind} {signal}" for kind, signal in zip(self.kinds, each, strict=True))
 
 
-def believed_matrices(plant: Plant, person: Observer) -> tuple[Array, Array, Array, Array]:
-    """F, C, Q and R of the subject's filter: states, then unknown perturbations."""
-    unknown = person.walk is not None
-    d = plant.E.shape[1] if unknown else 0
-    F = scipy.linalg.block_diag(plant.A, np.diag(person.persistence[:d]))
-    F[: plant.n, plant.n :] = plant.E[:, :d]
-    moved = plant.B @ np.diag(person.motor**2) @ plant.B.T + np.diag(person.process**2)
-    steps = np.zeros(0) if person.walk is None else np.asarray(person.walk)
-    Q = scipy.linalg.block_diag(moved, np.diag(steps**2))
-    C = np.hstack([person.C, np.zeros((len(person.C), d))])
-    return F, C, Q, np.diag(person.sensory**2)
+class Body(NamedTuple):
+    """Matrices of a plant, or their derivatives along k directions (first axis)."""
+
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    E: Array  # (n, d)
+    C: Array  # (p, n)
+
+
+class StationaryFilter(NamedTuple):
+    """A stationary filter, or its derivatives along k directions (first axis)."""
+
+    P: Array  # (n, n), covariance of the state given all earlier outputs
+    L: Array  # (n, p), gain from an innovation to the next state
+    S: Array  # (p, p), covariance of an innovation
 
 
 def believed_filter(plant: Plant, person: Observer) -> StationaryFilter:
     """Stationary filter of a subject who estimates."""
     return stationary_filter(*believed_matrices(plant, person))
+
+
+def believed_matrices(
+    plant: Plant | Body, person: Observer, levels: Sequence[Array] | None = None
+) -> tuple[Array, Array, Array, Array]:
+    """F, C, Q and R of the subject's filter: states, then unknown perturbations.
+
+    `levels`: other noise SDs, in the order of `LEVELS`; arrays may have k directions as first axis.
+    """
+    motor, _, process, sensory, walk = person.by_kind if levels is None else levels
+    n, d = plant.A.shape[-1], walk.shape[-1]
+    state, push = np.split(np.eye(n + d), [n], axis=1)
+    F = state @ plant.A @ state.T + state @ plant.E[..., :d] @ push.T
+    F = F + push @ np.diag(person.persistence[:d]) @ push.T
+    Q = state @ moving_noise(plant.B, motor, process) @ state.T
+    Q = Q + push @ diagonal(walk**2) @ push.T
+    return F, person.C @ state.T, Q, diagonal(sensory**2)
+
+
+def moving_noise(B: Array, motor: Array, process: Array) -> Array:
+    """Covariance (n, n) of motor and process noise."""
+    return np.asarray(B @ diagonal(motor**2) @ np.swapaxes(B, -1, -2) + diagonal(process**2))
+
+
+def diagonal(values: Array) -> Array:
+    """Diagonal matrices (..., a, a) from rows (..., a)."""
+    return np.asarray(values[..., None] * np.eye(values.shape[-1]))
+
+
+def stationary_filter(F: Array, C: Array, Q: Array, R: Array) -> StationaryFilter:
+    """Solve the Riccati equation by doubling (Anderson 1978), insensitive to scaling.
+
+    `F` (n, n); `C` (p, n); `Q` (n, n); `R` (p, p).
+    """
+    try:
+        P = _doubled(F, C, Q, R)
+        S = C @ P @ C.T + R
+        L = np.linalg.solve(S, C @ P @ F.T).T
+    except np.linalg.LinAlgError:
+        raise _no_filter() from None
+    if not is_stable(F - L @ C, discrete=True):
+        raise _no_filter()
+    return StationaryFilter(P, np.asarray(L), S)
+
+
+def _doubled(F: Array, C: Array, Q: Array, R: Array) -> Array:
+    eye = np.eye(len(F))
+    A, G, P = F.T, C.T @ np.linalg.solve(R, C), np.array(Q)
+    for _ in range(_DOUBLINGS):
+        if not (np.max(np.abs(A)) < _LARGEST and np.max(np.abs(P)) < _LARGEST):
+            raise _no_filter()
+        left = np.linalg.solve((eye + G @ P).T, A.T).T  # A (I + G P)^-1
+        change = A.T @ P @ np.linalg.solve(eye + G @ P, A)
+        A, G, P = left @ A, G + left @ G @ A.T, P + (change + change.T) / 2
+        if np.max(np.abs(change)) <= _SETTLED * np.max(np.abs(P)):
+            break
+    return P
+
+
+def filter_changes(
+    found: StationaryFilter, given: tuple[Array, Array], changes: Sequence[Array]
+) -> StationaryFilter:
+    """Derivatives of a filter of `given` F and C along the k `changes` of F, C, Q and R."""
+    (F, C), (P, L, S), (dF, dC, dQ, dR) = given, found, changes
+    turned = (dF - L @ dC) @ P @ (F - L @ C).T
+    dP = lyapunov_series(F - L @ C, turned + turned.transpose(0, 2, 1) + dQ + L @ dR @ L.T)
+    seen = dC @ P @ C.T
+    dS = C @ dP @ C.T + seen + seen.transpose(0, 2, 1) + dR
+    product = dF @ P @ C.T + F @ dP @ C.T + F @ P @ dC.transpose(0, 2, 1) - L @ dS
+    dL = np.linalg.solve(S.T, product.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return StationaryFilter(dP, np.asarray(dL), dS)
+
+
+def _no_filter() -> SolverError:
+    return SolverError(
+        "observer",
+        "has no stationary Kalman filter: a mode that does not decay is unobserved or noise-free",
+        "add a signal to `sensed`, or set motor or process noise above zero",
+    )
 
 
 def _sensed_rows(plant: Plant, sensed: Sequence[str]) -> Array:

@@ -12,15 +12,15 @@ import pandas as pd
 from impc.arrays import Array, Frozen
 from impc.control.simulation import Status
 from impc.inverse.regulator_span import kept_to
-from impc.output_feedback.profile import FARTHEST
+from impc.output_feedback.search import FARTHEST
 from impc.reporting.document import Block, Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.shown_units import shown_unit, signal_name
 
 if TYPE_CHECKING:
     from impc.model.plant import Plant
-    from impc.output_feedback.covariance import Confusion, PersonCovariance
     from impc.output_feedback.fit import OutputFeedbackFit
+    from impc.output_feedback.search import PersonCovariance
 
 # A noise SD counts as identified if its 95 % interval ends within a factor of ten.
 _IDENTIFIED = np.log(10)
@@ -79,7 +79,7 @@ class PersonReport(Frozen):
     # 95 % intervals of the gain entries (entries, 2); if profiled, all by profile, and NaN where an
     # entry is not individually identified
     entries: Array
-    confusion: Confusion | None  # combination of gain and noise that is distinguished least
+    confusion: float  # largest correlation of gain and noise; NaN without a fit
     whiteness: Array  # (p,), p-values of whiteness of the innovations of each output
     ahead: tuple[int, ...]  # prediction horizons in samples
     errors: Array  # (k, p), root-mean-square prediction errors, in the outputs' units
@@ -103,9 +103,9 @@ class PersonReport(Frozen):
     def sentences(self) -> list[str]:
         """Findings as sentences."""
         asked, fit, entries = self.models[0], self.fit, np.array(self.entries)
-        if fit is None or self.confusion is None:
+        if fit is None:
             return [f"No model with noise in senses or muscles could be fitted: {asked.reason}."]
-        found, together = [self._compared()], self.confusion.correlation
+        found, together = [self._compared()], self.confusion
         if len(entries):
             count = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
             loose = " The search did not converge: do not report these gains." * (not fit.converged)
@@ -149,7 +149,7 @@ class PersonReport(Frozen):
         """Entry of result.json."""
         fit = self.fit
         found: dict[str, Any] = {"models": [item.data() for item in self.models]}
-        if fit is None or self.confusion is None:
+        if fit is None:
             return found
         return found | {
             "K": fit.K,
@@ -164,7 +164,7 @@ class PersonReport(Frozen):
                     fit.space.names, fit.levels, self.levels, strict=True
                 )
             },
-            "confusion": self.confusion.correlation,
+            "confusion": self.confusion,
             "whiteness": self.whiteness,
             "ahead": self.ahead,
             "errors_ahead": self.errors,

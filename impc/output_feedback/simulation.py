@@ -1,12 +1,9 @@
-"""Simulate a trial of a subject with noisy senses under the constrained controller.
-
-The system is that of `joint_loop` with all bounds; samples run in compiled code.
-"""
+"""Simulate a trial of a subject with noisy senses: `joint_loop` with all bounds, compiled."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -35,7 +32,6 @@ if TYPE_CHECKING:
 
     from impc.control.closed_loop import PreparedLoop
     from impc.control.controller import Controller
-    from impc.output_feedback.joint_loop import JointLoop
     from impc.output_feedback.observer import Observer
 
 
@@ -55,6 +51,14 @@ class PersonTrial(Frozen):
         return int(np.count_nonzero(self.status <= Status.SOFTENED))
 
 
+class _Trace(NamedTuple):
+    """What a simulation writes."""
+
+    z: Buffer  # (steps + 1, z)
+    u: Buffer  # (steps, m)
+    status: Buffer  # (steps,)
+
+
 @checked(steps=(1, 10_000_000))
 def simulate_person(
     controller: Controller,
@@ -68,24 +72,22 @@ def simulate_person(
     seed: Any = 0,
 ) -> PersonTrial:
     """Simulate one trial; `recorder` noise SDs (p,); `x0` (n,)."""
-    plant = controller.plant
+    plant, m = controller.plant, controller.plant.m
     given = scenario(plant, np.zeros(plant.n) if x0 is None else x0, steps, disturbance, target)
     rng, p = np.random.default_rng(seed), len(plant.outputs)
     white = finite_array("recorder", np.full(p, recorder, dtype=np.float64), (p,))
     joint = joint_loop(plant, person, white)
-    at = plant.n if person.estimates else 0
-    size, (m, n) = len(joint.F), controller.K.shape
-    start = _root(joint.P0) @ rng.standard_normal(size)
-    start[at : at + n] += given.x0
-    noise = rng.standard_normal((given.steps, size)) @ _root(joint.Q).T
+    at = slice(plant.n, 2 * plant.n) if person.estimates else slice(0, plant.n)
+    start = _root(joint.P0) @ rng.standard_normal(len(joint.F))
+    start[at] += given.x0
+    noise = rng.standard_normal((given.steps, len(joint.F))) @ _root(joint.Q).T
     shared = rng.standard_normal((given.steps, m))
     law = prepare_loop(controller, directions(controller, 0), whole=True)
     aim = aim_of(controller, given, law.along)
     pushes = np.array(given.disturbance)
     z, u, status = run_joint(law, joint, start, pushes, aim, (noise, shared))
-    z = z[:-1]
-    estimates = z[:, at : at + plant.n]
-    states = estimates + z[:, : plant.n] if person.estimates else estimates
+    estimates = z[:-1, at]
+    states = estimates + z[:-1, : plant.n] if person.estimates else estimates
     outputs = states @ plant.C.T + white * rng.standard_normal((len(u), p))
     return PersonTrial(frozen(outputs), frozen(states), frozen(estimates), frozen(u), status)
 
@@ -97,29 +99,17 @@ def run_joint(
     disturbance: Array,
     aim: Aim,
     noise: tuple[Array, Array],
-) -> tuple[Array, Array, np.ndarray[tuple[int], np.dtype[np.int8]]]:
+) -> _Trace:
     """Simulate states of plant and estimate, and commands, for given noise samples."""
     steps, (m, n) = len(disturbance), law.controller.K.shape
     z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
     z[0] = start
-    status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
-    reached = run_person(
-        law.matrices,
-        law.matrix_directions,
-        law.rows,
-        law.row_directions,
-        law.unit,
-        joint,
-        0 if len(start) == n else n,
-        disturbance,
-        aim,
-        *noise,
-        z,
-        u,
-        status,
-    )
+    trace = _Trace(z, u, np.full(steps, Status.NOT_REACHED, dtype=np.int8))
+    parts = law.matrices, law.matrix_directions, law.rows, law.row_directions, law.unit
+    at = 0 if len(start) == n else n
+    reached = _run(*parts, joint, at, (disturbance, *noise), aim, trace)
     z[reached + 1 :], u[reached:] = z[reached], u[max(reached - 1, 0)]
-    return z, u, status
+    return trace
 
 
 def _root(covariance: Array) -> Array:
@@ -129,7 +119,7 @@ def _root(covariance: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def run_person(
+def _run(
     loop: LoopMatrices,
     dloop: LoopMatrices,
     rows: Rows,
@@ -137,16 +127,12 @@ def run_person(
     unit: Buffer,
     joint: JointLoop,
     at: int,
-    disturbance: Buffer,
+    driven: tuple[Buffer, Buffer, Buffer],
     aim: Aim,
-    noise: Buffer,
-    shared: Buffer,
-    z: Buffer,
-    u: Buffer,
-    status: Buffer,
+    trace: _Trace,
 ) -> int:
-    """Simulate from z[0] with given noise samples, without derivatives."""
-    n = loop.K.shape[1]
+    """Simulate from z[0]; `driven`: disturbance, noise, and noise in proportion to commands."""
+    (z, u, status), (disturbance, noise, shared), n = trace, driven, loop.K.shape[1]
     work = workspace(rows, drows, u.shape[1])
     lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
     for t in range(len(u)):

@@ -15,9 +15,8 @@ from impc.control.controller import Controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.structure import Structure
-from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.profile import level_interval
+from impc.output_feedback.search import level_interval, person_covariance
 from impc.output_feedback.simulation import simulate_person
 from tests.support import nelder_mead
 
@@ -65,7 +64,7 @@ def test_what_a_follower_senses_is_found() -> None:
     levels = follower.fit.levels
     found = dict(zip(follower.fit.space.names, levels, strict=True))
     identified = person_covariance(follower.fit, "expected")
-    deviations = dict(zip(identified.names, identified.levels, strict=True))
+    deviations = dict(zip(follower.fit.space.names, identified.levels, strict=True))
     assert follower.offset == pytest.approx(OFFSET, abs=1.5)
     for name, (value, near) in LEVELS.items():
         assert abs(np.log(found[name] / value)) < min(near, 3.5 * deviations[name]), name
@@ -81,7 +80,7 @@ def test_the_interval_of_an_sd_near_zero_ends_at_the_profile_fall() -> None:
     fit = fitted().fit
     index = fit.space.own + fit.space.names.index("recorder error")
     value = float(np.log(level_interval(fit, index - fit.space.own)[0]))
-    prior = fit.prior.freed(np.eye(len(fit.theta))[index])
+    prior = fit.space.freed(np.eye(len(fit.theta))[index])
 
     def lower(rest: np.ndarray) -> float:
         place = prior.tried(np.insert(rest, index, value))

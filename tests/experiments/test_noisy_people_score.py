@@ -8,8 +8,8 @@ import pytest
 from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import Score, above_truth, blind, score
 from impc.inverse.methods import fit
-from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import fit_output_feedback
+from impc.output_feedback.search import person_covariance
 
 pytestmark = pytest.mark.full
 
@@ -46,7 +46,7 @@ def test_on_the_seat_the_gain_is_found_if_least_squares_is_far_off() -> None:
     assert found.space.gain == 5
     np.testing.assert_allclose(found.K[0, :4], truth[0, :4], rtol=0.2)
     # The final prior is centred at a gain less than half a whitened unit away.
-    assert np.linalg.norm((np.array(found.theta) - found.prior.center)[:5]) < 0.5
+    assert np.linalg.norm((np.array(found.theta) - found.space.center)[:5]) < 0.5
     covariance = person_covariance(found)
     z = (np.array(found.K) - truth)[0] / np.array(covariance.entries)[0]
     assert np.all(np.abs(z[:4]) < 1.96)

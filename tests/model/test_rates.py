@@ -18,7 +18,7 @@ from impc.control.simulation import Scenario, Status
 from impc.inverse.methods import METHODS
 from impc.inverse.residuals import residual_only
 from impc.model.bounds import bound_rows
-from impc.output_feedback.likelihood import _unclipped
+from impc.output_feedback.likelihood import unclipped
 from tests.control.test_closed_loop import check_jacobian
 from tests.support import random_plant, random_weights
 
@@ -187,7 +187,7 @@ def test_limits_of_changes_are_not_those_of_commands() -> None:
     np.testing.assert_allclose(found, slope, rtol=0, atol=1e-6 * np.max(np.abs(slope)))
     cut_off = METHODS["clipped_lqr"].restrict(problem).bounds
     np.testing.assert_array_equal(cut_off.x_max, law.bounds.x_max)
-    inner, clip = _unclipped(prepare_loop(law, impc.directions(law, 0)))
+    inner, clip = unclipped(prepare_loop(law, impc.directions(law, 0)))
     names = bound_rows(law.bounds, law.plant).names
     now = {names[k] for k in inner.rows.family[inner.rows.stage == 0]}
     assert (clip.used, now) == (True, {"u0 <= 0.25875", "u0 >= -0.207"})

@@ -1,7 +1,9 @@
-"""Maximum likelihood fits: noise-free limit, derivatives, a known subject, cost weights."""
+"""Maximum likelihood fits: no noise, derivatives, a known subject, cost weights, storage."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace as replaced
 
@@ -14,79 +16,89 @@ from impc.arrays import Array
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import ImpcError, InputError, SolverError
-from impc.inverse.estimates import Estimate
 from impc.inverse.methods import fit
-from impc.inverse.problem import Problem
 from impc.inverse.search import refine_gain
-from impc.model.bounds import Bounds
+from impc.inverse.structured import fit_structured
 from impc.model.plant import Plant
-from impc.model.recordings import Recording
+from impc.model.plant_family import PlantFamily
 from impc.model.structure import Structure
-from impc.model.weights import Weights
 from impc.output_feedback import likelihood
-from impc.output_feedback.covariance import person_covariance
 from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
+from impc.output_feedback.models import decode_model, encode_model
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.search import unseen_slope
-from impc.output_feedback.simulation import simulate_person
+from impc.output_feedback.page import PersonModel
+from impc.output_feedback.search import person_covariance, reml_slope
+from impc.output_feedback.unknowns import NoisyUnknowns
+from tests.output_feedback.fits import cart, fitted, law, least_squares, posed
 from tests.support import extrapolated_slope
 
 pytestmark = pytest.mark.full
 
 
-def cart() -> Plant:
-    system = control.ss(
-        [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
-        states=["x", "v"], inputs=["u", "d"], outputs=["x"],
-    )  # fmt: skip
-    return Plant(system, ["u"])
+def unknowns() -> NoisyUnknowns:
+    """Gain, initial states of both trials, and noise SDs, at the start of a search."""
+    person, first = least_squares("limited")
+    return fit_output_feedback(first, person, max_evaluations=1).space
 
 
-def posed(person: Observer, recorder: float, limit: float, trials: int = 2) -> Problem:
-    plant = cart()
-    bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    weights = Weights(np.diag([8.0, 1.0]), 1)
-    law = Controller(plant, weights, bounds, 5, terminal_set=False)
-    rng, recordings = np.random.default_rng(3), []
-    for seed in range(trials):
-        push = np.repeat(rng.choice([-0.7, 0.0, 0.7], 40), 10)
-        found = simulate_person(law, person, push, recorder=recorder, seed=seed)
-        assert found.reached == len(push)
-        recordings.append(Recording(plant, found.outputs, push))
-    return Problem(plant, bounds, 5, recordings, terminal_set=False, unknown_start=True)
-
-
-@pytest.fixture(scope="module")
-def noisy() -> tuple[Observer, Estimate]:
-    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    return person, fit(posed(person, 0.01, 0.9))
-
-
-@pytest.fixture(scope="module")
-def fitted(noisy: tuple[Observer, Estimate]) -> OutputFeedbackFit:
-    return fit_output_feedback(noisy[1], noisy[0])
-
-
-def test_the_gradient_is_that_of_the_likelihood(noisy: tuple[Observer, Estimate]) -> None:
-    """Along gain, initial states of both trials, and noise SDs together."""
-    space = fit_output_feedback(noisy[1], noisy[0], max_evaluations=1).space
-    identified = space.identified(space.start)
-    assert identified.value == pytest.approx(space.value(space.start), rel=1e-12)
-    for step in np.random.default_rng(1).normal(size=(3, len(space.start))):
+def check_slope(value: Callable[[Array], float], gradient: Array, theta: Array) -> None:
+    for step in np.random.default_rng(1).normal(size=(2, len(theta))):
 
         def moved(t: float, step: Array = step) -> Array:
-            return np.array([space.value(space.start + t * step)])
+            return np.array([value(theta + t * step)])
 
-        slope = extrapolated_slope(moved, 1e-3)
-        assert identified.gradient @ step == pytest.approx(slope[0], rel=1e-6)
+        slope = extrapolated_slope(moved, 1e-3)[0]
+        assert gradient @ step == pytest.approx(slope, rel=1e-6)
+
+
+def unknowns_with_a_free_parameter() -> NoisyUnknowns:
+    """The same, and friction, on which the subject's filter depends as well."""
+
+    def make(values: Array) -> Plant:
+        system = control.ss(
+            [[1, 0.05], [0, 1 - float(values[0])]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
+            states=["x", "v"], inputs=["u", "d"], outputs=["x"],
+        )  # fmt: skip
+        return Plant(system, ["u"])
+
+    first = least_squares("limited")[1]
+    family = PlantFamily(make, ["friction"], [0.02])
+    posed = replace(first.problem, family=family, logarithms=np.zeros(1))
+    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02, walk=0.2)
+    return fit_output_feedback(replace(first, problem=posed), person, max_evaluations=1).space
+
+
+@pytest.mark.parametrize("make", [unknowns, unknowns_with_a_free_parameter])
+def test_the_gradient_is_that_of_likelihood_and_prior(make: Callable[[], NoisyUnknowns]) -> None:
+    space = make()
+    identified = space.identified(space.start)
+    assert identified.value == pytest.approx(space.value(space.start), rel=1e-12)
+    check_slope(space.value, identified.gradient, space.start)
+    check_slope(space.log_prior, space.slopes(space.start)[0], space.start)
+
+
+def test_the_barrier_is_how_far_noise_drives_the_loop() -> None:
+    """Against a sum over all samples after a push; its gradient against differences."""
+    space = unknowns()
+    theta = space.start + np.array([0.1, -0.2, *np.zeros(len(space.start) - 2)])
+    plant, T = space.space.problem.plant, space.space.T
+    closed = plant.A - plant.B @ space.unpack(theta)[0].K
+    column, total = plant.B @ space.space.G, 0.0
+    for _ in range(3000):  # the slowest mode has 0.9
+        total += float(np.sum(np.linalg.solve(T, column) ** 2))
+        column = closed @ column
+    value, gradient = space.noise_growth(theta)
+    assert value == pytest.approx(np.log(total / plant.n), rel=1e-9)
+    check_slope(lambda at: space.noise_growth(at)[0], gradient, theta)
+    assert space.noise_growth(space.start - 100 * (np.arange(len(theta)) < 2))[0] == np.inf
 
 
 def test_trials_side_by_side_say_what_they_say_one_after_the_other(
-    noisy: tuple[Observer, Estimate], monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem = posed(noisy[0], 0.01, 0.9, trials=6)
-    found = replaced(noisy[1], problem=problem)
-    space = fit_output_feedback(found, noisy[0], max_evaluations=1).space
+    person, first = least_squares("limited")
+    found = replaced(first, problem=posed(person, 0.01, 0.9, 6))
+    space = fit_output_feedback(found, person, max_evaluations=1).space
     beside = [space.identified(space.start) for _ in range(5)]
     monkeypatch.setattr(likelihood, "ThreadPoolExecutor", lambda _: ThreadPoolExecutor(1))
     alone = space.identified(space.start)
@@ -96,73 +108,35 @@ def test_trials_side_by_side_say_what_they_say_one_after_the_other(
             assert_array_equal(ours, theirs)
 
 
-def test_a_person_is_found_and_told_better_than_without_the_noise(
-    noisy: tuple[Observer, Estimate], fitted: OutputFeedbackFit
-) -> None:
-    person, first = noisy
-    truth = Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), first.problem.bounds, 5).K
-    assert fitted.converged
-    np.testing.assert_allclose(fitted.observer.motor, person.motor, rtol=0.2)
-    np.testing.assert_allclose(fitted.recorder, 0.01, rtol=0.1)
-    np.testing.assert_allclose(fitted.K, truth, rtol=0.15)
+def test_a_person_is_found_and_told_better_than_without_the_noise() -> None:
+    found, (person, _) = fitted("limited"), least_squares("limited")
+    assert found.converged
+    np.testing.assert_allclose(found.observer.motor, person.motor, rtol=0.2)
+    np.testing.assert_allclose(found.recorder, 0.01, rtol=0.1)
+    np.testing.assert_allclose(found.K, law(0.9).K, rtol=0.15)
     # With prior and REML term, the gradient is zero to 0.1 standard errors.
-    slope, bend = fitted.prior.slopes(np.array(fitted.theta))
-    unseen = unseen_slope(fitted.prior, fitted.prior.at(np.array(fitted.theta)))
-    gradient = fitted.identified.gradient + slope + unseen
-    assert gradient @ np.linalg.solve(fitted.identified.information + bend, gradient) < 1e-2
+    space, theta = found.space, np.array(found.theta)
+    slope, bend = space.slopes(theta)
+    gradient = found.identified.gradient + slope + reml_slope(space, space.at(theta))
+    assert gradient @ np.linalg.solve(found.identified.information + bend, gradient) < 1e-2
 
 
-def test_the_barrier_is_how_far_noise_drives_the_loop(noisy: tuple[Observer, Estimate]) -> None:
-    """Against a sum over all samples after a push; its gradient against differences."""
-    space = fit_output_feedback(noisy[1], noisy[0], max_evaluations=1).space
-    theta = space.start + np.array([0.1, -0.2, *np.zeros(len(space.start) - 2)])
-    plant, T = space.space.problem.plant, space.space.T
-    closed = plant.A - plant.B @ space.unpack(theta).point.K
-    column, total = plant.B @ space.space.G, 0.0
-    for _ in range(3000):  # the slowest mode has 0.9
-        total += float(np.sum(np.linalg.solve(T, column) ** 2))
-        column = closed @ column
-    value, gradient = space.noise_growth(theta)
-    assert value == pytest.approx(np.log(total / plant.n), rel=1e-9)
-    for step in np.random.default_rng(1).normal(size=(2, len(theta))):
-
-        def moved(t: float, step: Array = step) -> Array:
-            return np.array([space.noise_growth(theta + t * step)[0]])
-
-        assert gradient @ step == pytest.approx(extrapolated_slope(moved, 1e-3)[0], rel=1e-6)
-    assert space.noise_growth(space.start - 100 * (np.arange(len(theta)) < 2))[0] == np.inf
-
-
-def test_a_level_of_zero_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
-    seeing = fit_output_feedback(noisy[1], Observer(cart(), motor=0.4))
+def test_a_level_that_is_zero_or_known_is_not_searched() -> None:
+    person, first = least_squares("limited")
+    seeing = fit_output_feedback(first, Observer(cart(), motor=0.4))
     assert seeing.observer.share[0] == 0
     assert np.all(seeing.observer.process == 0)
-    assert seeing.space.names == ["motor u", "recorder x"]
-
-
-def test_a_level_that_is_known_is_not_searched(noisy: tuple[Observer, Estimate]) -> None:
-    held = fit_output_feedback(noisy[1], noisy[0], held=["sensory"])
-    assert held.observer.sensory[0] == noisy[0].sensory[0]
-    assert held.space.names == ["motor u", "recorder x"]
-    free = fit_output_feedback(noisy[1], noisy[0])
+    held, free = fit_output_feedback(first, person, held=["sensory"]), fitted("limited")
+    assert held.observer.sensory[0] == person.sensory[0]
+    assert held.space.names == seeing.space.names == ["motor u", "recorder x"]
     assert free.count == held.count + 1
     assert 0 <= free.log_likelihood - held.log_likelihood < 4  # chi-squared with 1 d.o.f.
-    with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
-        fit_output_feedback(noisy[1], noisy[0], held=["noise"])
-
-
-def test_a_trial_of_which_nothing_is_told_is_refused(noisy: tuple[Observer, Estimate]) -> None:
-    """All samples would be conditioned on, and the fit would be the prior."""
-    with pytest.raises(InputError, match="counted: got 400, but the shortest trial has 400"):
-        fit_output_feedback(noisy[1], noisy[0], counted=400)
 
 
 @pytest.mark.parametrize("logarithm", [400.0, -400.0, 1000.0, np.nan])
-def test_a_level_that_cannot_be_squared_has_no_likelihood(
-    fitted: OutputFeedbackFit, logarithm: float
-) -> None:
+def test_a_level_that_cannot_be_squared_has_no_likelihood(logarithm: float) -> None:
     """Regression: a profile reached such an SD along its ridge, with a warning of numpy."""
-    space = fitted.space
+    space = fitted("limited").space
     theta = space.start.copy()
     theta[space.own] = logarithm
     for said in (space.identified, space.value):
@@ -172,8 +146,7 @@ def test_a_level_that_cannot_be_squared_has_no_likelihood(
 
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
     """W, V -> 0: the same gain to 1e-6, if neither has a prior."""
-    problem = posed(Observer(cart()), 0.01, 0.9)
-    found = fit(problem)
+    found = fit(posed(Observer(cart()), 0.01, 0.9))
     least = refine_gain(found.problem, np.array(found.gain), np.array(found.metric))
     start = replace(found, K=least.K, problem=least.problem)
     tiny = Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
@@ -185,34 +158,56 @@ def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
 
 
 @pytest.mark.parametrize(("along", "units"), [(0, 3.0), (1, 3.0), (1, 5.0)])
-def test_a_gain_that_cannot_be_the_persons_is_left_behind(
-    noisy: tuple[Observer, Estimate], fitted: OutputFeedbackFit, along: int, units: float
-) -> None:
+def test_a_gain_that_cannot_be_the_persons_is_left_behind(along: int, units: float) -> None:
     """Regression: started 3 whitened units away, a search ended at 10 times the gain."""
-    far = np.array(noisy[1].gain) + units * fitted.space.space.gains[along]
-    found = fit_output_feedback(replaced(noisy[1], K=far), noisy[0])
+    near, (person, first) = fitted("limited"), least_squares("limited")
+    far = np.array(first.gain) + units * near.space.space.gains[along]
+    found = fit_output_feedback(replaced(first, K=far), person)
     assert found.converged
-    deviations = np.array(person_covariance(fitted, "expected").entries)
-    assert np.all(np.abs(np.array(found.K) - fitted.K) < 0.1 * deviations)
+    deviations = np.array(person_covariance(near, "expected").entries)
+    assert np.all(np.abs(np.array(found.K) - near.K) < 0.1 * deviations)
 
 
-def test_prices_of_a_structure_are_searched() -> None:
-    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    given = posed(person, 0.01, 0.9)
-    problem = Problem(
-        given.plant, given.bounds, 5, given.recordings, terminal_set=False, unknown_start=True,
-        structure=Structure(given.plant, ["x", "v"]),
-    )  # fmt: skip
-    found = fit_output_feedback(fit(problem, "structured"), person)
+def test_what_cannot_be_estimated_is_an_error() -> None:
+    person, first = least_squares("limited")
+    with pytest.raises(ImpcError, match="no start has a likelihood"):
+        fit_output_feedback(first, Observer(cart(), ["v"], sensory=0.1, motor=0.4))
+    with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
+        fit_output_feedback(first, person, held=["noise"])
+    # All samples would be conditioned on, and the fit would be the prior.
+    with pytest.raises(InputError, match="counted: got 400, but the shortest trial has 400"):
+        fit_output_feedback(first, person, counted=400)
+
+
+def test_prices_of_a_structure_are_searched_and_stored() -> None:
+    person, first = least_squares("limited")
+    structure = Structure(cart(), ["x", "v"])
+    problem = replace(first.problem, structure=structure)
+    found = fit_output_feedback(fit_structured(problem, structure, first), person)
     assert found.cost_weights is not None
     assert found.converged
-    weights = found.problem.structure.weights(found.cost_weights)  # type: ignore[union-attr]
-    law = Controller(given.plant, weights, given.bounds, 5, terminal_set=False)
-    np.testing.assert_allclose(law.K, found.K, rtol=1e-9)
+    weights = structure.weights(found.cost_weights)
+    there = Controller(cart(), weights, first.problem.bounds, 5, terminal_set=False)
+    np.testing.assert_allclose(there.K, found.K, rtol=1e-9)
     # In two trials of 20 s cost weights are known to within a factor of two.
     assert np.all(np.abs(np.array(found.cost_weights) - np.log([8.0, 1.0])) < 1.0)
+    check_stored(found)
 
 
-def test_what_cannot_be_estimated_is_an_error(noisy: tuple[Observer, Estimate]) -> None:
-    with pytest.raises(ImpcError, match="no start has a likelihood"):
-        fit_output_feedback(noisy[1], Observer(cart(), ["v"], sensory=0.1, motor=0.4))
+def test_a_stored_fit_is_the_one_that_was_fitted() -> None:
+    check_stored(fitted("limited"))
+
+
+def check_stored(fit: OutputFeedbackFit) -> None:
+    kept = json.loads(json.dumps(encode_model(PersonModel("one", fit, ""))))
+    again = decode_model("one", fit.problem, fit.space.request.observer, kept).fit
+    assert again is not None
+    for name in ("K", "S", "recorder", "theta", "unseen"):
+        assert_array_equal(getattr(again, name), getattr(fit, name))
+    assert (again.value, again.log_likelihood) == (fit.value, fit.log_likelihood)
+    assert (again.converged, again.evaluations) == (fit.converged, fit.evaluations)
+    assert_array_equal(again.problem.starts, fit.problem.starts)
+    ours, theirs = person_covariance(again), person_covariance(fit)
+    assert_array_equal(ours.entries, theirs.entries)
+    assert_array_equal(ours.levels, theirs.levels)
+    assert np.all(np.isfinite(ours.entries))

@@ -1,33 +1,33 @@
-"""Competing sensorimotor models, and predictions against those of the plant alone."""
+"""Competing sensorimotor models, stored when interrupted, and predictions of the filter."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from impc.inverse.methods import fit
 from impc.model.structure import Structure
-from impc.output_feedback.covariance import person_covariance
-from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.models import person_report, prediction_errors
 from impc.output_feedback.observer import Observer
+from impc.output_feedback.page import PersonModel
+from impc.output_feedback.search import person_covariance
+from impc.studies.fit.memory import open_memory
+from impc.studies.fit.settings import FitSettings
 from tests.inverse.test_regulator_span import late_body, late_problem
-from tests.output_feedback.test_fit import cart, posed
+from tests.output_feedback.fits import cart, fitted, least_squares, posed
+from tests.output_feedback.test_fit import check_stored
 
 pytestmark = pytest.mark.full
 
 
-@pytest.fixture(scope="module")
-def fitted() -> OutputFeedbackFit:
-    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    return fit_output_feedback(fit(posed(person, 0.01, 3.0)), person)
-
-
-def test_errors_ahead_are_those_that_the_filter_expects(fitted: OutputFeedbackFit) -> None:
+def test_errors_ahead_are_those_that_the_filter_expects() -> None:
     """One sample ahead they are the innovations; far ahead they grow to the noise in the loop."""
-    ahead = (1, 5, 20)
-    errors = prediction_errors(fitted, ahead)
-    identified = np.concatenate([trial.innovations for trial in fitted.identified.trials])
+    fit = fitted("vague")
+    errors = prediction_errors(fit, (1, 5, 20))
+    identified = np.concatenate([trial.innovations for trial in fit.identified.trials])
     # A hundred starts in each of two trials: 5 % of a deviation, twice.
     np.testing.assert_allclose(errors[0], np.sqrt(np.mean(identified**2, axis=0)), rtol=0.12)
     assert errors[0] < errors[1] < errors[2]
@@ -35,28 +35,28 @@ def test_errors_ahead_are_those_that_the_filter_expects(fitted: OutputFeedbackFi
 
 def test_without_limit_and_perturbation_there_are_three_models() -> None:
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    found = fit(posed(person, 0.01, np.inf, trials=1))
-    report = person_report(found, person, np.zeros(0))
+    report = person_report(fit(posed(person, 0.01, np.inf, 1)), person, np.zeros(0))
     assert [item.name for item in report.models] == [
         "estimates, perturbation known",
         "sees every state, noise in the loop",
         "sees every state, noise in the recorder alone",
     ]
     # Recording noise alone is the special case of noise in the loop without motor noise.
-    fits = [item.fit for item in report.models]
-    assert fits[1] is not None
-    assert fits[2] is not None
-    assert fits[1].log_likelihood > fits[2].log_likelihood
-    assert fits[1].count == fits[2].count + 1
+    _, loop, quiet = (item.fit for item in report.models)
+    assert loop is not None
+    assert quiet is not None
+    assert loop.log_likelihood > quiet.log_likelihood
+    assert loop.count == quiet.count + 1
 
 
 def test_who_cannot_estimate_has_a_reason() -> None:
     asked = Observer(cart(), ["v"], motor=0.15, sensory=0.02)
-    found = fit(posed(Observer(cart()), 0.01, np.inf, trials=1))
-    report = person_report(found, asked, np.zeros(0))
+    report = person_report(fit(posed(Observer(cart()), 0.01, np.inf, 1)), asked, np.zeros(0))
     assert report.models[0].fit is None
     assert "no stationary Kalman filter" in report.models[0].reason
     assert report.covariance is None
+    assert report.models[0].reason in report.sentences()[0]
+    assert report.data().keys() == {"models"}
 
 
 def test_a_structure_is_set_beside_any_gain() -> None:
@@ -73,3 +73,37 @@ def test_a_structure_is_set_beside_any_gain() -> None:
     assert -0.5 < free.log_likelihood - kept.log_likelihood < 6
     assert report.covariance is not None
     assert np.all(report.covariance.entries < person_covariance(free).entries)
+    check_stored(kept)
+
+
+def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> None:
+    """`test_subject.py` has checkpoints of the other parts of a fit."""
+    person, found = least_squares("limited")
+    settings = FitSettings(horizon=5, u_max=0.9)
+    stopped, computed = "sees every state, noise in the loop", []
+
+    def interrupt(name: str) -> None:
+        if name == stopped:
+            raise KeyboardInterrupt
+
+    whole = person_report(found, person, np.zeros(0))
+    memory = open_memory(tmp_path, found.problem, settings)
+    with pytest.raises(KeyboardInterrupt):
+        person_report(found, person, np.zeros(0), done=interrupt, remember=memory.part)
+    again = open_memory(tmp_path, found.problem, settings)
+
+    def counted(name: str, compute: Any, encode: Any, decode: Any) -> PersonModel:
+        def counting() -> PersonModel:
+            computed.append(name)
+            model: PersonModel = compute()
+            return model
+
+        model: PersonModel = again.part(name, counting, encode, decode)
+        return model
+
+    report = person_report(found, person, np.zeros(0), remember=counted)
+    names = [model.name for model in whole.models]
+    assert computed == names[names.index(stopped) + 1 :] != []
+    np.testing.assert_array_equal(report.entries, whole.entries)
+    np.testing.assert_array_equal(report.levels, whole.levels)
+    assert [one.criterion for one in report.models] == [one.criterion for one in whole.models]
