@@ -203,10 +203,11 @@ class WeightProfiles:
     def _end(self, line: _Line, quantile: float) -> float:
         """Value at which D crosses the quantile along a line, or infinity.
 
-        The approximation is recomputed at the end found, until the end stays between a point with
-        smaller and one with larger D. Divergence and a missing Riccati solution count as larger.
+        The approximation is recomputed at its own crossing until that stays; a crossing outside the
+        points with smaller and larger D is replaced by their midpoint. Divergence and a missing
+        Riccati solution count as larger.
         """
-        inside, outside = line.cost_weights, None
+        near, inside, outside = _STAYS * abs(line.step), line.cost_weights, None
         end, there = self._passing(self.near, line, line.cost_weights, quantile)
         for _ in range(_ROUNDS):
             before, form = end, self._form(there)
@@ -215,14 +216,16 @@ class WeightProfiles:
                 distance, there = self._distance(form, line.row, line.at(there), there)
                 more = distance > quantile
                 end, further = self._passing(form, line, there, quantile)
+                if end == before or abs(end - before) < near:
+                    break
             inside, outside = (inside, there) if more else (there, outside)
             if further is None or not line.between(inside, end, outside):
                 assert outside is not None
                 further = _middle(inside, outside)
                 end = line.at(further)
+                if abs(end - before) < near:
+                    break
             there = further
-            if end == before or abs(end - before) < _STAYS * abs(line.step):
-                break
         return end
 
     def _form(self, cost_weights: Array) -> NearFit | None:
