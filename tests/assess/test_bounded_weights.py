@@ -8,7 +8,7 @@ import pytest
 from experiments.benchmarks.workloads import Workload, chain_of_masses, example, seat
 from impc.arrays import Array
 from impc.assess.bounded_weights import WeightsSet, entry_ranges, linear_ranges, weights_set
-from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
+from impc.assess.intent_statements import pair_statements, widest_dominant_angle
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.errors import InputError
@@ -107,16 +107,15 @@ def test_statements_agree_with_sampled_members() -> None:
     found = set_of(example(), 1.5)
     sizes, names = np.array([1.0, 3.0]), found.fibre.plant.states
     sampled = random_members(found, 300)
-    for statement, values in (
-        (order_statements(found, sizes, names)[0], [X[0, 0] - 9 * X[1, 1] for X in sampled]),
-        (sense_statements(found, sizes, names, entry_ranges(found))[0], [X[0, 1] for X in sampled]),
-    ):
+    statements = pair_statements(found, sizes, names, entry_ranges(found))
+    order, sense = [X[0, 0] - 9 * X[1, 1] for X in sampled], [X[0, 1] for X in sampled]
+    for statement, values in zip(statements, (order, sense), strict=True):
         signs = {bool(value > 0) for value in values}
         if statement.holds is None:
             assert signs == {True, False}
         else:
             assert signs == {statement.holds}
-    assert order_statements(found, sizes, names)[0].holds is False
+    assert statements[0].holds is False
 
 
 def test_widest_angle_is_at_least_that_of_sampled_members() -> None:
