@@ -172,11 +172,8 @@ def _intervals(
     for i, j in itertools.permutations(np.flatnonzero(at.moving[: len(structure.labels)]), 2):
         shift = 2 * float(np.log(sizes[i] / sizes[j]))
         if at.cost_weights[i] - at.cost_weights[j] + shift >= 0:  # larger cost first
-            found = profiles.interval(rows[i] - rows[j])
-            moved = WeightInterval(
-                found.value + shift, found.low + shift, found.high + shift, found.level
-            )
-            ratios.append(Ratio(structure.labels[i], structure.labels[j], moved))
+            found = profiles.interval(rows[i] - rows[j]).shifted(shift)
+            ratios.append(Ratio(structure.labels[i], structure.labels[j], found))
     return intervals, tuple(ratios)
 
 

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-import scipy.special
 import scipy.stats
 
 from impc.arrays import Array
@@ -39,17 +38,21 @@ _END = 1e-2
 _STAYS, _ROUNDS = 0.05, 13
 # D without a Riccati solution.
 _HUGE = 1e12
+_QUANTILE = float(scipy.stats.chi2.ppf(LEVEL, 1))
 
 
 @dataclass(frozen=True)
 class WeightInterval:
-    """Interval of a log cost weight or of the log ratio of two."""
+    """95 % interval of a log cost weight or of the log ratio of two."""
 
     value: float  # Logarithm at the fit; minus infinity: cost weight zero
     # Ends of the logarithm; minus infinity if the cost weight may be zero
     low: float
     high: float
-    level: float  # Confidence level between 0 and 1
+
+    def shifted(self, by: float) -> WeightInterval:
+        """Interval of the logarithm plus a constant."""
+        return WeightInterval(self.value + by, self.low + by, self.high + by)
 
     def holds(self, value: float) -> bool:
         """Whether a logarithm `value` lies in the interval."""
@@ -65,44 +68,38 @@ class WeightProfiles:
         self.variance = at.noise**2 * samples / max(samples - covariance.rank, 1)
         self.base = at.quadratic.least(np.array(at.cost_weights), every)[0]
 
-    def interval(self, combination: Array, level: float = LEVEL) -> WeightInterval:
+    def interval(self, combination: Array) -> WeightInterval:
         """Interval of a'z for a `combination` a (count,)."""
         deviation, wider = self.covariance.spread(combination)
-        quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
+        quantile = _QUANTILE * wider**2
         moving, cost_weights = self.at.moving, np.array(self.at.cost_weights)
         value = float(combination[moving] @ cost_weights[moving])
         if not np.isfinite(deviation):
-            return WeightInterval(value, -np.inf, np.inf, level)
+            return WeightInterval(value, -np.inf, np.inf)
         step = min(max(deviation, 1e-9), 1.0)
         low, high = (
             self._end(_Line(combination, cost_weights, value, sign * step), quantile)
             for sign in (-1.0, 1.0)
         )
-        return WeightInterval(value, low, high, level)
+        return WeightInterval(value, low, high)
 
-    def zero(self, index: int, level: float = LEVEL) -> WeightInterval:
+    def zero(self, index: int) -> WeightInterval:
         """Interval of a cost weight `index` that is zero at the fit: only an upper end."""
         near = np.array(self.at.cost_weights)
         near[index] = self._smallest_seen(index)
         line = _Line(np.eye(len(near))[index], near, float(near[index]), 0.5)
-        high = self._end(line, float(scipy.stats.chi2.ppf(level, 1)))
-        return WeightInterval(-np.inf, -np.inf, high, level)
+        return WeightInterval(-np.inf, -np.inf, self._end(line, _QUANTILE))
 
-    def unknowns(self, level: float = LEVEL) -> tuple[WeightInterval, ...]:
+    def unknowns(self) -> tuple[WeightInterval, ...]:
         """Interval of each unknown; a normal one if products of features have cost weights."""
         structure, found = self.at.structure, self.covariance
         if structure.coupled or structure.input_coupled:
-            half = scipy.special.ndtri(0.5 + level / 2) * found.each
-            values = zip(found.values, found.values - half, found.values + half, strict=True)
-            return tuple(
-                WeightInterval(float(value), float(low), float(high), level)
-                for value, low, high in values
-            )
+            half = np.sqrt(_QUANTILE) * found.each
+            ends = np.column_stack([found.values, found.values - half, found.values + half])
+            return tuple(WeightInterval(*one) for one in ends.tolist())
+        rows = enumerate(zip(np.eye(structure.count), self.at.moving, strict=True))
         return tuple(
-            self.interval(row, level) if moving else self.zero(index, level)
-            for index, (row, moving) in enumerate(
-                zip(np.eye(structure.count), self.at.moving, strict=True)
-            )
+            self.interval(row) if moving else self.zero(index) for index, (row, moving) in rows
         )
 
     def _smallest_seen(self, index: int) -> float:
