@@ -113,40 +113,36 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     ends of the ranges of the largest costs, Frank-Wolfe steps increase the angle (the derivative of
     an eigenvector is linear in Q, so that each step is one program).
     """
-    n = found.fibre.plant.n
+    n, least = found.fibre.plant.n, found.least.weights
     if n == 1:  # a single state
-        return 0.0, found.least.weights
+        return 0.0, least
     D = np.diag(np.asarray(sizes, dtype=np.float64))
-    centre = dominant_direction(D @ found.least.weights.Q @ D)
-    largest = np.argsort(-np.diag(D @ found.least.weights.Q @ D))[:2]
-    starts = [found.least.weights.block]
+    centre = _dominant(D @ least.Q @ D)
+
+    def angle(X: Array) -> float:
+        return _angle(centre, _dominant(D @ X[:n, :n] @ D))
+
+    def climbed(X: Array) -> Array:
+        """Frank-Wolfe: along segments to the members that are extreme in the gradient."""
+        for _ in range(_FRANK_WOLFE):
+            gradient = np.zeros_like(X)
+            gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
+            end = linear_maxima(found, gradient[None])[0].weights.block
+            segment = [X + share * (end - X) for share in np.linspace(0.0, 1.0, 21)]
+            best = int(np.argmax([angle(Y) for Y in segment]))
+            if best == 0:
+                break
+            X = segment[best]
+        return X
+
+    largest = np.argsort(-np.diag(D @ least.Q @ D))[:2]
     directions = np.zeros((len(largest), *found.first.shape))
     directions[np.arange(len(largest)), largest, largest] = 1.0
+    starts = [least.block]
     for ends in linear_ranges(found, directions):
         starts += [ends.least.weights.block, ends.most.weights.block]
-    best_angle, best = 0.0, found.least.weights.block
-    for start in starts:
-        X = _frank_wolfe(found, D, centre, start)
-        angle = angle_between(centre, dominant_direction(D @ X[:n, :n] @ D))
-        if angle > best_angle:
-            best_angle, best = angle, X
-    return best_angle, type(found.least.weights)(best[:n, :n], best[n:, n:])
-
-
-def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Array:
-    """Increase the angle to the centre's direction along segments to extreme members."""
-    n, X = found.fibre.plant.n, start
-    for _ in range(_FRANK_WOLFE):
-        gradient = np.zeros_like(X)
-        gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
-        end = linear_maxima(found, gradient[None])[0].weights.block
-        segment = [X + share * (end - X) for share in np.linspace(0.0, 1.0, 21)]
-        angles = [angle_between(centre, dominant_direction(D @ Y[:n, :n] @ D)) for Y in segment]
-        best = int(np.argmax(angles))
-        if best == 0:
-            break
-        X = segment[best]
-    return X
+    best = max(map(climbed, starts), key=angle)
+    return angle(best), Weights(best[:n, :n], best[n:, n:])
 
 
 def _turning(Q: Array, centre: Array) -> Array:
@@ -161,12 +157,12 @@ def _turning(Q: Array, centre: Array) -> Array:
     return np.asarray((gradient + gradient.T) / 2)
 
 
-def dominant_direction(Q: Array) -> Array:
-    """The eigenvector (n,) of the largest eigenvalue of a symmetric matrix (n, n)."""
+def _dominant(Q: Array) -> Array:
+    """Eigenvector (n,) of the largest eigenvalue of a symmetric matrix (n, n)."""
     return np.asarray(np.linalg.eigh((Q + Q.T) / 2)[1][:, -1])
 
 
-def angle_between(one: Array, other: Array) -> float:
+def _angle(one: Array, other: Array) -> float:
     """Angle between two directions (n,) of either sign, degrees."""
     return float(np.degrees(np.arccos(min(1.0, abs(float(one @ other))))))
 
@@ -284,5 +280,5 @@ def _reading(rule: str, weights: Weights, before: list[Reading]) -> Reading:
     values, vectors = np.linalg.eigh(scaled.Q)
     largest = np.argmax(np.abs(vectors), axis=0)
     vectors = vectors * np.sign(vectors[largest, np.arange(len(values))])
-    angle = angle_between(before[0].dominant, vectors[:, -1]) if before else 0.0
+    angle = _angle(before[0].dominant, vectors[:, -1]) if before else 0.0
     return Reading(rule, scaled, condition_number(scaled), frozen(values), frozen(vectors), angle)
