@@ -139,6 +139,23 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
     np.testing.assert_allclose(ends(small), wanted, rtol=0.02)
 
 
+def test_a_product_of_commands_makes_intervals_normal() -> None:
+    """Two carts with a cross weight of their forces: the unknowns are factors, not logarithms."""
+    plant = carts(2)
+    structure, bounds = Structure(plant, "diagonal", "full"), Bounds(plant, u_min=-1, u_max=1)
+    unknowns = np.append(np.zeros(structure.count - 1), 0.3)
+    push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 2)), 10, axis=0)
+    law = Controller(plant, structure.weights(unknowns), bounds, 8, terminal_set=False)
+    trial = Recording(plant, law.simulate(np.zeros(4), disturbance=push).outputs[:-1], push)
+    problem = Problem(plant, bounds, 8, [trial], terminal_set=False, structure=structure)
+    found = expected_intervals(problem, unknowns, NOISE)
+    assert np.all(np.isfinite(found.deviations))
+    ends = np.array([[item.value, item.low, item.high] for item in found.intervals])
+    values = structure.reported(unknowns)[0][:, None]
+    wanted = values + 1.959964 * np.outer(found.deviations, [0.0, -1.0, 1.0])
+    np.testing.assert_allclose(ends, wanted, atol=1e-6)
+
+
 def known_to(uncertainty: dict[str, float | str]) -> Expectation:
     """Cart with stated uncertainties of force per command and rate of falling."""
 
