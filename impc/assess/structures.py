@@ -26,6 +26,7 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.assessments import evaluate_method
 from impc.assess.covariance import IDENTIFIED
 from impc.assess.long_run_covariance import residual_noise
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
@@ -34,11 +35,9 @@ from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
     residuals_of,
-    vaf,
 )
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
-from impc.control.closed_loop import simulate
-from impc.inverse.problem import EXPLAINED, recorded_size, scenarios
+from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.structured_fit import feature_sizes, structured_estimate
 from impc.inverse.structured_search import search_from
 from impc.model.riccati import solve_lqr
@@ -113,9 +112,7 @@ def assess_structure(
     at = tangent(structure, there, cost_weights)
     covariance = weight_covariance(at)
     sizes = feature_sizes(there, structure, np.array(found.gain), np.array(found.metric))
-    runs = [simulate(found.controller(), drive) for drive in scenarios(there)]
-    u = np.concatenate([run.applied for run in runs]) @ structure.input_features[0]
-    recorded = np.concatenate([trial.without_offset for trial in there.recordings])
+    own = evaluate_method(found, there.bounds)
     started = problem.at(there.starts, there.logarithms, there.shifts)
 
     def fit_without(index: int) -> Estimate:
@@ -131,12 +128,12 @@ def assess_structure(
         found,
         "",
         frozen(sizes),
-        float(np.mean(u**2)),
+        float(np.mean((own.commands @ structure.input_features[0]) ** 2)),
         covariance,
         intervals,
         ratios,
         structure_test(at),
-        frozen(vaf(recorded, np.concatenate([run.x @ there.plant.C.T for run in runs]))),
+        own.vaf,
         frozen(np.mean(left, axis=0) if left else nothing),
         criterion_of(found, innovation_roots(near), int(np.count_nonzero(covariance.identified))),
     )
