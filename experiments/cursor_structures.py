@@ -22,10 +22,9 @@ from tqdm import tqdm
 from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
-from impc.assess.long_run_covariance import residual_noise
 from impc.assess.structured_weights import tangent
 from impc.assess.structures import StructureFit, assess_structure, criterion_of
-from impc.assess.variance_accounted_for import left_out_vaf, residuals_of, vaf
+from impc.assess.variance_accounted_for import innovation_roots, left_out_vaf, vaf
 from impc.assess.weight_profiles import WeightProfiles
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
@@ -127,7 +126,7 @@ def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
         held.append(left_out_vaf(other, problem.recordings[index], 1.0).vaf)
     at = near.problem, np.array(near.gain), np.array(near.metric)
     identified = int(np.count_nonzero(gain_covariance(*at).identified))
-    roots = np.asarray(residual_noise(residuals_of(near, near.problem)).root)
+    roots = innovation_roots(near)
     nothing = float("nan")
     return StructureRow(
         blur, "any weights", "", False, nothing, 0, float(vaf(recorded, simulated)[0]),

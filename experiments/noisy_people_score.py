@@ -167,8 +167,8 @@ def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
     """The true subject in the coordinates of the fit, shape (q,)."""
     space = likely.space
     own, theta = space.space, np.array(space.start)
-    truth = own.natural(np.array(who.controller.K))
-    theta[: space.gain] = np.tensordot(own.natural(own.gains), truth, 2)
+    truth = space.gain_law.natural(np.array(who.controller.K))
+    theta[: space.gain] = np.tensordot(space.gain_law.natural(space.gain_law.gains), truth, 2)
     starts = np.array([trial.x0 for trial in own.problem.recordings])
     theta[space.shared : space.after] = np.ravel(-np.linalg.solve(own.own_unit, starts.T).T)
     levels = np.concatenate([who.person.levels, who.recorder])
@@ -180,8 +180,8 @@ def _steps(
     likely: OutputFeedbackFit, covariance: PersonCovariance, truth: Array
 ) -> list[tuple[float, float]]:
     own, space = likely.space.space, likely.space
-    error = own.natural(np.array(likely.K) - truth)
-    along = np.tensordot(own.natural(own.gains), error, 2)
+    error = space.gain_law.natural(np.array(likely.K) - truth)
+    along = np.tensordot(space.gain_law.natural(space.gain_law.gains), error, 2)
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])
 
 

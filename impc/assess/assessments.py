@@ -20,11 +20,11 @@ from impc.model.plant import Plant
 from impc.model.weights import condition_number
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
     from impc.model.bounds import Bounds
+    from impc.model.recordings import Recording
 
 
 @dataclass(frozen=True)
@@ -64,24 +64,25 @@ class MethodFit(Frozen):
 
 def evaluate_method(estimate: Estimate, bounds: Bounds) -> MethodFit:
     """Simulate all recordings with an estimate."""
-    problem = estimate.problem
-    if estimate.K is None:
-        return _without_gain(estimate, bounds)
-    runs = estimate.simulations
-    commands = np.concatenate([run.applied for run in runs])
+    problem, runs = estimate.problem, () if estimate.K is None else estimate.simulations
+    plant, trials, p = problem.plant, problem.recordings, len(problem.plant.outputs)
+    commands = np.concatenate([np.empty((0, plant.m)), *(run.applied for run in runs)])
     beyond = (commands > bounds.u_max + 1e-6 * np.abs(bounds.u_max)) | (
         commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)
     )
+    largest = np.max(np.abs(commands), axis=0, initial=0.0) if runs else np.full(plant.m, np.nan)
+    each = [_simulated_vaf(plant, (one,), (run,)) for one, run in zip(trials, runs, strict=False)]
     return MethodFit(
         estimate,
         bounds,
         runs,
-        frozen(_pooled_vaf(problem, runs)),
-        frozen([_trial_vaf(problem, index, run) for index, run in enumerate(runs)]),
-        frozen(np.empty((0, len(problem.plant.outputs)))),
-        frozen(np.max(np.abs(commands), axis=0, initial=0.0)),
+        frozen(_simulated_vaf(plant, trials, runs) if runs else np.full(p, np.nan)),
+        frozen(each or np.full((len(trials), p), np.nan)),
+        frozen(np.empty((0, p))),
+        frozen(largest),
         float(np.count_nonzero(np.any(beyond, axis=1)) / max(len(commands), 1)),
-        tuple(None if run.complete else run.reached * problem.plant.dt for run in runs),
+        tuple(None if run.complete else run.reached * plant.dt for run in runs)
+        or (None,) * len(trials),
     )
 
 
@@ -90,35 +91,14 @@ def estimate_vaf(estimate: Estimate) -> Array:
     return evaluate_method(estimate, estimate.problem.bounds).vaf
 
 
-def _without_gain(estimate: Estimate, bounds: Bounds) -> MethodFit:
-    plant, count = estimate.problem.plant, len(estimate.problem.recordings)
-    p = len(plant.outputs)
-    return MethodFit(
-        estimate,
-        bounds,
-        (),
-        frozen(np.full(p, np.nan)),
-        frozen(np.full((count, p), np.nan)),
-        frozen(np.empty((0, p))),
-        frozen(np.full(plant.m, np.nan)),
-        0.0,
-        (None,) * count,
-    )
-
-
-def _trial_vaf(problem: Problem, index: int, run: Simulation) -> Array:
-    trial = problem.recordings[index]
-    if not run.complete:
-        return np.full(len(problem.plant.outputs), np.nan)
-    return vaf(trial.corrected, run.x @ problem.plant.C.T)
-
-
-def _pooled_vaf(problem: Problem, runs: tuple[Simulation, ...]) -> Array:
+def _simulated_vaf(plant: Plant, trials: Sequence[Recording], runs: Sequence[Simulation]) -> Array:
+    """VAF (3.24) over trials (p,), NaN if a simulation stops early."""
     if not all(run.complete for run in runs):
-        return np.full(len(problem.plant.outputs), np.nan)
-    recorded = np.concatenate([trial.corrected for trial in problem.recordings])
-    simulated = np.concatenate([run.x @ problem.plant.C.T for run in runs])
-    return vaf(recorded, simulated)
+        return np.full(len(plant.outputs), np.nan)
+    return vaf(
+        np.concatenate([trial.corrected for trial in trials]),
+        np.concatenate([run.x @ plant.C.T for run in runs]),
+    )
 
 
 @dataclass(frozen=True)

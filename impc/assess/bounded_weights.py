@@ -163,10 +163,7 @@ def linear_ranges(
 ) -> tuple[Range, ...]:
     """Range over the set of trace(direction X) for `directions` (k, n + m, n + m)."""
     ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
-    half = len(directions)
-    return tuple(
-        Range(low, _negative(high)) for low, high in zip(ends[:half], ends[half:], strict=True)
-    )
+    return tuple(map(Range, ends[: len(directions)], map(_negative, ends[len(directions) :])))
 
 
 @checked(directions="* n+m n+m")
@@ -174,7 +171,7 @@ def linear_maxima(
     found: WeightsSet, directions: Array, *, tolerance: float = _GAP
 ) -> tuple[End, ...]:
     """Largest value over the set of each trace(direction X)."""
-    return tuple(_negative(end) for end in _minima(found, -directions, tolerance))
+    return tuple(map(_negative, _minima(found, -directions, tolerance)))
 
 
 @checked
@@ -193,15 +190,16 @@ def entry_ranges(
 
 def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]:
     """Members of least trace(direction X), for directions (k, n + m, n + m)."""
-    ends = [_same_for_all(found, direction) for direction in directions]
+    constants = np.tensordot(directions, found.first, 2)
     slopes = np.tensordot(directions, found.level, ([1, 2], [1, 2]))
     scales = np.linalg.norm(slopes, axis=1)
+    # Where the slope is zero the function is constant, or the set has a single member.
+    ends = [End(one, found.least.weights, functools.partial(float, one)) for one in constants]
     identified = np.flatnonzero(scales)
-    if len(identified) == 0:  # constant, or a single member
+    if len(identified) == 0:
         return ends
-    objectives = np.pad(slopes[identified] / scales[identified, None], ((0, 0), (0, 1)))
     each = solve_each(
-        objectives,
+        np.pad(slopes[identified] / scales[identified, None], ((0, 0), (0, 1))),
         found.cones,
         reach=np.full(len(found.level) + 1, found.reach),
         tolerance=tolerance,
@@ -211,18 +209,13 @@ def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]
         ends[index] = End(
             float(np.sum(directions[index] * X)),
             split_blocks(X, found.fibre.plant.n),
-            functools.partial(_bound, ends[index].value, float(scales[index]), solved),
+            functools.partial(_bound, float(constants[index]), float(scales[index]), solved),
         )
     return ends
 
 
 def _negative(end: End) -> End:
     return End(-end.value, end.weights, lambda: -end.bound)
-
-
-def _same_for_all(found: WeightsSet, direction: Array) -> End:
-    constant = float(np.sum(direction * found.first))
-    return End(constant, found.least.weights, lambda: constant)
 
 
 def _bound(constant: float, scale: float, solved: SemidefiniteSolution) -> float:

@@ -31,7 +31,7 @@ from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED, determined
 from impc.inverse.laws import metric_directions
 from impc.inverse.problem import noise_of_residual
-from impc.inverse.refit import IDENTIFIED as IDENTIFIED
+from impc.inverse.refit import IDENTIFIED
 from impc.inverse.residuals import evaluate, residual_only, residual_or_reason, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
 

@@ -18,13 +18,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.special
 
 from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.input_limits import on_limit
 from impc.assess.long_run_covariance import ResidualNoise
-from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
 from impc.checking import checked, replace
@@ -169,7 +167,7 @@ def expected_intervals(
     K, S = np.array(at.solution.K), np.array(at.solution.S)
     return Expectation(
         found,
-        _intervals(at, found),
+        WeightProfiles(at, found).unknowns(),
         gain_covariance(scaled, K, S, lambda _trials, _lost: coloured, curvature=True, scale=1.0),
         frozen(_limits(at, coloured)),
         _body_share(at, coloured),
@@ -199,19 +197,6 @@ def _body_share(at: Tangent, colour: ResidualNoise) -> BodyShare | None:
         frozen(_deviations(at, colour, noise=_NO_NOISE)),
         tuple(names[place] for place in places),
         frozen([_deviations(at, colour, place) for place in places]),
-    )
-
-
-def _intervals(at: Tangent, found: WeightCovariance) -> tuple[WeightInterval, ...]:
-    rows = np.eye(at.structure.count)
-    if not at.structure.coupled:
-        profiles = WeightProfiles(at, found)
-        return tuple(profiles.interval(row) for row in rows)
-    ends = -scipy.special.ndtri((1 - LEVEL) / 2) * np.asarray(found.each)
-    values = np.asarray(found.values)
-    return tuple(
-        WeightInterval(float(value), float(value - end), float(value + end), LEVEL)
-        for value, end in zip(values, ends, strict=True)
     )
 
 

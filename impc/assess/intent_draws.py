@@ -1,7 +1,6 @@
-"""Draw gains within the uncertainty of the fit, and check statements for each.
+"""Draw gains within the uncertainty of the fit.
 
-A statement over all weights with *the* fitted gain ignores the uncertainty of that gain. Here gains
-are drawn, each of weights X = L exp(D) L', where LL' = blkdiag(Q, R) is the fit:
+Each drawn gain is that of weights X = L exp(D) L', where LL' = blkdiag(Q, R) is the fit:
 
     log p(D) = -1/2 sum_i (d_i' vec(G^-1 (K(X) - K) T) / s_i)^2 - 1/2 |D|^2 / ln(10)^2 + const
 
@@ -9,34 +8,24 @@ K is the estimate (`gain_estimate`), d_i, s_i, G and T those of its `GainCovaria
 term limits unidentified directions to weights of the same order of magnitude. Sampling is
 elliptical slice sampling (Murray, Adams and MacKay 2010) about the linearised posterior, so that
 the curvature of K(X) counts.
-
-The range of 39 draws covers the next one in 38 of 40 cases (95 %). A statement is supported if it
-holds for all weights with the fitted gain and with at least 38 of the 39 drawn gains.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-from impc.assess.bounded_weights import linear_maxima, linear_ranges, weights_set
-from impc.assess.intent_statements import weight_direction
-from impc.checking import replace
-from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import block_basis
-from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import gain_gradients, solve_lqr
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from impc.assess.covariance import GainCovariance
-    from impc.assess.intent_statements import Statement
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
 
@@ -49,32 +38,8 @@ _STEPS = 6
 # Convergence of P: the next doubling would add the square of this share.
 _ENOUGH = 1e-9
 _DOUBLINGS = 60
-# Tolerance of the programs for a drawn gain: the range of 39 draws is itself approximate.
-_ROUGH = 1e-6
 # Least standard error in whitened units: exact data are limited by rounding and search.
 _SHARPEST = 1e-6
-
-
-@dataclass(frozen=True)
-class WeightRange:
-    """Cost of a typical excursion of a state, d^2 Q_ii at trace R = m."""
-
-    state: str  # Name of the state
-    low: float  # Over all weights with the fitted gain, in units of the cost
-    high: float
-    low_drawn: float  # Over all weights with any drawn gain: 95 %
-    high_drawn: float
-
-
-@dataclass(frozen=True)
-class DrawnSet:
-    """Weights of a drawn gain, and what holds for all of them."""
-
-    # Member of least condition number; None if the programs fail
-    least: Weights | None
-    # Least and largest cost of a typical excursion of each requested state
-    cost_weights: tuple[tuple[float, float], ...]
-    agrees: tuple[bool, ...]  # Whether each requested statement also holds here
 
 
 def drawn_gains(
@@ -134,67 +99,6 @@ def _directions(
     _, _, moving = np.linalg.svd(derivative, full_matrices=False)
     left, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
     return np.tensordot(rows, np.tensordot(moving, basis, 1), 1), left, values
-
-
-def with_confidence(
-    statements: tuple[Statement, ...], sets: tuple[DrawnSet, ...]
-) -> tuple[Statement, ...]:
-    """Statements with the share of drawn gains for which they hold too."""
-    shares = np.mean([one.agrees for one in sets], axis=0)
-    return tuple(
-        item if item.holds is None else replace(item, confidence=float(share))
-        for item, share in zip(statements, shares, strict=True)
-    )
-
-
-def weights_over_gains(
-    own: Mapping[str, tuple[float, float]], sets: tuple[DrawnSet, ...]
-) -> tuple[WeightRange, ...]:
-    """Costs of some states over the weights of the fitted gain and of all drawn gains."""
-    result = []
-    for position, (name, (low, high)) in enumerate(own.items()):
-        ends = [one.cost_weights[position] for one in sets]
-        widest = min([low, *(end[0] for end in ends)]), max([high, *(end[1] for end in ends)])
-        result.append(WeightRange(name, low, high, *widest))
-    return tuple(result)
-
-
-def set_of_gain(
-    plant: Plant,
-    solution: LqrSolution,
-    metrics: Array,
-    ratio: float,
-    sizes: Array,
-    states: tuple[str, ...],
-    statements: tuple[Statement, ...],
-) -> DrawnSet:
-    """Evaluate the statements for all weights of a drawn gain; `metrics` (k, m, m)."""
-    tried = [item for item in statements if item.holds is not None]
-    try:
-        own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
-        # Rough solutions suffice: only the extent of the set is needed.
-        found = weights_set(gain_fibre(plant, solution.K, own), ratio, rough=True)
-        penalised = np.array([weight_direction(plant, sizes, name) for name in states])
-        ranges = linear_ranges(found, penalised, tolerance=_ROUGH)
-        against = np.array([_against(item, plant, sizes) for item in tried])
-        most = linear_maxima(found, against, tolerance=_ROUGH) if tried else ()
-    except (WeightsError, SolverError):
-        return DrawnSet(None, ((0.0, np.inf),) * len(states), (False,) * len(statements))
-    holding = iter([end.value < 0 for end in most])
-    agrees = tuple(item.holds is not None and next(holding) for item in statements)
-    return DrawnSet(found.least.weights, tuple((one.low, one.high) for one in ranges), agrees)
-
-
-def _against(item: Statement, plant: Plant, sizes: Array) -> Array:
-    """Linear function that is negative for every member if the statement holds."""
-    if item.kind == "order":
-        direction = weight_direction(plant, sizes, item.first)
-        direction -= weight_direction(plant, sizes, item.second)
-    else:
-        i, j = plant.states.index(item.first), plant.states.index(item.second)
-        direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
-        direction[i, j] = direction[j, i] = sizes[i] * sizes[j] / 2
-    return -direction if item.holds else direction
 
 
 def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:

@@ -36,13 +36,11 @@ if TYPE_CHECKING:
 
     from impc.assess.bounded_weights import Range, WeightsSet
     from impc.model.plant import Plant
-    from impc.model.weights import Weights
-
 
 _FRANK_WOLFE = 12
 # A range that ends this close to zero, relative to its width, leaves the sign undecided.
 _TOUCHES = 1e-6
-# 38 of 39 draws, see `intent_draws`.
+# 38 of 39 draws, see `weights_ranges`.
 _AGREE = 38 / 39 - 1e-9
 
 
@@ -52,14 +50,13 @@ class Statement:
 
     first: str  # Names of the states
     second: str
-    says: str  # Statement in words
     holds: bool | None  # True or False if all members agree; otherwise None
     # Range of the linear function whose sign decides, over the cost of `first` in the member of
     # least condition number
     low: float
     high: float
     kind: str  # "order" or "sense"
-    # Share of the drawn gains for which it holds too (`intent_draws`); None if not checked
+    # Share of the drawn gains for which it holds too (`weights_ranges`); None if not checked
     confidence: float | None = None
 
     @property
@@ -68,49 +65,44 @@ class Statement:
         return self.confidence is not None and self.confidence >= _AGREE
 
 
-def weight_direction(plant: Plant, sizes: Array, state: str) -> Array:
-    """Linear function trace(. blkdiag(Q, R)) giving the cost of a state (n + m, n + m)."""
-    index = plant.states.index(state)
-    direction = np.zeros((plant.n + plant.m, plant.n + plant.m))
-    direction[index, index] = sizes[index] ** 2
-    return direction
+def statement_function(plant: Plant, sizes: Array, kind: str, first: str, second: str) -> Array:
+    """Linear function of blkdiag(Q, R) that is positive if a statement holds (n + m, n + m)."""
+    i, j = plant.states.index(first), plant.states.index(second)
+    function = np.zeros((plant.n + plant.m, plant.n + plant.m))
+    if kind == "order":
+        function[i, i], function[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
+    else:
+        function[i, j] = function[j, i] = sizes[i] * sizes[j] / 2
+    return function
 
 
-def order_statements(
-    found: WeightsSet, sizes: Array, states: tuple[str, ...]
-) -> tuple[Statement, ...]:
-    """Whether one state costs more than another, for every pair of the given states."""
-    names = found.fibre.plant.states
-    pairs = list(itertools.combinations(states, 2))
-    if not pairs:
-        return ()
-    cost_weights = {name: weight_direction(found.fibre.plant, sizes, name) for name in states}
-    directions = np.array([cost_weights[one] - cost_weights[other] for one, other in pairs])
-    statements = []
-    for (one, other), ends in zip(pairs, linear_ranges(found, directions), strict=True):
-        says = f"a typical {one} costs more than a typical {other}"
-        span = (ends.least.bound, ends.most.bound)  # no member goes beyond
-        size = sizes[names.index(one)]
-        statements.append(_statement(found, span, one, other, says, size, "order"))
-    return tuple(statements)
-
-
-def sense_statements(
+def pair_statements(
     found: WeightsSet,
     sizes: Array,
     states: tuple[str, ...],
     ranges: Mapping[tuple[int, int], Range],
 ) -> tuple[Statement, ...]:
-    """Whether equal signs of two states cost more (Q_ij > 0); `sizes` (n,)."""
-    names = found.fibre.plant.states
-    statements = []
-    for one, other in itertools.combinations(states, 2):
-        i, j = names.index(one), names.index(other)
-        ends, scale = ranges[max(i, j), min(i, j)], sizes[i] * sizes[j]
-        says = f"{one} and {other} of the same sign cost more than of opposite signs"
-        span = (scale * ends.least.bound, scale * ends.most.bound)
-        statements.append(_statement(found, span, one, other, says, sizes[i], "sense"))
-    return tuple(statements)
+    """Order and sense of every pair of the given states; `ranges` are those of Q_ij."""
+    plant, pairs = found.fibre.plant, list(itertools.combinations(states, 2))
+    if not pairs:
+        return ()
+
+    def statement(kind: str, pair: tuple[str, str], ends: Range, scale: float) -> Statement:
+        low, high = scale * ends.least.bound, scale * ends.most.bound  # no member goes beyond
+        touches = _TOUCHES * max(abs(low), abs(high))
+        holds = True if low > touches else False if high < -touches else None
+        index = plant.states.index(pair[0])
+        unit = float(found.least.weights.Q[index, index] * sizes[index] ** 2)
+        return Statement(*pair, holds, low / unit, high / unit, kind)
+
+    functions = np.array([statement_function(plant, sizes, "order", *pair) for pair in pairs])
+    order = zip(pairs, linear_ranges(found, functions), strict=True)
+    places = [tuple(plant.states.index(name) for name in pair) for pair in pairs]
+    sense = [(ranges[max(i, j), min(i, j)], float(sizes[i] * sizes[j])) for i, j in places]
+    return (
+        *(statement("order", pair, ends, 1.0) for pair, ends in order),
+        *(statement("sense", pair, *own) for pair, own in zip(pairs, sense, strict=True)),
+    )
 
 
 def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weights]:
@@ -121,40 +113,36 @@ def widest_dominant_angle(found: WeightsSet, sizes: Array) -> tuple[float, Weigh
     ends of the ranges of the largest costs, Frank-Wolfe steps increase the angle (the derivative of
     an eigenvector is linear in Q, so that each step is one program).
     """
-    n = found.fibre.plant.n
+    n, least = found.fibre.plant.n, found.least.weights
     if n == 1:  # a single state
-        return 0.0, found.least.weights
+        return 0.0, least
     D = np.diag(np.asarray(sizes, dtype=np.float64))
-    centre = dominant_direction(D @ found.least.weights.Q @ D)
-    largest = np.argsort(-np.diag(D @ found.least.weights.Q @ D))[:2]
-    starts = [found.least.weights.block]
+    centre = _dominant(D @ least.Q @ D)
+
+    def angle(X: Array) -> float:
+        return _angle(centre, _dominant(D @ X[:n, :n] @ D))
+
+    def climbed(X: Array) -> Array:
+        """Frank-Wolfe: along segments to the members that are extreme in the gradient."""
+        for _ in range(_FRANK_WOLFE):
+            gradient = np.zeros_like(X)
+            gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
+            end = linear_maxima(found, gradient[None])[0].weights.block
+            segment = [X + share * (end - X) for share in np.linspace(0.0, 1.0, 21)]
+            best = int(np.argmax([angle(Y) for Y in segment]))
+            if best == 0:
+                break
+            X = segment[best]
+        return X
+
+    largest = np.argsort(-np.diag(D @ least.Q @ D))[:2]
     directions = np.zeros((len(largest), *found.first.shape))
     directions[np.arange(len(largest)), largest, largest] = 1.0
+    starts = [least.block]
     for ends in linear_ranges(found, directions):
         starts += [ends.least.weights.block, ends.most.weights.block]
-    best_angle, best = 0.0, found.least.weights.block
-    for start in starts:
-        X = _frank_wolfe(found, D, centre, start)
-        angle = angle_between(centre, dominant_direction(D @ X[:n, :n] @ D))
-        if angle > best_angle:
-            best_angle, best = angle, X
-    return best_angle, type(found.least.weights)(best[:n, :n], best[n:, n:])
-
-
-def _frank_wolfe(found: WeightsSet, D: Array, centre: Array, start: Array) -> Array:
-    """Increase the angle to the centre's direction along segments to extreme members."""
-    n, X = found.fibre.plant.n, start
-    for _ in range(_FRANK_WOLFE):
-        gradient = np.zeros_like(X)
-        gradient[:n, :n] = D @ _turning(D @ X[:n, :n] @ D, centre) @ D
-        end = linear_maxima(found, gradient[None])[0].weights.block
-        segment = [X + share * (end - X) for share in np.linspace(0.0, 1.0, 21)]
-        angles = [angle_between(centre, dominant_direction(D @ Y[:n, :n] @ D)) for Y in segment]
-        best = int(np.argmax(angles))
-        if best == 0:
-            break
-        X = segment[best]
-    return X
+    best = max(map(climbed, starts), key=angle)
+    return angle(best), Weights(best[:n, :n], best[n:, n:])
 
 
 def _turning(Q: Array, centre: Array) -> Array:
@@ -169,31 +157,14 @@ def _turning(Q: Array, centre: Array) -> Array:
     return np.asarray((gradient + gradient.T) / 2)
 
 
-def dominant_direction(Q: Array) -> Array:
-    """The eigenvector (n,) of the largest eigenvalue of a symmetric matrix (n, n)."""
+def _dominant(Q: Array) -> Array:
+    """Eigenvector (n,) of the largest eigenvalue of a symmetric matrix (n, n)."""
     return np.asarray(np.linalg.eigh((Q + Q.T) / 2)[1][:, -1])
 
 
-def angle_between(one: Array, other: Array) -> float:
+def _angle(one: Array, other: Array) -> float:
     """Angle between two directions (n,) of either sign, degrees."""
     return float(np.degrees(np.arccos(min(1.0, abs(float(one @ other))))))
-
-
-def _statement(
-    found: WeightsSet,
-    span: tuple[float, float],
-    one: str,
-    other: str,
-    says: str,
-    size: float,
-    kind: str,
-) -> Statement:
-    low, high = span
-    index = found.fibre.plant.states.index(one)
-    unit = float(found.least.weights.Q[index, index] * size**2)
-    touches = _TOUCHES * max(abs(low), abs(high))
-    holds = True if low > touches else False if high < -touches else None
-    return Statement(one, other, says, holds, low / unit, high / unit, kind)
 
 
 # Smaller entries of a direction are not named in a sentence.
@@ -309,5 +280,5 @@ def _reading(rule: str, weights: Weights, before: list[Reading]) -> Reading:
     values, vectors = np.linalg.eigh(scaled.Q)
     largest = np.argmax(np.abs(vectors), axis=0)
     vectors = vectors * np.sign(vectors[largest, np.arange(len(values))])
-    angle = angle_between(before[0].dominant, vectors[:, -1]) if before else 0.0
+    angle = _angle(before[0].dominant, vectors[:, -1]) if before else 0.0
     return Reading(rule, scaled, condition_number(scaled), frozen(values), frozen(vectors), angle)

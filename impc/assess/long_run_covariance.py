@@ -52,12 +52,7 @@ class ResidualNoise(Frozen):
     """Autocorrelation model of residuals."""
 
     root: Array  # a of each output (p,)
-    gammas: Array  # Tapered autocovariances of eps, lags 0 to `bandwidth`, (lags, p, p)
-
-    @property
-    def bandwidth(self) -> int:
-        """Largest lag of eps that counts."""
-        return len(self.gammas) - 1
+    gammas: Array  # Tapered autocovariances of eps, from lag 0, (lags, p, p)
 
 
 def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:

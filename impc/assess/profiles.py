@@ -159,9 +159,11 @@ class _Search:
         tried, best = sorted(self.tried), self.best
         below = max([item for item in tried if item < best], default=best - self.deviation)
         above = min([item for item in tried if item > best], default=best + self.deviation)
-        accuracy = {"xatol": _MINIMUM * self.deviation}
         scipy.optimize.minimize_scalar(
-            self.objective, bounds=(below, above), method="bounded", options=accuracy
+            self.objective,
+            bounds=(below, above),
+            method="bounded",
+            options={"xatol": _MINIMUM * self.deviation},
         )
 
     def _end(self, origin: float, sign: float, quantile: float) -> float:

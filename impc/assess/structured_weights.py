@@ -1,4 +1,4 @@
-"""Standard errors of the weights of a structure under autocorrelated noise.
+"""Structured fit near its solution: covariance of the weights, quadratic form of the misfit.
 
 As `covariance` for a gain: with J_t the derivative of the outputs at sample t by the unknowns,
 after projection on initial states and physical parameters,
@@ -8,14 +8,25 @@ after projection on initial states and physical parameters,
 for log cost weights, and for correlations where products of features have cost weights
 (`Structure.reported`). A physical parameter moves the gain because the weights stay fixed. A cost
 weight of zero is at its bound and left out; `weight_profiles` gives its upper end.
+
+The recordings identify a gain; the nonlinear part is the map from cost weights to gains. Near a fit
+the misfit is therefore a quadratic form of gain and metric, computed from one simulation,
+
+    m^2(z) = |q + R (k(z) - k)|^2 + rest,       k = (K, S),
+
+R and q the triangular factor and residual in the columns of k after projection on initial states
+and parameters (to first order); `rest` is the part that no nearby gain explains.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
+import scipy.optimize
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED, by_trial, spread_of_rows
@@ -24,11 +35,12 @@ from impc.assess.long_run_covariance import (
     residual_noise,
     white_noise,
 )
+from impc.errors import WeightsError
 from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED
 from impc.inverse.laws import metric_directions, regulator_slopes
 from impc.inverse.problem import noise_of_residual
-from impc.inverse.residuals import evaluate, with_prior_rows
+from impc.inverse.residuals import evaluate, scaled_changes, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.riccati import solve_lqr
 
@@ -47,6 +59,9 @@ if TYPE_CHECKING:
 IDENTIFIED_FACTOR = 10.0
 # Share of an unknown in a direction without a value, below which it is rounding.
 _SHARE = 1e-3
+# Prior SD of a log cost weight about the fit: far wider than any finite interval.
+_SPREAD = 20.0
+_TRIES = 30
 
 
 @dataclass(frozen=True)
@@ -95,6 +110,11 @@ class Tangent(Frozen):
         on_metric = self.found.along_metric(metric, metric_directions(metric))
         return self.found.along_gain(T, G), on_metric
 
+    @functools.cached_property
+    def quadratic(self) -> LocalQuadratic:
+        """Quadratic approximation of the misfit here."""
+        return LocalQuadratic(self)
+
 
 def tangent(
     structure: Structure, problem: Problem, cost_weights: Array, noise: float | None = None
@@ -124,6 +144,82 @@ def tangent(
         frozen(found.dparameters + seen[:, count:]),
         size,
     )
+
+
+class LocalQuadratic:
+    """Quadratic form of gain and metric that approximates the misfit near a tangent."""
+
+    def __init__(self, at: Tangent) -> None:
+        self.at = at
+        # Whitened units of the gain: best conditioned.
+        T, G = natural_coordinates(at.problem.plant, np.array(at.solution.K))
+        metric = at.found.dS.reshape(len(at.residual), -1)
+        seen = at.without_nuisance(np.hstack([at.found.along_gain(T, G), metric]))
+        residual = at.without_nuisance(np.array(at.residual)[:, None])[:, 0]
+        triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
+        # R'q = columns' residual.
+        self.inside = np.linalg.pinv(triangle.T) @ (seen.T @ residual)
+        self.rest = float(residual @ residual - self.inside @ self.inside)
+        units = np.kron(np.linalg.inv(G), T.T), np.eye(metric.shape[1])
+        self.triangle = triangle @ scipy.linalg.block_diag(*units)
+        self.here = _gain_and_metric(at.solution)
+
+    def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
+        """Least m^2 from z over steps along columns, and its minimiser.
+
+        With `aim`, the distance to that regulator takes the place of the misfit.
+        """
+        moving = np.isfinite(z)
+        offset, rest = self.inside, self.rest
+        if aim is not None:
+            offset, rest = self.triangle @ (self.here - _gain_and_metric(aim)), 0.0
+        weight, rows = self.at.noise / _SPREAD, len(self.triangle)
+
+        def moved(step: Array) -> Array:
+            there = z.copy()
+            there[moving] += along @ step
+            return there
+
+        @functools.lru_cache(maxsize=1)  # scipy asks for residual and derivative separately
+        def seen(numbers: tuple[float, ...]) -> tuple[Array, Array]:
+            step = np.array(numbers)
+            prior = weight * np.eye(len(step))
+            try:
+                value, slopes = self._form(moved(step), moving)
+            except WeightsError:  # a derivative is used only at the start: the search ends there
+                far = np.full(rows + len(step), 1e6 * self.at.noise)
+                return far, np.vstack([np.zeros((rows, len(step))), prior])
+            return np.append(offset + value, weight * step), np.vstack([slopes @ along, prior])
+
+        def residual(step: Array) -> Array:
+            return seen(tuple(step))[0]
+
+        def derivative(step: Array) -> Array:
+            return seen(tuple(step))[1]
+
+        step: Array = np.zeros(along.shape[1])
+        if len(step):
+            step = scipy.optimize.least_squares(
+                residual, step, jac=derivative, ftol=1e-6, max_nfev=_TRIES
+            ).x
+        data = residual(step)[:rows]
+        return float(data @ data) + rest, moved(step)
+
+    def _form(self, z: Array, moving: Array) -> tuple[Array, Array]:
+        """R (k(z) - k) and its derivative by the free unknowns."""
+        problem, structure = self.at.problem.with_nuisance_fixed(), self.at.structure
+        solution = solve_lqr(problem.plant, structure.weights(z))
+        dK, dS = regulator_slopes(problem, structure, z, solution)
+        turned = scaled_changes(np.array(solution.S), dS[moving])
+        count = len(turned)
+        slopes = np.hstack([dK[moving].reshape(count, -1), turned.reshape(count, -1)])
+        return self.triangle @ (_gain_and_metric(solution) - self.here), self.triangle @ slopes.T
+
+
+def _gain_and_metric(solution: LqrSolution) -> Array:
+    """Entries of the gain, and of the metric scaled to trace m."""
+    S = np.array(solution.S)
+    return np.append(solution.K, S * len(S) / np.trace(S))
 
 
 @dataclass(frozen=True)

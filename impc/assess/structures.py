@@ -26,19 +26,18 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.covariance import IDENTIFIED
+from impc.assess.assessments import evaluate_method
 from impc.assess.long_run_covariance import residual_noise
-from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.variance_accounted_for import (
+    held_out_vafs,
+    innovation_roots,
     innovations_criterion,
-    left_out_vaf,
     residuals_of,
-    vaf,
 )
-from impc.assess.weight_profiles import NearFit, WeightInterval, WeightProfiles
-from impc.control.closed_loop import simulate
-from impc.inverse.problem import EXPLAINED, recorded_size, scenarios
+from impc.assess.weight_profiles import WeightInterval, WeightProfiles
+from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.refit import IDENTIFIED
 from impc.inverse.structured import feature_sizes, search_from, structured_estimate
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
@@ -112,26 +111,30 @@ def assess_structure(
     at = tangent(structure, there, cost_weights)
     covariance = weight_covariance(at)
     sizes = feature_sizes(there, structure, np.array(found.gain), np.array(found.metric))
-    runs = [simulate(found.controller(), drive) for drive in scenarios(there)]
-    u = np.concatenate([run.applied for run in runs]) @ structure.input_features[0]
-    recorded = np.concatenate([trial.corrected for trial in there.recordings])
-    left = _left_out(problem, structure, found, settle) if held_out else []
+    own = evaluate_method(found, there.bounds)
+    started = problem.at(there.starts, there.logarithms, there.errors)
+
+    def fit_without(index: int) -> Estimate:
+        others = started.leaving_out(index)
+        end = search_from(others, structure, _moving(cost_weights))
+        return structured_estimate(others, structure, end)
+
+    left = held_out_vafs(problem, fit_without, settle) if held_out else []
     nothing = np.full(len(problem.plant.outputs), np.nan)
     intervals, ratios = _intervals(at, covariance, sizes)
-    roots = np.asarray(residual_noise(residuals_of(near, near.problem)).root)
     return StructureFit(
         structure,
         found,
         "",
         frozen(sizes),
-        float(np.mean(u**2)),
+        float(np.mean((own.commands @ structure.input_features[0]) ** 2)),
         covariance,
         intervals,
         ratios,
         structure_test(at),
-        frozen(vaf(recorded, np.concatenate([run.x @ there.plant.C.T for run in runs]))),
+        own.vaf,
         frozen(np.mean(left, axis=0) if left else nothing),
-        criterion_of(found, roots, int(np.count_nonzero(covariance.identified))),
+        criterion_of(found, innovation_roots(near), int(np.count_nonzero(covariance.identified))),
     )
 
 
@@ -142,23 +145,9 @@ def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
     """
     floor = np.random.default_rng(0)
     residuals = [
-        part + EXPLAINED * floor.standard_normal(part.shape)
-        for part in residuals_of(found, found.problem)
+        part + EXPLAINED * floor.standard_normal(part.shape) for part in residuals_of(found)
     ]
     return innovations_criterion(residuals, roots) + 2 * identified
-
-
-def _left_out(problem: Problem, structure: Structure, end: Estimate, settle: float) -> list[Array]:
-    """VAF of each trial under the structure fitted to the others."""
-    there = end.problem
-    start, found = problem.at(there.starts, there.logarithms, there.errors), []
-    cost_weights = _moving(np.array(end.cost_weights))
-    for index in range(len(problem.recordings) if len(problem.recordings) > 1 else 0):
-        others = start.leaving_out(index)
-        one = search_from(others, structure, cost_weights)
-        other = structured_estimate(others, structure, one)
-        found.append(left_out_vaf(other, problem.recordings[index], settle).vaf)
-    return found
 
 
 def _moving(cost_weights: Array) -> Array:
@@ -171,26 +160,16 @@ def _intervals(
     at: Tangent, covariance: WeightCovariance, sizes: Array
 ) -> tuple[tuple[WeightInterval, ...], tuple[Ratio, ...]]:
     structure, rows = at.structure, np.eye(at.structure.count)
-    if structure.coupled or structure.input_coupled:
-        z = float(scipy.stats.norm.ppf(0.5 + LEVEL / 2))
-        return tuple(
-            WeightInterval(float(value), float(value - z * own), float(value + z * own), LEVEL)
-            for value, own in zip(covariance.values, covariance.each, strict=True)
-        ), ()
     profiles = WeightProfiles(at, covariance)
-    intervals = tuple(
-        profiles.interval(rows[index]) if moving else profiles.zero(index)
-        for index, moving in enumerate(at.moving)
-    )
+    intervals = profiles.unknowns()
+    if structure.coupled or structure.input_coupled:
+        return intervals, ()
     ratios = []
     for i, j in itertools.permutations(np.flatnonzero(at.moving[: len(structure.labels)]), 2):
         shift = 2 * float(np.log(sizes[i] / sizes[j]))
         if at.cost_weights[i] - at.cost_weights[j] + shift >= 0:  # larger cost first
-            found = profiles.interval(rows[i] - rows[j])
-            moved = WeightInterval(
-                found.value + shift, found.low + shift, found.high + shift, found.level
-            )
-            ratios.append(Ratio(structure.labels[i], structure.labels[j], moved))
+            found = profiles.interval(rows[i] - rows[j]).shifted(shift)
+            ratios.append(Ratio(structure.labels[i], structure.labels[j], found))
     return intervals, tuple(ratios)
 
 
@@ -254,7 +233,7 @@ def structure_test(at: Tangent) -> StructureTest:
 
 def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]:
     """Power of the test against cross terms, from their distance to the structure."""
-    structure, near = at.structure, NearFit(at)
+    structure = at.structure
     if structure.coupled:
         return ()
     penalised = np.flatnonzero(at.moving[: len(structure.labels)])
@@ -267,7 +246,7 @@ def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]
         crossed = Weights(given.Q + half * (np.outer(one, other) + np.outer(other, one)), given.R)
         there = solve_lqr(at.problem.plant, crossed)
         cost_weights = np.array(at.cost_weights)
-        apart, _ = near.least(cost_weights, np.eye(int(np.sum(at.moving))), there)
+        apart, _ = at.quadratic.least(cost_weights, np.eye(int(np.sum(at.moving))), there)
         power = float(scipy.stats.ncx2.sf(quantile, freedom, apart / variance))
         found.append(CrossTerm(structure.labels[i], structure.labels[j], power))
     return tuple(found)

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
@@ -32,7 +33,6 @@ from impc.inverse.search import with_fitted_starts
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from impc.arrays import Array
     from impc.control.simulation import Simulation
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
@@ -79,17 +79,18 @@ def vaf(recorded: Array, simulated: Array) -> Array:
     >>> impc.vaf(recorded, [[0.9], [-1.8], [0.45]]).round(6)
     array([99.])
     """
-    left = np.nansum((recorded - simulated) ** 2, axis=0)
-    total = np.nansum(recorded**2, axis=0)
-    share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
-    return np.asarray(100 * (1 - share))
+    return _explained(
+        np.nansum((recorded - simulated) ** 2, axis=0), np.nansum(recorded**2, axis=0)
+    )
 
 
 @checked(recorded="~i j", simulated="i j")
 def centred_vaf(recorded: Array, simulated: Array) -> Array:
     """VAF with the means of the recording and of the residual removed, % (p,)."""
-    left = np.nanvar(recorded - simulated, axis=0)
-    total = np.nanvar(recorded, axis=0)
+    return _explained(np.nanvar(recorded - simulated, axis=0), np.nanvar(recorded, axis=0))
+
+
+def _explained(left: Array, total: Array) -> Array:
     share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
     return np.asarray(100 * (1 - share))
 
@@ -171,6 +172,17 @@ def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
     return HeldOut(frozen(vaf(recorded, simulated)), frozen(centred_vaf(recorded, simulated)))
 
 
+def held_out_vafs(
+    problem: Problem, fit_without: Callable[[int], Estimate], settle: float
+) -> list[Array]:
+    """VAF (p,) of each trial under the fit without it; empty with one trial."""
+    count = len(problem.recordings)
+    return [
+        np.array(left_out_vaf(fit_without(index), trial, settle).vaf)
+        for index, trial in enumerate(problem.recordings if count > 1 else ())
+    ]
+
+
 _SAME, _RULED_OUT = 2.0, 10.0
 
 
@@ -202,7 +214,7 @@ def fit_alternatives(
         for length in horizons
         if length != problem.horizon
     ]
-    roots = np.asarray(residual_noise(residuals_of(fitted, fitted.problem)).root)
+    roots = innovation_roots(fitted)
     found = []
     for name, other in posed:
         found.append(_fit(name, other, fitted, settle, roots))
@@ -231,33 +243,25 @@ def verdict(one: Alternative, other: Alternative) -> str:
 def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:
     try:
         found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
-        held = [_left_out(problem, found, index, settle) for index in range(_trials(problem))]
+        weights = found.weights
+        held = held_out_vafs(
+            problem, lambda index: fit_controller(problem.leaving_out(index), weights), settle
+        )
     except (WeightsError, SolverError) as error:
         return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
-    aic = innovations_criterion(residuals_of(found, found.problem), roots)
+    aic = innovations_criterion(residuals_of(found), roots)
     mean = float(np.mean(held)) if held else float("nan")
     return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
 
 
-def _trials(problem: Problem) -> int:
-    count = len(problem.recordings)
-    return count if count > 1 else 0
+def residuals_of(found: Estimate) -> list[Array]:
+    """Scaled residuals (samples, p) of each trial under the fitted controller."""
+    return by_trial(found.problem, residual_only(found.problem, found.gain, found.metric))
 
 
-def _left_out(problem: Problem, found: Estimate, index: int, settle: float) -> Array:
-    fit = fit_controller(problem.leaving_out(index), found.weights)
-    return np.array(left_out_vaf(fit, problem.recordings[index], settle).vaf)
-
-
-def residuals_of(found: Estimate, problem: Problem) -> list[Array]:
-    """Scaled residuals (samples, p) of each trial of a problem under the fitted controller."""
-    flat = residual_only(problem, found.gain, found.metric)
-    ends = np.cumsum(problem.trial_sizes)[:-1]
-    parts = np.split(flat, ends)
-    return [
-        part.reshape(trial.samples, -1)
-        for part, trial in zip(parts, problem.recordings, strict=True)
-    ]
+def innovation_roots(found: Estimate) -> Array:
+    """First-order autoregression coefficient of the residuals of each output (p,)."""
+    return np.asarray(residual_noise(residuals_of(found)).root)
 
 
 def innovations_criterion(residuals: list[Array], roots: Array) -> float:

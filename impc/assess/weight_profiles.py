@@ -1,22 +1,14 @@
 """Profile-likelihood intervals of cost weights and of their ratios.
 
 With a combination a'z of the unknowns fixed at v, all other cost weights are refitted: in the
-quadratic approximation of the misfit near the fit, then in that near the end. With the least misfit
-m(v),
+quadratic approximation of the misfit near the fit (`structured_weights`), then in that near the
+end. With the least misfit m(v),
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),
 
 s^2 the residual variance and f the factor by which autocorrelation widens the variance of a'z. The
 interval is {v : D(v) <= q}, q a chi-squared quantile. Without a lower end the cost weight may be
 zero, and the statement is "at most" (docs/howto/weights.md).
-
-The recordings identify a gain; the nonlinear part is the map from cost weights to gains. Near a fit
-the misfit is therefore a quadratic form of gain and metric, computed from one simulation,
-
-    m^2(z) = |q + R (k(z) - k)|^2 + rest,       k = (G^-1 K T, S),
-
-R and q the triangular factor and residual in the columns of k after projection on initial states
-and parameters (to first order); `rest` is the part that no nearby gain explains.
 """
 
 from __future__ import annotations
@@ -34,128 +26,33 @@ from impc.arrays import Array
 from impc.assess.printed_gain import LEVEL
 from impc.assess.structured_weights import tangent
 from impc.errors import WeightsError
-from impc.inverse.laws import regulator_slopes
-from impc.inverse.residuals import scaled_changes
-from impc.inverse.solution_set import natural_coordinates
-from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
-    from impc.assess.structured_weights import Tangent, WeightCovariance
-    from impc.model.riccati import LqrSolution
-
-# Prior SD of a log cost weight about the fit: far wider than any finite interval.
-_SPREAD = 20.0
-_TRIES = 30
-
-
-class NearFit:
-    """Quadratic approximation of the misfit near a fit."""
-
-    def __init__(self, at: Tangent) -> None:
-        self.at = at
-        size, m = len(at.residual), at.problem.plant.m
-        # Whitened units of the gain: best conditioned.
-        T, G = natural_coordinates(at.problem.plant, np.array(at.solution.K))
-        self.right, self.left = T, np.linalg.inv(G)
-        units = np.eye(at.solution.K.size).reshape(-1, *at.solution.K.shape)
-        unit = np.linalg.inv(self._natural(units).reshape(len(units), -1))
-        columns = [at.found.dK.reshape(size, -1) @ unit.T]
-        columns += [at.found.dS.reshape(size, -1)] if m > 1 else []
-        seen = at.without_nuisance(np.hstack(columns))
-        self.triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
-        self.here = self._place(at.solution)
-        # R'q = columns' residual.
-        residual = at.without_nuisance(np.array(at.residual)[:, None])[:, 0]
-        self.inside = np.linalg.pinv(self.triangle.T) @ (seen.T @ residual)
-        self.rest = float(residual @ residual - self.inside @ self.inside)
-
-    def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
-        """Least m^2 from z over steps along columns, and its minimiser."""
-        moving = np.isfinite(z)
-        offset, rest = self.inside, self.rest
-        if aim is not None:
-            offset, rest = self.triangle @ (self.here - self._place(aim)), 0.0
-        weight = self.at.noise / _SPREAD
-        kept: dict[bytes, tuple[Array, Array]] = {}
-
-        def seen(step: Array) -> tuple[Array, Array]:
-            key = step.tobytes()
-            if key not in kept:
-                kept.clear()
-                value, slopes = self._form(_moved(z, moving, along @ step), moving)
-                kept[key] = offset + value, slopes @ along
-            return kept[key]
-
-        def residual(step: Array) -> Array:
-            try:
-                return np.concatenate([seen(step)[0], weight * step])
-            except WeightsError:
-                return np.full(len(self.triangle) + len(step), 1e6 * self.at.noise)
-
-        def derivative(step: Array) -> Array:
-            try:
-                slopes = seen(step)[1]
-            except WeightsError:  # only at the start: the search ends there
-                slopes = np.zeros((len(self.triangle), along.shape[1]))
-            return np.vstack([slopes, weight * np.eye(along.shape[1])])
-
-        step: Array = np.zeros(along.shape[1])
-        if len(step):
-            step = scipy.optimize.least_squares(
-                residual, step, jac=derivative, ftol=1e-6, max_nfev=_TRIES
-            ).x
-        data = residual(step)[: len(self.triangle)]
-        return float(data @ data) + rest, _moved(z, moving, along @ step)
-
-    def _natural(self, gains: Array) -> Array:
-        """G^-1 K T (..., m, n) of gains K (..., m, n)."""
-        return np.asarray(self.left @ gains @ self.right)
-
-    def _place(self, solution: LqrSolution) -> Array:
-        """k of a regulator."""
-        gain = self._natural(np.array(solution.K)).ravel()
-        if solution.plant.m == 1:
-            return np.asarray(gain)
-        S = np.array(solution.S)
-        return np.concatenate([gain, (S * len(S) / np.trace(S)).ravel()])
-
-    def _form(self, z: Array, moving: Array) -> tuple[Array, Array]:
-        """R (k(z) - k) and its derivative by the free unknowns."""
-        problem, structure = self.at.problem.with_nuisance_fixed(), self.at.structure
-        solution = solve_lqr(problem.plant, structure.weights(z))
-        dK, dS = regulator_slopes(problem, structure, z, solution)
-        slopes = self._natural(dK[moving]).reshape(int(np.sum(moving)), -1)
-        if problem.plant.m > 1:
-            turned = scaled_changes(np.array(solution.S), dS[moving])
-            slopes = np.hstack([slopes, turned.reshape(len(slopes), -1)])
-        return self.triangle @ (self._place(solution) - self.here), self.triangle @ slopes.T
-
-
-def _moved(z: Array, moving: Array, step: Array) -> Array:
-    there = z.copy()
-    there[moving.astype(bool)] += step
-    return there
-
+    from impc.assess.structured_weights import LocalQuadratic, Tangent, WeightCovariance
 
 # Largest log cost weight searched: beyond a factor of e^12 the interval has no end.
 _FARTHEST = 12.0
 # Accuracy of an end, relative to the step.
 _END = 1e-2
 # Accept an end if refitting there moves it by less than this share of a standard error.
-_STAYS, _ROUNDS = 0.05, 12
+_STAYS, _ROUNDS = 0.05, 13
 # D without a Riccati solution.
 _HUGE = 1e12
+_QUANTILE = float(scipy.stats.chi2.ppf(LEVEL, 1))
 
 
 @dataclass(frozen=True)
 class WeightInterval:
-    """Interval of a log cost weight or of the log ratio of two."""
+    """95 % interval of a log cost weight or of the log ratio of two."""
 
     value: float  # Logarithm at the fit; minus infinity: cost weight zero
     # Ends of the logarithm; minus infinity if the cost weight may be zero
     low: float
     high: float
-    level: float  # Confidence level between 0 and 1
+
+    def shifted(self, by: float) -> WeightInterval:
+        """Interval of the logarithm plus a constant."""
+        return WeightInterval(self.value + by, self.low + by, self.high + by)
 
     def holds(self, value: float) -> bool:
         """Whether a logarithm `value` lies in the interval."""
@@ -166,33 +63,44 @@ class WeightProfiles:
     """Profile-likelihood intervals from quadratic approximations at the fit and at each end."""
 
     def __init__(self, at: Tangent, covariance: WeightCovariance) -> None:
-        self.at, self.covariance, self.near = at, covariance, NearFit(at)
-        samples = len(at.residual)
+        self.at, self.covariance = at, covariance
+        samples, every = len(at.residual), np.eye(int(np.sum(at.moving)))
         self.variance = at.noise**2 * samples / max(samples - covariance.rank, 1)
-        self.base = self.near.least(np.array(at.cost_weights), np.eye(int(np.sum(at.moving))))[0]
+        self.base = at.quadratic.least(np.array(at.cost_weights), every)[0]
 
-    def interval(self, combination: Array, level: float = LEVEL) -> WeightInterval:
+    def interval(self, combination: Array) -> WeightInterval:
         """Interval of a'z for a `combination` a (count,)."""
         deviation, wider = self.covariance.spread(combination)
-        quantile = float(scipy.stats.chi2.ppf(level, 1)) * wider**2
+        quantile = _QUANTILE * wider**2
         moving, cost_weights = self.at.moving, np.array(self.at.cost_weights)
         value = float(combination[moving] @ cost_weights[moving])
         if not np.isfinite(deviation):
-            return WeightInterval(value, -np.inf, np.inf, level)
+            return WeightInterval(value, -np.inf, np.inf)
         step = min(max(deviation, 1e-9), 1.0)
         low, high = (
             self._end(_Line(combination, cost_weights, value, sign * step), quantile)
             for sign in (-1.0, 1.0)
         )
-        return WeightInterval(value, low, high, level)
+        return WeightInterval(value, low, high)
 
-    def zero(self, index: int, level: float = LEVEL) -> WeightInterval:
+    def zero(self, index: int) -> WeightInterval:
         """Interval of a cost weight `index` that is zero at the fit: only an upper end."""
         near = np.array(self.at.cost_weights)
         near[index] = self._smallest_seen(index)
         line = _Line(np.eye(len(near))[index], near, float(near[index]), 0.5)
-        high = self._end(line, float(scipy.stats.chi2.ppf(level, 1)))
-        return WeightInterval(-np.inf, -np.inf, high, level)
+        return WeightInterval(-np.inf, -np.inf, self._end(line, _QUANTILE))
+
+    def unknowns(self) -> tuple[WeightInterval, ...]:
+        """Interval of each unknown; a normal one if products of features have cost weights."""
+        structure, found = self.at.structure, self.covariance
+        if structure.coupled or structure.input_coupled:
+            half = np.sqrt(_QUANTILE) * found.each
+            ends = np.column_stack([found.values, found.values - half, found.values + half])
+            return tuple(WeightInterval(*one) for one in ends.tolist())
+        rows = enumerate(zip(np.eye(structure.count), self.at.moving, strict=True))
+        return tuple(
+            self.interval(row) if moving else self.zero(index) for index, (row, moving) in rows
+        )
 
     def _smallest_seen(self, index: int) -> float:
         """Log cost weight that moves the outputs by a tenth of a noise SD."""
@@ -203,48 +111,48 @@ class WeightProfiles:
     def _end(self, line: _Line, quantile: float) -> float:
         """Value at which D crosses the quantile along a line, or infinity.
 
-        The approximation is recomputed at the end found, until the end stays between a point with
-        smaller and one with larger D. Divergence and a missing Riccati solution count as larger.
+        The approximation is recomputed at its own crossing until that stays; a crossing outside the
+        points with smaller and larger D is replaced by their midpoint. Divergence and a missing
+        Riccati solution count as larger.
         """
-        inside, outside = line.cost_weights, None
-        end, there = self._passing(self.near, line, line.cost_weights, quantile)
+        side, near = np.sign(line.step), _STAYS * abs(line.step)
+        form: LocalQuadratic | None = self.at.quadratic
+        here, inside, outside, end = line.cost_weights, line.cost_weights, None, line.value
         for _ in range(_ROUNDS):
-            before, form = end, self._form(there)
-            more, further = True, None
+            before, beyond, further = end, True, None
             if form is not None:
-                distance, there = self._distance(form, line.row, line.at(there), there)
-                more = distance > quantile
-                end, further = self._passing(form, line, there, quantile)
-            inside, outside = (inside, there) if more else (there, outside)
-            if further is None or not line.between(inside, end, outside):
-                assert outside is not None
+                beyond, here, end, further = self._crossing(form, line, here, quantile)
+                if end == before or abs(end - before) < near:
+                    break
+            inside, outside = (inside, here) if beyond else (here, outside)
+            left = further is None or side * end < side * line.at(inside)
+            if outside is not None and (left or side * end >= side * line.at(outside)):
                 further = _middle(inside, outside)
                 end = line.at(further)
-            there = further
-            if end == before or abs(end - before) < _STAYS * abs(line.step):
-                break
+                if abs(end - before) < near:
+                    break
+            assert further is not None  # without an approximation `outside` is known
+            here, form = further, self._form(further)
         return end
 
-    def _form(self, cost_weights: Array) -> NearFit | None:
+    def _form(self, cost_weights: Array) -> LocalQuadratic | None:
         """Quadratic approximation elsewhere, noise of the fit; None if infeasible."""
         try:
-            at = self.at
-            there = tangent(at.structure, at.problem, cost_weights, at.noise)
+            there = tangent(self.at.structure, self.at.problem, cost_weights, self.at.noise)
         except WeightsError:
             return None
-        if there.found.reason:
-            return None
-        return NearFit(there)
+        return None if there.found.reason else there.quadratic
 
-    def _passing(
-        self, form: NearFit, line: _Line, here: Array, quantile: float
-    ) -> tuple[float, Array]:
-        """Crossing of D and the quantile for one approximation, bracketed by growing steps.
+    def _crossing(
+        self, form: LocalQuadratic, line: _Line, here: Array, quantile: float
+    ) -> tuple[bool, Array, float, Array]:
+        """Whether D is above the quantile, its minimiser here, the crossing, and that there.
 
-        Outwards if D is smaller at the starting point, else inwards. sqrt(D) is almost linear; each
-        point starts from the nearest known one.
+        Steps grow outwards if D is smaller here, else inwards, until they bracket the crossing.
+        sqrt(D) is almost linear; each point starts from the nearest known one.
         """
-        known = {line.value: line.cost_weights, line.at(here): here}
+        value = line.at(here)
+        known = {line.value: line.cost_weights, value: here}
 
         @functools.cache  # a second search from another start may end elsewhere
         def excess(value: float) -> float:
@@ -254,21 +162,20 @@ class WeightProfiles:
             distance, known[value] = self._distance(form, line.row, value, near)
             return float(np.sqrt(np.clip(distance, 0.0, _HUGE)) - np.sqrt(quantile))
 
-        value = line.at(here)
-        outwards = excess(value) <= 0
-        step = line.step if outwards else -line.step
-        while not outwards or abs(value - line.value) < _FARTHEST:
-            beyond = value + step
-            if not outwards and (beyond - line.value) * line.step <= 0:
-                beyond = line.value
-            if (excess(beyond) > 0) == outwards:
-                end = float(scipy.optimize.brentq(excess, value, beyond, xtol=_END * abs(step)))
-                return end, known[min(known, key=lambda other: abs(other - end))]
-            value, step = beyond, 1.6 * step
-        return float(np.sign(line.step) * np.inf), known[value]
+        beyond = excess(value) > 0
+        start, step = known[value], -line.step if beyond else line.step
+        while beyond or abs(value - line.value) < _FARTHEST:
+            further = value + step
+            if beyond and (further - line.value) * line.step <= 0:
+                further = line.value
+            if (excess(further) > 0) != beyond:
+                end = float(scipy.optimize.brentq(excess, value, further, xtol=_END * abs(step)))
+                return beyond, start, end, known[min(known, key=lambda other: abs(other - end))]
+            value, step = further, 1.6 * step
+        return beyond, start, float(np.sign(line.step) * np.inf), known[value]
 
     def _distance(
-        self, form: NearFit, row: Array, value: float, near: Array
+        self, form: LocalQuadratic, row: Array, value: float, near: Array
     ) -> tuple[float, Array]:
         """D for white residuals with the combination fixed, and the minimiser."""
         moving = np.isfinite(near)
@@ -299,12 +206,6 @@ class _Line(NamedTuple):
         """Value of the combination at other unknowns."""
         finite = np.isfinite(cost_weights)
         return float(self.row[finite] @ cost_weights[finite])
-
-    def between(self, inside: Array, value: float, outside: Array | None) -> bool:
-        """Whether a value lies between those of two points (or beyond `inside`)."""
-        side = np.sign(self.step)
-        nearest = side * self.at(inside) <= side * value
-        return bool(nearest and (outside is None or side * value < side * self.at(outside)))
 
 
 def _middle(one: Array, other: Array) -> Array:

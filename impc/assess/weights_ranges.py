@@ -2,6 +2,11 @@
 
 All numbers are over the weights with the gain whose condition number, in the units of the plant, is
 at most a multiple of the least (`weights_set`; docs/why/equivalent_weights.md).
+
+A statement over all weights with *the* fitted gain ignores the uncertainty of that gain, so it is
+checked with drawn gains too (`intent_draws`). The range of 39 draws covers the next one in 38 of 40
+cases (95 %): a statement is supported if it holds for all weights with the fitted gain and with at
+least 38 of the 39 drawn gains.
 """
 
 from __future__ import annotations
@@ -11,15 +16,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.bounded_weights import entry_ranges, weights_set
-from impc.assess.intent_draws import set_of_gain, weights_over_gains, with_confidence
+from impc.assess.bounded_weights import entry_ranges, linear_maxima, linear_ranges, weights_set
 from impc.assess.intent_statements import (
-    angle_between,
-    dominant_direction,
-    order_statements,
-    sense_statements,
+    pair_statements,
+    statement_function,
     widest_dominant_angle,
 )
+from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
 
@@ -27,17 +30,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from impc.arrays import Array
-    from impc.assess.bounded_weights import WeightsSet
-    from impc.assess.intent_draws import DrawnSet, WeightRange
     from impc.assess.intent_statements import Statement
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
-#: Largest condition number in the set, as a multiple of the least.
-RATIO = 10.0
+# Largest condition number in the set, as a multiple of the least.
+_RATIO = 10.0
 # Number of states shown: recorded ones, then those that cost most at their typical size.
 _NAMED = 4
+# Tolerance of the programs for a drawn gain: the range of 39 draws is itself approximate.
+_ROUGH = 1e-6
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,29 @@ class EntryRange:
 
 
 @dataclass(frozen=True)
+class WeightRange:
+    """Cost of a typical excursion of a state, d^2 Q_ii at trace R = m."""
+
+    state: str  # Name of the state
+    low: float  # Over all weights with the fitted gain, in units of the cost
+    high: float
+    low_drawn: float  # Over all weights with any drawn gain: 95 %
+    high_drawn: float
+
+
+@dataclass(frozen=True)
+class DrawnSet:
+    """What holds for all weights of a drawn gain."""
+
+    # Least and largest cost of a typical excursion of each requested state
+    cost_weights: tuple[tuple[float, float], ...]
+    agrees: tuple[bool, ...]  # Whether each requested statement also holds here
+
+
+@dataclass(frozen=True)
 class WeightsSummary:
     """Set of equivalent weights of a gain."""
 
-    dimension: int  # Free directions of the weights without scale
-    least_condition: float  # Least condition number, then the largest in the set
-    limit: float
     entries: tuple[EntryRange, ...]  # Entries of the states that are recorded or cost most
     statements: tuple[Statement, ...]  # Order and sense of these states
     # Widest angle found between the dominant directions of D Q D of the least-condition member and
@@ -64,9 +84,6 @@ class WeightsSummary:
     widest_angle: float
     drawn: int  # Number of drawn gains
     cost_weights: tuple[WeightRange, ...]  # Costs of the named states; empty without draws
-    # Widest angle over the drawn gains between the dominant direction of their least-condition
-    # member and that of the fitted gain, degrees; NaN without draws
-    angle_of_gain: float
 
 
 def summarise_weights(
@@ -78,37 +95,33 @@ def summarise_weights(
     each: Callable[..., Iterable[DrawnSet]] = map,
 ) -> WeightsSummary:
     """Summarise the set of weights of a gain and of drawn gains, which `each` maps."""
-    found = weights_set(gain_fibre(plant, gain, metrics), RATIO)
+    found = weights_set(gain_fibre(plant, gain, metrics), _RATIO)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
     angle, _ = widest_dominant_angle(found, sizes)
-    statements = order_statements(found, sizes, names) + sense_statements(
-        found, sizes, names, ranges
-    )
+    statements = pair_statements(found, sizes, names, ranges)
 
     def set_of(drawn: LqrSolution) -> DrawnSet:
-        return set_of_gain(plant, drawn, metrics, RATIO, sizes, names, statements)
+        return _set_of_gain(plant, drawn, metrics, sizes, names, statements)
 
-    sets = tuple(each(set_of, draws))
-    cost_weights = {
-        plant.states[k]: (sizes[k] ** 2 * ranges[k, k].low, sizes[k] ** 2 * ranges[k, k].high)
-        for k in named
-    }
-    return WeightsSummary(
-        found.fibre.dimension - 1,
-        found.least.condition,
-        found.limit,
-        tuple(
-            EntryRange(plant.states[i], plant.states[j], item.low, item.high)
-            for (i, j), item in ranges.items()
-        ),
-        with_confidence(statements, sets) if sets else statements,
-        angle,
-        len(sets),
-        weights_over_gains(cost_weights, sets) if sets else (),
-        _angle_of_gain(found, sets, sizes),
+    sets, costs = tuple(each(set_of, draws)), []
+    if sets:
+        shares = np.mean([one.agrees for one in sets], axis=0)
+        statements = tuple(
+            item if item.holds is None else replace(item, confidence=float(share))
+            for item, share in zip(statements, shares, strict=True)
+        )
+        drawn = np.array([one.cost_weights for one in sets])
+        for position, (k, name) in enumerate(zip(named, names, strict=True)):
+            low, high = (sizes[k] ** 2 * end for end in (ranges[k, k].low, ranges[k, k].high))
+            widest = min(low, drawn[:, position, 0].min()), max(high, drawn[:, position, 1].max())
+            costs.append(WeightRange(name, low, high, *widest))
+    entries = tuple(
+        EntryRange(plant.states[i], plant.states[j], item.low, item.high)
+        for (i, j), item in ranges.items()
     )
+    return WeightsSummary(entries, statements, angle, len(sets), tuple(costs))
 
 
 def weights_summary_or_reason(
@@ -126,16 +139,39 @@ def weights_summary_or_reason(
         return None, str(error)
 
 
-def _angle_of_gain(found: WeightsSet, sets: tuple[DrawnSet, ...], sizes: Array) -> float:
-    if not sets:
-        return float("nan")
-    D = np.diag(np.asarray(sizes))
-    own = dominant_direction(D @ found.least.weights.Q @ D)
-    # Without a member the direction is unknown: 90 degrees.
-    return max(
-        90.0 if one.least is None else angle_between(own, dominant_direction(D @ one.least.Q @ D))
-        for one in sets
+def _set_of_gain(
+    plant: Plant,
+    solution: LqrSolution,
+    metrics: Array,
+    sizes: Array,
+    states: tuple[str, ...],
+    statements: tuple[Statement, ...],
+) -> DrawnSet:
+    """Evaluate the statements for all weights of a drawn gain; `metrics` (k, m, m)."""
+    penalised = np.zeros((len(states), plant.n + plant.m, plant.n + plant.m))
+    for cost, name in zip(penalised, states, strict=True):
+        index = plant.states.index(name)
+        cost[index, index] = sizes[index] ** 2
+    # Functions that are negative for every member if the statement holds.
+    against = np.array(
+        [
+            (-1 if item.holds else 1)
+            * statement_function(plant, sizes, item.kind, item.first, item.second)
+            for item in statements
+            if item.holds is not None
+        ]
     )
+    try:
+        own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
+        # Rough solutions suffice: only the extent of the set is needed.
+        found = weights_set(gain_fibre(plant, solution.K, own), _RATIO, rough=True)
+        ranges = linear_ranges(found, penalised, tolerance=_ROUGH)
+        most = linear_maxima(found, against, tolerance=_ROUGH) if len(against) else ()
+    except (WeightsError, SolverError):
+        return DrawnSet(((0.0, np.inf),) * len(states), (False,) * len(statements))
+    holding = iter([end.value < 0 for end in most])
+    agrees = tuple(item.holds is not None and next(holding) for item in statements)
+    return DrawnSet(tuple((one.low, one.high) for one in ranges), agrees)
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:

@@ -40,18 +40,16 @@ from impc.inverse.proximal_step import block_basis
 from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import gain_fibre
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
     from impc.assess.printed_gain import GainEstimate
-    from impc.inverse.equivalent_weights import EquivalentWeights
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.inverse.residuals import Evaluation
     from impc.inverse.solution_set import GainFibre
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
+    from impc.model.weights import Weights
 
 
 # p-value below which weights are rejected.
@@ -223,13 +221,12 @@ def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> 
 
 
 def _others(problem: Problem, fibre: GainFibre) -> tuple[OtherWeights, ...]:
+    found = []
     try:
-        return tuple(_explain(problem, item) for item in other_weights(fibre, 2))
+        for item in other_weights(fibre, 2):
+            solution = solve_lqr(problem.plant, item.weights)
+            left = misfit(problem, simulated(problem, solution.K, solution.S))
+            found.append(OtherWeights(item.weights, left))
     except (WeightsError, SolverError):  # numerically at the edge of the cone
         return ()
-
-
-def _explain(problem: Problem, found: EquivalentWeights) -> OtherWeights:
-    solution = solve_lqr(problem.plant, found.weights)
-    left = misfit(problem, simulated(problem, solution.K, solution.S))
-    return OtherWeights(found.weights, condition_number(found.weights), left)
+    return tuple(found)

@@ -98,7 +98,6 @@ class OtherWeights:
     """Weights other than the reported ones, with their misfit on the same recordings."""
 
     weights: Weights
-    condition: float  # kappa(blkdiag(Q, R))
     misfit: float  # 2-norm of the output residual
 
 

@@ -59,7 +59,9 @@ def with_delay_unknown(problem: Problem) -> Problem | None:
 
 def with_offsets_unknown(problem: Problem) -> Problem | None:
     """Free a constant offset of every output in every trial."""
-    return replace(problem, offsets=problem.plant.outputs)
+    others = tuple(pair for pair in problem.signal_errors if pair[0] != "offset")
+    offsets = tuple(("offset", name) for name in problem.plant.outputs)
+    return replace(problem, signal_errors=others + offsets)
 
 
 def with_strength_unknown(problem: Problem) -> Problem | None:

@@ -57,8 +57,9 @@ class _Key:
     metric: bytes
 
     def __eq__(self, other: object) -> bool:
-        same = isinstance(other, _Key) and self.problem is other.problem
-        return same and (self.gain, self.metric) == (other.gain, other.metric)
+        if not isinstance(other, _Key) or self.problem is not other.problem:
+            return False
+        return (self.gain, self.metric) == (other.gain, other.metric)
 
     def __hash__(self) -> int:
         return hash((id(self.problem), self.gain, self.metric))

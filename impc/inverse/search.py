@@ -46,8 +46,8 @@ FEW = 2000
 # Searches of short recordings that must agree, and of very short ones: three wrong searches agreed
 # in 2 of 80 problems.
 _AGREE, _HANDFUL, _SURE = 3, 200, 5
-# Two ends agree if their gains differ by at most the first in standard errors, and their objectives by
-# at most the second: creases along initial states leave 0.3 between ends of equal gain.
+# Two ends agree if their gains differ by at most the first in standard errors, and their objectives
+# by at most the second: creases along initial states leave 0.3 between ends of equal gain.
 _SAME, _NEAR = 0.1, 0.5
 # Factor above the best prediction at which a start is dropped.
 _HOPELESS = 30.0
@@ -59,9 +59,9 @@ _WEAK = 1e-3
 # Largest numbers of evaluations of predictions, of initial states and of simulations; decrease per
 # recorded value at which a prediction ends.
 _PREDICTED, _STATES, _SIMULATED, _ROUGH = 25, 20, 200, 1e-3
-# Promise at which a search of long recordings ends, since it is a start of a refit, and per recorded
-# value of short ones.
-_START, _FINE = 0.5, 1e-6
+# Promise at which a search of long recordings ends, since it is a start of a refit, and that of
+# short ones per recorded value.
+_START, _FINE = 0.5, 1e-8
 # Misfit of rounding relative to the recorded outputs.
 _ROUNDING = 1e-13
 # Factor of each step back towards a stabilising gain.

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from impc.arrays import Array
+from impc.arrays import Array, BoolArray
 from impc.checking import replace
 from impc.errors import ImpcError, SolverError, WeightsError
 from impc.inverse.estimates import Estimate, determined, simulated_estimate
@@ -134,7 +134,7 @@ def _with_zeros(posed: Problem, structure: Structure, end: Fitted) -> Fitted:
     return end
 
 
-def _without_zeros(posed: Problem, structure: Structure, end: Fitted, free: Array) -> Fitted:
+def _without_zeros(posed: Problem, structure: Structure, end: Fitted, free: BoolArray) -> Fitted:
     """Restore zero cost weights, of those that were `free`, whose restoration lowers the misfit."""
     for index in np.flatnonzero(np.isneginf(_unknowns(end)) & free):
         if end.evaluations >= _MOST:

@@ -52,8 +52,9 @@ _EXPLAINED = 1e-12
 class Law(Protocol):
     """The unknowns of a controller."""
 
-    #: Unknowns at which a search starts (count,).
-    start: Array
+    @property
+    def start(self) -> Array:
+        """Unknowns at which a search starts (count,)."""
 
     def pair(self, problem: Problem, part: Array) -> tuple[Array, Array]:
         """Gain (m, n) and metric (m, m) at the unknowns `part` (count,)."""
@@ -119,7 +120,7 @@ class Fitted(Frozen):
     evaluations: int  # Simulations with derivatives
     ended: Ended
     promised: float  # Decrease of `objective` that an undamped step promises
-    cost_weights: Array | None = None  # Unknowns of the structure, if cost weights were searched
+    cost_weights: Array  # Unknowns of the structure (count,); empty if a gain was searched
     unconfirmed: bool = False  # Whether no second search from another start ended here
 
     @property
@@ -358,6 +359,7 @@ class Unknowns:
     ) -> Fitted:
         """The values at z (q,) as the end of a search."""
         here, misfit = self.unpack(z), self.misfit(z)
+        weights = self.law.cost_weights(z[self.controller])
         return Fitted(
             frozen(z),
             frozen(here.K),
@@ -367,7 +369,7 @@ class Unknowns:
             evaluations,
             Ended.EXACT if explains(here.problem, misfit) else ended,
             promised,
-            self.law.cost_weights(z[self.controller]),
+            frozen([] if weights is None else weights),
         )
 
 

@@ -21,11 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
+    from impc.arrays import Array, IntArray
 
-#: Words for pages, unit (after that of the signal, if it begins with a space or is empty), its size,
-#: and the power of the sampling interval in it: by name, in the order of the rows of
-#: `Recording.errors`.
+#: By name, in the order of the rows of `Recording.errors`: words for pages; unit, after that of the
+#: signal if it begins with a space or is empty; its size; power of the sampling interval in it.
 KINDS = {
     "offset": ("an offset", "", 1, 0),
     "drift": ("a drift", " /s", 1, -1),
@@ -70,9 +69,9 @@ def _places(samples: int, error: Array) -> Array:
     return np.asarray(np.arange(samples + 1) * (1 - error[CLOCK]) - error[SHIFT])
 
 
-def _before(place: Array, samples: int) -> Array:
+def _before(place: Array, samples: int) -> IntArray:
     """Sample before each place; at both ends the first and last intervals continue."""
-    return np.clip(np.floor(place).astype(int), 0, samples - 2)
+    return np.asarray(np.clip(np.floor(place).astype(np.int64), 0, samples - 2))
 
 
 def _moved(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array, Array]:

@@ -141,6 +141,14 @@ class NoisyUnknowns:
                 self.weights[np.ix_(mine, mine)] @= unit.T @ np.linalg.solve(driven, unit)
 
     @property
+    def gain_law(self) -> GainLaw:
+        """Whitened coordinates of the gain; only if a gain is searched."""
+        law = self.space.law
+        if not isinstance(law, GainLaw):
+            raise SolverError("gain", "is that of cost weights", "fit without a structure")
+        return law
+
+    @property
     def _starts(self) -> IntArray:
         """Indices of the initial states of each trial (trials, n)."""
         return np.arange(self.shared, self.after).reshape(self.space.trials, -1)

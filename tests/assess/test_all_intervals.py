@@ -14,10 +14,10 @@ from impc.assess.profiles import profile_likelihood
 from impc.assess.variance_accounted_for import Alternative, fit_alternatives, verdict
 from impc.checking import replace
 from impc.errors import InputError
-from impc.inverse.noisy_fit import fit_controller
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
+from tests.assess.cart_fits import cart_fit, cart_problem
 
 SEEDS = (11, 12)
 EXTRAS = FitSettings(
@@ -56,7 +56,6 @@ def test_every_interval_holds_the_truth(result: FitResult) -> None:
 def test_the_set_of_weights_is_described(result: FitResult) -> None:
     found = result.uncertainty.weights
     assert found is not None
-    assert found.dimension == 1
     Q = result.intent.reported.weights.Q
     for item in found.entries:
         i, j = (result.fitted.problem.plant.states.index(n) for n in (item.first, item.second))
@@ -87,12 +86,10 @@ def test_verdicts() -> None:
 
 def test_aic_is_that_of_the_innovations() -> None:
     """White residuals of one output: T log of the mean square, up to a common constant."""
-    trial = noisy_trial(SEEDS[0], 0.0)
-    problem = fit_problem(cart(), [trial], EXTRAS)
-    fitted = fit_controller(problem)
-    found = fit_alternatives(problem, fitted, [20], 1.0)
+    problem = cart_problem(SEEDS[0])
+    found = fit_alternatives(problem, cart_fit(SEEDS[0]), [20], 1.0)
     misfits = np.array([item.misfit for item in found])
-    expected = trial.samples * np.log(misfits**2)
+    expected = problem.recordings[0].samples * np.log(misfits**2)
     differences = np.array([item.aic for item in found]) - (expected - np.min(expected))
     # The estimated coefficient of white residuals is not exactly zero.
     assert np.max(np.abs(differences)) < 0.05 * np.max(expected - np.min(expected)) + 1.0

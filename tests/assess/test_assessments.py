@@ -5,19 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.coverage import cart, noisy_trial
 from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed, evaluate_method
 from impc.checking import replace
 from impc.inverse import methods
-from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
+from tests.assess.cart_fits import cart_problem
 
 
 @pytest.fixture(scope="module")
 def fit() -> MethodFit:
     """Gain that exceeds the bound of the cart."""
-    settings = FitSettings(horizon=10, u_max=1.0)
-    problem = fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (21, 22)], settings)
+    problem = cart_problem(21, 22)
     return evaluate_method(methods.fit(problem, "feedback_gain"), problem.bounds)
 
 

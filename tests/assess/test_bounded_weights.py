@@ -8,7 +8,7 @@ import pytest
 from experiments.benchmarks.workloads import Workload, chain_of_masses, example, seat
 from impc.arrays import Array
 from impc.assess.bounded_weights import WeightsSet, entry_ranges, linear_ranges, weights_set
-from impc.assess.intent_statements import order_statements, sense_statements, widest_dominant_angle
+from impc.assess.intent_statements import pair_statements, widest_dominant_angle
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.errors import InputError
@@ -107,16 +107,15 @@ def test_statements_agree_with_sampled_members() -> None:
     found = set_of(example(), 1.5)
     sizes, names = np.array([1.0, 3.0]), found.fibre.plant.states
     sampled = random_members(found, 300)
-    for statement, values in (
-        (order_statements(found, sizes, names)[0], [X[0, 0] - 9 * X[1, 1] for X in sampled]),
-        (sense_statements(found, sizes, names, entry_ranges(found))[0], [X[0, 1] for X in sampled]),
-    ):
+    statements = pair_statements(found, sizes, names, entry_ranges(found))
+    order, sense = [X[0, 0] - 9 * X[1, 1] for X in sampled], [X[0, 1] for X in sampled]
+    for statement, values in zip(statements, (order, sense), strict=True):
         signs = {bool(value > 0) for value in values}
         if statement.holds is None:
             assert signs == {True, False}
         else:
             assert signs == {statement.holds}
-    assert order_statements(found, sizes, names)[0].holds is False
+    assert statements[0].holds is False
 
 
 def test_widest_angle_is_at_least_that_of_sampled_members() -> None:
@@ -125,19 +124,12 @@ def test_widest_angle_is_at_least_that_of_sampled_members() -> None:
     angle, weights = widest_dominant_angle(found, sizes)
     D = np.diag(sizes)
 
-    def dominant(
-        Q: Array,
-    ) -> Array:
-        return np.asarray(np.linalg.eigh(D @ Q @ D)[1][:, -1])
+    def turned(Q: Array) -> float:
+        one, centre = (np.linalg.eigh(D @ P @ D)[1][:, -1] for P in (Q, found.least.weights.Q))
+        return float(np.degrees(np.arccos(min(1.0, abs(float(one @ centre))))))
 
-    centre = dominant(found.least.weights.Q)
-    sampled = [
-        np.degrees(np.arccos(min(1.0, abs(float(centre @ dominant(X[:2, :2]))))))
-        for X in random_members(found, 2000)
-    ]
-    assert angle >= max(sampled) - 0.5
-    reached = np.degrees(np.arccos(abs(float(centre @ dominant(weights.Q)))))
-    assert reached == pytest.approx(angle, abs=1e-6)
+    assert angle >= max(turned(X[:2, :2]) for X in random_members(found, 2000)) - 0.5
+    assert turned(np.array(weights.Q)) == pytest.approx(angle, abs=1e-6)
     assert condition_number(Weights(weights.Q, weights.R)) <= found.limit * (1 + 1e-6)
 
 

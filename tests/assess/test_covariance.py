@@ -51,6 +51,12 @@ def differences(problem: Problem, K: Array, S: Array) -> Array:
     return np.array([(residual(step) - residual(-step)) / (2 * STEP) for step in steps]).T
 
 
+def deviations(columns: Array) -> Array:
+    """Standard errors (q,) for unit white noise, from scaled columns (r, q)."""
+    size = np.linalg.norm(columns, axis=0)
+    return np.asarray(np.linalg.norm(np.linalg.pinv(columns / size, 1e-6), axis=1) / size)
+
+
 def test_deviations_of_two_inputs_count_the_metric_as_unknown() -> None:
     """Unit white noise: (J'J)^-1 over K, S, x0; with S known errors are a tenth smaller."""
     controller = regulator(carts(2))
@@ -60,14 +66,10 @@ def test_deviations_of_two_inputs_count_the_metric_as_unknown() -> None:
     found = gain_covariance(problem, K, S, lambda _residuals, _lost: white)
     J = differences(problem, K, S)
 
-    def deviations(columns: Array) -> Array:
-        size = np.linalg.norm(columns, axis=0)
-        rows = np.linalg.norm(np.linalg.pinv(columns / size, 1e-6), axis=1)
-        return np.asarray((rows / size)[: K.size])
-
-    np.testing.assert_allclose(np.ravel(found.entries), deviations(J), rtol=1e-4)
-    known = deviations(np.delete(J, [K.size, K.size + 1], axis=1))
-    assert np.max(1 - known / deviations(J)) > 0.1
+    whole = deviations(J)[: K.size]
+    np.testing.assert_allclose(np.ravel(found.entries), whole, rtol=1e-4)
+    known = deviations(np.delete(J, [K.size, K.size + 1], axis=1))[: K.size]
+    assert np.max(1 - known / whole) > 0.1
 
 
 def stronger(plant: Plant) -> PlantFamily:
@@ -98,11 +100,9 @@ def test_deviations_where_a_parameter_is_fitted(m: int, seed: int) -> None:
         for step in (STEP, -STEP)
     ]
     column = (on_parameter[0] - on_parameter[1]) / (2 * STEP)
-    J = np.column_stack([differences(problem, K, S), column])
-    size = np.linalg.norm(J, axis=0)
-    deviations = np.linalg.norm(np.linalg.pinv(J / size, 1e-6), axis=1) / size
-    np.testing.assert_allclose(found.parameters, deviations[-1], rtol=1e-4)
-    np.testing.assert_allclose(np.ravel(found.entries), deviations[: K.size], rtol=1e-4)
+    expected = deviations(np.column_stack([differences(problem, K, S), column]))
+    np.testing.assert_allclose(found.parameters, expected[-1], rtol=1e-4)
+    np.testing.assert_allclose(np.ravel(found.entries), expected[: K.size], rtol=1e-4)
 
 
 @pytest.mark.full

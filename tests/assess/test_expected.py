@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import control
 import numpy as np
 import pytest
@@ -43,6 +45,7 @@ def outputs(cost_weights: Array, x0: Array, limit: float) -> Array:
     return np.asarray((run.x @ plant.C.T)[:SAMPLES, 0])
 
 
+@functools.cache
 def cart_problem() -> Problem:
     plant, structure, push = cart()
     trial = Recording(plant, outputs(COST_WEIGHTS, np.zeros(2), 1.0)[:, None], push)
@@ -50,6 +53,11 @@ def cart_problem() -> Problem:
         plant, Bounds(plant, u_min=-1, u_max=1), 8, [trial],
         terminal_set=False, unknown_start=True, structure=structure,
     )  # fmt: skip
+
+
+@functools.cache
+def expected(root: float = 0.0) -> Expectation:
+    return expected_intervals(cart_problem(), COST_WEIGHTS, NOISE, root=root)
 
 
 def differences(points: list[tuple[Array, Array, float]], step: float) -> Array:
@@ -81,7 +89,7 @@ def dense(root: float) -> Array:
 
 @pytest.mark.parametrize("root", [0.0, 0.6])
 def test_deviations_are_those_of_least_squares(root: float) -> None:
-    found = expected_intervals(cart_problem(), COST_WEIGHTS, NOISE, root=root)
+    found = expected(root)
     on_cost_weights, on_start, _ = columns()
     both = np.hstack([on_cost_weights, on_start])
     back = np.linalg.pinv(both)
@@ -96,7 +104,7 @@ def test_deviations_are_those_of_least_squares(root: float) -> None:
 
 
 def test_the_limit_is_told_as_least_squares_with_a_free_gain_tells_it() -> None:
-    found = expected_intervals(cart_problem(), COST_WEIGHTS, NOISE)
+    found = expected()
     on_cost_weights, on_start, on_limit = columns()
     # Two cost weights move this gain in both of its directions: the same span.
     others = np.hstack([on_cost_weights, on_start])
@@ -131,6 +139,23 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
     np.testing.assert_allclose(ends(small), wanted, rtol=0.02)
 
 
+def test_a_product_of_commands_makes_intervals_normal() -> None:
+    """Two carts with a cross weight of their forces: the unknowns are factors, not logarithms."""
+    plant = carts(2)
+    structure, bounds = Structure(plant, "diagonal", "full"), Bounds(plant, u_min=-1, u_max=1)
+    unknowns = np.append(np.zeros(structure.count - 1), 0.3)
+    push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 2)), 10, axis=0)
+    law = Controller(plant, structure.weights(unknowns), bounds, 8, terminal_set=False)
+    trial = Recording(plant, law.simulate(np.zeros(4), disturbance=push).outputs[:-1], push)
+    problem = Problem(plant, bounds, 8, [trial], terminal_set=False, structure=structure)
+    found = expected_intervals(problem, unknowns, NOISE)
+    assert np.all(np.isfinite(found.deviations))
+    ends = np.array([[item.value, item.low, item.high] for item in found.intervals])
+    values = structure.reported(unknowns)[0][:, None]
+    wanted = values + 1.959964 * np.outer(found.deviations, [0.0, -1.0, 1.0])
+    np.testing.assert_allclose(ends, wanted, atol=1e-6)
+
+
 def known_to(uncertainty: dict[str, float | str]) -> Expectation:
     """Cart with stated uncertainties of force per command and rate of falling."""
 
@@ -159,7 +184,7 @@ STATED: dict[str, float | str] = {"force": "5 %", "fall": 0.06, "u_max": "5 %"}
 
 
 def test_an_exact_body_and_one_that_is_measured_are_those_of_their_own_problems() -> None:
-    found, exact = known_to(STATED), expected_intervals(cart_problem(), COST_WEIGHTS, NOISE)
+    found, exact = known_to(STATED), expected()
     assert exact.body is None
     assert found.body is not None
     assert found.body.names == ("force", "fall", "u_max.force1")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.workloads import seat
-from experiments.coverage import cart, noisy_trial, true_controller
+from experiments.coverage import cart, true_controller
 from experiments.simulated_subjects import noisy_recordings
 from impc.assess import input_limits
 from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
@@ -18,6 +18,7 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
+from tests.assess.cart_fits import cart_fit
 
 SEED = 3
 
@@ -41,7 +42,7 @@ def gentle_trial() -> Recording:
 @pytest.mark.parametrize("assumed", [None, 1.4])
 def test_a_limit_that_is_met_is_found(assumed: float | None) -> None:
     """Seed 3: within 2 % and covered by the interval, from any assumed limit."""
-    found = input_limit(fitted_cart(noisy_trial(SEED, 0.0), assumed))
+    found = input_limit(cart_fit(SEED, u_max=assumed))
     assert found.value == pytest.approx(1.0, rel=0.02)
     assert found.low < 1.0 < found.high
     assert found.against_none > found.quantile
@@ -60,7 +61,7 @@ def test_a_limit_that_is_never_met_is_not_determined() -> None:
 def test_the_search_starts_at_the_given_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The unlimited regulator of a seat commands 20 times the limit: a grid below it misses it."""
     monkeypatch.setattr(input_limits, "_typical_peak", lambda *_: 1e3)
-    found = input_limit(fitted_cart(noisy_trial(SEED, 0.0), 1.2))
+    found = input_limit(cart_fit(SEED, u_max=1.2))
     assert found.value == pytest.approx(1.0, rel=0.02)
 
 

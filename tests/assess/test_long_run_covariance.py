@@ -92,3 +92,20 @@ def test_deviations_of_a_regression_are_those_of_the_noise(root: float, short: f
     assert given_back == pytest.approx(1, abs=0.04)
     assert bare < short
     assert root > 0 or white == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(("samples", "lags"), [(9, 1), (9, 4), (3, 5), (60, 40)])
+def test_sums_over_lags_are_those_of_the_whole_covariance_matrix(samples: int, lags: int) -> None:
+    """Two outputs with asymmetric cross-covariances; more lags than samples; many lags."""
+    rng = np.random.default_rng(samples + lags)
+    columns = rng.standard_normal((samples, 2, 3))
+    gammas = rng.standard_normal((lags, 2, 2))
+    gammas[0] += gammas[0].T
+    whole = np.zeros((samples, 2, samples, 2))
+    for t, s in np.ndindex(samples, samples):
+        if abs(t - s) < lags:
+            whole[t, :, s, :] = gammas[t - s] if t >= s else gammas[s - t].T
+    flat = columns.reshape(-1, 3)
+    expected = flat.T @ whole.reshape(len(flat), -1) @ flat
+    found = spread_of_sum(ResidualNoise(np.zeros(2), gammas), [columns])
+    np.testing.assert_allclose(found, expected, atol=1e-10)

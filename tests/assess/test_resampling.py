@@ -23,7 +23,7 @@ from impc.assess.printed_gain import (
 )
 from impc.assess.profiles import profile_likelihood
 from impc.assess.resampling import (
-    Replicate,
+    BootstrapModel,
     block_length,
     block_residuals,
     bootstrap_intervals,
@@ -32,7 +32,6 @@ from impc.assess.resampling import (
 )
 from impc.checking import replace
 from impc.errors import InputError
-from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason
@@ -40,14 +39,12 @@ from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
+from tests.assess.cart_fits import cart_fit, cart_gain, cart_problem
 
 SEED = 4
 
 
-@pytest.fixture(scope="module", params=[0.0, 0.9], ids=["white", "coloured"])
-def fitted(request: pytest.FixtureRequest) -> Estimate:
-    trial = noisy_trial(SEED, request.param)
-    return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
+both_roots = pytest.mark.parametrize("root", [0.0, 0.9], ids=["white", "coloured"])
 
 
 def test_replicates_draw_what_is_known_of_the_body_again() -> None:
@@ -64,7 +61,7 @@ def test_replicates_draw_what_is_known_of_the_body_again() -> None:
     trials = [Recording(plant, y + noise, push)]
     posed = Problem(plant, bounds, 10, trials, unknown_start=True, family=family)
     at = gain_estimate(fit_controller(posed))
-    model = bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
+    model = model_of(at)
     repeated = [replicate(model, index, SEED) for index in range(40)]
     spread = np.std([np.log(one.K[0, 0] / at.K[0, 0]) for one in repeated])
     assert 0.07 < spread < 0.13
@@ -78,10 +75,8 @@ def first_order(root: float, samples: int, seed: int) -> Array:
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
 
 
-def drawn(fitted: Estimate, index: int, seed: int) -> Replicate:
-    at = gain_estimate(fitted)
-    model = bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
-    return replicate(model, index, seed)
+def model_of(at: GainEstimate) -> BootstrapModel:
+    return bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
 
 
 def white_covariance(estimate: GainEstimate) -> GainCovariance:
@@ -95,25 +90,22 @@ def width(found: tuple[Interval, ...]) -> Array:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    "fitted",
-    [0.9, pytest.param(0.0, marks=pytest.mark.full)],
-    ids=["coloured", "white"],
-    indirect=True,
-)
-def test_bootstrap_agrees_with_the_sandwich(fitted: Estimate) -> None:
+@both_roots
+def test_bootstrap_agrees_with_the_sandwich(root: float) -> None:
     """30 replicates, seed 4: widths within a third of the sandwich's."""
-    estimate = gain_estimate(fitted)
+    estimate = cart_gain(SEED, root=root)
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
-    found = [drawn(fitted, index, SEED) for index in range(30)]
+    model = model_of(estimate)
+    found = [replicate(model, index, SEED) for index in range(30)]
     ratio = width(bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / sandwich
     assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
 
 
 @pytest.mark.full
-def test_profile_agrees_with_the_sandwich(fitted: Estimate) -> None:
+@both_roots
+def test_profile_agrees_with_the_sandwich(root: float) -> None:
     """Nearly quadratic, so nearly equal ends."""
-    estimate = gain_estimate(fitted)
+    estimate = cart_gain(SEED, root=root)
     for item in covariance_intervals(estimate, estimate.covariance, "sandwich"):
         found = profile_likelihood(estimate, item.name).interval
         assert found.low == pytest.approx(item.low, abs=0.15 * (item.high - item.low))
@@ -123,17 +115,17 @@ def test_profile_agrees_with_the_sandwich(fitted: Estimate) -> None:
 
 @pytest.mark.full
 def test_plain_intervals_are_narrower_with_coloured_noise() -> None:
-    trial = noisy_trial(SEED, 0.9)
-    fit = fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=1.0)))
-    estimate = gain_estimate(fit)
+    estimate = cart_gain(SEED, root=0.9)
     plain = width(covariance_intervals(estimate, white_covariance(estimate), "white"))
     sandwich = width(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     assert np.all(sandwich > 2 * plain)
 
 
 @pytest.mark.full
-def test_profile_against_brute_force(fitted: Estimate) -> None:
+@both_roots
+def test_profile_against_brute_force(root: float) -> None:
     """D at one value against a grid search over the other entry, initial state refitted."""
+    fitted = cart_fit(SEED, root=root)
     problem = replace(fitted.problem, unknown_start=False)
     known = gain_estimate(replace(fitted, problem=problem))
     name = entry_names(problem.plant)[0]
@@ -173,26 +165,30 @@ def test_what_is_not_determined_has_no_end() -> None:
     assert estimate.covariance.individually_identified.tolist() == [[True, True, False]]
 
 
-def test_an_unknown_name_is_told(fitted: Estimate) -> None:
+def test_an_unknown_name_is_told() -> None:
     with pytest.raises(InputError, match=r"choose from: K\.force"):
-        profile_likelihood(gain_estimate(fitted), "mass")
+        profile_likelihood(cart_gain(SEED), "mass")
 
 
-def test_a_replicate_depends_on_seed_and_number_only(fitted: Estimate) -> None:
-    alone = drawn(fitted, 3, SEED)
-    after = [drawn(fitted, index, SEED) for index in (2, 3)][1]
+@both_roots
+def test_a_replicate_depends_on_seed_and_number_only(root: float) -> None:
+    at = cart_gain(SEED, root=root)
+    alone = replicate(model_of(at), 3, SEED)
+    model = model_of(at)
+    after = [replicate(model, index, SEED) for index in (2, 3)][1]
     np.testing.assert_array_equal(alone.K, after.K)
-    assert not np.array_equal(drawn(fitted, 3, SEED + 1).K, alone.K)
+    assert not np.array_equal(replicate(model, 3, SEED + 1).K, alone.K)
 
 
+@both_roots
 def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
-    fitted: Estimate, monkeypatch: pytest.MonkeyPatch
+    root: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Against a full fit (weights, then identified gain): within 0.01 standard errors.
 
     The full fit uses the recordings drawn by the replicate.
     """
-    at = gain_estimate(fitted)
+    at = cart_gain(SEED, root=root)
     kept: list[list[Array]] = []
 
     def keep(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
@@ -200,7 +196,7 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
         return kept[-1]
 
     monkeypatch.setattr(resampling, "block_residuals", keep)
-    model = bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
+    model = model_of(at)
     found = replicate(model, 0, SEED)
     trials = tuple(
         replace(trial, outputs=outputs + noise)
@@ -208,7 +204,7 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
             at.problem.recordings, model.measured, kept[0], strict=True
         )
     )
-    whole = gain_estimate(fit_controller(replace(fitted.problem, recordings=trials)))
+    whole = gain_estimate(fit_controller(replace(cart_problem(SEED, root=root), recordings=trials)))
     assert np.all(np.abs(found.K - whole.K) < 0.01 * whole.covariance.entries)
     assert np.all(np.abs(found.K - at.K) > 0.01 * whole.covariance.entries)
 

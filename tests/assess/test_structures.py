@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+from typing import TYPE_CHECKING
 
 import control
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 
 import plants
@@ -14,11 +16,9 @@ from experiments.printed_intervals import carts, with_noise
 from experiments.structure_study import cart_person, seat_person
 from impc.assess.structured_weights import Tangent, tangent, weight_covariance
 from impc.assess.structures import structure_test
-from impc.assess.weight_profiles import NearFit, WeightProfiles
+from impc.assess.weight_profiles import WeightProfiles
 from impc.checking import replace
-from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import scenario
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured import search_from
@@ -27,6 +27,9 @@ from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 SEAT = np.log([6e3, 9e3, 6e2, 4e2])
@@ -99,24 +102,8 @@ def test_deviations_are_those_of_the_whole_normal_matrix() -> None:
     np.testing.assert_allclose(white, np.sqrt(np.diag(whole)), rtol=0.03)
 
 
-def test_an_interval_ends_where_the_misfit_has_grown() -> None:
-    """Against searches of the recordings with the cost weight fixed at the end."""
-    at = fitted()
-    covariance = weight_covariance(at)
-    structure, cost_weights = at.structure, np.array(at.cost_weights)
-    found = WeightProfiles(at, covariance).interval(np.eye(structure.count)[0])
-    wider = covariance.spread(np.eye(structure.count)[0])[1]
-    best = _held(
-        at, cost_weights, float(cost_weights[0])
-    )  # without the weak prior on the initial states
-    for end in (found.low, found.high):
-        grown = len(at.residual) * (_held(at, cost_weights, end) / best - 1)
-        # The bisection ends within 1/50 of a standard error, 2 % of D.
-        assert grown == pytest.approx(3.84 * wider**2, rel=0.05)
-
-
-@pytest.mark.full
-def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -> None:
+@functools.cache
+def fitted_seat() -> Tangent:
     """One trial of a subject whose weights are known to within a factor of ten.
 
     The quadratic form at the fit alone would end 1.3 (log cost weight) short.
@@ -124,18 +111,11 @@ def test_an_interval_ends_where_the_recordings_say_and_not_where_a_line_does() -
     person = seat_person(4, 99.0, 0.0)
     one = replace(person.problem, recordings=person.problem.recordings[:1])
     end = search_from(one, person.structure, person.cost_weights)
-    at = tangent(person.structure, end.problem, np.array(end.cost_weights))
-    covariance = weight_covariance(at)
-    row = np.eye(person.structure.count)[0]
-    found = WeightProfiles(at, covariance).interval(row)
-    rows, rank = len(at.residual), covariance.rank
-    best = _least(at, 0, float(at.cost_weights[0]))
-    for value in (found.low, found.high):
-        grown = (rows - rank) * (_least(at, 0, value) / best - 1)
-        assert grown == pytest.approx(3.84 * covariance.spread(row)[1] ** 2, rel=0.1)
+    return tangent(person.structure, end.problem, np.array(end.cost_weights))
 
 
-def test_an_interval_ends_where_the_body_all_but_falls() -> None:
+@functools.cache
+def fitted_scalar() -> Tangent:
     """Unstable plant near its limit, with so much noise that linearisation has no lower end.
 
     The misfit diverges towards the cost weight at which the plant does.
@@ -150,76 +130,71 @@ def test_an_interval_ends_where_the_body_all_but_falls() -> None:
     x = law.simulate([0.0], disturbance=push).x[:-1]
     outputs = x + 8.0 * np.random.default_rng(0).standard_normal(x.shape)
     trial = Recording(plant, outputs, push)
-    end = search_from(
-        Problem(plant, bounds, 5, [trial], terminal_set=False), structure, np.zeros(1)
-    )
-    at = tangent(structure, end.problem, np.array(end.cost_weights))
-    covariance = weight_covariance(at)
-    found = WeightProfiles(at, covariance).interval(np.eye(1)[0])
+    problem = Problem(plant, bounds, 5, [trial], terminal_set=False)
+    end = search_from(problem, structure, np.zeros(1))
+    return tangent(structure, end.problem, np.array(end.cost_weights))
 
-    def misfit(cost_weight: float) -> float:
-        other = Controller(
-            plant, structure.weights(np.array([cost_weight])), bounds, 5, terminal_set=False
-        )
-        run = simulate(other, scenario(plant, [0.0], disturbance=push))
-        return float(np.sum((run.x[:-1] - outputs) ** 2)) if run.complete else np.inf
 
-    best = misfit(float(end.cost_weights[0]))
-    grown = (len(x) - covariance.rank) * (misfit(found.low) / best - 1)
-    assert grown == pytest.approx(3.84 * covariance.spread(np.eye(1)[0])[1] ** 2, rel=0.1)
-    assert misfit(found.low - 2.0) == np.inf
+@pytest.mark.parametrize(
+    ("fit", "tolerance"),
+    [(fitted, 0.05), pytest.param(fitted_seat, 0.1, marks=pytest.mark.full), (fitted_scalar, 0.1)],
+)
+def test_an_interval_ends_where_the_misfit_has_grown(
+    fit: Callable[[], Tangent], tolerance: float
+) -> None:
+    """Against searches of the recordings with the cost weight fixed at the end."""
+    at = fit()
+    covariance, row = weight_covariance(at), np.eye(at.structure.count)[0]
+    found = WeightProfiles(at, covariance).interval(row)
+    best = _least(at, float(at.cost_weights[0]))
+    ends = [end for end in (found.low, found.high) if np.isfinite(end)]
+    assert len(ends) == (1 if fit is fitted_scalar else 2)
+    for end in ends:
+        grown = (len(at.residual) - covariance.rank) * (_least(at, end) / best - 1)
+        # The search ends within 1/50 of a standard error, 2 % of D.
+        assert grown == pytest.approx(3.84 * covariance.spread(row)[1] ** 2, rel=tolerance)
+
+
+def test_an_interval_has_no_end_where_the_misfit_stays() -> None:
+    at = fitted_scalar()
+    found = WeightProfiles(at, weight_covariance(at)).interval(np.eye(1)[0])
     assert found.high == np.inf
+    assert tangent(at.structure, at.problem, np.array([found.low - 2.0])).found.reason
 
 
-def _least(at: Tangent, index: int, value: float) -> float:
-    """Least squares over the other weights, initial states free, on the recordings."""
-    free = np.delete(np.arange(at.structure.count), index)
+def _least(at: Tangent, value: float) -> float:
+    """Least squares over all weights but the first, initial states free, on the recordings."""
 
-    def place(others: np.ndarray) -> Tangent:
-        cost_weights = np.insert(others, index, value)
-        return tangent(at.structure, at.problem, cost_weights)
+    def reduced(others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        place = tangent(at.structure, at.problem, np.append(value, others))
+        columns = np.column_stack([place.residual, place.on_cost_weights[:, 1:]])
+        left = place.without_nuisance(columns) / at.noise
+        return left[:, 0], left[:, 1:]
+
+    starts = [np.array(at.cost_weights)[1:]]
+    if len(starts[0]) == 0:
+        return float(np.sum(reduced(starts[0])[0] ** 2))
+
+    if at.structure.count == len(SEAT):
+        starts.append(SEAT[1:])
 
     def residual(others: np.ndarray) -> np.ndarray:
-        there = place(others)
-        return there.without_nuisance(np.array(there.residual)[:, None])[:, 0] / at.noise
+        return reduced(others)[0]
 
     def slopes(others: np.ndarray) -> np.ndarray:
-        there = place(others)
-        return there.without_nuisance(np.array(there.on_cost_weights[:, free])) / at.noise
+        return reduced(others)[1]
 
-    found = [
-        scipy.optimize.least_squares(residual, start, jac=slopes, max_nfev=30).cost
-        for start in (np.array(at.cost_weights)[free], SEAT[free])
-    ]
-    return float(2 * min(found) * at.noise**2)
-
-
-def _held(at: Tangent, cost_weights: np.ndarray, end: float) -> float:
-    """Gauss-Newton on the recordings with the first cost weight fixed at `end`."""
-    structure, problem, free = at.structure, at.problem, np.arange(1, at.structure.count)
-    here = cost_weights.copy()
-    here[0] = end
-    for _ in range(6):
-        place = tangent(structure, problem, here)
-        columns = np.hstack([place.on_cost_weights[:, free], _start_columns(place)])
-        step = np.linalg.lstsq(columns, -np.array(place.residual), rcond=None)[0]
-        here[free] += step[: len(free)]
-        starts = np.asarray(problem.starts)
-        problem = problem.at(starts + step[len(free) :].reshape(starts.shape), np.zeros(0))
-    last = tangent(structure, problem, here)
-    return float(last.residual @ last.residual)
+    searches = (
+        scipy.optimize.least_squares(residual, start, jac=slopes, max_nfev=30) for start in starts
+    )
+    return float(2 * min(found.cost for found in searches))
 
 
 def _start_columns(place: Tangent) -> np.ndarray:
     """Derivative by the initial state of every trial, zero outside the trial."""
     sizes = [trial.outputs.size for trial in place.problem.recordings]
     parts = np.split(np.asarray(place.found.own), np.cumsum(sizes)[:-1])
-    whole = np.zeros((sum(sizes), sum(part.shape[1] for part in parts)))
-    row = column = 0
-    for part in parts:
-        whole[row : row + len(part), column : column + part.shape[1]] = part
-        row, column = row + len(part), column + part.shape[1]
-    return whole
+    return np.asarray(scipy.linalg.block_diag(*parts))
 
 
 def test_a_price_of_zero_has_an_upper_end() -> None:
@@ -240,7 +215,7 @@ def test_a_price_of_zero_has_an_upper_end() -> None:
 
 def test_the_structure_that_holds_is_not_refused_and_a_cross_term_is() -> None:
     holds, crossed = structure_test(fitted()), structure_test(fitted(0, 0.5))
-    assert holds.freedom == crossed.freedom == 4 or holds.freedom >= 3
+    assert min(holds.freedom, crossed.freedom) >= 3
     assert not holds.refused
     assert crossed.refused
     first = next(item for item in holds.powers if (item.first, item.second) == ("x[0]", "x[1]"))
@@ -292,20 +267,13 @@ def test_nothing_to_test_where_prices_make_every_gain() -> None:
 def test_near_a_fit_the_misfit_is_that_of_the_recordings() -> None:
     """A few standard errors away, against a simulation with refitted initial states."""
     at = fitted()
-    near = NearFit(at)
-    moved = np.array(at.cost_weights) + 0.3 * np.array(weight_covariance(at).each) * [
-        1,
-        -1,
-        0.5,
-        0.5,
-        1,
-    ]
+    here = np.array(at.cost_weights)
+    moved = here + 0.3 * np.array(weight_covariance(at).each) * [1, -1, 0.5, 0.5, 1]
     nothing = np.zeros((at.structure.count, 0))
-    here, there = (near.least(z, nothing)[0] for z in (np.array(at.cost_weights), moved))
-    found = []
-    for cost_weights in (np.array(at.cost_weights), moved):
+    near, true = [], []
+    for cost_weights in (here, moved):
+        near.append(at.quadratic.least(cost_weights, nothing)[0])
         place = tangent(at.structure, at.problem, cost_weights)
         columns, e = _start_columns(place), np.array(place.residual)
-        least = e - columns @ np.linalg.lstsq(columns, e, rcond=None)[0]
-        found.append(float(least @ least))
-    assert there - here == pytest.approx(found[1] - found[0], rel=0.1)
+        true.append(float(np.sum((e - columns @ np.linalg.lstsq(columns, e)[0]) ** 2)))
+    assert near[1] - near[0] == pytest.approx(true[1] - true[0], rel=0.1)

@@ -10,8 +10,8 @@ import pytest
 
 from experiments.misfit_ceiling import short_of_truth
 from experiments.printed_intervals import carts, fit, noisy_recording, random_recording, regulator
+from impc.assess.bounded_weights import weights_set
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.weights_ranges import summarise_weights
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
@@ -160,9 +160,9 @@ def test_set_of_weights_has_the_metric_in_it() -> None:
     assert len(fitted.metrics) == 1
     plant, K = problem.plant, np.array(fitted.gain)
     numbers = plant.n * (plant.n + 1) // 2 + plant.m * (plant.m + 1) // 2
-    found = summarise_weights(plant, K, np.array(fitted.metrics), np.ones(plant.n))
+    found = weights_set(gain_fibre(plant, K, np.array(fitted.metrics)))
     # n m + m - 1 directions are identified; one further is the scale.
-    assert found.dimension == numbers - (plant.n * plant.m + plant.m - 1) - 1
+    assert len(found.level) == numbers - (plant.n * plant.m + plant.m - 1) - 1
 
 
 def test_fibre_of_a_metric_in_a_span() -> None:

@@ -78,8 +78,8 @@ def test_a_shift_and_back_is_the_mean_of_neighbours_and_none_changes_nothing() -
         np.testing.assert_allclose(distorted(signal, none, held=held)[0], signal, atol=1e-14)
     late = none.copy()
     late[3] = 0.25  # a quarter of a sample later
-    held = distorted(signal, late, held=True)[0]
-    np.testing.assert_allclose(held[1:], 0.75 * signal[1:] + 0.25 * signal[:-1])
+    found = distorted(signal, late, held=True)[0]
+    np.testing.assert_allclose(found[1:], 0.75 * signal[1:] + 0.25 * signal[:-1])
 
 
 def test_derivatives_of_outputs_are_moved_with_them() -> None:

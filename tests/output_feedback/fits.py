@@ -90,7 +90,9 @@ def unknown_truth(found: OutputFeedbackFit, levels: list[float], limit: float) -
     """The true subject in the coordinates of a fit (q,), at its own initial states."""
     space, theta = found.space, np.array(found.space.start)
     own = space.space
-    theta[: space.gain] = np.tensordot(own.natural(own.gains), own.natural(law(limit).K), 2)
+    theta[: space.gain] = np.tensordot(
+        space.gain_law.natural(space.gain_law.gains), space.gain_law.natural(law(limit).K), 2
+    )
     starts = np.array([trial.x0 for trial in own.problem.recordings])
     theta[space.shared : space.after] = -np.linalg.solve(own.own_unit, starts.T).T.ravel()
     theta[space.own :] = np.log(levels)

@@ -81,9 +81,9 @@ def test_the_barrier_is_how_far_noise_drives_the_loop() -> None:
     """Against a sum over all samples after a push; its gradient against differences."""
     space = unknowns()
     theta = space.start + np.array([0.1, -0.2, *np.zeros(len(space.start) - 2)])
-    plant, T = space.space.problem.plant, space.space.T
+    plant, T = space.space.problem.plant, space.gain_law.T
     closed = plant.A - plant.B @ space.unpack(theta)[0].K
-    column, total = plant.B @ space.space.G, 0.0
+    column, total = plant.B @ space.gain_law.G, 0.0
     for _ in range(3000):  # the slowest mode has 0.9
         total += float(np.sum(np.linalg.solve(T, column) ** 2))
         column = closed @ column
@@ -161,7 +161,7 @@ def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
 def test_a_gain_that_cannot_be_the_persons_is_left_behind(along: int, units: float) -> None:
     """Regression: started 3 whitened units away, a search ended at 10 times the gain."""
     near, (person, first) = fitted("limited"), least_squares("limited")
-    far = np.array(first.gain) + units * near.space.space.gains[along]
+    far = np.array(first.gain) + units * near.space.gain_law.gains[along]
     found = fit_output_feedback(replaced(first, K=far), person)
     assert found.converged
     deviations = np.array(person_covariance(near, "expected").entries)

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from impc.assess.covariance import IDENTIFIED, TWO_SIDED
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names
 from impc.assess.variance_accounted_for import verdict
 from impc.files.disk import truth_beside
+from impc.inverse.refit import IDENTIFIED
 from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
