@@ -24,8 +24,8 @@ from tqdm import tqdm
 from experiments.cursor_data import RATE, Condition, data_file, read_conditions
 from experiments.cursor_people import FIRST, Follower, fit_follower, judged, nats, regression_nats
 from experiments.cursor_steps import Expected, fit_steps, step_nats
+from impc.output_feedback.intervals import level_intervals, person_covariance
 from impc.output_feedback.models import prediction_errors
-from impc.output_feedback.search import level_intervals, person_covariance
 from impc.reporting.writer import write_files
 
 if TYPE_CHECKING:

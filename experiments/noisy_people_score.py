@@ -11,15 +11,15 @@ import numpy as np
 from impc.assess.covariance import gain_covariance
 from impc.inverse.methods import fit
 from impc.output_feedback.fit import fit_output_feedback
-from impc.output_feedback.search import IDENTIFIED, fallen, person_covariance
+from impc.output_feedback.intervals import IDENTIFIED, fallen, person_covariance
 from impc.output_feedback.simulation import simulate_person
 
 if TYPE_CHECKING:
     from experiments.noisy_people import Recorded, Subject
     from impc.arrays import Array
     from impc.output_feedback.fit import OutputFeedbackFit
+    from impc.output_feedback.intervals import PersonCovariance
     from impc.output_feedback.observer import Observer
-    from impc.output_feedback.search import PersonCovariance
 
 __all__ = [
     "FALLEN",
@@ -179,7 +179,7 @@ def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
 def _steps(
     likely: OutputFeedbackFit, covariance: PersonCovariance, truth: Array
 ) -> list[tuple[float, float]]:
-    own, space = likely.space.space, likely.space
+    space = likely.space
     error = space.gain_law.natural(np.array(likely.K) - truth)
     along = np.tensordot(space.gain_law.natural(space.gain_law.gains), error, 2)
     return _pairs(covariance.directions, covariance.deviations, along[: space.gain])

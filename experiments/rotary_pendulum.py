@@ -29,7 +29,7 @@ import impc
 from impc.arrays import Array
 from impc.errors import DataError
 from impc.output_feedback.fit import OutputFeedbackFit
-from impc.output_feedback.search import entry_intervals, person_covariance
+from impc.output_feedback.intervals import entry_intervals, person_covariance
 
 ARCHIVE = "furuta_pinned_sessions_thesis_20260209.zip"
 DIGEST = "047a1227a30e303eeffbd734ca3d96c73c7b0497538b662b864ad61d70d4d1db"

@@ -22,7 +22,7 @@ from terminal import RESULTS, show
 
 import impc
 from impc.assess.covariance import gain_covariance
-from impc.output_feedback.search import level_intervals, person_covariance
+from impc.output_feedback.intervals import level_intervals, person_covariance
 from impc.output_feedback.simulation import simulate_person
 
 system = control.ss(

@@ -158,7 +158,7 @@ def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
     """VAF of a held-out trial under the controller fitted without it."""
     gain, metric = np.array(other.gain), np.array(other.metric)
     fixed = other.problem.with_nuisance_fixed()
-    alone = replace(fixed, recordings=(trial,), offsets=other.problem.offsets)
+    alone = replace(fixed, recordings=(trial,), signal_errors=other.problem.signal_errors)
     first = round(settle / alone.plant.dt)
     started = alone
     if other.problem.unknown_start:

@@ -41,6 +41,10 @@ class FixedLaw:
     def __init__(self, gain: Array, metric: Array) -> None:
         self.given = gain, metric
 
+    def reference(self, _problem: Problem) -> Array:
+        """The gain."""
+        return self.given[0]
+
     def pair(self, _problem: Problem, _part: Array) -> tuple[Array, Array]:
         """Gain and metric."""
         return self.given
@@ -87,6 +91,10 @@ class GainLaw:
     def natural(self, gains: Array) -> Array:
         """G^-1 K T (..., m, n) of gains K (..., m, n)."""
         return np.asarray(np.linalg.solve(self.G, gains @ self.T))
+
+    def reference(self, _problem: Problem) -> Array:
+        """The gain that defines the whitened coordinates."""
+        return self.given[0]
 
     def pair(self, _problem: Problem, part: Array) -> tuple[Array, Array]:
         """Gain (m, n) and metric (m, m) at `part` (count,)."""
@@ -147,6 +155,10 @@ class WeightLaw:
             found = solve_lqr(plant, self.structure.weights(self.cost_weights(part)))
             self.solved = plant, key, found
         return self.solved[2]
+
+    def reference(self, problem: Problem) -> Array:
+        """The gain at the start."""
+        return self.pair(problem, self.start)[0]
 
     def pair(self, problem: Problem, part: Array) -> tuple[Array, Array]:
         """Gain (m, n) and metric (m, m); with a given terminal weight those of the first stage."""

@@ -27,8 +27,8 @@ import numpy as np
 if TYPE_CHECKING:
     from impc.arrays import Array
 
-# Initial and least damping; its factors after a rejected or poor and after a good step, which are
-# told apart by the ratio of gained to predicted decrease.
+# Initial and least damping; its factors after a rejected or poor and after a good step, by ratios
+# of the gained to the predicted decrease.
 _DAMPING, _LEAST, _UP, _DOWN, _GOOD, _POOR = 1e-3, 1e-12, 6.0, 0.2, 0.5, 0.1
 # A search is stuck after this many rejected steps in a row, or if this many accepted ones together
 # lower F by less than `Stop.promise` and than this share of what is still promised.

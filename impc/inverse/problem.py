@@ -190,12 +190,6 @@ class Problem(Value):
             raise DataError("recordings", missing, "pass [Recording(...)]")
         commands = [trial.commands for trial in recordings if len(trial.commands)]
         outputs = [trial.outputs for trial in recordings]
-        for name in sorted(set(offsets) - set(plant.outputs)):
-            known = ", ".join(plant.outputs)
-            raise InputError("offsets", f"no output is named {name!r}", f"choose from: {known}")
-        pairs = [("offset", name) for name in offsets]
-        pairs += [(kind, name) for kind, names in (signal_errors or {}).items() for name in names]
-        _require_errors(plant, pairs)
         if family is not None:
             if plant_at(family, np.zeros(len(family.names))).states != plant.states:
                 remedy = "pass plant=family.make(family.nominal)"
@@ -216,7 +210,7 @@ class Problem(Value):
             softening=softening,
             output_scale=frozen(_scale("output_scale", output_scale, outputs, len(plant.outputs))),
             command_scale=frozen(_scale("command_scale", command_scale, commands, plant.m)),
-            signal_errors=tuple(dict.fromkeys(pairs)),
+            signal_errors=_error_pairs(plant, offsets, signal_errors or {}),
             unknown_start=unknown_start,
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
@@ -375,8 +369,15 @@ class Problem(Value):
         return sum(int(np.isfinite(recorded(self, trial)).sum()) for trial in self.recordings)
 
 
-def _require_errors(plant: Plant, pairs: Sequence[tuple[str, str]]) -> None:
-    """Require known kinds and signals, and a plant whose disturbances can be moved."""
+def _error_pairs(
+    plant: Plant, offsets: Sequence[str], errors: Mapping[str, Sequence[str]]
+) -> tuple[tuple[str, str], ...]:
+    """Pairs (kind, signal); requires known ones, and a plant whose disturbances can be moved."""
+    for name in sorted(set(offsets) - set(plant.outputs)):
+        said = f"choose from: {', '.join(plant.outputs)}"
+        raise InputError("offsets", f"no output is named {name!r}", said)
+    pairs = [("offset", name) for name in offsets]
+    pairs += [(kind, name) for kind, names in errors.items() for name in names]
     known = (*plant.outputs, *plant.disturbances)
     for kind, name in pairs:
         if kind not in KINDS:
@@ -388,6 +389,7 @@ def _require_errors(plant: Plant, pairs: Sequence[tuple[str, str]]) -> None:
         if name in plant.disturbances and dressed:
             problem = f"{name} drives a nonlinear body or is known to the controller"
             raise InputError("signal_errors", problem, "estimate errors of outputs only")
+    return tuple(dict.fromkeys(pairs))
 
 
 def aims(plant: Plant, recordings: Sequence[Recording]) -> bool:

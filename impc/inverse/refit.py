@@ -23,7 +23,7 @@ from impc.arrays import Array
 from impc.checking import replace
 from impc.inverse.laws import GainLaw
 from impc.inverse.minimiser import PROMISE
-from impc.inverse.problem import explains
+from impc.inverse.problem import explains, require_riccati
 from impc.inverse.search import stop_at
 from impc.inverse.unknowns import Unknowns
 
@@ -45,6 +45,7 @@ _STAYS = 0.1
 
 def refit(problem: Problem, gain: Array, metric: Array) -> Fitted:
     """Refit from a `gain` (m, n) and `metric` (m, m), at the other values of the problem."""
+    require_riccati(problem)
     return _refitted(_Key(problem, gain.tobytes(), metric.tobytes()))
 
 

@@ -192,7 +192,8 @@ def inverse_mpc(
         direct = _simulated("inverse_mpc", posed, K, S, weights=found.weights, **more)
         if direct.explained or not explain:
             return direct
-        behind = weights_behind(refine_gain(posed, K, S))
+        gain = refine_gain(posed, K, S)
+        behind = weights_behind(gain if gain.converged else fit_gain(posed))
         spent = found.evaluations + behind.gain.evaluations
         return _explaining("inverse_mpc", behind, spent) if behind.explained else direct
 

@@ -56,6 +56,9 @@ class Law(Protocol):
     def start(self) -> Array:
         """Unknowns at which a search starts (count,)."""
 
+    def reference(self, problem: Problem) -> Array:
+        """Gain (m, n) under which the states have the size of a unit."""
+
     def pair(self, problem: Problem, part: Array) -> tuple[Array, Array]:
         """Gain (m, n) and metric (m, m) at the unknowns `part` (count,)."""
 
@@ -157,8 +160,7 @@ class Unknowns:
     def __init__(self, problem: Problem, law: Law, correction: Correction | None = None) -> None:
         self.problem, self.law, self.correction = problem, law, correction
         self.trials, self.own = len(problem.recordings), problem.own_unknowns
-        K, _ = law.pair(problem, law.start)
-        self.own_unit = own_unit(problem, K)
+        self.own_unit = own_unit(problem, law.reference(problem))
         self.units, self.stated = problem.parameter_units, problem.stated
         first = len(law.start)
         last = first + self.trials * self.own
@@ -458,6 +460,8 @@ def start_unit(problem: Problem, gain: Array) -> Array:
     outputs.
     """
     plant = problem.plant
+    if problem.terminal_weight is not None:  # there is no single gain
+        return np.eye(plant.n)
     runs = simulated(problem, gain, np.eye(plant.m))
     x = np.concatenate([run.x for run in runs])
     second = x.T @ x / len(x)

@@ -12,7 +12,7 @@ import pandas as pd
 from impc.arrays import Array, Frozen
 from impc.control.simulation import Status
 from impc.inverse.regulator_span import kept_to
-from impc.output_feedback.search import FARTHEST
+from impc.output_feedback.intervals import FARTHEST
 from impc.reporting.document import Block, Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.shown_units import shown_unit, signal_name
@@ -20,7 +20,7 @@ from impc.reporting.shown_units import shown_unit, signal_name
 if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.output_feedback.fit import OutputFeedbackFit
-    from impc.output_feedback.search import PersonCovariance
+    from impc.output_feedback.intervals import PersonCovariance
 
 # A noise SD counts as identified if its 95 % interval ends within a factor of ten.
 _IDENTIFIED = np.log(10)

@@ -15,8 +15,8 @@ from impc.control.controller import Controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.structure import Structure
+from impc.output_feedback.intervals import level_interval, person_covariance
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.search import level_interval, person_covariance
 from impc.output_feedback.simulation import simulate_person
 from tests.support import nelder_mead
 

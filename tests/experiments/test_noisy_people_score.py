@@ -9,7 +9,7 @@ from experiments.noisy_people import recorded, subject
 from experiments.noisy_people_score import Score, above_truth, blind, score
 from impc.inverse.methods import fit
 from impc.output_feedback.fit import fit_output_feedback
-from impc.output_feedback.search import person_covariance
+from impc.output_feedback.intervals import person_covariance
 
 pytestmark = pytest.mark.full
 

@@ -17,20 +17,17 @@ from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import InputError
 from impc.output_feedback.fit import fit_output_feedback
-from impc.output_feedback.observer import Observer
-from impc.output_feedback.search import (
-    boxed_step,
+from impc.output_feedback.intervals import (
     confusion,
     entry_intervals,
     fallen,
     level_interval,
     level_intervals,
-    maximise,
     person_covariance,
     profile,
-    reml_slope,
-    updated_slope,
 )
+from impc.output_feedback.observer import Observer
+from impc.output_feedback.search import boxed_step, maximise, reml_slope, updated_slope
 from impc.output_feedback.unknowns import NoisyUnknowns
 from tests.output_feedback.fits import cart, fitted, posed, unknown_truth
 
