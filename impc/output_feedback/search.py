@@ -13,6 +13,7 @@ import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 from scipy.optimize import lsq_linear
 
 from impc.arrays import Array
