@@ -159,7 +159,8 @@ def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop)
             damping = max(_UP * damping, 1e-8)
         if moved is None or gained <= 0:
             return End(u, v, spent, Ended.STUCK, promised)
-        ratio = gained / step.predicted
+        # A tiny step can predict 0 in rounding, and is poor then.
+        ratio = gained / step.predicted if step.predicted else 0.0
         damping *= _DOWN if ratio > _GOOD else _UP if ratio < _POOR else 1.0
         damping = max(damping, _LEAST)
         u, v = u + moved[0], v + moved[1]

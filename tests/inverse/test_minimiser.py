@@ -147,3 +147,29 @@ def test_a_search_that_ran_out_says_what_is_left() -> None:
     end = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 2))
     assert end.ended is Ended.STOPPED
     assert end.promised > 1e-8
+
+
+class ShortSteps:
+    """Long steps are infeasible, and each short one gains the same little."""
+
+    count, tries, level = 1, 0, 1.0
+
+    def rows(self, _u: np.ndarray, _v: np.ndarray) -> Rows:
+        return Rows(np.full((1, 1), np.sqrt(self.level)), np.ones((1, 1, 1)), np.zeros((1, 1, 0)))
+
+    def square(self, _u: np.ndarray, _v: np.ndarray) -> float:
+        self.tries += 1
+        if self.tries % 14:
+            return np.inf
+        self.level *= 1 - 1e-6
+        return self.level
+
+    def bend(self, _du: np.ndarray, _dv: np.ndarray, _share: float) -> None:
+        return None
+
+
+def test_steps_too_short_to_predict_a_decrease_end_as_stuck() -> None:
+    start = np.zeros(1), np.zeros((1, 0))
+    end = minimise(ShortSteps(), Prior(*start, np.zeros(1), 0.0), start, Stop(1e-2, 0.0, 50))
+    assert end.ended is Ended.STUCK
+    assert end.promised == pytest.approx(1.0)
