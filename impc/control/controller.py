@@ -85,9 +85,10 @@ class Controller(Value):
         Set that x_N must reach; None for no such constraint.
     softening : float or None
         None: state bounds and terminal set are hard. A number: exceeding one of their rows
-        E x <= b by s costs ``softening * U^2 * s / b``, where U is the smallest finite input bound
-        (1 without any). The penalty is exact: while it exceeds the multipliers, the solution is
-        that of the hard problem if that is feasible. Input bounds are always hard.
+        E x <= b by s adds ``softening * U^2 * s / b`` to half of the sum of v_k'S v_k, with S as
+        scaled here and U the smallest finite input bound (1 without any). The penalty is exact:
+        while it exceeds the multipliers, the solution is that of the hard problem if that is
+        feasible. Input bounds are always hard.
     solver : str
         Method where the gain violates a bound: "compiled" (built in), or "daqp", "qpoases" or
         "ipopt" of CasADi.

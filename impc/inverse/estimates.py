@@ -128,7 +128,7 @@ class Estimate(Frozen):
         Identifier in `impc.inverse.methods.METHODS`.
     problem : Problem
         Problem that the method solved (inverse LQR: without bounds), at the fitted initial states,
-        offsets and physical parameters.
+        errors of signals and physical parameters.
     K, S : ndarray of shape (m, n) and (m, m), or None
         Gain of u = -Kx and input metric; None if the method found none.
     weights : Weights or None

@@ -2,8 +2,8 @@
 
 For a gain K and a metric S the residual is vec(Y_sim - Y), all recordings stacked and every output
 divided by its scale. Weights enter only through K and S, so each method searches either a gain or
-weights over this residual. Unknown initial states, output offsets and physical parameters are
-searched jointly (docs/why/theory.md). Recorded commands are fitted as further outputs; missing
+weights over this residual. Unknown initial states, errors of signals and physical parameters are
+searched jointly (`impc.inverse.unknowns`). Recorded commands are fitted as further outputs; missing
 values have zero residuals.
 """
 
@@ -74,9 +74,10 @@ class Problem(Value):
     offsets : sequence of str, optional
         Outputs with an unknown offset: short for ``signal_errors={"offset": offsets}``.
     signal_errors : mapping of str to sequence of str, optional
-        Signals with an unknown error in each trial, by kind: "offset", "drift", "scale" (of the
-        recorded values), "shift" (time of the signal against the clock of the trial) or "clock"
-        (rate of its own clock). See `impc.model.signal_errors`.
+        Outputs and disturbances with an unknown error in each trial, by kind: "offset", "drift",
+        "scale" (of the values), "shift" (positive: the output is recorded late, or the disturbance
+        acts later than recorded) or "clock" (share of the time by which that delay grows). Not for
+        a disturbance that drives a nonlinear body or that the controller knows.
 
     Attributes
     ----------
@@ -90,8 +91,9 @@ class Problem(Value):
         `impc fit` choose the variant that explains the recordings better, and the problem of the
         estimate states the choice; other functions treat None as False.
     softening : float
-        Cost weight of violating a state bound or the terminal set during the search (see
-        `Controller`); the estimate counts the samples that violate them.
+        Cost weight of violating a state bound or the terminal set during the search: a violation
+        is weighed against half of the sum of v_k'S v_k (see `Controller`). The estimate counts the
+        samples that violate them.
     output_scale : ndarray of shape (p,)
         Scale of each output in the residual, in its unit.
     command_scale : ndarray of shape (m,)

@@ -6,7 +6,7 @@ The controller is a gain with its metric (`GainLaw`), cost weights of a structur
 given (`FixedLaw`). Initial states are scaled by the states of the trials (`start_unit`), errors of
 signals by the outputs (`signal_errors`), free parameters by a third of themselves, and parameters
 with a stated uncertainty by that. The latter have a prior at their nominal value that is never
-weakened (docs/why/theory.md).
+weakened (docs/why/uncertain_plant.md).
 
 To add an unknown of the controller, write a law; of a trial, add a row to `signal_errors.KINDS`; of
 the plant, extend its `PlantFamily`.

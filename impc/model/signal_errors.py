@@ -8,10 +8,10 @@ and the disturbance d that acts on the plant follows the recorded one d_rec by
 
     d(t) = (1 + scale) d_rec(t - shift - clock t) + offset + drift t.
 
-A positive shift means later than recorded. The model is moved, never a recorded output. Outputs are
-interpolated linearly between samples; a disturbance is held over its sample, and a moved one is the
-mean over the new sample. A further kind is a row of `KINDS`, an entry of `search_unit` and a term
-of `distorted`.
+A positive shift is a delay: a recorded output follows the movement, a disturbance acts later than
+recorded. The model is moved, never a recorded output. Outputs are interpolated linearly between
+samples; a disturbance is held over its sample, and a moved one is the mean over the new sample. A
+further kind is a row of `KINDS`, an entry of `search_unit` and a term of `distorted`.
 """
 
 from __future__ import annotations

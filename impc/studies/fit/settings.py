@@ -131,8 +131,9 @@ class FitSettings:
     offsets : list of str
         Outputs with an unknown constant offset in each trial.
     signal_errors : dict of str to list of str
-        Signals with another unknown error in each trial, by kind: "drift", "scale", "shift" (time
-        of a signal against the others; positive: later than recorded) or "clock" (rate).
+        Outputs and disturbances with an unknown error in each trial, by kind: "offset", "drift",
+        "scale" (of the values), "shift" (positive: the output is recorded late, or the disturbance
+        acts later than recorded) or "clock" (share of the time by which that delay grows).
     feedback_states : list of str
         States whose gains the dissertation's preliminary estimate (3.19), (3.20) fits. Empty: no
         preliminary estimate.
