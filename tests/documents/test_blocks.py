@@ -14,6 +14,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.documents.blocks import PAGES, Block, blocks, command_lines
@@ -41,7 +42,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_the_blocks_run(page: str, kept: Path, tmp_path: Path) -> None:
     names: dict[str, object] = {"__name__": "page"}
-    with working_in(tmp_path):
+    with working_in(tmp_path), np.printoptions():  # restored after the page
         for block in blocks(page):
             if block.file is not None:
                 Path(block.file).write_text(block.text, encoding="utf-8")
