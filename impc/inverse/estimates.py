@@ -18,6 +18,7 @@ from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
 from impc.inverse.columns import trial_span
+from impc.inverse.laws import metric_directions
 from impc.inverse.problem import (
     controller_for,
     explains,
@@ -29,6 +30,7 @@ from impc.inverse.problem import (
 )
 from impc.inverse.residuals import evaluate, with_prior_rows
 from impc.inverse.solution_set import natural_coordinates
+from impc.model.bounds import bound_rows
 from impc.model.riccati import stabilises
 from impc.model.weights import Weights, normalised
 
@@ -88,6 +90,8 @@ class Goodness:
     samples: int
     # Number of identified directions of the gain (with a fixed terminal weight: of the weights)
     rank: int
+    # Number of identified directions of the metric, of m (m + 1) / 2 - 1
+    metric_rank: int = 0
     unconfirmed: bool = False  # Only one of several searches reached this misfit
     # Method whose solution has a smaller misfit in the model of this one; empty if none
     beaten_by: str = ""
@@ -237,6 +241,7 @@ class Estimate(Frozen):
             doubts.append(
                 f"The recordings identify {found.rank} of the {self.K.size} directions of the gain."
             )
+        doubts += self._open_metric()
         if self.explained:
             return tuple(doubts)
         share = self.misfit / recorded_size(self.problem)
@@ -257,7 +262,7 @@ class Estimate(Frozen):
             )
         if found.unconfirmed:
             doubts.append(
-                "Only one of several searches reached this misfit: a better solution may exist."
+                "No second search confirms this misfit: a better solution may exist."
             )
         if not found.white:
             doubts.append(
@@ -265,6 +270,17 @@ class Estimate(Frozen):
                 "better solution that the search missed."
             )
         return tuple(doubts)
+
+    def _open_metric(self) -> list[str]:
+        """Sentence on unidentified directions of S, which has no effect without bounds."""
+        m, bounds = len(self.metric), bound_rows(self.problem.bounds, self.problem.plant)
+        known, count = self.fit.metric_rank, m * (m + 1) // 2 - 1
+        if known == count or len(bounds.b) == 0 or self.problem.terminal_weight is not None:
+            return []
+        return [
+            f"The recordings identify {known} of the {count} directions of the metric S, which "
+            "decides between inputs where a limit is active."
+        ]
 
     @property
     def gain(self) -> Array:
@@ -379,8 +395,8 @@ def simulated_estimate(
     rank: int | None = None,
 ) -> Estimate:
     """Build an estimate: simulate the recordings and set status and diagnostics."""
-    known = gain_rank(problem, K, S) if rank is None else rank
-    misfit, fit = goodness(problem, simulated(problem, K, S, weights), known)
+    ranks = gain_ranks(problem, K, S) if rank is None else (rank, 0)
+    misfit, fit = goodness(problem, simulated(problem, K, S, weights), *ranks)
     if weights is None:
         status = Status.GAIN_ONLY
     elif explains(problem, misfit) and not reason:
@@ -416,27 +432,35 @@ def no_estimate(method: str, problem: Problem, reason: str) -> Estimate:
     )
 
 
-def goodness(problem: Problem, runs: list[Simulation], rank: int) -> tuple[float, Goodness]:
-    """Misfit and diagnostics of simulated recordings, for a known `rank`."""
+def goodness(
+    problem: Problem, runs: list[Simulation], rank: int, metric_rank: int = 0
+) -> tuple[float, Goodness]:
+    """Misfit and diagnostics of simulated recordings, for known ranks."""
     status = np.concatenate([run.status for run in runs])
     softened = int(np.count_nonzero(status == SampleStatus.SOFTENED))
-    left = misfit(problem, runs)
-    return left, Goodness(_is_white(problem, runs), softened, len(status), rank)
+    left, white = misfit(problem, runs), _is_white(problem, runs)
+    return left, Goodness(white, softened, len(status), rank, metric_rank)
 
 
-def gain_rank(problem: Problem, gain: Array, metric: Array) -> int:
-    """Number of directions of a `gain` (m, n) with a `metric` (m, m) that the data identify."""
+def gain_ranks(problem: Problem, gain: Array, metric: Array) -> tuple[int, int]:
+    """Numbers of directions of a `gain` (m, n) and of a `metric` (m, m) that the data identify."""
     found = evaluate(problem, gain, metric)
     if found.reason:
-        return 0
+        return 0, 0
     found = with_prior_rows(problem, found, noise_of_residual(problem, found.residual))
     plant = problem.plant
     stable = stabilises(plant, gain)
     T, G = natural_coordinates(plant, gain) if stable else (np.eye(plant.n), np.eye(plant.m))
-    beside = np.hstack([found.dS.reshape(len(found.residual), -1), found.dparameters])
-    left = trial_span(found.own, problem.row_sizes, beside).without(found.along_gain(T, G))
-    values: Array = np.asarray(np.linalg.svd(left, compute_uv=False), dtype=np.float64)
-    return int(np.count_nonzero(determined(problem, values)))
+    on_gain = found.along_gain(T, G)
+    on_metric = found.along_metric(metric, metric_directions(metric))
+    parts = (on_gain, on_metric), (on_metric, on_gain)
+    ranks = []
+    for own, other in parts:
+        beside = np.hstack([other, found.dparameters])
+        left = trial_span(found.own, problem.row_sizes, beside).without(own)
+        values = np.asarray(np.linalg.svd(left, compute_uv=False), dtype=np.float64)
+        ranks.append(int(np.count_nonzero(determined(problem, values))) if values.size else 0)
+    return ranks[0], ranks[1]
 
 
 def determined(problem: Problem, values: Array) -> BoolArray:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 # of the gained to the predicted decrease.
 _DAMPING, _LEAST, _UP, _DOWN, _GOOD, _POOR = 1e-3, 1e-12, 6.0, 0.2, 0.5, 0.1
 # A search is stuck after this many rejected steps in a row, or if this many accepted ones together
-# lower F by less than `Stop.promise` and than this share of what is still promised.
-_TRIES, _CREEPING, _DELIVERED = 14, 4, 0.01
+# lower F by less than this share of what is still promised.
+_TRIES, _CREEPING, _DELIVERED = 14, 3, 0.03
 # Damping of the step that counts as undamped: directions that nothing identifies stay.
 _NONE = 1e-10
 # Least squared norm of a column in the damping, relative to the largest.
@@ -144,7 +144,7 @@ def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop)
             if _gained(model, prior, here, (u, v), (last.du, last.dv)) > 0:
                 u, v = u + last.du, v + last.dv
             return End(u, v, spent, Ended.CONVERGED, promised)
-        if sum(gains[-_CREEPING:]) <= min(stop.promise, _DELIVERED * promised):
+        if sum(gains[-_CREEPING:]) <= _DELIVERED * promised:
             return End(u, v, spent, Ended.STUCK, promised)
         if spent >= stop.evaluations:
             return End(u, v, spent, Ended.STOPPED, promised)

@@ -33,7 +33,13 @@ from impc.inverse.natural_search import (
     in_plant_units,
     inverse_mpc_natural,
 )
-from impc.inverse.problem import EXPLAINED, misfit, recorded_size, with_or_without_set
+from impc.inverse.problem import (
+    EXPLAINED,
+    explains,
+    misfit,
+    recorded_size,
+    with_or_without_set,
+)
 from impc.inverse.proximal_search import weights_near
 from impc.inverse.refit import refit
 from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
@@ -58,7 +64,6 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
     from impc.inverse.unknowns import Fitted
-    from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
@@ -135,7 +140,19 @@ def _fitted(problem: Problem, start: Weights | None) -> Estimate:
     settled = free.problem
     if problem.own_unknowns:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
-    return _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
+    one = _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
+    return one if start is None else _not_worse(problem, free, one, start)
+
+
+def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) -> Estimate:
+    """The estimate, or that of the given weights if these fit better."""
+    solution, there = solve_lqr(problem.plant, start), problem
+    if problem.own_unknowns:
+        there = with_fitted_starts(problem, solution.K, solution.S)
+    left, reason = misfit_or_reason(there, solution.K, solution.S)
+    if reason or left >= one.misfit:
+        return one
+    return _finish(free, there, start, evaluations=one.evaluations, converged=one.converged)
 
 
 def _confirmed(
@@ -239,7 +256,7 @@ def _finish(
     free: Fitted, problem: Problem, weights: Weights, *, evaluations: int, converged: bool
 ) -> Estimate:
     metrics = _metrics(problem, solve_lqr(problem.plant, weights))
-    weights = _by_convention(problem.plant, weights, metrics)
+    weights = _by_convention(problem, weights, metrics)
     solution = solve_lqr(problem.plant, weights)
     return simulated_estimate(
         "inverse_mpc",
@@ -255,13 +272,24 @@ def _finish(
     )
 
 
-def _by_convention(plant: Plant, weights: Weights, metrics: Array) -> Weights:
-    """Reported weights of those with the same gain; `weights` themselves if the program fails."""
+def _by_convention(problem: Problem, weights: Weights, metrics: Array) -> Weights:
+    """Reported weights with the same gain; `weights` if the program fails or they fit worse.
+
+    Metrics that the recordings do not identify to first order can still differ at a few samples.
+    """
+    plant = problem.plant
     solution = solve_lqr(plant, weights)
     try:
-        return least_condition_weights(gain_fibre(plant, solution.K, metrics), weights).weights
+        fibre = gain_fibre(plant, solution.K, metrics)
+        found = least_condition_weights(fibre, weights).weights
     except (WeightsError, SolverError):  # numerically at the edge of the cone
         return normalised(weights)
+    if plant.m == 1:
+        return found
+    other = solve_lqr(plant, found)
+    least, most = (misfit_or_reason(problem, one.K, one.S)[0] for one in (solution, other))
+    worse = most > (1 + _SAME) * least and not explains(problem, most)
+    return normalised(weights) if worse else found
 
 
 def _metrics(problem: Problem, solution: LqrSolution) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +26,8 @@ _UNSEEN = 1e-8
 _EFFORTS = 10.0 ** np.arange(-4, 5)
 # Random weights: share of the identity, and decades of the command weight either way.
 _DEFINITE, _DECADES = 0.05, 2.0
+# Sizes of drawn initial states, relative to those of the recorded outputs, in turn.
+_REACHES = (1.0, 3.0)
 
 
 def balanced_regulator(problem: Problem, effort: float = 1.0) -> LqrSolution:
@@ -59,7 +62,7 @@ def drawn_starts(problem: Problem, seed: int = 0) -> Iterator[tuple[Problem, Lqr
     sizes = T * (np.sqrt(len(plant.outputs)) / natural if natural > 0 else 1.0)
     unseen = np.eye(plant.n) - np.linalg.pinv(plant.C) @ plant.C
     unseen[problem.searched_states :] = 0.0
-    while True:
+    for reach in itertools.cycle(_REACHES):
         try:
             regulator = solve_lqr(plant, _random_weights(sizes, command_sizes(problem), rng))
         except WeightsError:  # ill-conditioned draw
@@ -67,6 +70,7 @@ def drawn_starts(problem: Problem, seed: int = 0) -> Iterator[tuple[Problem, Lqr
         there = problem
         if problem.unknown_start:
             drawn = rng.standard_normal((len(problem.recordings), plant.n)) @ sizes.T @ unseen.T
+            drawn *= reach
             there = problem.at(problem.starts + drawn, np.array(problem.logarithms))
         yield there, regulator
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
 
-_STEP, _FINE_STEP = 1e-3, 1e-4
+_STEP, _FORWARD = 1e-3, 1e-6
 #: Uncertainties that are not parameters of `make`.
 DELAY, LIMIT = "extra_delay", "u_max"
 # Scale of the logarithm of a free parameter.
@@ -297,10 +297,10 @@ def _differential(family: PlantFamily, point: bytes) -> PlantDifferential:
     logarithms = np.frombuffer(point)
     parts: list[tuple[Array, ...]] = []
     bodies: list[tuple[tuple[float, Body], ...]] = []
+    here = plant_at(family, logarithms)
     for index, name in enumerate(family.names):
-        if family.stated[index]:  # accurate to 1e-7, which suffices for the prior parameters
-            slopes, _ = _central(family, logarithms, index, _FINE_STEP)
-            parts.append(slopes)
+        if family.stated[index]:  # accurate to 1e-6, which suffices for the prior parameters
+            parts.append(_forward(family, logarithms, index, here))
             bodies.append(())
             continue
         coarse, far = _central(family, logarithms, index, _STEP)
@@ -317,6 +317,16 @@ def _differential(family: PlantFamily, point: bytes) -> PlantDifferential:
         bodies.append((*shares, *((-factor / 3, body) for factor, body in far)))
     A, B, E, C, observer = (np.stack(group, axis=-1) for group in zip(*parts, strict=True))
     return PlantDifferential(A, B, E, C, observer, tuple(bodies))
+
+
+def _forward(family: PlantFamily, logarithms: Array, index: int, here: Plant) -> tuple[Array, ...]:
+    """Forward differences of the matrices from the plant at `logarithms`."""
+    shift = np.zeros(len(family.names))
+    shift[index] = _FORWARD
+    above = plant_at(family, logarithms + shift)
+    found = [(getattr(above, name) - getattr(here, name)) / _FORWARD for name in "ABEC"]
+    rates = np.where(np.isinf(here.observer), 0.0, [above.observer, here.observer])
+    return *found, (rates[0] - rates[1]) / _FORWARD
 
 
 def _central(
