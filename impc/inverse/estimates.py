@@ -261,9 +261,7 @@ class Estimate(Frozen):
                 f"The solution of {found.beaten_by} has a smaller misfit here: the search failed."
             )
         if found.unconfirmed:
-            doubts.append(
-                "No second search confirms this misfit: a better solution may exist."
-            )
+            doubts.append("No second search confirms this misfit: a better solution may exist.")
         if not found.white:
             doubts.append(
                 "The residuals are autocorrelated: noise inside the loop, a wrong model, or a "
