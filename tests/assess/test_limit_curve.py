@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from impc.assess.limit_curve import limit_curve
+from impc.assess.input_limits import limit_curve
 from tests.assess.cart_fits import cart_fit
 
 

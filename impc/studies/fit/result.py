@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
     from impc.assess.frequency_response import FrequencyResponse
+    from impc.assess.input_limits import LimitCurve
     from impc.assess.intent_statements import Intent, Statement
     from impc.assess.lack_of_fit import LackOfFit, ModelError
-    from impc.assess.limit_curve import LimitCurve
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
