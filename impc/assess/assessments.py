@@ -2,7 +2,7 @@
 
 `impc fit`, `impc compare`, `impc cohort` and `impc.report` print them in their tables and write
 them to result.json under `methods.<method>.<assessment>` (docs/ref/results.md). For analyses that
-need further fits (intervals, other horizons) see `impc.assess.all_intervals`.
+need further fits (intervals, other horizons) see `impc.studies.fit.uncertainty`.
 """
 
 from __future__ import annotations

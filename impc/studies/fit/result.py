@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from impc.arrays import Array
-    from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
     from impc.assess.frequency_response import FrequencyResponse
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.output_feedback.page import PersonReport
     from impc.studies.fit.settings import FitSettings
+    from impc.studies.fit.uncertainty import Uncertainty
 
 #: Largest number of trials on a page: 500 trials gave 51 MB and needed 6.3 GB of memory.
 MOST_TRIALS = 24

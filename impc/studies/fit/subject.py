@@ -17,7 +17,6 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from impc.arrays import Array, frozen
-from impc.assess.all_intervals import assess, count_stages
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
@@ -49,6 +48,7 @@ from impc.studies.fit.asked import (
 )
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings, ObserverSettings
+from impc.studies.fit.uncertainty import assess, count_stages
 from impc.studies.pool import threads
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from impc.assess.all_intervals import Attempt
     from impc.assess.assessments import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
@@ -70,6 +69,7 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
     from impc.output_feedback.page import PersonReport
+    from impc.studies.fit.uncertainty import Attempt
 
 _THREADS = 2
 _UNUSABLE = "the controller explains less than half of a recorded signal (VAF below 50 %)."

@@ -10,23 +10,17 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.assess.input_limits import input_limit
 from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals
 from impc.assess.profiles import profile_likelihood, require_numbers
-from impc.assess.resampling import (
-    bootstrap_intervals,
-    bootstrap_model,
-    replicate,
-)
+from impc.assess.resampling import bootstrap_intervals, bootstrap_model, replicate
 from impc.assess.variance_accounted_for import fit_alternatives
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from impc.assess.input_limits import LimitEstimate
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
@@ -34,37 +28,10 @@ if TYPE_CHECKING:
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.studies.fit.settings import FitSettings
 
 #: (stage, compute, default) -> result, or the default if it fails.
 Attempt = Callable[[str, Callable[[], Any], Any], Any]
-
-
-class Asked(Protocol):
-    """Requested analyses: the part of the fit settings that this module reads."""
-
-    @property
-    def replicates(self) -> int:
-        """Number of bootstrap replicates; 0 for none."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the bootstrap."""
-
-    @property
-    def profiles(self) -> Sequence[str]:
-        """Names of the numbers to profile."""
-
-    @property
-    def unknown_limit(self) -> bool:
-        """Whether to estimate the limit of each input."""
-
-    @property
-    def horizons(self) -> Sequence[int]:
-        """Other horizons to compare, in samples."""
-
-    @property
-    def settle(self) -> float:
-        """Time at the start of a held-out trial that serves to fit its initial state, s."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +47,7 @@ class Uncertainty:
     alternatives: tuple[Alternative, ...]
 
 
-def count_stages(problem: Problem, settings: Asked) -> int:
+def count_stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `assess` reports, and one for the set of weights."""
     limited = int(np.any(np.isfinite(problem.bounds.u_max)))
     others = [length for length in settings.horizons if length != problem.horizon]
@@ -98,7 +65,7 @@ def assess(
     fitted: Estimate,
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
-    settings: Asked,
+    settings: FitSettings,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
     attempt: Attempt,
@@ -135,7 +102,7 @@ def _limit_interval(found: LimitEstimate, control: str) -> Interval:
 
 def _bootstrap(
     estimate: GainEstimate,
-    settings: Asked,
+    settings: FitSettings,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
 ) -> tuple[Interval, ...]:
