@@ -256,52 +256,29 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
     y = run.x[:-1] @ plant.C.T
     y = y / np.maximum(np.sqrt(np.mean(y**2, axis=0)), 1e-300)
     A, B, E = slopes_along(plant, run.x[:-1], run.u, d)
-    late = u - np.vstack([u[:1], u[:-1]])
+    changes, late = np.diff(y, axis=0, prepend=y[:1]), np.diff(u, axis=0, prepend=u[:1])
     shortest = min(one.samples for one in problem.recordings)
     steps = [max(1, round(share * shortest)) for share in _LATER]
+    earlier = [np.vstack([np.zeros_like(d[:step]), d[:-step]]) for step in steps]
     forces = {
-        DELAY: [-_through(B, np.eye(plant.m)[k] * late) for k in range(plant.m)],
-        LEAN: [_through(B, column) for column in _single(np.ones_like(u))],
-        PUSH: [_through(E, column) for column in _single(d)],
-        STIFFNESS: [
-            _through(E, column)
-            for signal in (y, np.diff(y, axis=0, prepend=y[:1]))
-            for column in _crossed(signal, d.shape[1])
-        ],
-        MODE: [_through(E, _later(column, step)) for step in steps for column in _single(d)],
-        NONLINEAR: [
-            _through(slopes, column)
-            for slopes, width in ((B, plant.m), (E, d.shape[1]))
-            for power in (y**2, y**3)
-            for column in _crossed(power, width)
-        ],
+        DELAY: -B * late[:, None],
+        LEAN: B,
+        PUSH: E * d[:, None],
+        STIFFNESS: np.dstack([_crossed(E, y), _crossed(E, changes)]),
+        MODE: np.dstack([E * signals[:, None] for signals in earlier]),
+        NONLINEAR: np.dstack([_crossed(slopes, y**power) for slopes in (B, E) for power in (2, 3)]),
     }
-    every = np.stack([force for part in forces.values() for force in part], axis=2)
+    every = np.dstack(list(forces.values()))
     closed, dx = A + B @ local, np.zeros((trial.samples, plant.n, every.shape[2]))
     for t in range(len(u)):
         dx[t + 1] = closed[t] @ dx[t] + every[t]
-    seen = problem.scaled_outputs @ dx
     rows = np.zeros((trial.samples, len(problem.measured), every.shape[2]))
-    rows[:, : len(plant.outputs)] = seen
-    flat = rows.reshape(-1, every.shape[2])
-    ends = np.cumsum([len(part) for part in forces.values()])[:-1]
-    return dict(zip(forces, np.split(flat, ends, axis=1), strict=True))
+    rows[:, : len(plant.outputs)] = problem.scaled_outputs @ dx
+    ends = np.cumsum([part.shape[2] for part in forces.values()])[:-1]
+    return dict(zip(forces, np.split(np.concatenate(rows), ends, axis=1), strict=True))
 
 
-def _through(slopes: Array, column: Array) -> Array:
-    """Forcing (steps, n) of a signal (steps, inputs) through slopes (steps, n, inputs)."""
-    return np.asarray(np.einsum("tni,ti->tn", slopes, column))
-
-
-def _single(signals: Array) -> list[Array]:
-    """Each signal (steps, i) alone, the others zero."""
-    return [signals * unit for unit in np.eye(signals.shape[1])]
-
-
-def _crossed(signals: Array, inputs: int) -> list[Array]:
-    """Each signal (steps, k) at each input alone (steps, inputs)."""
-    return [signals[:, [k]] * unit for k in range(signals.shape[1]) for unit in np.eye(inputs)]
-
-
-def _later(signal: Array, steps: int) -> Array:
-    return np.vstack([np.zeros((steps, signal.shape[1])), signal[:-steps]])
+def _crossed(slopes: Array, signals: Array) -> Array:
+    """Forcing (steps, n, k inputs) of each signal (steps, k) through each of the slopes."""
+    both: Array = np.einsum("tni,tk->tnki", slopes, signals)
+    return both.reshape(*slopes.shape[:2], -1)
