@@ -20,11 +20,11 @@ import numpy as np
 import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.assessments import simulated_vaf
 from impc.assess.covariance import by_trial
 from impc.assess.fit_curve import FitCurve
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
 from impc.assess.printed_gain import LEVEL
-from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.errors import InputError
 from impc.inverse.laws import GainLaw
@@ -235,19 +235,15 @@ def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
     curve.tried[given] = curve.start[1]
     for share in _SHARES:
         curve.loss(share * given)
-    unexplained = [_unexplained(curve.tried[limit], problem) for limit in curve.finite]
+    unexplained = [_unexplained(curve.tried[limit], len(problem.plant.C)) for limit in curve.finite]
     name = problem.plant.controls[control]
     return LimitCurve(name, given, frozen(curve.finite), frozen(unexplained))
 
 
-def _unexplained(found: Fitted | None, problem: Problem) -> Array:
-    """100 - VAF, % (p,)."""
-    nothing = np.full(len(problem.plant.outputs), np.nan)
-    if found is None:  # no stabilising gain with so low a limit
-        return nothing
-    problem = found.problem
-    recorded = np.concatenate([trial.corrected for trial in problem.recordings])
-    runs = simulated(problem, np.array(found.K), np.array(found.S))
-    modelled = np.concatenate([run.x for run in runs]) @ problem.plant.C.T
-    complete = all(run.complete for run in runs)
-    return np.asarray(100 - vaf(recorded, modelled)) if complete else nothing
+def _unexplained(found: Fitted | None, outputs: int) -> Array:
+    """100 - VAF, % (p,); NaN if no gain stabilises with so low a limit."""
+    if found is None:
+        return np.full(outputs, np.nan)
+    problem, K, S = found.problem, np.array(found.K), np.array(found.S)
+    shares = simulated_vaf(problem.plant, problem.recordings, simulated(problem, K, S))
+    return np.asarray(100 - shares)
