@@ -2,7 +2,7 @@
 
 `impc fit`, `impc compare`, `impc cohort` and `impc.report` print them in their tables and write
 them to result.json under `methods.<method>.<assessment>` (docs/ref/results.md). For analyses that
-need further fits (intervals, other horizons) see `impc.assess.all_intervals`.
+need further fits (intervals, other horizons) see `impc.studies.fit.uncertainty`.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ def evaluate_method(estimate: Estimate, bounds: Bounds) -> MethodFit:
         commands < bounds.u_min - 1e-6 * np.abs(bounds.u_min)
     )
     largest = np.max(np.abs(commands), axis=0, initial=0.0) if runs else np.full(plant.m, np.nan)
-    each = [_simulated_vaf(plant, (one,), (run,)) for one, run in zip(trials, runs, strict=False)]
+    each = [simulated_vaf(plant, (one,), (run,)) for one, run in zip(trials, runs, strict=False)]
     return MethodFit(
         estimate,
         bounds,
         runs,
-        frozen(_simulated_vaf(plant, trials, runs) if runs else np.full(p, np.nan)),
+        frozen(simulated_vaf(plant, trials, runs) if runs else np.full(p, np.nan)),
         frozen(each or np.full((len(trials), p), np.nan)),
         frozen(np.empty((0, p))),
         frozen(largest),
@@ -91,7 +91,7 @@ def estimate_vaf(estimate: Estimate) -> Array:
     return evaluate_method(estimate, estimate.problem.bounds).vaf
 
 
-def _simulated_vaf(plant: Plant, trials: Sequence[Recording], runs: Sequence[Simulation]) -> Array:
+def simulated_vaf(plant: Plant, trials: Sequence[Recording], runs: Sequence[Simulation]) -> Array:
     """VAF (3.24) over trials (p,), NaN if a simulation stops early."""
     if not all(run.complete for run in runs):
         return np.full(len(plant.outputs), np.nan)

@@ -10,7 +10,7 @@ and the local gain G_t of the controller:
     delay               f = -B (u_t - u_{t-1}), a command that arrives one sample late
     limit               derivative by the command limit
     lean                f = B in one trial, a constant push by or on the subject
-    offset              c = 1 in one output and trial
+    offset              c = 1 in one output and trial, an error of the signal
     perturbation        f = E d_t, its size or the inertia that it moves
     stiffness           f = E y_t and E (y_t - y_{t-1}), stiffness and damping where it acts
     further mode        f = E d_{t-l}, responses later than those of the model
@@ -49,19 +49,18 @@ from impc.inverse.further_unknowns import (
     with_offsets_unknown,
     with_strength_unknown,
 )
-from impc.inverse.laws import metric_directions
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
-from impc.inverse.residuals import evaluate, residual_along, with_prior_rows
-from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.residuals import along_bounds
+from impc.inverse.unknowns import Unknowns
 from impc.model import plant_family
 from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
-    from impc.control.controller import Controller
     from impc.control.simulation import Simulation
     from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Evaluation
+    from impc.inverse.residuals import Linear
     from impc.inverse.unknowns import Fitted
     from impc.model.recordings import Recording
 
@@ -122,14 +121,17 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     if all(trial.has_gaps for trial in estimate.problem.recordings):
         return None
     problem, K, S = _some_trials(estimate.problem), np.array(estimate.K), np.array(estimate.S)
-    found = evaluate(problem, K, S)
+    space = Unknowns(with_offsets_unknown(problem), GainLaw(problem, K, S))
+    found = space.evaluated(space.start)[0]
     samples = sum(trial.samples for trial in problem.recordings)
     size = np.linalg.norm(found.residual) / np.sqrt(problem.recorded_numbers)
     if found.reason or samples < _FEWEST or size <= _EXACT:
         return None
-    groups = {name: columns for name, columns in _columns(problem, K, S) if columns.shape[1]}
+    offsets = [table[:, found.shared + problem.own_unknowns :] for table in found.tables]
+    every = _columns(problem, K, S) | {OFFSET: scipy.linalg.block_diag(*offsets)}
+    groups = {name: columns for name, columns in every.items() if columns.shape[1]}
     widths = [columns.shape[1] for columns in groups.values()]
-    tested = _Tested(problem, found, K, S, np.hstack(list(groups.values())))
+    tested = _Tested(problem, found, np.hstack(list(groups.values())))
     parts = np.split(np.arange(sum(widths)), np.cumsum(widths)[:-1])
     results = {name: tested.of(name, part) for name, part in zip(groups, parts, strict=True)}
     errors = sorted(
@@ -159,26 +161,26 @@ def _some_trials(problem: Problem) -> Problem:
 class _Tested:
     """Whitened columns after projection on the fitted quantities, and their noise."""
 
-    def __init__(
-        self, problem: Problem, found: Evaluation, K: Array, S: Array, columns: Array
-    ) -> None:
+    def __init__(self, problem: Problem, found: Linear, columns: Array) -> None:
         self.problem, trials = problem, len(problem.recordings)
-        found, self.root = _whitened(problem, found)
-        columns = _white_rows(problem, columns, self.root)
-        self.scale, rows = noise_of_residual(problem, found.residual), len(found.residual)
-        found = with_prior_rows(problem, found, self.scale)
-        below = np.zeros((len(found.residual) - rows, columns.shape[1]))
-        T, G = natural_coordinates(problem.plant, K)
-        shared = [found.along_gain(T, G), found.along_metric(S, metric_directions(S))]
-        sizes = problem.row_sizes
-        fitted = trial_span(found.own, sizes, np.hstack([*shared, found.dparameters]))
-        whole = np.vstack([columns, below])
-        self.seen = fitted.without(whole)
-        self.whole = np.linalg.norm(whole, axis=0)
-        self.residual = fitted.without(found.residual[:, None])[:, 0]
+        shared, own = found.shared, found.shared + problem.own_unknowns
+        rows = np.column_stack([np.concatenate(found.tables)[:, :own], columns, found.residual])
+        self.root = np.array(residual_noise(by_trial(problem, found.residual)).root)
+        rows = _white_rows(problem, rows, self.root)
+        self.scale, count = noise_of_residual(problem, rows[:, -1]), len(rows)
+        # One row for each parameter with a stated uncertainty.
+        slopes = self.scale * np.diag(1 / problem.parameter_units)[problem.stated]
+        below = np.zeros((len(slopes), rows.shape[1]))
+        below[:, shared - len(problem.logarithms) : shared] = slopes
+        below[:, -1] = slopes @ problem.logarithms
+        rows = np.vstack([rows, below])
+        fitted = trial_span(rows[:, shared:own], problem.row_sizes, rows[:, :shared])
+        self.whole = np.linalg.norm(rows[:, own:-1], axis=0)
+        left = fitted.without(rows[:, own:])
+        self.seen, self.residual = left[:, :-1], left[:, -1]
         basis = self._basis(np.arange(columns.shape[1]))
         left = self.residual - basis @ (basis.T @ self.residual)
-        everything = fitted.plus(basis).upper(trials, rows)
+        everything = fitted.plus(basis).upper(trials, count)
         self.noise = residual_noise(by_trial(problem, left), everything)
 
     def _basis(self, part: IntArray) -> Array:
@@ -217,14 +219,6 @@ class _Tested:
         return max(samples * (1 - slow) / (1 + slow), 10.0)
 
 
-def _whitened(problem: Problem, found: Evaluation) -> tuple[Evaluation, Array]:
-    """Evaluation with whitened rows, and the autoregression coefficients (p,)."""
-    root = np.array(residual_noise(by_trial(problem, found.residual)).root)
-    names = ("residual", "dK", "dS", "own", "dparameters")
-    parts = {name: _white_rows(problem, getattr(found, name), root) for name in names}
-    return replace(found, **parts), root
-
-
 def _white_rows(problem: Problem, rows: Array, root: Array) -> Array:
     """x_t - a x_{t-1} of each trial and output; the first sample scaled to equal variance."""
     parts = []
@@ -237,27 +231,23 @@ def _white_rows(problem: Problem, rows: Array, root: Array) -> Array:
     return np.concatenate(parts)
 
 
-def _columns(problem: Problem, K: Array, S: Array) -> list[tuple[str, Array]]:
-    """Derivatives of the residual by each kind of error, by name."""
+def _columns(problem: Problem, K: Array, S: Array) -> dict[str, Array]:
+    """Derivatives of the residual by each kind of error that is not fitted, but offsets."""
     controller = controller_for(problem, K, S)
     prepared = prepare_loop(
         controller, directions(controller, problem.plant.n, x0=np.eye(len(K.T)))
     )
-    forced: dict[str, list[Array]] = {}
+    trials = []
     for trial in problem.recordings:
         run, moved = run_loop(prepared, drive_of(trial, trial.x0), local=True, proved=False)
-        for name, columns in _forced(problem, trial, run, moved.u).items():
-            forced.setdefault(name, []).append(columns)
-    leans = forced.pop(LEAN)
-    found = [(name, np.concatenate(parts)) for name, parts in forced.items()]
-    found.append((LEAN, scipy.linalg.block_diag(*leans)))
-    fitted = problem.parameter_names
-    found = [(name, part) for name, part in found if PARAMETERS.get(name) not in fitted]
-    if not any(name.startswith(PARAMETERS[LIMIT]) for name in fitted):
-        found.append((LIMIT, _along_limits(problem, controller)))
-    if len(problem.offsets) < len(problem.plant.outputs):
-        found.append((OFFSET, _offsets(problem)))
-    return found
+        trials.append(_forced(problem, trial, run, moved.u))
+    found = {name: np.concatenate([forced[name] for forced in trials]) for name in trials[0]}
+    found[LEAN] = scipy.linalg.block_diag(*(forced[LEAN] for forced in trials))
+    rows = bound_rows(problem.bounds, problem.plant)
+    moves = np.array([rows.along_limit(control) for control in range(problem.plant.m)])
+    found[LIMIT] = along_bounds(problem, K, S, moves[np.any(moves, axis=1)].T)
+    fitted = {name.split(".")[0] for name in problem.parameter_names}
+    return {name: part for name, part in found.items() if PARAMETERS.get(name) not in fitted}
 
 
 def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -> dict[str, Array]:
@@ -266,75 +256,29 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
     y = run.x[:-1] @ plant.C.T
     y = y / np.maximum(np.sqrt(np.mean(y**2, axis=0)), 1e-300)
     A, B, E = slopes_along(plant, run.x[:-1], run.u, d)
-    late = u - np.vstack([u[:1], u[:-1]])
+    changes, late = np.diff(y, axis=0, prepend=y[:1]), np.diff(u, axis=0, prepend=u[:1])
     shortest = min(one.samples for one in problem.recordings)
     steps = [max(1, round(share * shortest)) for share in _LATER]
+    earlier = [np.vstack([np.zeros_like(d[:step]), d[:-step]]) for step in steps]
     forces = {
-        DELAY: [-_through(B, np.eye(plant.m)[k] * late) for k in range(plant.m)],
-        LEAN: [_through(B, column) for column in _single(np.ones_like(u))],
-        PUSH: [_through(E, column) for column in _single(d)],
-        STIFFNESS: [
-            _through(E, column)
-            for signal in (y, np.diff(y, axis=0, prepend=y[:1]))
-            for column in _crossed(signal, d.shape[1])
-        ],
-        MODE: [_through(E, _later(column, step)) for step in steps for column in _single(d)],
-        NONLINEAR: [
-            _through(slopes, column)
-            for slopes, width in ((B, plant.m), (E, d.shape[1]))
-            for power in (y**2, y**3)
-            for column in _crossed(power, width)
-        ],
+        DELAY: -B * late[:, None],
+        LEAN: B,
+        PUSH: E * d[:, None],
+        STIFFNESS: np.dstack([_crossed(E, y), _crossed(E, changes)]),
+        MODE: np.dstack([E * signals[:, None] for signals in earlier]),
+        NONLINEAR: np.dstack([_crossed(slopes, y**power) for slopes in (B, E) for power in (2, 3)]),
     }
-    every = np.stack([force for part in forces.values() for force in part], axis=2)
+    every = np.dstack(list(forces.values()))
     closed, dx = A + B @ local, np.zeros((trial.samples, plant.n, every.shape[2]))
     for t in range(len(u)):
         dx[t + 1] = closed[t] @ dx[t] + every[t]
-    seen = problem.scaled_outputs @ dx
     rows = np.zeros((trial.samples, len(problem.measured), every.shape[2]))
-    rows[:, : len(plant.outputs)] = seen
-    flat = rows.reshape(-1, every.shape[2])
-    ends = np.cumsum([len(part) for part in forces.values()])[:-1]
-    return dict(zip(forces, np.split(flat, ends, axis=1), strict=True))
+    rows[:, : len(plant.outputs)] = problem.scaled_outputs @ dx
+    ends = np.cumsum([part.shape[2] for part in forces.values()])[:-1]
+    return dict(zip(forces, np.split(np.concatenate(rows), ends, axis=1), strict=True))
 
 
-def _through(slopes: Array, column: Array) -> Array:
-    """Forcing (steps, n) of a signal (steps, inputs) through slopes (steps, n, inputs)."""
-    return np.asarray(np.einsum("tni,ti->tn", slopes, column))
-
-
-def _single(signals: Array) -> list[Array]:
-    """Each signal (steps, i) alone, the others zero."""
-    return [signals * unit for unit in np.eye(signals.shape[1])]
-
-
-def _crossed(signals: Array, inputs: int) -> list[Array]:
-    """Each signal (steps, k) at each input alone (steps, inputs)."""
-    return [signals[:, [k]] * unit for k in range(signals.shape[1]) for unit in np.eye(inputs)]
-
-
-def _later(signal: Array, steps: int) -> Array:
-    return np.vstack([np.zeros((steps, signal.shape[1])), signal[:-steps]])
-
-
-def _along_limits(problem: Problem, controller: Controller) -> Array:
-    """Derivatives by the log of each finite control limit (r, k)."""
-    rows = bound_rows(controller.bounds, problem.plant)
-    moves = [column for k in range(problem.plant.m) if np.any(column := rows.along_limit(k))]
-    if not moves:
-        return np.zeros((sum(problem.trial_sizes), 0))
-    along = directions(controller, len(moves), bounds=np.stack(moves, axis=1))
-    return residual_along(problem, controller, along)
-
-
-def _offsets(problem: Problem) -> Array:
-    """Unit offset in each output and trial that is not fitted (r, k)."""
-    names = problem.plant.outputs
-    places = [k for k, name in enumerate(names) if name not in problem.offsets]
-    parts, count = [], len(problem.recordings)
-    for index, trial in enumerate(problem.recordings):
-        rows = np.zeros((trial.samples, len(problem.measured), count, len(places)))
-        for column, place in enumerate(places):
-            rows[:, place, index, column] = 1 / problem.output_scale[place]
-        parts.append(rows.reshape(-1, count * len(places)))
-    return np.concatenate(parts)
+def _crossed(slopes: Array, signals: Array) -> Array:
+    """Forcing (steps, n, k inputs) of each signal (steps, k) through each of the slopes."""
+    both: Array = np.einsum("tni,tk->tnki", slopes, signals)
+    return both.reshape(*slopes.shape[:2], -1)

@@ -41,7 +41,6 @@ class GainEstimate:
     K: Array  # (m, n); that of the weights along unidentified directions
     S: Array  # (m, m); that of the weights where not identified
     misfit: float  # 2-norm of the residual
-    linear: GainCovariance  # To first order
     covariance: GainCovariance  # HAC covariance with curvature
     # The same with stated uncertainties set to zero; None if there are none
     exact: GainCovariance | None = None
@@ -64,7 +63,6 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
         problem,
         *at,
         end.misfit,
-        gain_covariance(problem, *at, evaluation=found),
         gain_covariance(problem, *at, curvature=True, evaluation=found),
         None if fixed is problem else gain_covariance(fixed, *at, curvature=True, evaluation=alone),
         end.ended,

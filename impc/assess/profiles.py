@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import gain_covariance
+from impc.assess.fit_curve import FitCurve
 from impc.assess.long_run_covariance import white_noise
 from impc.assess.printed_gain import LEVEL, Interval, entry_names
 from impc.errors import InputError
@@ -41,11 +41,10 @@ if TYPE_CHECKING:
 
 # 1 / SD of a prior, far beyond any possible gain, that keeps free directions from drifting.
 _WEAK = 1e-2
-# Steps, in standard errors, towards an end; if D stays low there is no end.
-_STEPS = (1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
-# Accuracy of an end, and of the minimum in standard errors; evaluations of a point.
-_END, _MINIMUM, _EVALUATIONS = 1e-3, 0.02, 40
-_ROUNDS = 6
+# Values tried on each side, in standard errors; if D stays low there is no end.
+_STEPS = np.array([1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, np.inf])
+# Accuracy of the minimum in standard errors, and evaluations of a point.
+_MINIMUM, _EVALUATIONS = 0.02, 40
 
 
 @dataclass(frozen=True)
@@ -61,14 +60,26 @@ class Profile(Frozen):
 def profile_likelihood(estimate: GainEstimate, name: str) -> Profile:
     """Profile an entry of K (K.<control>.<state>) or a fitted parameter."""
     require_numbers(estimate, [name])
-    search = _Search(estimate, name)
-    low, high = search.ends(float(scipy.special.chdtri(1, 1 - LEVEL)))
-    tried = sorted(search.tried)
-    best = search.number(search.best)
+    problem, entries = estimate.problem, entry_names(estimate.problem.plant)
+    is_entry = name in entries
+    index = entries.index(name) if is_entry else problem.parameter_names.index(name)
+    curve, (error, factor) = _curve(estimate, is_entry, index), _spread(estimate, is_entry, index)
+    curve.loss(0.0)
+
+    def number(offset: float) -> float:
+        if is_entry:
+            return float(estimate.K.ravel()[index]) + offset
+        return float(estimate.parameters[index] * np.exp(offset)) if offset < 700 else np.inf
+
+    rise, steps = float(scipy.special.chdtri(1, 1 - LEVEL)) * factor, error * _STEPS
+    low, high = curve.ends(
+        rise, lambda at: ((at - steps).tolist(), (at + steps).tolist()), _MINIMUM * error, error
+    )
+    least = curve.loss(curve.best)
     return Profile(
-        Interval(name, "profile", LEVEL, best, search.number(low), search.number(high)),
-        frozen([search.number(offset) for offset in tried]),
-        frozen([search.distance(offset) for offset in tried]),
+        Interval(name, "profile", LEVEL, number(curve.best), number(low), number(high)),
+        frozen([number(offset) for offset in curve.finite]),
+        frozen([(curve.loss(offset) - least) / factor for offset in curve.finite]),
     )
 
 
@@ -81,105 +92,26 @@ def require_numbers(estimate: GainEstimate, names: Sequence[str]) -> None:
             raise InputError(f"profile of {name}", "no such entry or parameter", said)
 
 
-class _Search:
-    """Cached fits with the number held at offsets from the estimate."""
+def _curve(estimate: GainEstimate, is_entry: bool, index: int) -> FitCurve:
+    """Fits with an entry or a log-parameter at an offset from the estimate."""
+    law = GainLaw(estimate.problem, np.array(estimate.K), np.array(estimate.S))
+    space = Unknowns(estimate.problem, law)
+    row = np.zeros(len(space.start))
+    if is_entry:
+        row[: len(law.gains)] = law.gains.reshape(len(law.gains), -1)[:, index]
+    else:
+        row[space.parameters.start + index] = space.units[index]
+    shared, step = np.delete(row, space.trial), row / float(row @ row)
+    # Parameters stay columns of their own: the stated ones have a prior.
+    first, last = np.flatnonzero(shared)[[0, -1]] + [0, 1]
+    null = scipy.linalg.null_space(shared[None, first:last])
+    along = scipy.linalg.block_diag(np.eye(first), null, np.eye(len(shared) - last))
 
-    def __init__(self, estimate: GainEstimate, name: str) -> None:
-        problem, K = estimate.problem, np.array(estimate.K)
-        law = GainLaw(problem, K, np.array(estimate.S))
-        self.space, entries = Unknowns(problem, law), entry_names(problem.plant)
-        self.is_entry = name in entries
-        index = entries.index(name) if self.is_entry else problem.parameter_names.index(name)
-        q = len(self.space.start)
-        row = np.zeros(q)
-        if self.is_entry:
-            row[: K.size] = law.gains.reshape(len(law.gains), -1)[:, index]
-            self.value = float(K.ravel()[index])
-        else:
-            row[self.space.parameters.start + index] = self.space.units[index]
-            self.value = float(estimate.parameters[index])
-        self.step = row / float(row @ row)
-        shared = np.delete(row, self.space.trial)
-        held = np.flatnonzero(shared)
-        # Parameters stay columns of their own: the stated ones have a prior.
-        first, last = held[0], held[-1] + 1
-        null = scipy.linalg.null_space(shared[None, first:last])
-        others = np.eye(first), null, np.eye(len(shared) - last)
-        self.along = scipy.linalg.block_diag(*others)
-        self.deviation, self.factor = _spread(estimate, self.is_entry, index)
-        self.tried: dict[float, Fitted] = {}
-        self.objective(0.0)
+    def fit(offset: float, near: float, start: Fitted) -> Fitted:
+        z, stop = np.array(start.z) + (offset - near) * step, Stop(PROMISE, 0.0, _EVALUATIONS)
+        return space.search(z, stop, shared=_WEAK, own=_WEAK, along=along)
 
-    def number(self, offset: float) -> float:
-        """Number at an offset: of the entry, or of the logarithm of the parameter."""
-        if self.is_entry:
-            return self.value + offset
-        return float(self.value * np.exp(offset)) if offset < 700 else np.inf
-
-    def objective(self, offset: float) -> float:
-        """F with the number at this offset, started from the nearest previous fit."""
-        if offset not in self.tried:
-            z = self.space.start + offset * self.step
-            if self.tried:
-                near = min(self.tried, key=lambda known: abs(known - offset))
-                z = np.array(self.tried[near].z) + (offset - near) * self.step
-            stop = Stop(PROMISE, 0.0, _EVALUATIONS)
-            self.tried[offset] = self.space.search(
-                z, stop, shared=_WEAK, own=_WEAK, along=self.along
-            )
-        return self.tried[offset].objective
-
-    @property
-    def best(self) -> float:
-        """Offset of the least F."""
-        return min(self.tried, key=lambda offset: self.tried[offset].objective)
-
-    def distance(self, offset: float) -> float:
-        """D at an offset."""
-        return (self.objective(offset) - self.tried[self.best].objective) / self.factor
-
-    def ends(self, quantile: float) -> tuple[float, float]:
-        """Offsets at which D crosses the quantile on either side of its minimum.
-
-        The minimum of the search may lie elsewhere; if a step finds a better one, the bracketing
-        restarts there.
-        """
-        if not np.isfinite(self.deviation):
-            return -np.inf, np.inf
-        for _ in range(_ROUNDS):
-            self._refine()
-            origin = self.best
-            ends = self._end(origin, -1.0, quantile), self._end(origin, 1.0, quantile)
-            if self.best == origin:
-                break
-        return ends
-
-    def _refine(self) -> None:
-        """Refine the minimum between the neighbours of the best offset."""
-        tried, best = sorted(self.tried), self.best
-        below = max([item for item in tried if item < best], default=best - self.deviation)
-        above = min([item for item in tried if item > best], default=best + self.deviation)
-        scipy.optimize.minimize_scalar(
-            self.objective,
-            bounds=(below, above),
-            method="bounded",
-            options={"xatol": _MINIMUM * self.deviation},
-        )
-
-    def _end(self, origin: float, sign: float, quantile: float) -> float:
-        """Offset at which D crosses the quantile, infinite if it does not."""
-
-        def excess(offset: float) -> float:
-            return self.distance(offset) - quantile
-
-        inside = origin
-        for step in _STEPS:
-            outside = origin + sign * step * self.deviation
-            if excess(outside) > 0:
-                accuracy = _END * abs(outside - inside)
-                return float(scipy.optimize.brentq(excess, inside, outside, xtol=accuracy))
-            inside = outside
-        return sign * np.inf
+    return FitCurve(fit, (0.0, space.ended(space.start)), lambda end: end.objective)
 
 
 def _spread(estimate: GainEstimate, is_entry: bool, index: int) -> tuple[float, float]:

@@ -1,14 +1,12 @@
 """Agreement of simulation and recording (VAF, whiteness), and comparison of models (AIC).
 
-VAF (3.24), also of held-out trials. Models (other horizons, no limit) are compared by Akaike's
-criterion. Residuals are autocorrelated, so the likelihood is that of their innovations under one
-first-order autoregression per output, estimated from the fit; over T rows of innovations with
-covariance V
+VAF (3.24), also of held-out trials. Models are compared by Akaike's criterion. Residuals are
+autocorrelated, so the likelihood is that of their innovations under one first-order autoregression
+per output, estimated from the fit; over T rows of innovations with covariance V
 
     AIC = T log det V + 2 k,
 
-with k fitted numbers. All alternatives fit equally many, so only differences count: below 2 the
-models are not distinguished; above 10 the worse one has no support (Burnham and Anderson 2002, 70).
+with k fitted numbers.
 """
 
 from __future__ import annotations
@@ -24,14 +22,13 @@ from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
-from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.noisy_fit import fit_controller
+from impc.errors import InputError
 from impc.inverse.problem import controller_for, scenarios
 from impc.inverse.residuals import residual_only
 from impc.inverse.search import with_fitted_starts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from impc.control.simulation import Simulation
     from impc.inverse.estimates import Estimate
@@ -181,77 +178,6 @@ def held_out_vafs(
         np.array(left_out_vaf(fit_without(index), trial, settle).vaf)
         for index, trial in enumerate(problem.recordings if count > 1 else ())
     ]
-
-
-_SAME, _RULED_OUT = 2.0, 10.0
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """One way to fit the same recordings."""
-
-    name: str  # "as fitted", "no limit" or "horizon N"
-    horizon: int  # In samples
-    misfit: float  # 2-norm of the residual; infinite without a controller
-    aic: float  # Difference to the least AIC of all alternatives
-    held_out: float  # Mean VAF over outputs and held-out trials, %; NaN with one trial
-    reason: str  # Why there is no controller; otherwise empty
-
-
-def fit_alternatives(
-    problem: Problem,
-    fitted: Estimate,
-    horizons: Sequence[int],
-    settle: float,
-    progress: Callable[[str], None] = lambda _: None,
-) -> tuple[Alternative, ...]:
-    """Refit without the limit, if there is one, and with each other horizon."""
-    posed = [("as fitted", problem)]
-    if np.any(np.isfinite(problem.bounds.u_max)):
-        posed.append(("no limit", problem.without_bounds()))
-    posed += [
-        (f"horizon {length}", replace(problem, horizon=length))
-        for length in horizons
-        if length != problem.horizon
-    ]
-    roots = innovation_roots(fitted)
-    found = []
-    for name, other in posed:
-        found.append(_fit(name, other, fitted, settle, roots))
-        progress(name)
-    least = min(item.aic for item in found)
-    return tuple(replace(item, aic=item.aic - least) for item in found)
-
-
-def verdict(one: Alternative, other: Alternative) -> str:
-    """Sentence that compares two alternatives by AIC."""
-    if one.reason or other.reason:
-        failed = one if one.reason else other
-        return f"{failed.name}: no controller ({failed.reason})"
-    better, worse = (one, other) if one.aic <= other.aic else (other, one)
-    distance = worse.aic - better.aic
-    pair = f"{better.name} and {worse.name}"
-    if distance < _SAME:
-        return f"the recordings do not distinguish {pair} (AIC differs by {distance:.1f})"
-    strength = "rule out" if distance > _RULED_OUT else "give weak evidence against"
-    return (
-        f"the recordings {strength} {worse.name} compared with {better.name} (AIC +{distance:.0f}, "
-        f"held-out VAF {worse.held_out - better.held_out:+.2f} points)"
-    )
-
-
-def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:
-    try:
-        found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
-        weights = found.weights
-        held = held_out_vafs(
-            problem, lambda index: fit_controller(problem.leaving_out(index), weights), settle
-        )
-    except (WeightsError, SolverError) as error:
-        return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
-    aic = innovations_criterion(residuals_of(found), roots)
-    mean = float(np.mean(held)) if held else float("nan")
-    return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
 
 
 def residuals_of(found: Estimate) -> list[Array]:

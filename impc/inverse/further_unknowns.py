@@ -57,11 +57,10 @@ def with_delay_unknown(problem: Problem) -> Problem | None:
     return _posed(problem, family, **parts)
 
 
-def with_offsets_unknown(problem: Problem) -> Problem | None:
-    """Free a constant offset of every output in every trial."""
-    others = tuple(pair for pair in problem.signal_errors if pair[0] != "offset")
-    offsets = tuple(("offset", name) for name in problem.plant.outputs)
-    return replace(problem, signal_errors=others + offsets)
+def with_offsets_unknown(problem: Problem) -> Problem:
+    """Free a constant offset of every output in every trial; new ones come last."""
+    offsets = [("offset", name) for name in problem.plant.outputs]
+    return replace(problem, signal_errors=tuple(dict.fromkeys([*problem.signal_errors, *offsets])))
 
 
 def with_strength_unknown(problem: Problem) -> Problem | None:

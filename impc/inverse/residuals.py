@@ -398,12 +398,14 @@ def measured_slope(problem: Problem, trial: Recording, moved: Sensitivity) -> Ar
     return slope
 
 
-def residual_along(problem: Problem, controller: Controller, along: Directions) -> Array:
-    """Derivative of the residual (r, k) along directions of the controller."""
-    parts, prepared = [], prepare_loop(controller, along)
+def along_bounds(problem: Problem, gain: Array, metric: Array, moves: Array) -> Array:
+    """Derivative of the residual (r, k) by `moves` (c, k) of the right sides of `bound_rows`."""
+    controller = controller_for(problem, gain, metric)
+    prepared = prepare_loop(controller, directions(controller, moves.shape[1], bounds=moves))
+    parts = []
     for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
         _, moved = run_loop(prepared, drive, seen=problem.scaled_outputs)
-        parts.append(measured_slope(problem, trial, moved).reshape(-1, along.count))
+        parts.append(np.concatenate(measured_slope(problem, trial, moved)))
     return np.concatenate(parts)
 
 

@@ -21,8 +21,10 @@ from impc.inverse.further_unknowns import (
     with_offsets_unknown,
     with_strength_unknown,
 )
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import evaluate, residual_only
+from impc.inverse.unknowns import Unknowns
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings
 
@@ -46,7 +48,7 @@ def problem_and_gain() -> tuple[Problem, Array, Array]:
 
 def column(name: str) -> Array:
     problem, K, S = problem_and_gain()
-    return dict(module._columns(problem, K, S))[name]
+    return module._columns(problem, K, S)[name]
 
 
 @pytest.mark.parametrize(("seed", "root"), [(0, 0.0), (1, 0.0), (0, 0.9), (1, 0.9)])
@@ -125,11 +127,19 @@ def test_what_is_named_is_fitted_too() -> None:
     assert all(low <= value <= high for (low, high), value in zip(ends, truth[0], strict=True))
 
 
-def test_offsets_are_no_error_where_they_are_fitted() -> None:
+def test_what_is_fitted_or_absent_is_not_tested() -> None:
     problem, K, S = problem_and_gain()
-    wider = with_offsets_unknown(problem)
-    assert wider is not None
-    assert OFFSET not in dict(module._columns(wider, K, S))
+    with_offsets, unlimited = with_offsets_unknown(problem), problem.without_bounds()
+    for name, one, tested in (
+        (OFFSET, problem, True),
+        (OFFSET, with_offsets, False),
+        (LIMIT, problem, True),
+        (LIMIT, unlimited, False),
+    ):
+        space = Unknowns(one, GainLaw(one, K, S))
+        found = lack_of_fit(space.ended(space.start))
+        assert found is not None
+        assert (name in [*found.untestable, *(item.name for item in found.errors)]) == tested
 
 
 def test_too_little_is_not_tested() -> None:

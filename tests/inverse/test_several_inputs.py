@@ -11,6 +11,7 @@ import pytest
 from experiments.misfit_ceiling import short_of_truth
 from experiments.printed_intervals import carts, fit, noisy_recording, random_recording, regulator
 from impc.assess.bounded_weights import weights_set
+from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.control.closed_loop import simulate
@@ -298,10 +299,11 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     # The reported gain is at the minimum over the identified directions: a Gauss-Newton step along
     # them would lower chi-squared by less than 0.1.
     printed = gain_estimate(found)
-    here = evaluate(printed.problem, np.array(printed.K), np.array(printed.S))
+    at = printed.problem, np.array(printed.K), np.array(printed.S)
+    here, linear = evaluate(*at), gain_covariance(*at)
     T, G = natural_coordinates(clean.plant, np.array(printed.K))
     on_gain = here.dK.reshape(len(here.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
-    along = on_gain @ printed.linear.directions[printed.linear.identified].T
+    along = on_gain @ linear.directions[linear.identified].T
     step = along @ np.linalg.lstsq(along, here.residual)[0]
     assert step @ step < 0.1 * printed.misfit**2 / len(here.residual)
 

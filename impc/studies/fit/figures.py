@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.assess.frequency_response import FrequencyResponse
-    from impc.assess.limit_curve import LimitCurve
+    from impc.assess.input_limits import LimitCurve
     from impc.studies.fit.result import FitResult
 
 _WINDOW, _PHONE_WINDOW = 10.0, 6.0  # s

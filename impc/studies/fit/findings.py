@@ -9,7 +9,6 @@ import pandas as pd
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names
-from impc.assess.variance_accounted_for import verdict
 from impc.files.disk import truth_beside
 from impc.inverse.refit import IDENTIFIED
 from impc.model.plant import UNKNOWN, gain_unit
@@ -18,6 +17,7 @@ from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
 from impc.studies.fit.facts import gain_rows, named_gains, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.fit.uncertainty import verdict
 from impc.studies.methods_table import trajectory_table, weight_entries
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from impc.assess.lack_of_fit import LIMIT
 from impc.assess.lasting_response import LastingResponse, lasting_responses
 from impc.control.named_solver import described
+from impc.inverse.minimiser import Ended
 from impc.reporting.document import (
     Block,
     Check,
@@ -461,7 +462,13 @@ def _others(result: FitResult) -> list[Check]:
                   f"{shares(result, one.vaf, 1)} of the variance repeats with the perturbation "
                   f"({one.repetitions} repetitions): a model without noise cannot explain more.")
         )  # fmt: skip
-    found += [Check(Level.NOTE, "Search", doubt) for doubt in result.fitted.doubts]
+    doubts, gain = list(result.fitted.doubts), result.estimate
+    if result.fitted.fit.unconfirmed and gain.ended in (Ended.STUCK, Ended.STOPPED):
+        doubts.append(
+            "The search for the gain did not end at a minimum, and no search from another start "
+            "confirmed the gain: a better one may exist."
+        )
+    found += [Check(Level.NOTE, "Search", doubt) for doubt in doubts]
     for stage, reason in result.failures.items():
         found.append(Check(Level.NOTE, f"Not available: {stage}", reason))
     return found

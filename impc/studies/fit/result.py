@@ -20,13 +20,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from impc.arrays import Array
-    from impc.assess.all_intervals import Uncertainty
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
     from impc.assess.frequency_response import FrequencyResponse
+    from impc.assess.input_limits import LimitCurve
     from impc.assess.intent_statements import Intent, Statement
     from impc.assess.lack_of_fit import LackOfFit, ModelError
-    from impc.assess.limit_curve import LimitCurve
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.output_feedback.page import PersonReport
     from impc.studies.fit.settings import FitSettings
+    from impc.studies.fit.uncertainty import Uncertainty
 
 #: Largest number of trials on a page: 500 trials gave 51 MB and needed 6.3 GB of memory.
 MOST_TRIALS = 24

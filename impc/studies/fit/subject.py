@@ -17,15 +17,14 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from impc.arrays import Array, frozen
-from impc.assess.all_intervals import assess, count_stages
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
 from impc.assess.frequency_response import frequency_response
+from impc.assess.input_limits import LimitCurve, limit_curve
 from impc.assess.intent_draws import drawn_gains
 from impc.assess.intent_statements import intent
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
-from impc.assess.limit_curve import LimitCurve, limit_curve
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out_vaf
@@ -49,6 +48,7 @@ from impc.studies.fit.asked import (
 )
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
 from impc.studies.fit.settings import FitSettings, ObserverSettings
+from impc.studies.fit.uncertainty import assess, count_stages
 from impc.studies.pool import threads
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from impc.assess.all_intervals import Attempt
     from impc.assess.assessments import MethodFit
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
@@ -70,6 +69,7 @@ if TYPE_CHECKING:
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
     from impc.output_feedback.page import PersonReport
+    from impc.studies.fit.uncertainty import Attempt
 
 _THREADS = 2
 _UNUSABLE = "the controller explains less than half of a recorded signal (VAF below 50 %)."

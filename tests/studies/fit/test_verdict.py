@@ -14,6 +14,7 @@ from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.files.plant_sources import plant_source
+from impc.inverse.minimiser import Ended
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -97,6 +98,20 @@ def test_an_error_of_the_model_forbids_gains() -> None:
     # The numbers are only in a folded part that says so.
     assert "(do not report)" in page.partition('id="feedback-gain"')[2][:900]
     assert added_sentence(replace(result, lack=(alarm, None))).startswith("The residuals of a")
+
+
+@pytest.mark.parametrize(
+    ("ended", "unconfirmed", "said"),
+    [(Ended.STUCK, True, True), (Ended.STUCK, False, False), (Ended.CONVERGED, True, False)],
+)
+def test_an_unconfirmed_gain_at_no_minimum_is_said(
+    ended: Ended, unconfirmed: bool, said: bool
+) -> None:
+    result = explained()
+    fit = replace(result.fitted, fit=replace(result.fitted.fit, unconfirmed=unconfirmed))
+    result = replace(result, fitted=fit, estimate=replace(result.estimate, ended=ended))
+    page = fit_report(result, Provenance()).page()
+    assert ("did not end at a minimum, and no search from another start confirmed" in page) == said
 
 
 @pytest.mark.full

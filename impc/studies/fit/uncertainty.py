@@ -10,61 +10,38 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.assess.input_limits import input_limit
 from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals
 from impc.assess.profiles import profile_likelihood, require_numbers
-from impc.assess.resampling import (
-    bootstrap_intervals,
-    bootstrap_model,
-    replicate,
+from impc.assess.resampling import bootstrap_intervals, bootstrap_model, replicate
+from impc.assess.variance_accounted_for import (
+    held_out_vafs,
+    innovation_roots,
+    innovations_criterion,
+    residuals_of,
 )
-from impc.assess.variance_accounted_for import fit_alternatives
+from impc.checking import replace
+from impc.errors import SolverError, WeightsError
+from impc.inverse.noisy_fit import fit_controller
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from impc.arrays import Array
     from impc.assess.input_limits import LimitEstimate
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.resampling import Replicate
-    from impc.assess.variance_accounted_for import Alternative
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.studies.fit.settings import FitSettings
 
 #: (stage, compute, default) -> result, or the default if it fails.
 Attempt = Callable[[str, Callable[[], Any], Any], Any]
-
-
-class Asked(Protocol):
-    """Requested analyses: the part of the fit settings that this module reads."""
-
-    @property
-    def replicates(self) -> int:
-        """Number of bootstrap replicates; 0 for none."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of the bootstrap."""
-
-    @property
-    def profiles(self) -> Sequence[str]:
-        """Names of the numbers to profile."""
-
-    @property
-    def unknown_limit(self) -> bool:
-        """Whether to estimate the limit of each input."""
-
-    @property
-    def horizons(self) -> Sequence[int]:
-        """Other horizons to compare, in samples."""
-
-    @property
-    def settle(self) -> float:
-        """Time at the start of a held-out trial that serves to fit its initial state, s."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +57,7 @@ class Uncertainty:
     alternatives: tuple[Alternative, ...]
 
 
-def count_stages(problem: Problem, settings: Asked) -> int:
+def count_stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `assess` reports, and one for the set of weights."""
     limited = int(np.any(np.isfinite(problem.bounds.u_max)))
     others = [length for length in settings.horizons if length != problem.horizon]
@@ -98,7 +75,7 @@ def assess(
     fitted: Estimate,
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
-    settings: Asked,
+    settings: FitSettings,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
     attempt: Attempt,
@@ -135,7 +112,7 @@ def _limit_interval(found: LimitEstimate, control: str) -> Interval:
 
 def _bootstrap(
     estimate: GainEstimate,
-    settings: Asked,
+    settings: FitSettings,
     done: Callable[[str], None],
     remember: Callable[[str, Callable[[], Replicate]], Replicate],
 ) -> tuple[Interval, ...]:
@@ -149,3 +126,76 @@ def _bootstrap(
         found.append(remember(name, compute))
         done(name)
     return bootstrap_intervals(estimate, found, "block", LEVEL)
+
+
+# Differences of AIC below which models are not distinguished, and above which the worse one has no
+# support (Burnham and Anderson 2002, 70). All alternatives fit equally many numbers.
+_SAME, _RULED_OUT = 2.0, 10.0
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One way to fit the same recordings."""
+
+    name: str  # "as fitted", "no limit" or "horizon N"
+    horizon: int  # In samples
+    misfit: float  # 2-norm of the residual; infinite without a controller
+    aic: float  # Difference to the least AIC of all alternatives
+    held_out: float  # Mean VAF over outputs and held-out trials, %; NaN with one trial
+    reason: str  # Why there is no controller; otherwise empty
+
+
+def fit_alternatives(
+    problem: Problem,
+    fitted: Estimate,
+    horizons: Sequence[int],
+    settle: float,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Alternative, ...]:
+    """Refit without the limit, if there is one, and with each other horizon."""
+    posed = [("as fitted", problem)]
+    if np.any(np.isfinite(problem.bounds.u_max)):
+        posed.append(("no limit", problem.without_bounds()))
+    posed += [
+        (f"horizon {length}", replace(problem, horizon=length))
+        for length in horizons
+        if length != problem.horizon
+    ]
+    roots = innovation_roots(fitted)
+    found = []
+    for name, other in posed:
+        found.append(_fit(name, other, fitted, settle, roots))
+        progress(name)
+    least = min(item.aic for item in found)
+    return tuple(replace(item, aic=item.aic - least) for item in found)
+
+
+def verdict(one: Alternative, other: Alternative) -> str:
+    """Sentence that compares two alternatives by AIC."""
+    if one.reason or other.reason:
+        failed = one if one.reason else other
+        return f"{failed.name}: no controller ({failed.reason})"
+    better, worse = (one, other) if one.aic <= other.aic else (other, one)
+    distance = worse.aic - better.aic
+    pair = f"{better.name} and {worse.name}"
+    if distance < _SAME:
+        return f"the recordings do not distinguish {pair} (AIC differs by {distance:.1f})"
+    strength = "rule out" if distance > _RULED_OUT else "give weak evidence against"
+    return (
+        f"the recordings {strength} {worse.name} compared with {better.name} (AIC +{distance:.0f}, "
+        f"held-out VAF {worse.held_out - better.held_out:+.2f} points)"
+    )
+
+
+def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:
+    try:
+        found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
+        weights = found.weights
+        held = held_out_vafs(
+            problem, lambda index: fit_controller(problem.leaving_out(index), weights), settle
+        )
+    except (WeightsError, SolverError) as error:
+        return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
+    aic = innovations_criterion(residuals_of(found), roots)
+    mean = float(np.mean(held)) if held else float("nan")
+    return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
