@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import impc
 from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.printed_intervals import carts, fit, noisy_recording, regulator
 from impc.assess.covariance import gain_covariance
@@ -12,15 +13,13 @@ from impc.assess.long_run_covariance import white_noise
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.profiles import profile_likelihood
 from impc.assess.variance_accounted_for import Alternative, fit_alternatives, verdict
-from impc.checking import replace
-from impc.errors import InputError
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.settings import FitSettings, fit_settings
-from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
+from impc.studies.fit.settings import fit_settings
+from impc.studies.fit.subject import FitProgress, fit_recordings, stages
 from tests.assess.cart_fits import cart_fit, cart_problem
 
 SEEDS = (11, 12)
-EXTRAS = FitSettings(
+EXTRAS = impc.FitSettings(
     horizon=10,
     u_max=1.0,
     replicates=20,
@@ -34,7 +33,7 @@ EXTRAS = FitSettings(
 def result() -> FitResult:
     trials = [noisy_trial(seed, 0.0) for seed in SEEDS]
     heard: list[str] = []
-    problem = fit_problem(cart(), trials, EXTRAS)
+    problem = impc.fit_problem(cart(), trials, EXTRAS)
     found = fit_recordings(problem, EXTRAS, FitProgress(heard.append))
     assert len(heard) == stages(problem, EXTRAS)
     return found
@@ -45,28 +44,24 @@ def test_every_interval_holds_the_truth(result: FitResult) -> None:
     """Seeds 11 and 12, fixed before the run; 95 % intervals of two entries and the limit."""
     truth = dict(zip(("K.force.x[0]", "K.force.x[1]"), true_controller().K[0], strict=True))
     truth["u_max.force"] = 1.0
-    methods = {item.method for item in result.uncertainty.intervals}
-    assert methods == {"sandwich", "block", "profile"}
-    for item in result.uncertainty.intervals:
+    intervals = result.uncertainty.intervals
+    assert {item.method for item in intervals} == {"sandwich", "block", "profile"}
+    for item in intervals:
         assert item.low < truth[item.name] < item.high, item
         assert item.value is not None
 
 
 @pytest.mark.full
-def test_the_set_of_weights_is_described(result: FitResult) -> None:
+def test_the_set_of_weights_and_the_alternatives_are_described(result: FitResult) -> None:
+    """True limit 1 and N = 10: "no limit" is ruled out, N = 20 is not distinguished."""
     found = result.uncertainty.weights
     assert found is not None
-    Q = result.intent.reported.weights.Q
-    for item in found.entries:
-        i, j = (result.fitted.problem.plant.states.index(n) for n in (item.first, item.second))
-        assert item.low <= Q[i, j] * (1 + 1e-6) + 1e-9
-        assert Q[i, j] <= item.high + 1e-6 * abs(item.high)
     assert len(found.statements) == 2
-
-
-@pytest.mark.full
-def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -> None:
-    """True limit 1 and N = 10: "no limit" is ruled out, N = 20 is not distinguished."""
+    Q, states = result.intent.reported.weights.Q, result.fitted.problem.plant.states
+    for item in found.entries:
+        value = Q[states.index(item.first), states.index(item.second)]
+        assert item.low <= value * (1 + 1e-6) + 1e-9
+        assert value <= item.high + 1e-6 * abs(item.high)
     by_name = {item.name: item for item in result.uncertainty.alternatives}
     assert list(by_name) == ["as fitted", "no limit", "horizon 1", "horizon 20"]
     first = by_name["as fitted"]
@@ -77,11 +72,11 @@ def test_the_limit_is_told_from_none_and_short_horizons_too(result: FitResult) -
 
 def test_verdicts() -> None:
     one = Alternative("as fitted", 10, 1.0, 0.0, 90.0, "")
-    assert "do not distinguish" in verdict(one, replace(one, name="b", aic=1.9))
-    assert "give weak evidence against b" in verdict(one, replace(one, name="b", aic=5.0))
-    assert "rule out b" in verdict(one, replace(one, name="b", aic=50.0))
-    assert "rule out as fitted" in verdict(replace(one, aic=50.0), replace(one, name="b"))
-    assert "no controller (why)" in verdict(one, replace(one, name="b", reason="why"))
+    assert "do not distinguish" in verdict(one, impc.replace(one, name="b", aic=1.9))
+    assert "give weak evidence against b" in verdict(one, impc.replace(one, name="b", aic=5.0))
+    assert "rule out b" in verdict(one, impc.replace(one, name="b", aic=50.0))
+    assert "rule out as fitted" in verdict(impc.replace(one, aic=50.0), impc.replace(one, name="b"))
+    assert "no controller (why)" in verdict(one, impc.replace(one, name="b", reason="why"))
 
 
 def test_aic_is_that_of_the_innovations() -> None:
@@ -107,15 +102,13 @@ def test_aic_is_that_of_the_innovations() -> None:
     ],
 )
 def test_settings_are_checked(table: dict[str, object], match: str) -> None:
-    with pytest.raises(InputError, match=match):
+    with pytest.raises(impc.InputError, match=match):
         fit_settings(table)
 
 
 def test_profiles_of_two_inputs_end_where_deviations_say() -> None:
-    """At a VAF of 99.9 % the problem is almost linear: ends at 1.96 standard errors.
-
-    The ends differ from that by 2.6 and 1.0 %, and from each other by at most 0.5 %.
-    """
+    """At a VAF of 99.9 % the problem is almost linear: ends at 1.96 standard errors."""
+    # The ends differ from that by 2.6 and 1.0 %, and from each other by at most 0.5 %.
     controller = regulator(carts(2))
     estimate = gain_estimate(fit(controller, noisy_recording(controller, 0, 99.9, 0.0)))
     at = estimate.problem, np.array(estimate.K), np.array(estimate.S)
