@@ -6,8 +6,6 @@ import os
 from collections.abc import Iterator
 from typing import Any
 
-import control
-import numpy as np
 import pytest
 from hypothesis import settings
 from matplotlib.figure import Figure
@@ -16,6 +14,7 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.studies.example.cases import CaseResult, run_case
 from plants import yalmip_example
+from tests import support
 from tests.labelled_axes import require_labels
 from tests.support import SEARCH, leave_blank
 
@@ -52,7 +51,7 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def example_plant() -> Plant:
     """The example of section 3.4: unstable, two states, one input."""
-    return Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+    return support.example_plant()
 
 
 @pytest.fixture

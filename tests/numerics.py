@@ -38,7 +38,6 @@ FILES = (
     "tests/control/test_casadi_controller.py",
     "tests/control/test_solvers.py",
     "tests/experiments/test_nonlinear_mpc.py",
-    "tests/inverse/test_random_inverse.py",
     "tests/inverse/test_semidefinite.py",
     "tests/control/test_terminal_set.py",
     "tests/assess/test_input_limits.py",

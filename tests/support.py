@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import os
 from collections import deque
@@ -24,6 +25,7 @@ from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.studies.cache import Steps
+from impc.studies.example.cases import CASES
 from impc.studies.pool import Answer, Task, answered
 
 #: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
@@ -72,6 +74,60 @@ def extrapolated_slope(function: Callable[[float], Any], first: float = 1e-2) ->
                 best, least = row[-1], float(error)
         table = row
     return best
+
+
+def extrapolated_jacobian(
+    function: Callable[[Any], Any], at: np.ndarray, first: float = 1e-2
+) -> np.ndarray:
+    """Derivative (r, q) of an array at `at` (q,), one `extrapolated_slope` a column."""
+    columns = [
+        extrapolated_slope(lambda t, unit=unit: function(at + t * unit), first)  # type: ignore[misc]
+        for unit in np.eye(len(at))
+    ]
+    return np.array([column.ravel() for column in columns]).T
+
+
+def differences(function: Callable[[Any], Any], at: Any, step: float = 1e-6) -> np.ndarray:
+    """Derivative (r, q) of an array at `at` of any shape, by central differences."""
+    at = np.asarray(at, dtype=float)
+    columns = []
+    for unit in step * np.eye(at.size):
+        move = unit.reshape(at.shape)
+        columns.append(np.ravel((function(at + move) - function(at - move)) / (2 * step)))
+    return np.array(columns).T
+
+
+def plant_of(A: Any, B: Any, C: Any = None, dt: float = 1.0) -> Plant:
+    """A plant without disturbances; all states are outputs unless C is given."""
+    return Plant(control.ss(A, B, np.eye(len(np.asarray(A))) if C is None else C, 0, dt))
+
+
+def regulator(
+    plant: Plant, Q: Any, limit: Any, horizon: int, R: Any = 1, *, terminal_set: bool = False
+) -> Controller:
+    """The controller of weights Q and R, and |u| <= limit."""
+    bounds = Bounds(plant, u_min=-limit, u_max=limit)
+    return Controller(plant, Weights(Q, R), bounds, horizon, terminal_set=terminal_set)
+
+
+def posed(law: Controller, *trials: Recording, **given: Any) -> Problem:
+    """The inverse problem of recordings of a controller."""
+    return Problem(law.plant, law.bounds, law.horizon, trials, **given)
+
+
+@functools.cache
+def example_plant() -> Plant:
+    """The example of section 3.4: unstable, two states, one input."""
+    return Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+
+
+@functools.cache
+def example_problem(case: str, scale: float = 1.0) -> Problem:
+    """The example recorded under Q = I and R = 1; all numbers `scale` times as large."""
+    plant = example_plant()
+    law = regulator(plant, np.eye(2), scale, 3, terminal_set=True)
+    run = simulate(law, scenario(plant, x0=scale * np.array(CASES[case]), steps=20))
+    return posed(law, Recording(plant, run.x))
 
 
 def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int = 0) -> Plant:
@@ -123,6 +179,12 @@ def saturated_problem(
                 trial = Recording(plant, run.x, np.append(size * push, 0))
                 problem = Problem(plant, bounds, 5, (trial,), terminal_set=False)
                 return weights, controller, problem
+
+
+@functools.cache
+def random_problem(seed: int, m: int) -> tuple[Controller, Problem]:
+    """`saturated_problem` of 2 to 6 states and m inputs."""
+    return saturated_problem(np.random.default_rng([14, m, seed]), 2 + seed % 5, m)[1:]
 
 
 def kept_names(steps: Steps) -> set[str]:

@@ -11,7 +11,7 @@ from impc.arrays import Array, as_numbers, finite_array, frozen, require_finite,
 from impc.checking import Value, checked
 from impc.errors import DataError
 from impc.model.foresight import physical_disturbances, physical_states, with_steps
-from impc.model.signal_errors import DRIFT, KINDS, OFFSET, SCALE
+from impc.model.signal_errors import KINDS, OFFSET, undistorted
 from impc.model.targets import reference
 
 if TYPE_CHECKING:
@@ -187,10 +187,8 @@ class Recording(Value):
 
     @property
     def corrected(self) -> Array:
-        """Outputs without offset, drift and scale error (samples, p)."""
-        errors = self.errors[:, : self.outputs.shape[1]]
-        moved = errors[OFFSET] + errors[DRIFT] * np.arange(self.samples)[:, None]
-        return np.asarray((self.outputs - moved) / (1 + errors[SCALE]))
+        """Outputs without their errors (samples, p), for comparison; NaN where not recorded."""
+        return undistorted(self.outputs, self.errors[:, : self.outputs.shape[1]])
 
     @property
     def has_gaps(self) -> bool:

@@ -51,6 +51,18 @@ def distorted(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array
     return gain * moved + errors[OFFSET] + errors[DRIFT] * time, np.stack(slopes, axis=2)
 
 
+def undistorted(signal: Array, errors: Array) -> Array:
+    """Recorded outputs (samples, c) without their `errors` (kinds, c); NaN outside the recording."""
+    time = np.arange(len(signal))
+    found = (signal - errors[OFFSET] - errors[DRIFT] * time[:, None]) / (1 + errors[SCALE])
+    for column, error in enumerate(errors.T):
+        if error[SHIFT] or error[CLOCK]:
+            place = (time + error[SHIFT]) / (1 - error[CLOCK])
+            values = found[:, column].copy()
+            found[:, column] = np.interp(place, time, values, left=np.nan, right=np.nan)
+    return np.asarray(found)
+
+
 def resampled(table: Array, errors: Array) -> Array:
     """Derivatives (samples, c, k) of outputs, overwritten by those of outputs with `errors`."""
     for column, error in enumerate(errors.T):

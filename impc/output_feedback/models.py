@@ -22,7 +22,7 @@ from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, drive_of
 from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
-from impc.output_feedback import search
+from impc.output_feedback import intervals
 from impc.output_feedback.fit import fit_output_feedback, person_at
 from impc.output_feedback.joint_loop import joint_loop
 from impc.output_feedback.observer import Observer
@@ -82,18 +82,18 @@ def person_report(
         frozen([np.nan] * len(plant.outputs)), (), frozen([[]]),
     )  # fmt: skip
     if fit is not None:
-        covariance = search.person_covariance(fit)
+        covariance = intervals.person_covariance(fit)
         levels, entries = covariance.level_intervals(fit.levels), covariance.entry_intervals(fit.K)
         if profiled:
-            levels = search.level_intervals(fit, covariance)
-            entries = search.entry_intervals(fit, covariance)
+            levels = intervals.level_intervals(fit, covariance)
+            entries = intervals.entry_intervals(fit, covariance)
         ahead = tuple(sorted({1 + round(time / plant.dt) for time in _AHEAD}))
         report = replace(
             report,
             covariance=covariance,
             levels=levels,
             entries=entries,
-            confusion=search.confusion(fit),
+            confusion=intervals.confusion(fit),
             whiteness=frozen(_white(fit)),
             ahead=ahead,
             errors=frozen(prediction_errors(fit, ahead)),

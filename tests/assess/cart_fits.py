@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import functools
 
+import impc
 from experiments.coverage import cart, noisy_trial
 from impc.assess.printed_gain import GainEstimate, gain_estimate
-from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import Problem
-from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 
-def cart_problem(*seeds: int, root: float = 0.0, u_max: float | None = 1.0) -> Problem:
+def cart_problem(*seeds: int, root: float = 0.0, u_max: float | None = 1.0) -> impc.Problem:
     """One trial for each seed, with first-order noise of coefficient `root`."""
     trials = [noisy_trial(seed, root) for seed in seeds]
-    return fit_problem(cart(), trials, FitSettings(horizon=10, u_max=u_max))
+    return impc.fit_problem(cart(), trials, impc.FitSettings(horizon=10, u_max=u_max))
 
 
 @functools.cache
-def cart_fit(*seeds: int, root: float = 0.0, u_max: float | None = 1.0) -> Estimate:
+def cart_fit(*seeds: int, root: float = 0.0, u_max: float | None = 1.0) -> impc.Estimate:
     """Weights of the trials of these seeds."""
     return fit_controller(cart_problem(*seeds, root=root, u_max=u_max))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import impc
 from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed, evaluate_method
-from impc.checking import replace
 from impc.inverse import methods
 from tests.assess.cart_fits import cart_problem
 
@@ -31,13 +31,13 @@ def test_numbers_of_a_gain(fit: MethodFit) -> None:
     for name in ("first_fall", "condition_number"):
         assert np.isnan(found[name])  # type: ignore[arg-type]
     assert np.all(np.isnan(ASSESSMENTS["held_out_vaf"].find(fit)))
-    left = replace(fit, held_out=np.array([[80.0], [90.0]]), fell=(None, 1.5))
+    left = impc.replace(fit, held_out=np.array([[80.0], [90.0]]), fell=(None, 1.5))
     assert assessed(left)["held_out_vaf"] == {plant.outputs[0]: 85.0}
     assert assessed(left)["first_fall"] == 1.5
 
 
 def test_a_method_without_a_gain(fit: MethodFit) -> None:
-    none = evaluate_method(replace(fit.estimate, K=None, S=None), fit.estimate.problem.bounds)
+    none = evaluate_method(impc.replace(fit.estimate, K=None, S=None), fit.estimate.problem.bounds)
     for item in ASSESSMENTS.values():
         values = item.find(none)
         assert len(values) == len(item.signals(none.estimate.problem.plant))

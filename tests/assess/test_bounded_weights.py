@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
+import impc
 from experiments.benchmarks.workloads import Workload, chain_of_masses, example, seat
 from impc.arrays import Array
 from impc.assess.bounded_weights import WeightsSet, entry_ranges, linear_ranges, weights_set
 from impc.assess.intent_statements import pair_statements, widest_dominant_angle
 from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
-from impc.errors import InputError
-from impc.inverse.solution_set import gain_fibre, pair_blocks, split_blocks
-from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number
+from impc.inverse.solution_set import pair_blocks, split_blocks
+from impc.model.weights import condition_number
 
 SEED = 2
 
 
 def set_of(work: Workload, ratio: float = 10.0) -> WeightsSet:
-    return weights_set(gain_fibre(work.problem.plant, work.controller.K), ratio)
+    return weights_set(impc.gain_fibre(work.problem.plant, work.controller.K), ratio)
 
 
 def random_members(found: WeightsSet, count: int) -> list[Array]:
     """Points along random rays from the least-condition member to the edge of the set."""
-    rng = np.random.default_rng(SEED)
+    rng, m = np.random.default_rng(SEED), found.fibre.plant.m
     centre = found.least.weights.block
-    m = found.fibre.plant.m
     centre = centre * (m / np.trace(centre[-m:, -m:]))
     members = []
     for _ in range(count):
@@ -38,8 +37,7 @@ def random_members(found: WeightsSet, count: int) -> list[Array]:
         for _ in range(60):
             middle = (low + high) / 2
             low, high = (middle, high) if _inside(found, centre + middle * ray) else (low, middle)
-        members.append(centre + low * ray)
-        members.append(centre + rng.uniform() * low * ray)
+        members += [centre + low * ray, centre + rng.uniform() * low * ray]
     return members
 
 
@@ -49,24 +47,17 @@ def _inside(found: WeightsSet, X: Array) -> bool:
 
 
 @pytest.mark.parametrize("make", [example, lambda: seat(1, 10.0)], ids=["example", "seat"])
-def test_members_give_the_same_trajectories(make) -> None:  # type: ignore[no-untyped-def]
+def test_members_give_the_same_trajectories(make: Callable[[], Workload]) -> None:
     """Sampled weights, rebuilt as controllers with bounds, give equal trajectories to 1e-9."""
     work = make()
-    found = set_of(work)
-    truth = simulate(work.controller, work.drives[0])
-    plant = work.problem.plant
-    size = float(np.max(np.abs(truth.x @ plant.C.T)))
-    for X in random_members(found, 5):
+    plant, law = work.problem.plant, work.controller
+    truth = simulate(law, work.drives[0]).x @ plant.C.T
+    size, kept = max(1.0, float(np.max(np.abs(truth)))), law.terminal is not None
+    for X in random_members(set_of(work), 5):
         weights = split_blocks(X, plant.n)
-        controller = Controller(
-            plant,
-            Weights(weights.Q, weights.R),
-            work.controller.bounds,
-            work.controller.horizon,
-            terminal_set=work.controller.terminal is not None,
-        )
-        run = simulate(controller, work.drives[0])
-        np.testing.assert_allclose(run.x @ plant.C.T, truth.x @ plant.C.T, atol=1e-9 * max(1, size))
+        same = impc.Controller(plant, weights, law.bounds, law.horizon, terminal_set=kept)
+        run = simulate(same, work.drives[0])
+        np.testing.assert_allclose(run.x @ plant.C.T, truth, atol=1e-9 * size)
 
 
 def test_ranges_are_those_of_random_search_with_two_states() -> None:
@@ -89,8 +80,7 @@ def test_ranges_of_several_inputs_are_never_passed() -> None:
     pairs = ((0, 0), (2, 1), (5, 5))
     directions = np.zeros((len(pairs), *found.first.shape))
     for direction, (i, j) in zip(directions, pairs, strict=True):
-        direction[i, j] += 0.5
-        direction[j, i] += 0.5
+        direction[[i, j], [j, i]] += 0.5 if i != j else 1.0
     for (i, j), ends in zip(pairs, linear_ranges(found, directions), strict=True):
         width = ends.high - ends.low
         assert np.min(sampled[:, i, j]) >= ends.low - 1e-7 * width
@@ -99,7 +89,7 @@ def test_ranges_of_several_inputs_are_never_passed() -> None:
         assert abs(ends.high - ends.most.bound) <= 1e-5 * width
         for weights in (ends.least.weights, ends.most.weights):
             assert condition_number(weights) <= found.limit * (1 + 1e-4)
-            K = solve_lqr(work.problem.plant, Weights(weights.Q, weights.R)).K
+            K = impc.solve_lqr(work.problem.plant, impc.Weights(weights.Q, weights.R)).K
             np.testing.assert_allclose(K, work.controller.K, atol=1e-6 * np.max(np.abs(K)))
 
 
@@ -130,11 +120,11 @@ def test_widest_angle_is_at_least_that_of_sampled_members() -> None:
 
     assert angle >= max(turned(X[:2, :2]) for X in random_members(found, 2000)) - 0.5
     assert turned(np.array(weights.Q)) == pytest.approx(angle, abs=1e-6)
-    assert condition_number(Weights(weights.Q, weights.R)) <= found.limit * (1 + 1e-6)
+    assert condition_number(impc.Weights(weights.Q, weights.R)) <= found.limit * (1 + 1e-6)
 
 
 def test_a_ratio_must_leave_room() -> None:
-    with pytest.raises(InputError, match="ratio"):
+    with pytest.raises(impc.InputError, match="ratio"):
         set_of(example(), 1.0)
 
 

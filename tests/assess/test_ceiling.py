@@ -9,21 +9,20 @@ import impc
 from experiments.uncertain_body import cart
 from impc.arrays import Array
 from impc.assess.ceiling import ceiling
-from impc.inverse.problem import Problem
+from tests.support import posed, regulator
 
 
-def problem(pushes: list[Array], noise: float, seed: int = 0) -> tuple[Problem, float]:
+def problem(pushes: list[Array], noise: float, seed: int = 0) -> tuple[impc.Problem, float]:
     """Pushed carts with white noise, and the noise share of the outputs, %."""
     rng, plant = np.random.default_rng(seed), cart()
-    bounds = impc.Bounds(plant, u_min=-5, u_max=5)
-    law = impc.Controller(plant, impc.Weights(np.diag([4.0, 1.0]), 1), bounds, 10)
+    law = regulator(plant, np.diag([4.0, 1.0]), 5, 10, terminal_set=True)
     trials, squares, size = [], 0.0, 0.0
     for push in pushes:
         y = law.simulate([0, 0], disturbance=push).x[:-1, :1]
         added = noise * rng.standard_normal(y.shape)
         squares, size = squares + float(np.sum(added**2)), size + float(np.sum((y + added) ** 2))
         trials.append(impc.Recording(plant, y + added, push))
-    return Problem(plant, bounds, 10, trials, unknown_start=True), 100 * (1 - squares / size)
+    return posed(law, *trials, unknown_start=True), 100 * (1 - squares / size)
 
 
 def push(seed: int, samples: int = 600) -> Array:
@@ -58,28 +57,28 @@ def test_a_periodic_perturbation_in_one_trial() -> None:
     assert found.vaf[0] == pytest.approx(truth, abs=3.0)
 
 
-def test_what_does_not_repeat_has_none() -> None:
-    assert ceiling(problem([push(1), push(2)], 0.03)[0], 0.0) is None
-    assert ceiling(problem([np.zeros(300)] * 2, 0.03)[0], 0.0) is None
+@pytest.mark.parametrize(
+    ("pushes", "repeats"),
+    [
+        ([push(1), push(2)], False),
+        ([np.zeros(300)] * 2, False),
+        ([np.full(600, 0.2)], False),  # a lasting push is not periodic
+        ([np.tile(push(2, 150), 4) + 1.0], True),
+    ],
+)
+def test_what_does_not_repeat_has_none(pushes: list[Array], repeats: bool) -> None:
+    assert (ceiling(problem(pushes, 0.03)[0], 0.0) is not None) == repeats
 
 
 def test_targets_count_as_what_drives() -> None:
     """The same push towards two targets is no repetition; towards one target it is."""
-    plant, rng = cart(), np.random.default_rng(3)
-    bounds, force = impc.Bounds(plant, u_min=-5, u_max=5), push(1)
+    plant, rng, force = cart(), np.random.default_rng(3), push(1)
+    bounds = impc.Bounds(plant, u_min=-5, u_max=5)
     paths = [np.repeat(rng.standard_normal(40), 15) for _ in range(2)]
-
-    def found(first: Array, second: Array) -> object:
+    for pair in (paths, [paths[0]] * 2):
         trials = [
             impc.Recording(plant, rng.standard_normal((600, 1)), force, target={"pos": path})
-            for path in (first, second)
+            for path in pair
         ]
-        return ceiling(Problem(plant, bounds, 10, trials, unknown_start=True), 0.0)
-
-    assert found(*paths) is None
-    assert found(paths[0], paths[0]) is not None
-
-
-def test_a_lasting_push_is_not_periodic() -> None:
-    assert ceiling(problem([np.full(600, 0.2)], 0.03)[0], 0.0) is None
-    assert ceiling(problem([np.tile(push(2, 150), 4) + 1.0], 0.03)[0], 0.0) is not None
+        found = ceiling(impc.Problem(plant, bounds, 10, trials, unknown_start=True), 0.0)
+        assert (found is None) == (pair is paths)

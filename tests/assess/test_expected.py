@@ -9,120 +9,86 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+import impc
 from experiments.printed_intervals import carts
 from impc.arrays import Array
-from impc.assess.expected import Expectation, expected_intervals
-from impc.checking import replace
+from impc.assess.expected import Expectation
 from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
-from impc.control.simulation import scenario
-from impc.errors import InputError
-from impc.inverse.problem import Problem
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.plant_family import PlantFamily
-from impc.model.recordings import Recording
-from impc.model.structure import Structure
+from tests.support import differences
 
 COST_WEIGHTS = np.log([4.0, 1.5])
 NOISE = 0.03
 SAMPLES = 160
 
 
-def cart() -> tuple[Plant, Structure, Array]:
+def cart() -> tuple[impc.Plant, impc.Structure, Array]:
     """Cart with cost weights of position and speed, and a push up to its limit."""
     plant = carts(1)
     push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 1)), 10, axis=0)
-    return plant, Structure(plant, "diagonal"), push
+    return plant, impc.Structure(plant, "diagonal"), push
 
 
 def outputs(cost_weights: Array, x0: Array, limit: float) -> Array:
     """Simulated positions (samples,)."""
     plant, structure, push = cart()
-    bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    law = Controller(plant, structure.weights(cost_weights), bounds, 8, terminal_set=False)
-    run = simulate(law, scenario(plant, x0, disturbance=push))
+    bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
+    law = impc.Controller(plant, structure.weights(cost_weights), bounds, 8, terminal_set=False)
+    run = simulate(law, impc.scenario(plant, x0, disturbance=push))
     return np.asarray((run.x @ plant.C.T)[:SAMPLES, 0])
 
 
 @functools.cache
-def cart_problem() -> Problem:
+def cart_problem(family: impc.PlantFamily | None = None) -> impc.Problem:
     plant, structure, push = cart()
-    trial = Recording(plant, outputs(COST_WEIGHTS, np.zeros(2), 1.0)[:, None], push)
-    return Problem(
-        plant, Bounds(plant, u_min=-1, u_max=1), 8, [trial],
-        terminal_set=False, unknown_start=True, structure=structure,
+    trial = impc.Recording(plant, outputs(COST_WEIGHTS, np.zeros(2), 1.0)[:, None], push)
+    return impc.Problem(
+        plant, impc.Bounds(plant, u_min=-1, u_max=1), 8, [trial],
+        terminal_set=False, unknown_start=True, structure=structure, family=family,
     )  # fmt: skip
 
 
 @functools.cache
 def expected(root: float = 0.0) -> Expectation:
-    return expected_intervals(cart_problem(), COST_WEIGHTS, NOISE, root=root)
+    return impc.expected_intervals(cart_problem(), COST_WEIGHTS, NOISE, root=root)
 
 
-def differences(points: list[tuple[Array, Array, float]], step: float) -> Array:
-    """Derivative (samples,) from values at +h, -h, +2h, -2h."""
-    one, two, three, four = (outputs(*point) for point in points)
-    return np.asarray((8 * (one - two) - (three - four)) / (12 * step))
-
-
+@functools.cache
 def columns() -> tuple[Array, Array, Array]:
-    """Derivatives by log weights, initial state and log limit."""
+    """Derivatives by log weights, initial state and log limit, by five-point differences."""
+
+    def moved(z: Array) -> Array:
+        return outputs(COST_WEIGHTS + z[:2], z[2:4], float(np.exp(z[4])))
+
     # At steps of 1e-4 a sample reaches its limit in between.
-    h, still = 1e-5, np.zeros(2)
-    ways = (1.0, -1.0, 2.0, -2.0)
-    on_cost_weights = [
-        differences([(COST_WEIGHTS + way * h * row, still, 1.0) for way in ways], h)
-        for row in np.eye(2)
-    ]
-    on_start = [
-        differences([(COST_WEIGHTS, way * h * row, 1.0) for way in ways], h) for row in np.eye(2)
-    ]
-    on_limit = differences([(COST_WEIGHTS, still, float(np.exp(way * h))) for way in ways], h)
-    return np.array(on_cost_weights).T, np.array(on_start).T, on_limit
-
-
-def dense(root: float) -> Array:
-    """Covariance of first-order noise (samples, samples)."""
-    return np.asarray(NOISE**2 * scipy.linalg.toeplitz(root ** np.arange(SAMPLES)))
+    one, two = (differences(moved, np.zeros(5), step) for step in (1e-5, 2e-5))
+    found = (4 * one - two) / 3
+    return found[:, :2], found[:, 2:4], found[:, 4]
 
 
 @pytest.mark.parametrize("root", [0.0, 0.6])
 def test_deviations_are_those_of_least_squares(root: float) -> None:
-    found = expected(root)
-    on_cost_weights, on_start, _ = columns()
-    both = np.hstack([on_cost_weights, on_start])
-    back = np.linalg.pinv(both)
-    truth = np.sqrt(np.diag(back @ dense(root) @ back.T))[:2]
+    """Against the covariance matrix of first-order noise."""
+    found, noise = expected(root), NOISE**2 * scipy.linalg.toeplitz(root ** np.arange(SAMPLES))
+    back = np.linalg.pinv(np.hstack(columns()[:2]))
+    block = (back @ noise @ back.T)[:2, :2]
     # The package's noise model reaches 250 samples back; differences are accurate to 1e-7.
-    np.testing.assert_allclose(found.deviations, truth, rtol=2e-5)
-    assert found.mean_variance == pytest.approx(np.mean(truth**2), rel=1e-4)
-    block = (back @ dense(root) @ back.T)[:2, :2]
+    np.testing.assert_allclose(found.deviations, np.sqrt(np.diag(block)), rtol=2e-5)
+    assert found.mean_variance == pytest.approx(np.mean(np.diag(block)), rel=1e-4)
     if root == 0:
-        determinant = np.linalg.slogdet(block)[1]
-        assert found.log_determinant == pytest.approx(determinant, abs=1e-4)
+        assert found.log_determinant == pytest.approx(np.linalg.slogdet(block)[1], abs=1e-4)
 
 
-def test_the_limit_is_told_as_least_squares_with_a_free_gain_tells_it() -> None:
-    found = expected()
+def test_the_limit_is_known_as_least_squares_with_a_free_gain_says() -> None:
     on_cost_weights, on_start, on_limit = columns()
     # Two cost weights move this gain in both of its directions: the same span.
     others = np.hstack([on_cost_weights, on_start])
     rest = on_limit - others @ np.linalg.lstsq(others, on_limit)[0]
-    assert found.limits[0] == pytest.approx(NOISE / np.linalg.norm(rest), rel=2e-5)
-
-
-def test_a_limit_that_is_never_met_is_not_told() -> None:
-    problem = cart_problem()
-    plant = problem.plant
-    wide = Bounds(plant, u_min=-9, u_max=9)
-    law = Controller(plant, cart()[1].weights(COST_WEIGHTS), wide, 8, terminal_set=False)
-    run = simulate(law, scenario(plant, np.zeros(2), disturbance=cart()[2]))
-    trial = Recording(plant, (run.x @ plant.C.T)[:SAMPLES], cart()[2])
-    found = expected_intervals(
-        replace(problem, bounds=wide, recordings=[trial]), COST_WEIGHTS, NOISE
-    )
-    assert np.isinf(found.limits[0])
+    assert expected().limits[0] == pytest.approx(NOISE / np.linalg.norm(rest), rel=2e-5)
+    plant, _, push = cart()
+    wide = impc.Bounds(plant, u_min=-9, u_max=9)  # never met
+    trial = impc.Recording(plant, outputs(COST_WEIGHTS, np.zeros(2), 9.0)[:, None], push)
+    problem = impc.replace(cart_problem(), bounds=wide, recordings=[trial])
+    assert np.isinf(impc.expected_intervals(problem, COST_WEIGHTS, NOISE).limits[0])
 
 
 def test_small_noise_makes_intervals_of_deviations() -> None:
@@ -133,7 +99,7 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
             [[item.low - item.value, item.high - item.value] for item in found.intervals]
         )
 
-    small, large = (expected_intervals(cart_problem(), COST_WEIGHTS, x) for x in (1e-4, 1e-3))
+    small, large = (impc.expected_intervals(cart_problem(), COST_WEIGHTS, x) for x in (1e-4, 1e-3))
     assert large.deviations == pytest.approx(10 * small.deviations, rel=1e-9)
     wanted = 1.959964 * np.outer(small.deviations, [-1.0, 1.0])
     np.testing.assert_allclose(ends(small), wanted, rtol=0.02)
@@ -142,13 +108,16 @@ def test_small_noise_makes_intervals_of_deviations() -> None:
 def test_a_product_of_commands_makes_intervals_normal() -> None:
     """Two carts with a cross weight of their forces: the unknowns are factors, not logarithms."""
     plant = carts(2)
-    structure, bounds = Structure(plant, "diagonal", "full"), Bounds(plant, u_min=-1, u_max=1)
+    structure, bounds = (
+        impc.Structure(plant, "diagonal", "full"),
+        impc.Bounds(plant, u_min=-1, u_max=1),
+    )
     unknowns = np.append(np.zeros(structure.count - 1), 0.3)
     push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 2)), 10, axis=0)
-    law = Controller(plant, structure.weights(unknowns), bounds, 8, terminal_set=False)
-    trial = Recording(plant, law.simulate(np.zeros(4), disturbance=push).outputs[:-1], push)
-    problem = Problem(plant, bounds, 8, [trial], terminal_set=False, structure=structure)
-    found = expected_intervals(problem, unknowns, NOISE)
+    law = impc.Controller(plant, structure.weights(unknowns), bounds, 8, terminal_set=False)
+    trial = impc.Recording(plant, law.simulate(np.zeros(4), disturbance=push).outputs[:-1], push)
+    problem = impc.Problem(plant, bounds, 8, [trial], terminal_set=False, structure=structure)
+    found = impc.expected_intervals(problem, unknowns, NOISE)
     assert np.all(np.isfinite(found.deviations))
     ends = np.array([[item.value, item.low, item.high] for item in found.intervals])
     values = structure.reported(unknowns)[0][:, None]
@@ -159,25 +128,16 @@ def test_a_product_of_commands_makes_intervals_normal() -> None:
 def known_to(uncertainty: dict[str, float | str]) -> Expectation:
     """Cart with stated uncertainties of force per command and rate of falling."""
 
-    def made(values: Array) -> Plant:
+    def made(values: Array) -> impc.Plant:
         force, fall = values
         system = control.ss(
             [[0, 1], [fall, -0.3]], [[0, 0], [force, 1]], [[1, 0]], 0,
             inputs=["force1", "push1"], outputs=["position1"],
         )  # fmt: skip
-        return Plant(control.c2d(system, 0.1), ["force1"])
+        return impc.Plant(control.c2d(system, 0.1), ["force1"])
 
-    family = PlantFamily(made, ["force", "fall"], [1.0, 0.3], uncertainty)
-    problem = replace(cart_problem(), family=None)
-    bounds, trials = problem.bounds, problem.recordings
-    return expected_intervals(
-        Problem(
-            problem.plant, bounds, 8, trials,
-            terminal_set=False, unknown_start=True, structure=problem.structure, family=family,
-        ),
-        COST_WEIGHTS,
-        NOISE,
-    )  # fmt: skip
+    family = impc.PlantFamily(made, ["force", "fall"], [1.0, 0.3], uncertainty)
+    return impc.expected_intervals(cart_problem(family), COST_WEIGHTS, NOISE)
 
 
 STATED: dict[str, float | str] = {"force": "5 %", "fall": 0.06, "u_max": "5 %"}
@@ -199,10 +159,8 @@ def test_an_exact_body_and_one_that_is_measured_are_those_of_their_own_problems(
 
 
 def test_no_number_of_trials_tells_a_weak_force_from_a_weak_person() -> None:
-    """Scaling force, commands, limits and cost weights together leaves the outputs unchanged.
-
-    The best known precision is therefore 2 sqrt(1 / (1 / .05^2 + 1 / .05^2)).
-    """
+    """Scaling force, commands, limits and cost weights together leaves the outputs unchanged."""
+    # The best known precision is therefore 2 sqrt(1 / (1 / .05^2 + 1 / .05^2)).
     body = known_to(STATED).body
     assert body is not None
     assert body.floor == pytest.approx(np.full(2, 2 * 0.05 / np.sqrt(2)), rel=0.01)
@@ -214,9 +172,9 @@ def test_no_number_of_trials_tells_a_weak_force_from_a_weak_person() -> None:
 
 def test_what_cannot_be_meant_is_refused() -> None:
     problem = cart_problem()
-    with pytest.raises(InputError, match="structure"):
-        expected_intervals(replace(problem, structure=None), COST_WEIGHTS, NOISE)
-    with pytest.raises(InputError, match="deviation"):
-        expected_intervals(problem, COST_WEIGHTS, 0.0)
-    with pytest.raises(InputError, match="root"):
-        expected_intervals(problem, COST_WEIGHTS, NOISE, root=1.0)
+    with pytest.raises(impc.InputError, match="structure"):
+        impc.expected_intervals(impc.replace(problem, structure=None), COST_WEIGHTS, NOISE)
+    with pytest.raises(impc.InputError, match="deviation"):
+        impc.expected_intervals(problem, COST_WEIGHTS, 0.0)
+    with pytest.raises(impc.InputError, match="root"):
+        impc.expected_intervals(problem, COST_WEIGHTS, NOISE, root=1.0)

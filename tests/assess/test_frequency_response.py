@@ -7,12 +7,13 @@ import numpy as np
 import impc
 from experiments.coverage import cart
 from impc.assess.frequency_response import frequency_response
-from impc.inverse.problem import Problem
 
 GAIN = np.array([[2.5, 2.2]])
 
 
-def problem(noise: float, seed: int = 0, trials: int = 3) -> tuple[Problem, list[impc.Simulation]]:
+def problem(
+    noise: float, seed: int = 0, trials: int = 3
+) -> tuple[impc.Problem, list[impc.Simulation]]:
     """Cart under linear feedback with random pushes, and its simulations."""
     plant, rng = cart(), np.random.default_rng(seed)
     bounds = impc.Bounds(plant, u_min=-1e3, u_max=1e3)
@@ -24,7 +25,7 @@ def problem(noise: float, seed: int = 0, trials: int = 3) -> tuple[Problem, list
         y = run.outputs[: len(push)]
         recordings.append(impc.Recording(plant, y + noise * rng.standard_normal(y.shape), push))
         runs.append(run)
-    return Problem(plant, bounds, 5, recordings, unknown_start=True), runs
+    return impc.Problem(plant, bounds, 5, recordings, unknown_start=True), runs
 
 
 def test_the_response_is_the_transfer_function() -> None:
@@ -36,9 +37,8 @@ def test_the_response_is_the_transfer_function() -> None:
     low = (found.frequencies > 0.2) & (found.frequencies < 1.0)
     z = np.exp(2j * np.pi * found.frequencies * plant.dt)
     closed = plant.A - plant.B @ GAIN
-    true = np.array(
-        [(plant.C @ np.linalg.solve(one * np.eye(2) - closed, plant.E))[0, 0] for one in z]
-    )
+    gains = [plant.C @ np.linalg.solve(one * np.eye(2) - closed, plant.E) for one in z]
+    true = np.array(gains)[:, 0, 0]
     np.testing.assert_allclose(found.recorded[low, 0], np.abs(true)[low], rtol=0.1)
     turned = np.degrees(np.angle(true)[low]) - found.recorded_phase[low, 0]
     assert np.max(np.abs((turned + 180) % 360 - 180)) < 8
@@ -52,14 +52,13 @@ def test_errors_hold_what_noise_does() -> None:
     assert clean is not None
     held: list[bool] = []
     for seed in range(12):
-        posed, runs = problem(0.0)
+        asked, runs = problem(0.0)
         rng = np.random.default_rng(seed + 100)
         noisy = [
-            impc.Recording(posed.plant, one.outputs + 0.05 * rng.standard_normal(one.outputs.shape),
-                           one.disturbance)
-            for one in posed.recordings
-        ]  # fmt: skip
-        found = frequency_response(Problem(posed.plant, posed.bounds, 5, noisy), runs)
+            impc.replace(one, outputs=one.outputs + 0.05 * rng.standard_normal(one.outputs.shape))
+            for one in asked.recordings
+        ]
+        found = frequency_response(impc.Problem(asked.plant, asked.bounds, 5, noisy), runs)
         assert found is not None
         k = min(len(found.frequencies), len(clean.frequencies), 25)
         off = np.abs(found.recorded[:k, 0] / clean.recorded[:k, 0] - 1)
@@ -68,8 +67,6 @@ def test_errors_hold_what_noise_does() -> None:
 
 
 def test_where_nothing_drives_there_is_none() -> None:
-    posed, runs = problem(0.0)
-    still = [
-        impc.Recording(posed.plant, one.outputs, 0 * one.disturbance) for one in posed.recordings
-    ]
-    assert frequency_response(Problem(posed.plant, posed.bounds, 5, still), runs) is None
+    asked, runs = problem(0.0)
+    still = [impc.replace(one, disturbance=0 * one.disturbance) for one in asked.recordings]
+    assert frequency_response(impc.Problem(asked.plant, asked.bounds, 5, still), runs) is None

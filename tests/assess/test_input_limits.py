@@ -5,37 +5,33 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import impc
 from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, true_controller
 from experiments.simulated_subjects import noisy_recordings
 from impc.assess import input_limits
 from impc.assess.input_limits import LimitEstimate, input_limit, limit_curve, with_limit
 from impc.control.closed_loop import simulate
-from impc.control.simulation import scenario
-from impc.errors import InputError
-from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
-from impc.model.recordings import Recording
-from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 from tests.assess.cart_fits import cart_fit
 
 SEED = 3
 
 
-def fitted_cart(trial: Recording, limit: float | None) -> Estimate:
-    return fit_controller(fit_problem(cart(), [trial], FitSettings(horizon=10, u_max=limit)))
+def fitted_cart(trial: impc.Recording, limit: float | None) -> impc.Estimate:
+    settings = impc.FitSettings(horizon=10, u_max=limit)
+    return fit_controller(impc.fit_problem(cart(), [trial], settings))
 
 
-def gentle_trial() -> Recording:
+def gentle_trial() -> impc.Recording:
     """Pushes too small to reach the limit of 1; noise 20 %."""
     rng, controller = np.random.default_rng(SEED), true_controller()
     push = np.repeat(rng.choice([-0.1, 0.0, 0.1], 150), 10)
-    run = simulate(controller, scenario(controller.plant, np.zeros(2), disturbance=push))
+    run = simulate(controller, impc.scenario(controller.plant, np.zeros(2), disturbance=push))
     assert np.max(np.abs(run.u)) < 0.8
     clean = (run.x @ controller.plant.C.T)[:1500]
     noise = rng.standard_normal(clean.shape)
-    return Recording(controller.plant, clean + 0.2 * np.std(clean) * noise, push)
+    return impc.Recording(controller.plant, clean + 0.2 * np.std(clean) * noise, push)
 
 
 @pytest.mark.full
@@ -67,16 +63,14 @@ def test_the_search_starts_at_the_given_limit(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 def test_limits_of_noisy_subjects() -> None:
-    """Seat at 6 Nm, 12.5 % of samples saturated, seeds 0 to 4; at 70 Nm not identified.
-
-    At a VAF of 90 % the limit has a standard error of 1 %: the median of five subjects must be
-    within 2 %, and no interval may miss by more than half its width.
-    """
+    """Seat at 6 Nm, 12.5 % of samples saturated, seeds 0 to 4; at 70 Nm not identified."""
+    # At a VAF of 90 % the limit has a standard error of 1 %: the median of five subjects must be
+    # within 2 %, and no interval may miss by more than half its width.
     plant = seat(1, 1.0).problem.plant
 
     def found(limit: float, seed: int) -> LimitEstimate:
         trials = noisy_recordings(limit, seed, 0.9)
-        return input_limit(fit_controller(fit_problem(plant, trials, FitSettings())))
+        return input_limit(fit_controller(impc.fit_problem(plant, trials, impc.FitSettings())))
 
     errors = []
     for seed in range(5):
@@ -93,19 +87,16 @@ def test_with_limit_changes_one_input_only() -> None:
     fitted = fitted_cart(gentle_trial(), 1.0)
     assert with_limit(fitted.problem, 2.0).bounds.u_max.tolist() == [2.0]
     assert np.isinf(with_limit(fitted.problem, np.inf).bounds.u_min[0])
-    with pytest.raises(InputError, match="control"):
+    with pytest.raises(impc.InputError, match="control"):
         input_limit(fitted, 1)
 
 
-def test_the_true_limit_is_the_best() -> None:
+def test_the_true_limit_is_the_best_of_the_curve() -> None:
     curve = limit_curve(cart_fit(4), 0)
     assert curve is not None
+    assert limit_curve(cart_fit(4, u_max=None), 0) is None
     assert curve.given == 1.0
     assert curve.limits[np.nanargmin(curve.unexplained[:, 0])] == 1.0
     here = curve.unexplained[curve.limits == 1.5, 0]
     there = 100 - np.array(cart_fit(4, u_max=1.5).vaf)
     np.testing.assert_allclose(here, there, rtol=0.15)
-
-
-def test_no_limit_has_no_curve() -> None:
-    assert limit_curve(cart_fit(4, u_max=None), 0) is None

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import impc
 from experiments.coverage import cart
 from experiments.cursor_tracking import ConditionResult, weight_ratio
+from impc.arrays import Array
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.intent_draws import drawn_gains
-from impc.assess.weights_ranges import summarise_weights
-from impc.checking import replace
-from impc.inverse.estimates import Estimate
-from impc.model.riccati import solve_lqr
+from impc.assess.weights_ranges import WeightsSummary, summarise_weights
 from impc.studies.fit.result import FittedParameter
 from tests.assess.cart_fits import cart_fit
 
@@ -20,14 +19,14 @@ SIZES = np.array([1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[Estimate, GainCovariance]:
+def fitted() -> tuple[impc.Estimate, GainCovariance]:
     found = cart_fit(3)
     K, S = np.array(found.gain), np.array(found.metric)
     return found, gain_covariance(found.problem, K, S)
 
 
 def test_drawn_gains_spread_as_their_covariance(
-    fitted: tuple[Estimate, GainCovariance],
+    fitted: tuple[impc.Estimate, GainCovariance],
 ) -> None:
     """300 draws: centre to 0.2 standard errors, standard errors along both directions to 15 %."""
     found, covariance = fitted
@@ -37,13 +36,13 @@ def test_drawn_gains_spread_as_their_covariance(
     np.testing.assert_allclose(np.std(scaled, axis=0), 1.0, atol=0.15)
     assert np.all(np.abs(np.mean(scaled, axis=0)) < 0.2)
     for one in drawn[:5]:
-        np.testing.assert_allclose(solve_lqr(cart(), one.weights).K, one.K)
+        np.testing.assert_allclose(impc.solve_lqr(cart(), one.weights).K, one.K)
     again = drawn_gains(cart(), found.stage_weights, found.gain, covariance, 2)
     np.testing.assert_array_equal(again[1].K, drawn[1].K)
 
 
 def test_a_statement_is_made_only_when_other_gains_agree(
-    fitted: tuple[Estimate, GainCovariance],
+    fitted: tuple[impc.Estimate, GainCovariance],
 ) -> None:
     """Same gain and weights: well identified, and almost unidentified."""
     found, covariance = fitted
@@ -52,23 +51,20 @@ def test_a_statement_is_made_only_when_other_gains_agree(
     held = [item for item in bare.statements if item.holds is not None]
     assert held, "at the fitted gain a cost weight is above the other"
     assert not any(item.made for item in bare.statements), "nothing was tried"
-    outcomes = {}
-    for name, deviations in (
-        ("identified", covariance.deviations),
-        ("unknown", np.full(2, np.inf)),
-    ):
-        draws = drawn_gains(
-            cart(), found.stage_weights, K, replace(covariance, deviations=deviations)
-        )
-        outcomes[name] = summarise_weights(cart(), K, metrics, SIZES, draws=draws)
-        assert [item.holds for item in outcomes[name].statements] == [
+
+    def drawn(deviations: Array) -> WeightsSummary:
+        there = impc.replace(covariance, deviations=deviations)
+        draws = drawn_gains(cart(), found.stage_weights, K, there)
+        return summarise_weights(cart(), K, metrics, SIZES, draws=draws)
+
+    identified, unknown = drawn(covariance.deviations), drawn(np.full(2, np.inf))
+    for outcome in (identified, unknown):
+        assert [item.holds for item in outcome.statements] == [
             item.holds for item in bare.statements
         ]
-    assert any(item.made for item in outcomes["identified"].statements)
-    assert not any(item.made for item in outcomes["unknown"].statements)
-    for near, far in zip(
-        outcomes["identified"].cost_weights, outcomes["unknown"].cost_weights, strict=True
-    ):
+    assert any(item.made for item in identified.statements)
+    assert not any(item.made for item in unknown.statements)
+    for near, far in zip(identified.cost_weights, unknown.cost_weights, strict=True):
         assert far.low_drawn <= near.low_drawn <= near.low <= near.high <= near.high_drawn
         assert near.high_drawn < far.high_drawn
     assert bare.cost_weights == ()
@@ -86,8 +82,8 @@ def test_the_ratio_of_prices_has_an_interval() -> None:
         11.0, 9, 0.1, 0.08, True, False, [], [], [], [], [1.0, 1.0], 3, 1e6, 1e6, 1e6,
         [5e5, 2e6], [1.0, 2.0], "", [], [], [],
     )  # fmt: skip
-    other = replace(one, blur=29.0, weight_of_error=1e3, resampled_weight=[1e2, 1e4])
+    other = impc.replace(one, blur=29.0, weight_of_error=1e3, resampled_weight=[1e2, 1e4])
     assert "falls by a factor of 1e+03 (33 %: 200 to 5e+03)" in weight_ratio([one, other])
-    crossing = replace(other, resampled_weight=[1e2, 1e7])
+    crossing = impc.replace(other, resampled_weight=[1e2, 1e7])
     assert "is not distinguished from constant" in weight_ratio([one, crossing])
-    assert "is unknown" in weight_ratio([replace(one, resampled_weight=[]), other])
+    assert "is unknown" in weight_ratio([impc.replace(one, resampled_weight=[]), other])

@@ -8,10 +8,9 @@ import numpy as np
 import impc
 from impc.assess.lasting_response import follows_command, lasting_responses
 from impc.assess.printed_gain import gain_estimate
-from impc.checking import replace
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import Problem
 from plants import seated_balance_for
+from tests.support import differences, posed, regulator
 
 
 def test_states_of_nerves_and_muscles_are_found() -> None:
@@ -30,14 +29,12 @@ def test_the_command_settles_at_it() -> None:
         states=["tilt", "rate", "muscle"], inputs=["u", "push"], outputs=["angle"],
     )  # fmt: skip
     plant = impc.Plant(system, ["u"])
-    bounds = impc.Bounds(plant, u_min=-9, u_max=9)
-    law = impc.Controller(plant, impc.Weights(np.diag([4.0, 1.0, 0.1]), 1), bounds, 8)
+    law = regulator(plant, np.diag([4.0, 1.0, 0.1]), 9, 8, terminal_set=True)
     rng = np.random.default_rng(1)
     push = 0.5 * np.repeat(rng.standard_normal(80), 5)
     y = law.simulate([0, 0, 0], disturbance=push).outputs[:-1]
     trial = impc.Recording(plant, y + 1e-3 * rng.standard_normal(y.shape), push)
-    problem = Problem(plant, bounds, 8, [trial], unknown_start=True)
-    estimate = gain_estimate(fit_controller(problem))
+    estimate = gain_estimate(fit_controller(posed(law, trial, unknown_start=True)))
     (found,) = lasting_responses(estimate)
     K, muscle, u = np.array(estimate.K)[0], 0.0, 0.0
     for _ in range(500):
@@ -45,13 +42,8 @@ def test_the_command_settles_at_it() -> None:
         muscle = 0.7 * muscle + 0.4 * u
     np.testing.assert_allclose(found.value, -u, rtol=1e-9)
     # Interval of the linearised value.
-    slopes = []
-    for k in range(3):
-        ends = []
-        for sign in (-1, 1):
-            moved = K.copy()
-            moved[k] += sign * 1e-6
-            ends.append(lasting_responses(replace(estimate, K=moved[None]))[0].value)
-        slopes.append((ends[1] - ends[0]) / 2e-6)
-    (error,), _ = estimate.covariance.combinations(np.array([slopes]))
+    slopes = differences(
+        lambda K: np.array(lasting_responses(impc.replace(estimate, K=K))[0].value), K[None]
+    )
+    (error,), _ = estimate.covariance.combinations(slopes)
     np.testing.assert_allclose((found.high - found.low) / 2, 1.96 * error, rtol=1e-3)

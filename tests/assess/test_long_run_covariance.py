@@ -8,12 +8,7 @@ import scipy.linalg
 import scipy.signal
 
 from impc.arrays import Array
-from impc.assess.long_run_covariance import (
-    ResidualNoise,
-    residual_noise,
-    spread_of_sum,
-    white_noise,
-)
+from impc.assess import long_run_covariance
 from impc.inverse.columns import trial_span
 
 _TRIALS, _SAMPLES, _OUTPUTS, _DRAWS = 2, 400, 2, 60
@@ -40,9 +35,9 @@ def test_colour_of_a_first_order_process() -> None:
     noise = rng.standard_normal((40000, 1))
     for a in (0.0, 0.5, 0.9):
         series = scipy.signal.lfilter([1.0], [1.0, -a], noise, axis=0)
-        found = residual_noise([series])
+        found = long_run_covariance.residual_noise([series])
         assert found.root[0] == pytest.approx(a, abs=0.01)
-        spread = spread_of_sum(found, [np.ones((10000, 1, 1))])[0, 0]
+        spread = long_run_covariance.spread_of_sum(found, [np.ones((10000, 1, 1))])[0, 0]
         assert spread / 10000 == pytest.approx(1 / (1 - a) ** 2, rel=0.05)
 
 
@@ -50,7 +45,7 @@ def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
     """Known autocorrelation, two outputs: against the full covariance matrix of the noise."""
     a, rng = np.array([0.6, -0.3]), np.random.default_rng(8)
     mixing = np.array([[1.0, 0.4], [0.0, 0.8]])
-    found = ResidualNoise(a, (mixing @ mixing.T)[None])
+    found = long_run_covariance.ResidualNoise(a, (mixing @ mixing.T)[None])
     samples, before = 30, 200
     columns = rng.standard_normal((samples, 2, 3))
     response = np.zeros((samples, 2, before + samples, 2))  # of e_t to eps_s
@@ -58,36 +53,39 @@ def test_spread_of_a_weighted_sum_is_that_of_its_toeplitz_matrix() -> None:
         for s in range(before + t + 1):
             response[t, :, s, :] = np.diag(a ** (before + t - s)) @ mixing
     weighted = np.tensordot(columns, response, ((0, 1), (0, 1))).reshape(3, -1)
-    np.testing.assert_allclose(spread_of_sum(found, [columns]), weighted @ weighted.T, rtol=1e-9)
+    np.testing.assert_allclose(
+        long_run_covariance.spread_of_sum(found, [columns]), weighted @ weighted.T, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(("root", "short"), [(0.0, 0.99), (0.5, 0.98), (0.9, 0.85)])
 def test_deviations_of_a_regression_are_those_of_the_noise(root: float, short: float) -> None:
-    """60 draws: mean variance of ten coefficients equals theory only with the correction.
-
-    Theory: Toeplitz covariance of first-order noise. The mean of 60 draws has a standard error of
-    about 1 % (.5) to 3 % (.9).
-    """
+    """60 draws: mean variance of ten coefficients equals theory only with the correction."""
+    # The mean of 60 draws has a standard error of about 1 % (.5) to 3 % (.9).
     slow, own = _regression()
     sizes = [_SAMPLES * _OUTPUTS] * _TRIALS
     fitted = trial_span(own, sizes, slow)
     left = trial_span(own, sizes, np.zeros((len(own), 0))).without(slow)
     coefficients = np.linalg.solve(left.T @ left, left.T)  # (10, r)
     one = scipy.linalg.toeplitz(root ** np.arange(_SAMPLES)) / (1 - root**2)
-    true = np.diagonal(
-        coefficients @ np.kron(np.eye(_TRIALS), np.kron(one, np.eye(_OUTPUTS))) @ coefficients.T
-    )
+    noise = np.kron(np.eye(_TRIALS), np.kron(one, np.eye(_OUTPUTS)))
+    true = np.diagonal(coefficients @ noise @ coefficients.T)
     columns = [np.array(part) for part in coefficients.T.reshape(_TRIALS, _SAMPLES, _OUTPUTS, -1)]
     rng, shares = np.random.default_rng(5), []
     for _ in range(_DRAWS):
         residual = fitted.without(_noise(rng, root).reshape(-1, 1))
         trials = list(residual.reshape(_TRIALS, _SAMPLES, _OUTPUTS))
-        kinds = [
-            residual_noise(trials, fitted),
-            residual_noise(trials),
-            white_noise(trials, fitted),
-        ]
-        shares.append([np.mean(np.diagonal(spread_of_sum(kind, columns)) / true) for kind in kinds])
+        kinds = (
+            long_run_covariance.residual_noise(trials, fitted),
+            long_run_covariance.residual_noise(trials),
+            long_run_covariance.white_noise(trials, fitted),
+        )
+        shares.append(
+            [
+                np.mean(np.diagonal(long_run_covariance.spread_of_sum(kind, columns)) / true)
+                for kind in kinds
+            ]
+        )
     given_back, bare, white = np.mean(shares, axis=0)
     assert given_back == pytest.approx(1, abs=0.04)
     assert bare < short
@@ -107,5 +105,7 @@ def test_sums_over_lags_are_those_of_the_whole_covariance_matrix(samples: int, l
             whole[t, :, s, :] = gammas[t - s] if t >= s else gammas[s - t].T
     flat = columns.reshape(-1, 3)
     expected = flat.T @ whole.reshape(len(flat), -1) @ flat
-    found = spread_of_sum(ResidualNoise(np.zeros(2), gammas), [columns])
+    found = long_run_covariance.spread_of_sum(
+        long_run_covariance.ResidualNoise(np.zeros(2), gammas), [columns]
+    )
     np.testing.assert_allclose(found, expected, atol=1e-10)

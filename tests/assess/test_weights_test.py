@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import control
+import itertools
+
 import numpy as np
 import pytest
 
@@ -11,29 +12,26 @@ from experiments.search_problems import stick
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.weights_test import WeightsTest, return_difference, weights_test
 from impc.inverse.equivalent_weights import weights_margin
-from impc.inverse.problem import Problem
-from impc.inverse.solution_set import gain_fibre
 from plants import yalmip_example
-from tests.support import random_plant, random_weights
+from tests.support import plant_of, posed, random_plant, random_weights
 
 
-def compared(problem: Problem) -> WeightsTest:
+def compared(problem: impc.Problem) -> WeightsTest:
     fitted = impc.fit(problem)
     return weights_test(fitted, gain_estimate(fitted))
 
 
-def noisy_problem(seed: int, K: np.ndarray | None = None) -> Problem:
-    """Random optimal regulator of one to three states, or a given gain, with 2 % noise."""
+def noisy_problem(seed: int) -> impc.Problem:
+    """Random optimal regulator of one to three states, with 2 % noise."""
     rng = np.random.default_rng([470, seed])
     n = 1 + seed % 3
     plant = random_plant(rng, n, 1, rng.uniform(0.8, 1.1), d=1)
-    bounds = impc.Bounds(plant)
     weights = impc.Weights(random_weights(rng, n), random_weights(rng, 1))
-    law = impc.Controller(plant, weights, bounds, 3, terminal_set=False)
+    law = impc.Controller(plant, weights, impc.Bounds(plant), 3, terminal_set=False)
     push = rng.choice([-1.0, 0.0, 1.0], 40).repeat(5)
     x = law.simulate(np.zeros(n), disturbance=push).x[:-1]
     noisy = x + 0.02 * np.std(x, axis=0) * rng.standard_normal(x.shape)
-    return Problem(plant, bounds, 3, (impc.Recording(plant, noisy, push),))
+    return posed(law, impc.Recording(plant, noisy, push))
 
 
 @pytest.mark.parametrize(
@@ -52,17 +50,14 @@ def test_the_inequality_of_the_readme_holds_and_is_the_linear_matrix_inequality(
     assert found.least == pytest.approx(0.1754, abs=1e-4)
     assert found.needed == pytest.approx(0.1572, abs=1e-4)
     assert found.kept
-    plant = impc.Plant(stick(), ["finger"])
-    kept, exist = [], []
-    for angle in np.linspace(-60, -16, 8):
-        for rate in np.linspace(-12, -2, 6):
-            K = np.array([[angle, rate]])
-            if np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ K))) > 0.999:
-                continue
+    plant, kept, exist = impc.Plant(stick(), ["finger"]), [], []
+    for gain in itertools.product(np.linspace(-60, -16, 8), np.linspace(-12, -2, 6)):
+        K = np.array([gain])
+        if np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ K))) <= 0.999:
             found = return_difference(plant, K)
             assert found is not None
             kept.append(found.kept)
-            exist.append(weights_margin(gain_fibre(plant, K)).exist)
+            exist.append(weights_margin(impc.gain_fibre(plant, K)).exist)
     assert kept == exist
     assert 0 < sum(kept) < len(kept)
 
@@ -86,7 +81,5 @@ def test_a_gain_without_weights_is_said_to_have_none() -> None:
 
 def test_several_inputs_and_a_delay_have_no_inequality() -> None:
     """A chain of delays is not invertible."""
-    delay = control.ss([[0, 0], [1, 0]], [[1], [0]], np.eye(2), 0, True)
-    assert return_difference(impc.Plant(delay), np.zeros((1, 2))) is None
-    two = control.ss(0.5 * np.eye(2), np.eye(2), np.eye(2), 0, True)
-    assert return_difference(impc.Plant(two), np.zeros((2, 2))) is None
+    for plant in (plant_of([[0, 0], [1, 0]], [[1], [0]]), plant_of(0.5 * np.eye(2), np.eye(2))):
+        assert return_difference(plant, np.zeros((plant.m, 2))) is None

@@ -8,74 +8,55 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import impc
+from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
-from impc.errors import DataError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import (
     SLACK,
     EquivalentWeights,
     analytic_centre,
     inverse_factor,
-    least_condition_weights,
-    other_weights,
     weights_margin,
 )
-from impc.inverse.solution_set import gain_fibre, split_blocks
-from impc.model.plant import Plant
-from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights, condition_number, weight_error
-from tests.support import draws
+from impc.inverse.solution_set import GainFibre, split_blocks
+from impc.model.weights import condition_number
+from tests.support import draws, example_plant, plant_of
 
-EXAMPLE = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, 1.0))
-INTEGRATOR = Plant(control.ss([[1, 1], [0, 1]], [[0.5], [1]], np.eye(2), 0, 1.0))
+INTEGRATOR = plant_of([[1, 1], [0, 1]], [[0.5], [1]])
+GAIN = [[1.351294, -0.836590]]  # of the example
 
 # Priess et al. 2015, the feasible example (T1), continuous.
-PRIESS = Plant(
-    control.ss(
-        [[0, 1, 7, 9], [4, -8, -5, -3], [8, -7, 7, -6], [10, -5, -5, -5]],
-        [[2, 2, 5, -9], [-1, 1, 5, -9], [-3, 9, -3, 1], [7, -4, 1, 6]],
-        np.eye(4),
-        0,
-    )
+PRIESS = plant_of(
+    [[0, 1, 7, 9], [4, -8, -5, -3], [8, -7, 7, -6], [10, -5, -5, -5]],
+    [[2, 2, 5, -9], [-1, 1, 5, -9], [-3, 9, -3, 1], [7, -4, 1, 6]],
+    dt=0,
 )
-PRIESS_GAIN = np.array(
-    [
-        [2.376, -1.328, 1.188, 1.847],
-        [4.294, -0.8621, 3.77, 1.509],
-        [-2.279, 1.366, -2.067, -1.323],
-        [-2.7, -0.06092, -2.036, -0.7217],
-    ]
-)
+PRIESS_GAIN = [
+    [2.376, -1.328, 1.188, 1.847], [4.294, -0.8621, 3.77, 1.509],
+    [-2.279, 1.366, -2.067, -1.323], [-2.7, -0.06092, -2.036, -0.7217],
+]  # fmt: skip
 
 
-def random_case(seed: int, n: int, m: int, dt: float) -> tuple[Plant, Weights]:
+def random_case(seed: int, n: int, m: int, dt: float) -> tuple[impc.Plant, impc.Weights]:
     rng = np.random.default_rng(seed)
-    plant = Plant(control.ss(rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.eye(n), 0, dt))
+    plant = plant_of(rng.normal(size=(n, n)), rng.normal(size=(n, m)), dt=dt)
     q, r = rng.normal(size=(n, n)), rng.normal(size=(m, m))
-    return plant, Weights(q @ q.T + 0.1 * np.eye(n), r @ r.T + 0.1 * np.eye(m))
+    return plant, impc.Weights(q @ q.T + 0.1 * np.eye(n), r @ r.T + 0.1 * np.eye(m))
 
 
-def seat() -> tuple[Plant, Weights]:
-    from plants.seated_balance import seated_balance_plant  # noqa: PLC0415  # CasADi, for two tests
-
-    plant = Plant(seated_balance_plant(), controls=["command"])
-    direction = np.array([0.70, 0.65, 0.22, 0.20])
-    direction /= np.linalg.norm(direction)
-    Q = 1e-2 * np.eye(10)
-    Q[:4, :4] = 6e5 * np.outer(direction, direction) + np.diag([2e4, 2e4, 500.0, 500.0])
-    return plant, Weights(Q, 1.0)
+def fibre_of(plant: impc.Plant, weights: impc.Weights) -> GainFibre:
+    return impc.gain_fibre(plant, impc.solve_lqr(plant, weights).K)
 
 
-def rescaled(plant: Plant, states: Array) -> Plant:
+def rescaled(plant: impc.Plant, states: Array) -> impc.Plant:
     """The same plant with x = states @ z."""
     back = np.linalg.inv(states)
-    system = control.ss(
-        back @ plant.A @ states, back @ plant.B, plant.C @ states, 0, plant.dt, inputs=plant.m
-    )
-    return Plant(system)
+    A, B, C = back @ plant.A @ states, back @ plant.B, plant.C @ states
+    return impc.Plant(control.ss(A, B, C, 0, plant.dt, inputs=plant.m))
 
 
 def test_published_example_has_the_least_condition_number_of_the_reference() -> None:
-    found = least_condition_weights(gain_fibre(PRIESS, PRIESS_GAIN))
+    found = impc.least_condition_weights(impc.gain_fibre(PRIESS, PRIESS_GAIN))
     assert found.least is not None
     assert found.least == pytest.approx(15.84287, abs=5e-6)
     assert found.least <= found.condition <= found.least * (1 + 2 * SLACK)
@@ -84,17 +65,13 @@ def test_published_example_has_the_least_condition_number_of_the_reference() -> 
     assert found.gap < 1e-8
     scaled = found.weights.block / np.linalg.eigvalsh(found.weights.block)[0]
     Q = [
-        [13.6214, -1.173, 4.0657, 2.7301],
-        [-1.173, 7.3251, 3.4964, -2.4546],
-        [4.0657, 3.4964, 4.9217, 0.1421],
-        [2.7301, -2.4546, 0.1421, 4.4088],
-    ]
+        [13.6214, -1.173, 4.0657, 2.7301], [-1.173, 7.3251, 3.4964, -2.4546],
+        [4.0657, 3.4964, 4.9217, 0.1421], [2.7301, -2.4546, 0.1421, 4.4088],
+    ]  # fmt: skip
     R = [
-        [10.5486, 0.3483, 6.5105, -1.7114],
-        [0.3483, 4.3186, 1.8088, 3.5052],
-        [6.5105, 1.8088, 6.9223, -0.4818],
-        [-1.7114, 3.5052, -0.4818, 6.5442],
-    ]
+        [10.5486, 0.3483, 6.5105, -1.7114], [0.3483, 4.3186, 1.8088, 3.5052],
+        [6.5105, 1.8088, 6.9223, -0.4818], [-1.7114, 3.5052, -0.4818, 6.5442],
+    ]  # fmt: skip
     # The reference is within 1e-5 of the least condition; here the least norm within 1e-5.
     np.testing.assert_allclose(scaled[:4, :4], Q, atol=15 * np.sqrt(SLACK))
     np.testing.assert_allclose(scaled[4:, 4:], R, atol=15 * np.sqrt(SLACK))
@@ -105,32 +82,31 @@ def test_published_example_has_the_least_condition_number_of_the_reference() -> 
     [
         (INTEGRATOR, [[0.434483, 1.028466]], 1.0, [[1, 0], [0, 1]]),
         (INTEGRATOR, [[0.692029, 1.226288]], 4.0, [[4, 0], [0, 1]]),
-        (EXAMPLE, [[1.351294, -0.836590]], 3.2588, np.divide(
+        (example_plant(), GAIN, 3.2588, np.divide(
             [[1.32597, 0.39116], [0.39116, 1.46938]], 3.25881)),
     ],
 )  # fmt: skip
 def test_least_condition_of_the_examples(
-    plant: Plant, gain: list[list[float]], condition: float, Q: Array
+    plant: impc.Plant, gain: list[list[float]], condition: float, Q: Array
 ) -> None:
-    found = least_condition_weights(gain_fibre(plant, gain))
+    found = impc.least_condition_weights(impc.gain_fibre(plant, gain))
     assert found.condition == pytest.approx(condition, abs=7e-5)  # the gain has six decimals
     np.testing.assert_allclose(found.weights.Q, Q, atol=np.sqrt(SLACK) / 5)
     assert found.gain_error < 1e-14
 
 
-def test_least_condition_agrees_with_a_fine_grid_over_the_fibre() -> None:
-    fibre = gain_fibre(EXAMPLE, [[1.351294, -0.836590]])
+def test_least_condition_and_centre_agree_with_a_fine_grid_over_the_fibre() -> None:
+    fibre = impc.gain_fibre(example_plant(), GAIN)
     angles = np.linspace(0, np.pi, 200_001)
     coordinates = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     Q, R = np.tensordot(coordinates, fibre.Q, 1), np.tensordot(coordinates, fibre.R, 1)
     values = np.concatenate([np.linalg.eigvalsh(Q), R[:, :, 0]], axis=1) * np.sign(R[:, 0])
     least, largest = values.min(axis=1), values.max(axis=1)
     conditions = np.where(least > 0, largest / np.maximum(least, 1e-300), np.inf)
-    found = least_condition_weights(fibre)
+    found = impc.least_condition_weights(fibre)
     assert found.least is not None
     assert found.least <= conditions.min()
     assert found.least == pytest.approx(conditions.min(), rel=1e-4)
-    # The analytic centre, against the same grid.
     volumes = np.where(least > 0, np.linalg.det(Q) / R[:, 0, 0] ** 2, 0.0)
     best = Q[np.argmax(volumes)] / R[np.argmax(volumes)]
     np.testing.assert_allclose(analytic_centre(fibre).weights.Q, best, rtol=1e-3)
@@ -143,14 +119,13 @@ def test_the_fibre_contains_the_truth_and_nothing_with_another_gain(
     m: int, dt: float, seed: int, n: int
 ) -> None:
     plant, truth = random_case(seed, n, m, dt)
-    solution = solve_lqr(plant, truth)
-    fibre = gain_fibre(plant, solution.K)
+    fibre = fibre_of(plant, truth)
     X, basis = fibre.to_natural(truth), fibre.natural_basis()
     inside = np.tensordot(np.tensordot(basis, X, 2), basis, 1)
     assert np.linalg.norm(X - inside) < 1e-8 * np.linalg.norm(X)
-    found = least_condition_weights(fibre)
+    found = impc.least_condition_weights(fibre)
     assert found.condition <= condition_number(truth) * (1 + 1e-8)
-    members: list[EquivalentWeights] = [found, *other_weights(fibre, 3)]
+    members: list[EquivalentWeights] = [found, *impc.other_weights(fibre, 3)]
     assert max(member.gain_error for member in members) < 1e-7
 
 
@@ -158,41 +133,39 @@ def test_the_fibre_contains_the_truth_and_nothing_with_another_gain(
 @given(seed=st.integers(0, 2**32 - 1), dt=st.sampled_from([0, 1.0]))
 def test_a_metric_narrows_the_fibre_to_weights_with_that_metric(seed: int, dt: float) -> None:
     plant, truth = random_case(seed, 4, 2, dt)
-    solution = solve_lqr(plant, truth)
-    free = gain_fibre(plant, solution.K)
+    solution = impc.solve_lqr(plant, truth)
     # Only S up to scale may matter.
-    fibre = gain_fibre(plant, solution.K, 3.0 * solution.S)
-    assert fibre.dimension == free.dimension - 1  # m - 1: see the next test
-    found = least_condition_weights(fibre)
+    fibre = impc.gain_fibre(plant, solution.K, 3.0 * solution.S)
+    assert fibre.dimension == fibre_of(plant, truth).dimension - 1  # m - 1: see the next test
+    found = impc.least_condition_weights(fibre)
     assert found.condition <= condition_number(truth) * (1 + 1e-8)
-    S = solve_lqr(plant, found.weights).S
-    np.testing.assert_allclose(
-        S / np.trace(S), solution.S / np.trace(solution.S), rtol=1e-6, atol=1e-8
-    )
+    S, true = impc.solve_lqr(plant, found.weights).S, solution.S
+    np.testing.assert_allclose(S / np.trace(S), true / np.trace(true), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize(("n", "m"), [(3, 2), (4, 2), (5, 3), (6, 3)])
 def test_gain_and_metric_determine_m_minus_1_numbers_more_than_the_gain(n: int, m: int) -> None:
     """S K A^-1 B = B'PB is symmetric: the gain leaves m of the m(m+1)/2 entries of S free."""
     plant, truth = random_case(1, n, m, 1.0)
-    solution = solve_lqr(plant, truth)
+    solution = impc.solve_lqr(plant, truth)
     numbers = n * (n + 1) // 2 + m * (m + 1) // 2
-    assert gain_fibre(plant, solution.K).dimension == numbers - n * m
-    assert gain_fibre(plant, solution.K, solution.S).dimension == numbers - n * m - (m - 1)
+    assert impc.gain_fibre(plant, solution.K).dimension == numbers - n * m
+    fibre = impc.gain_fibre(plant, solution.K, solution.S)
+    assert fibre.dimension == numbers - n * m - (m - 1)
 
 
 def test_seat_plant() -> None:
-    plant, truth = seat()
-    fibre = gain_fibre(plant, solve_lqr(plant, truth).K)
+    work = seat(1, 1.0)
+    fibre = fibre_of(work.problem.plant, work.weights)
     assert fibre.dimension == 46
     assert fibre.singular_values[-1] > 1e-3 * fibre.singular_values[0]
-    found = least_condition_weights(fibre)
+    found = impc.least_condition_weights(fibre)
     # The reference's 1.69e7 belongs to another realisation of the delay.
     assert found.condition == pytest.approx(2.368523e7, rel=1e-4)
     assert found.gap is not None
     assert found.gap < 1e-6
-    assert found.condition < condition_number(truth)
-    centre, *others = analytic_centre(fibre), *other_weights(fibre)
+    assert found.condition < condition_number(work.weights)
+    centre, *others = analytic_centre(fibre), *impc.other_weights(fibre)
     assert len(others) == 2
     for member in (found, centre, *others):
         assert member.gain_error < 1e-9
@@ -202,46 +175,41 @@ def test_seat_plant() -> None:
 
 
 def test_margin_and_centre_do_not_depend_on_units_but_the_least_condition_does() -> None:
-    plant, truth = seat()
-    scale = np.diag(np.logspace(-3, 2, 10))
-    other = rescaled(plant, scale)
-    moved = Weights(scale @ truth.Q @ scale, truth.R)
-    fibres = [gain_fibre(a, solve_lqr(a, w).K) for a, w in ((plant, truth), (other, moved))]
+    work, scale = seat(1, 1.0), np.diag(np.logspace(-3, 2, 10))
+    plant, truth = work.problem.plant, work.weights
+    moved = impc.Weights(scale @ truth.Q @ scale, truth.R)
+    fibres = fibre_of(plant, truth), fibre_of(rescaled(plant, scale), moved)
     first, second = (weights_margin(fibre).margin for fibre in fibres)
     assert second == pytest.approx(first, rel=1e-6)
     centre, again = (analytic_centre(fibre).weights for fibre in fibres)
     np.testing.assert_allclose(scale @ centre.Q @ scale, again.Q, rtol=1e-5, atol=1e-6)
-    lowest = [least_condition_weights(fibre).condition for fibre in fibres]
+    lowest = [impc.least_condition_weights(fibre).condition for fibre in fibres]
     assert not np.isclose(lowest[0], lowest[1], rtol=0.5)
 
 
 def test_analytic_centre_with_two_inputs_does_not_depend_on_their_coordinates() -> None:
     plant, truth = random_case(3, 4, 2, 1.0)
-    gain = solve_lqr(plant, truth).K
-    inputs = np.array([[1.0, 0.4], [0.0, 50.0]])
-    moved = Plant(control.ss(plant.A, plant.B @ inputs, plant.C, 0, 1.0))
-    centre = analytic_centre(gain_fibre(plant, gain)).weights
-    other = analytic_centre(gain_fibre(moved, np.linalg.solve(inputs, gain))).weights
-    expected = Weights(centre.Q, inputs.T @ centre.R @ inputs)
-    assert weight_error(expected, other) < 1e-6 * np.linalg.norm(other.block)
+    gain, inputs = impc.solve_lqr(plant, truth).K, np.array([[1.0, 0.4], [0.0, 50.0]])
+    moved = plant_of(plant.A, plant.B @ inputs)
+    centre = analytic_centre(impc.gain_fibre(plant, gain)).weights
+    other = analytic_centre(impc.gain_fibre(moved, np.linalg.solve(inputs, gain))).weights
+    expected = impc.Weights(centre.Q, inputs.T @ centre.R @ inputs)
+    assert impc.weight_error(expected, other) < 1e-6 * np.linalg.norm(other.block)
 
 
 def test_a_gain_that_no_weights_have() -> None:
-    fibre = gain_fibre(EXAMPLE, [[1.21183, -0.71277]])
+    fibre = impc.gain_fibre(example_plant(), [[1.21183, -0.71277]])
     found = weights_margin(fibre)
     assert not found.exist
     assert found.weights is None
     assert found.margin < -1
-    for function in (least_condition_weights, analytic_centre, other_weights):
-        with pytest.raises(WeightsError, match="no positive definite weights"):
+    for function in (impc.least_condition_weights, analytic_centre, impc.other_weights):
+        with pytest.raises(impc.WeightsError, match="no positive definite weights"):
             function(fibre)
-
-
-def test_a_gain_that_does_not_stabilise_is_refused() -> None:
-    with pytest.raises(WeightsError, match="not stable"):
-        gain_fibre(EXAMPLE, [[0.0, 0.0]])
-    with pytest.raises(DataError, match="shape"):
-        gain_fibre(EXAMPLE, [0.0, 0.0])
+    with pytest.raises(impc.WeightsError, match="not stable"):
+        impc.gain_fibre(example_plant(), [[0.0, 0.0]])
+    with pytest.raises(impc.DataError, match="shape"):
+        impc.gain_fibre(example_plant(), [0.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -252,65 +220,59 @@ def test_a_gain_that_does_not_stabilise_is_refused() -> None:
     ],
 )
 def test_an_unbounded_fibre_has_a_least_condition_but_no_centre(A: object, B: object) -> None:
-    plant = Plant(control.ss(A, B, np.eye(len(np.asarray(A))), 0, 1.0))
-    gain = solve_lqr(plant, Weights(np.eye(plant.n), 1.0)).K
-    fibre = gain_fibre(plant, gain)
-    assert least_condition_weights(fibre).condition == pytest.approx(1.0, abs=1e-9)
-    with pytest.raises(WeightsError, match="no analytic centre"):
+    plant = plant_of(A, B)
+    fibre = fibre_of(plant, impc.Weights(np.eye(plant.n), 1.0))
+    assert impc.least_condition_weights(fibre).condition == pytest.approx(1.0, abs=1e-9)
+    with pytest.raises(impc.WeightsError, match="no analytic centre"):
         analytic_centre(fibre)
 
 
-@pytest.mark.parametrize("seed", [55, 107, 199, 209, 306])
-def test_a_fibre_with_members_is_never_called_empty(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "n", "m", "dt"),
+    [(55, 8, 2, 1.0), (107, 6, 3, 1.0), (199, 8, 2, 1.0), (209, 8, 3, 1.0), (306, 8, 3, 0)],
+)
+def test_a_fibre_with_members_is_never_called_empty(seed: int, n: int, m: int, dt: float) -> None:
     """With the trace as an equality Clarabel stopped at the first iterations on these."""
-    size = {55: (8, 2, 1.0), 107: (6, 3, 1.0), 199: (8, 2, 1.0), 209: (8, 3, 1.0), 306: (8, 3, 0)}
-    plant, truth = random_case(seed, *size[seed])
-    found = weights_margin(gain_fibre(plant, solve_lqr(plant, truth).K))
+    found = weights_margin(fibre_of(*random_case(seed, n, m, dt)))
     assert found.exist
     assert found.margin > 1e-6
 
 
 def test_others_are_unlike_and_a_single_member_has_none() -> None:
-    fibre = gain_fibre(INTEGRATOR, [[0.434483, 1.028466]])
-    found, others = least_condition_weights(fibre), other_weights(fibre)
+    fibre = impc.gain_fibre(INTEGRATOR, [[0.434483, 1.028466]])
+    found, others = impc.least_condition_weights(fibre), impc.other_weights(fibre)
     assert len(others) == 2
     for member in others:
         assert member.condition == pytest.approx(10 * found.condition, rel=1e-6)
-        assert weight_error(member.weights, found.weights) > 0.5
+        assert impc.weight_error(member.weights, found.weights) > 0.5
         assert member.gain_error < 1e-14
-    assert weight_error(others[0].weights, others[1].weights) > 0.5
-    single = gain_fibre(Plant(control.ss([[1.2]], [[1]], [[1]], 0, 1.0)), [[0.7]])
-    assert other_weights(single) == ()
-    assert (
-        weight_error(analytic_centre(single).weights, least_condition_weights(single).weights)
-        < 1e-9
-    )
+    assert impc.weight_error(others[0].weights, others[1].weights) > 0.5
+    single = impc.gain_fibre(plant_of([[1.2]], [[1]]), [[0.7]])
+    assert impc.other_weights(single) == ()
+    pair = analytic_centre(single).weights, impc.least_condition_weights(single).weights
+    assert impc.weight_error(*pair) < 1e-9
 
 
 def test_basis_is_orthonormal_in_natural_coordinates() -> None:
-    fibre = gain_fibre(PRIESS, PRIESS_GAIN)
+    fibre = impc.gain_fibre(PRIESS, PRIESS_GAIN)
     basis = fibre.natural_basis()
     assert basis.shape == (4, 8, 8)
     np.testing.assert_allclose(np.tensordot(basis, basis, ((1, 2), (1, 2))), np.eye(4), atol=1e-9)
-    X = fibre.to_natural(least_condition_weights(fibre).weights)
+    X = fibre.to_natural(impc.least_condition_weights(fibre).weights)
     np.testing.assert_allclose(split_blocks(X, 4).Q, X[:4, :4], atol=1e-12)
 
 
 def test_the_reported_weights_do_not_depend_on_rounding() -> None:
-    """Six states, two inputs: members of equal condition number differ by a half in Q.
-
-    Their least-norm member is unique. Rotated states keep norm and condition number and change the
-    rounding, as another processor does.
-    """
+    """Members of equal condition differ by a half in Q; the one of least norm is unique."""
     A = np.random.default_rng(3).normal(size=(6, 6)) / 2.2
-    B = np.random.default_rng(4).normal(size=(6, 2))
     L = np.random.default_rng(5).normal(size=(6, 6))
-    plant = Plant(control.ss(A, B, np.eye(6), 0, True))
-    K = solve_lqr(plant, Weights(L @ L.T + 0.1 * np.eye(6), np.eye(2))).K
-    first = least_condition_weights(gain_fibre(plant, K)).weights
+    plant = plant_of(A, np.random.default_rng(4).normal(size=(6, 2)))
+    K = impc.solve_lqr(plant, impc.Weights(L @ L.T + 0.1 * np.eye(6), np.eye(2))).K
+    first = impc.least_condition_weights(impc.gain_fibre(plant, K)).weights
     for seed in range(4):
+        # Rotated states keep norm and condition number, and change the rounding.
         U, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(6, 6)))
-        found = least_condition_weights(gain_fibre(rescaled(plant, U), K @ U)).weights
+        found = impc.least_condition_weights(impc.gain_fibre(rescaled(plant, U), K @ U)).weights
         size = 1e-4 * np.max(np.abs(first.Q))
         np.testing.assert_allclose(U @ found.Q @ U.T, first.Q, atol=size)
         np.testing.assert_allclose(found.R, first.R, atol=1e-4)
@@ -318,7 +280,6 @@ def test_the_reported_weights_do_not_depend_on_rounding() -> None:
 
 def test_weights_on_the_border_of_the_set_are_refused() -> None:
     """`_by_convention` then reports the weights of the search."""
-    plant = Plant(control.ss([[1.1, 0.1], [0, 0.9]], [[0], [1]], np.eye(2), 0, 1))
-    fibre = gain_fibre(plant, solve_lqr(plant, Weights(np.eye(2), 1)).K)
-    with pytest.raises(SolverError, match="singular to working precision"):
-        inverse_factor(fibre, Weights(np.diag([1.0, 0.0]), 1))
+    fibre = fibre_of(plant_of([[1.1, 0.1], [0, 0.9]], [[0], [1]]), impc.Weights(np.eye(2), 1))
+    with pytest.raises(impc.SolverError, match="singular to working precision"):
+        inverse_factor(fibre, impc.Weights(np.diag([1.0, 0.0]), 1))

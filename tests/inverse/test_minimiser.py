@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.optimize
 
-from impc.inverse.minimiser import Ended, Prior, Rows, Stop, minimise
+from impc.inverse.minimiser import End, Ended, Prior, Rows, Stop, minimise
 
 TRIALS, ROWS, SHARED, OWN = 30, 9, 3, 2
 COUNT = TRIALS * ROWS
@@ -46,7 +47,9 @@ class Curved:
         )
 
 
-def problem(seed: int, *, exact: bool = False, bent: bool = False) -> tuple[Curved, Prior]:
+def problem(
+    seed: int, *, exact: bool = False, bent: bool = False, weight: float = 0.0
+) -> tuple[Curved, Prior]:
     """Noisy, or with zero residual near the start."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((TRIALS, ROWS, SHARED))
@@ -56,7 +59,11 @@ def problem(seed: int, *, exact: bool = False, bent: bool = False) -> tuple[Curv
     c = np.sin(A @ truth[0] + np.einsum("twn,tn->tw", B, truth[1]))
     if not exact:
         c = c + 0.3 * rng.standard_normal(c.shape)
-    return Curved(A, B, c, bent), Prior(u, v, np.full(SHARED, 0.0), 0.0)
+    return Curved(A, B, c, bent), Prior(u, v, np.full(SHARED, weight), weight)
+
+
+def searched(model: Curved, prior: Prior, *stop: Any) -> End:
+    return minimise(model, prior, (prior.u, prior.v), Stop(*stop))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -64,9 +71,8 @@ def problem(seed: int, *, exact: bool = False, bent: bool = False) -> tuple[Curv
 @pytest.mark.parametrize("weight", [0.0, 5.0])
 def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: float) -> None:
     """BFGS from the solution finds no lower value of N log |r|^2 plus prior."""
-    model, prior = problem(seed, bent=bent)
-    prior = Prior(prior.u, prior.v, np.full(SHARED, weight), weight)
-    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 400))
+    model, prior = problem(seed, bent=bent, weight=weight)
+    end = searched(model, prior, 1e-8, 0.0, 400)
     u, v = end.u, end.v
     assert end.ended is Ended.CONVERGED
     assert end.promised <= 1e-8
@@ -85,16 +91,15 @@ def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: fl
 @pytest.mark.parametrize("bent", [False, True])
 def test_an_exact_problem_ends_at_rounding(bent: bool) -> None:
     """Any prior loses its weight as the residual vanishes."""
-    model, prior = problem(7, exact=True, bent=bent)
-    prior = Prior(prior.u, prior.v, np.full(SHARED, 1.0), 1.0)
-    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-6, 1e-24, 100))
+    model, prior = problem(7, exact=True, bent=bent, weight=1.0)
+    end = searched(model, prior, 1e-6, 1e-24, 100)
     assert model.square(end.u, end.v) <= 1e-20
 
 
 def test_a_column_that_nothing_sees_stays() -> None:
     model, prior = problem(3)
     model.A[..., -1] = 0
-    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-4, 0.0, 100))
+    end = searched(model, prior, 1e-4, 0.0, 100)
     assert end.converged
     assert end.u[-1] == prior.u[-1]
 
@@ -106,8 +111,7 @@ def test_where_nothing_can_be_evaluated_the_start_is_returned() -> None:
         def rows(self, u: np.ndarray, v: np.ndarray) -> None:  # type: ignore[override]
             return None
 
-    begin = prior.u, prior.v
-    end = minimise(Refuses(model.A, model.B, model.c), prior, begin, Stop(1e-8, 0.0, 100))
+    end = searched(Refuses(model.A, model.B, model.c), prior, 1e-8, 0.0, 100)
     np.testing.assert_array_equal(end.u, prior.u)
     np.testing.assert_array_equal(end.v, prior.v)
     assert end.evaluations == 1
@@ -144,7 +148,7 @@ def test_an_end_at_a_crease_is_no_minimum() -> None:
 
 def test_a_search_that_ran_out_says_what_is_left() -> None:
     model, prior = problem(3)
-    end = minimise(model, prior, (prior.u, prior.v), Stop(1e-8, 0.0, 2))
+    end = searched(model, prior, 1e-8, 0.0, 2)
     assert end.ended is Ended.STOPPED
     assert end.promised > 1e-8
 

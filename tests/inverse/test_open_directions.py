@@ -10,7 +10,7 @@ import impc
 from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_only
 from impc.model.riccati import solve_lqr
-from tests.inverse.test_several_inputs import random_problem
+from tests.support import random_problem
 
 RNG = np.random.default_rng(3)
 PLANT = impc.Plant(

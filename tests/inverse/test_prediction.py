@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+import impc
 from experiments.search_problems import random_problem, stick_problem
-from impc.checking import replace
 from impc.inverse.prediction import Correction, correction
 from impc.inverse.residuals import evaluate
 
@@ -15,16 +15,15 @@ from impc.inverse.residuals import evaluate
 @pytest.mark.parametrize("ratio", [1.0, 10.0])
 def test_the_corrected_loop_is_the_recursion(ratio: float) -> None:
     """Stick with a limit: predict, correct by the innovation, clip the command (horizon 1)."""
-    known = next(one for one in map(stick_problem, range(50)) if one is not None)
-    problem = replace(known.problem, horizon=1, terminal_set=False)
+    known = next(filter(None, map(stick_problem, range(50))))
+    problem = impc.replace(known.problem, horizon=1, terminal_set=False)
     plant, (trial,) = problem.plant, problem.recordings
     found = evaluate(problem, known.K, known.S, correction=correction(problem, ratio))
     M, limit = correction(problem, ratio).M, problem.bounds.u_max
     x, errors = np.array(trial.x0), []
     for y, d in zip(trial.outputs, trial.disturbance, strict=True):
-        error = y - plant.C @ x
-        errors.append(error)
-        x = x + M @ error
+        errors.append(y - plant.C @ x)
+        x = x + M @ errors[-1]
         u = np.clip(-known.K @ x, -limit, limit)
         x = plant.A @ x + plant.B @ u + plant.E @ d
     scaled = np.array(errors) / problem.output_scale

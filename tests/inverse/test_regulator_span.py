@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
+import functools
+
 import control
 import numpy as np
 import pytest
 import scipy.linalg
 
+import impc
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
-from impc.control.controller import Controller
 from impc.inverse.laws import GainLaw
-from impc.inverse.methods import fit
-from impc.inverse.problem import Problem
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.unknowns import Unknowns
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.plant_family import PlantFamily
-from impc.model.recordings import Recording
-from impc.model.structure import Structure
-from impc.model.weights import Weights
-from impc.output_feedback.fit import fit_output_feedback
-from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import simulate_person
-from tests.support import extrapolated_slope
+from tests.support import extrapolated_slope, posed, regulator
 
 _BODY = np.array([[1.0, 0.1], [0.05, 0.98]])
 _LATE = 3
+_Q = np.diag([6.0, 1.0, 0, 0, 0])
 
 
-def late_body() -> Plant:
+def late_body() -> impc.Plant:
     """Unstable body of two states; the command arrives three samples late."""
     A = np.zeros((2 + _LATE, 2 + _LATE))
     A[:2, :2], A[:2, 2], A[2:-1, 3:] = _BODY, [0.0, 0.1], np.eye(_LATE - 1)
@@ -41,27 +34,24 @@ def late_body() -> Plant:
     system = control.ss(
         A, inputs, np.eye(len(A))[:1], 0, 0.1, states=names, inputs=["u", "push"], outputs=["p"]
     )
-    return Plant(system, ["u"])
+    return impc.Plant(system, ["u"])
 
 
-def weighed(plant: Plant, rng: np.random.Generator) -> Array:
+def weighed(plant: impc.Plant, rng: np.random.Generator) -> Array:
     """Gain of random weights on the body, by scipy's Riccati solver."""
     root = rng.normal(size=(2, 2))
     Q = scipy.linalg.block_diag(root @ root.T, np.zeros((_LATE, _LATE)))
     P = scipy.linalg.solve_discrete_are(plant.A, plant.B, Q, np.eye(1))
-    S = 1 + plant.B.T @ P @ plant.B
-    return np.asarray(np.linalg.solve(S, plant.B.T @ P @ plant.A))
+    return np.asarray(np.linalg.solve(1 + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A))
 
 
-def spanned(plant: Plant, structure: Structure, gain: Array) -> Array:
-    T, _ = natural_coordinates(plant, gain)
-    return regulators_alone(plant, structure, T)
+def spanned(plant: impc.Plant, structure: impc.Structure, gain: Array) -> Array:
+    return regulators_alone(plant, structure, natural_coordinates(plant, gain)[0])
 
 
 def outside(found: Array, gain: Array) -> float:
     """Share of a gain outside the span."""
-    rows = found.reshape(len(found), -1)
-    row = np.ravel(gain)
+    rows, row = found.reshape(len(found), -1), np.ravel(gain)
     left = row - np.linalg.lstsq(rows.T, row, rcond=None)[0] @ rows
     return float(np.linalg.norm(left) / np.linalg.norm(row))
 
@@ -69,7 +59,7 @@ def outside(found: Array, gain: Array) -> float:
 def test_over_a_delay_the_controller_predicts() -> None:
     """K = K_b (A^3, A^2 b, A b, b) for all cost weights of the body: two dimensions of five."""
     plant, rng = late_body(), np.random.default_rng(0)
-    found = spanned(plant, Structure(plant, "full", over=["p", "v"]), weighed(plant, rng))
+    found = spanned(plant, impc.Structure(plant, "full", over=["p", "v"]), weighed(plant, rng))
     assert len(found) == 2
     b = plant.A[:2, 2:3]
     powers = [np.linalg.matrix_power(_BODY, k) for k in range(_LATE + 1)]
@@ -87,7 +77,7 @@ def test_it_is_that_of_all_products_of_the_features(features: str | list[str]) -
     plant = late_body()
     over = ["p", "v"] if features == "diagonal" else None
     gain = weighed(plant, np.random.default_rng(1))
-    found = spanned(plant, Structure(plant, features, over=over), gain)
+    found = spanned(plant, impc.Structure(plant, features, over=over), gain)
     assert len(found) == 2
     assert outside(found, gain) < 1e-9
 
@@ -96,7 +86,7 @@ def test_on_the_seat_five_dimensions_hold_them_all() -> None:
     """Weights over angles and rates, from 0.01 to 100 times those of the benchmark."""
     work = seat(1, 2.0)
     plant, rng = work.controller.plant, np.random.default_rng(2)
-    structure = Structure(plant, "full", over=plant.states[:4])
+    structure = impc.Structure(plant, "full", over=plant.states[:4])
     found = spanned(plant, structure, np.array(work.controller.K))
     assert len(found) == 5
     root = np.linalg.cholesky(np.array(work.weights.Q)[:4, :4])
@@ -104,67 +94,64 @@ def test_on_the_seat_five_dimensions_hold_them_all() -> None:
     for size in (0.01, 1.0, 100.0):
         mixed = root @ (np.eye(4) + 0.5 * np.tril(rng.normal(size=(4, 4))))
         Q = scipy.linalg.block_diag(size * mixed @ mixed.T, np.zeros((6, 6)))
-        gain = Controller(plant, Weights(Q, 1), Bounds(plant), 1, terminal_set=False).K
+        gain = impc.Controller(
+            plant, impc.Weights(Q, 1), impc.Bounds(plant), 1, terminal_set=False
+        ).K
         natural = found[:, 0] @ T
         row = np.array(gain)[0] @ T
         # Measured: 1e-4; the sampled Padé delay is not exactly all-pass.
         assert np.linalg.norm(row - natural.T @ (natural @ row)) < 5e-4 * np.linalg.norm(row)
 
 
-def late_problem(**given: object) -> Problem:
+@functools.cache
+def late_trials() -> tuple[impc.Controller, tuple[impc.Recording, ...]]:
     plant = late_body()
-    bounds = Bounds(plant, u_min=-1, u_max=1)
-    weights = Weights(np.diag([6.0, 1.0, 0, 0, 0]), 0.2)
-    law = Controller(plant, weights, bounds, 8, terminal_set=False)
-    person = Observer(plant, ["p", "v"], motor=0.1, sensory=0.02)
-    rng, trials = np.random.default_rng(4), []
+    law, rng, trials = regulator(plant, _Q, 1, 8, 0.2), np.random.default_rng(4), []
+    person = impc.Observer(plant, ["p", "v"], motor=0.1, sensory=0.02)
     for seed in range(2):
         push = np.repeat(rng.choice([-0.6, 0.0, 0.6], 40), 10)
         found = simulate_person(law, person, push, recorder=0.005, seed=seed)
         assert np.any(np.abs(found.u) >= 1 - 1e-9)
-        trials.append(Recording(plant, found.outputs, push))
-    return Problem(
-        plant, bounds, 8, trials, terminal_set=False, unknown_start=True,
-        **given,  # type: ignore[arg-type]
-    )  # fmt: skip
+        trials.append(impc.Recording(plant, found.outputs, push))
+    return law, tuple(trials)
+
+
+def late_problem(**given: object) -> impc.Problem:
+    law, trials = late_trials()
+    return posed(law, *trials, terminal_set=False, unknown_start=True, **given)
 
 
 def test_a_structure_that_prices_every_state_keeps_no_gain_out() -> None:
     plant = late_body()
+    shape = impc.Structure(plant, ["p", "v"])
+    family = impc.PlantFamily(lambda _: plant, ["mass"], [1.0])
     assert kept_to(late_problem()) is None
-    assert kept_to(late_problem(structure=Structure(plant, "diagonal"))) is None
-    shape = Structure(plant, ["p", "v"])
+    assert kept_to(late_problem(structure=impc.Structure(plant, "diagonal"))) is None
     assert kept_to(late_problem(structure=shape)) is shape
-    family = PlantFamily(lambda _: plant, ["mass"], [1.0])
     assert kept_to(late_problem(structure=shape, family=family)) is None
 
 
 @pytest.mark.full
 def test_a_person_is_searched_within_the_span() -> None:
     """Three unknowns fewer, a predicting gain, and derivatives equal to finite differences."""
-    problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
-    person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
-    first = fit(problem)
-    found = fit_output_feedback(first, person)
+    problem = late_problem(structure=impc.Structure(late_body(), ["p", "v"]))
+    person = impc.Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
+    first = impc.fit(problem)
+    found = impc.fit_output_feedback(first, person)
     assert found.converged
     assert found.space.gain == 2
-    truth = Controller(
-        problem.plant, Weights(np.diag([6.0, 1.0, 0, 0, 0]), 0.2), problem.bounds, 8
-    ).K
-    np.testing.assert_allclose(found.K, truth, rtol=0.3)
+    np.testing.assert_allclose(found.K, late_trials()[0].K, rtol=0.3)
     closed = np.abs(np.linalg.eigvals(problem.plant.A - problem.plant.B @ found.K))
     np.testing.assert_allclose(np.sort(closed)[:_LATE], 0, atol=1e-3)  # cube root of 1e-15
     step = np.random.default_rng(5).normal(size=len(found.theta))
-
-    def moved(t: float) -> Array:
-        return np.array([found.space.value(found.theta + t * step)])
-
-    slope = extrapolated_slope(moved, 1e-3)[0]
+    slope = extrapolated_slope(
+        lambda t: np.array([found.space.value(found.theta + t * step)]), 1e-3
+    )[0]
     assert found.identified.gradient @ step == pytest.approx(slope, rel=1e-6)
 
 
 def test_the_search_begins_next_to_the_gain_that_is_given() -> None:
-    structure = Structure(late_body(), ["p", "v"])
+    structure = impc.Structure(late_body(), ["p", "v"])
     problem = late_problem(structure=structure)
     gain = weighed(problem.plant, np.random.default_rng(6))
     law = GainLaw(problem, gain, np.eye(1), spanned(problem.plant, structure, gain))

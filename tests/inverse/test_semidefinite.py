@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from impc.errors import SolverError
-from impc.inverse.semidefinite import (
-    matrix_inequality,
-    norm_bound,
-    solve_each,
-    solve_semidefinite,
-)
+import impc
+from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_each, solve_semidefinite
 from tests.support import random_weights
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-4, 1e-6, 1e-9])
@@ -75,7 +67,7 @@ def test_a_solver_that_breaks_off_is_an_error_of_ours(monkeypatch: pytest.Monkey
     cone = matrix_inequality(np.eye(2), np.eye(2)[None])
     panic = type("PanicException", (BaseException,), {})
     monkeypatch.setattr("clarabel.DefaultSolver", broken(panic))
-    with pytest.raises(SolverError, match="Clarabel: Eigval error"):
+    with pytest.raises(impc.SolverError, match="Clarabel: Eigval error"):
         solve_semidefinite(np.ones(1), [cone])
     monkeypatch.setattr("clarabel.DefaultSolver", broken(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 import scipy.optimize
@@ -13,11 +11,8 @@ import impc
 from experiments.two_link_standing import GAIN, standing_problem
 from impc.assess.printed_gain import gain_estimate
 
-if TYPE_CHECKING:
-    from impc.inverse.problem import Problem
 
-
-def least_misfit(problem: Problem, start: np.ndarray) -> float:
+def least_misfit(problem: impc.Problem, start: np.ndarray) -> float:
     """Least misfit of linear feedback, by another simulator and optimiser."""
     plant, trial = problem.plant, problem.recordings[0]
     drive, scale = np.array(trial.disturbance), np.array(problem.output_scale)
