@@ -62,6 +62,10 @@ class FitCurve:
         found = self._at(value)
         return _FAILED if found is None else self.of(found)
 
+    def rise(self, value: float) -> float:
+        """F at a value above the least F."""
+        return self.loss(value) - self.loss(self.best)
+
     def refine(self, accuracy: float, reach: float = 0.0) -> None:
         """Refine the minimum between the neighbours of the best value, or to `reach` beyond it."""
         values, best = self.finite, self.best
@@ -94,7 +98,7 @@ class FitCurve:
 
     def _end(self, rise: float, values: Sequence[float]) -> float:
         def excess(value: float) -> float:
-            return self.loss(value) - self.loss(self.best) - rise
+            return self.rise(value) - rise
 
         for inside, outside in itertools.pairwise(values):
             if np.isfinite(outside) and excess(outside) > 0:

@@ -87,20 +87,19 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
             "choose an input of the plant",
         )
     curve, near = _searched(fitted, control)
-    none, best = curve.at(np.inf).misfit ** 2, curve.at(curve.best)
+    curve.at(np.inf)  # raises if nothing can be simulated without a limit
+    best = curve.at(curve.best)
     top = max(_typical_peak(near, control), curve.best)
     unit = best.misfit**2 / near.problem.recorded_numbers * _colour_factor(best, control)
     quantile = float(scipy.special.chdtri(1, 1 - LEVEL))
 
-    def against() -> float:
-        return (none - curve.loss(curve.best)) / unit
-
     def sides(value: float) -> tuple[list[float], list[float]]:
-        above = _towards(value, 1.5 * top) if against() > quantile else [np.inf]
+        above = _towards(value, 1.5 * top) if curve.rise(np.inf) > quantile * unit else [np.inf]
         return _towards(value, 0.3 * value), above
 
     low, high = curve.ends(quantile * unit, sides, _RESOLUTION * curve.best)
-    value, determined = curve.best, against() > quantile
+    value, none = curve.best, curve.rise(np.inf) / unit
+    determined = none > quantile
     if determined:
         reason = f"a limit of {value:.3g} explains the recordings better than none"
     else:
@@ -113,11 +112,11 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
         low,
         high,
         LEVEL,
-        against(),
+        none,
         quantile,
         reason,
         frozen(curve.finite),
-        frozen([(curve.loss(limit) - curve.loss(value)) / unit for limit in curve.finite]),
+        frozen([curve.rise(limit) / unit for limit in curve.finite]),
     )
 
 

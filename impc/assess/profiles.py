@@ -75,11 +75,10 @@ def profile_likelihood(estimate: GainEstimate, name: str) -> Profile:
     low, high = curve.ends(
         rise, lambda at: ((at - steps).tolist(), (at + steps).tolist()), _MINIMUM * error, error
     )
-    least = curve.loss(curve.best)
     return Profile(
         Interval(name, "profile", LEVEL, number(curve.best), number(low), number(high)),
         frozen([number(offset) for offset in curve.finite]),
-        frozen([(curve.loss(offset) - least) / factor for offset in curve.finite]),
+        frozen([curve.rise(offset) / factor for offset in curve.finite]),
     )
 
 
