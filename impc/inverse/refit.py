@@ -7,8 +7,9 @@ jointly with S, initial states, errors of signals and parameters:
 
     K = K_start + sum over identified directions i of  w_i  direction_i     (whitened coordinates)
 
-All else has a prior about the last end. The rounds are repeated from there, with directions of the
-new gain, until -2 log L stays: at the end the prior has no effect.
+Other directions of the gain keep a prior of SD 1 at the start, and S one at the last end. Initial
+states, errors and free parameters have a weak one there: the rounds are repeated from it, with
+directions of the new gain, until -2 log L stays.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg
 
 from impc.arrays import Array
 from impc.checking import replace
@@ -34,9 +36,9 @@ if TYPE_CHECKING:
 #: Largest standard error, in whitened units, of an identified direction. Beyond it the prior of the
 #: search and the curvature of the problem matter.
 IDENTIFIED = 0.2
-# Prior SD of all that is not identified, in units of a search. With 1 a fit of the seat took ten
-# rounds, with 3 it takes three.
-_SPREAD = 3.0
+# Prior SD of free parameters, and 1 / SD of initial states and errors, about the last end: states
+# that hardly move in the trials have tiny units.
+_SPREAD, _OWN = 3.0, 0.0033
 # Largest numbers of rounds and of evaluations of each.
 _ROUNDS, _EVALUATIONS = 12, 100
 # Decrease of the objective in a round below which the prior no longer matters.
@@ -70,18 +72,31 @@ class _Key:
 def _refitted(key: _Key) -> Fitted:
     problem, m = key.problem, key.problem.plant.m
     gain, metric = np.frombuffer(key.gain).reshape(m, -1), np.frombuffer(key.metric).reshape(m, m)
-    space = Unknowns(problem, GainLaw(problem, gain, metric))
-    end = space.ended(space.start)
-    spent = 0
+    law = GainLaw(problem, gain, metric)
+    space = Unknowns(problem, law)
+    end, spent = space.ended(space.start), 0
     for _ in range(0 if explains(problem, end.misfit) else _ROUNDS):
-        rows, errors = space.deviations(space.start)
-        stop = stop_at(problem, 0.1 * PROMISE, _EVALUATIONS)
-        there = space.along_identified(space.start, stop, IDENTIFIED, _SPREAD, (rows, errors))
+        rows, errors = space.deviations(space.start, gain.size)
+        beside, parameters = len(law.start) - gain.size, len(problem.logarithms)
+        centre = space.centre
+        centre[space.controller] = law.at_gain(gain)
+        there = space.search(
+            space.start,
+            stop_at(problem, 0.1 * PROMISE, _EVALUATIONS),
+            shared=np.repeat(
+                [*(errors >= IDENTIFIED), 1.0, 1 / _SPREAD],
+                [*np.ones(gain.size, int), beside, parameters],
+            ),
+            own=_OWN,
+            along=scipy.linalg.block_diag(rows.T, np.eye(beside + parameters)),
+            centre=centre,
+        )
         spent += there.evaluations
         if not there.stabilises:  # no covariance there: keep the last gain
             break
         gained, end = end.objective - there.objective, there
         if gained < _STAYS:
             break
-        space = Unknowns(end.problem, GainLaw(end.problem, np.array(end.K), np.array(end.S)))
+        law = GainLaw(end.problem, np.array(end.K), np.array(end.S))
+        space = Unknowns(end.problem, law)
     return replace(end, evaluations=spent)

@@ -42,9 +42,6 @@ if TYPE_CHECKING:
     from impc.inverse.residuals import Linear
 
 _START_FLOOR = 1e-8
-# 1 / SD of the trials' unknowns relative to that of the controller: states that hardly move in the
-# trials have tiny units.
-_OWN = 0.01
 # Relative size below which columns are rounding.
 _EXPLAINED = 1e-12
 
@@ -317,8 +314,9 @@ class Unknowns:
         shared: Array | float = 0.0,
         own: float = 0.0,
         along: Array | None = None,
+        centre: Array | None = None,
     ) -> Fitted:
-        """Minimise from z (q,) with a normal prior about the start, `shared` and `own` 1 / SD.
+        """Minimise from z (q,) with a normal prior about the centre, `shared` and `own` 1 / SD.
 
         `along` (shared, k): combinations of controller and parameters that are searched; stated
         parameters are columns of their own, and have their prior.
@@ -327,34 +325,24 @@ class Unknowns:
         weights = np.array(np.broadcast_to(shared, model.columns.shape[1]), dtype=np.float64)
         parameters = model.columns[len(model.columns) - len(self.stated) :]
         weights[np.any(parameters[self.stated] != 0, axis=0)] = 1.0
-        prior = Prior(*model.apart(self.centre), weights, own)
+        prior = Prior(*model.apart(self.centre if centre is None else centre), weights, own)
         end = minimise(model, prior, model.begin, stop)
         z = model.placed(end.u, end.v)
         return self.ended(z, end.evaluations, end.ended, end.promised)
 
-    def deviations(self, z: Array) -> tuple[Array, Array]:
-        """Directions of the controller (rows) and their standard errors, all else fitted (a,)."""
-        noise = self.misfit(z) / np.sqrt(self.problem.recorded_numbers)
-        _, values, rows = np.linalg.svd(self.without_nuisance(z), full_matrices=False)
-        return rows, noise / np.maximum(values, 1e-300)
+    def deviations(self, z: Array, count: int | None = None) -> tuple[Array, Array]:
+        """Directions of the first `count` unknowns (rows), and their standard errors (a,).
 
-    def along_identified(
-        self, z: Array, stop: Stop, limit: float, spread: float, rows: tuple[Array, Array] | None
-    ) -> Fitted:
-        """Minimise from z (q,): directions with a standard error below `limit` are free.
-
-        The others have a prior of SD `spread` about the start. `rows`: directions of the controller
-        and their standard errors, by default `deviations`.
+        All other unknowns are fitted too; by default those of the controller.
         """
-        directions, errors = rows or self.deviations(z)
-        beside = len(self.stated)
-        return self.search(
-            z,
-            stop,
-            shared=np.concatenate([(errors >= limit) / spread, np.full(beside, 1 / spread)]),
-            own=_OWN / spread,
-            along=scipy.linalg.block_diag(directions.T, np.eye(beside)),
-        )
+        seen = self.without_nuisance(z)
+        if count is not None and count < seen.shape[1]:
+            rest, values, _ = np.linalg.svd(seen[:, count:], full_matrices=False)
+            rest = rest[:, values > _EXPLAINED * np.max(values)]
+            seen = seen[:, :count] - rest @ (rest.T @ seen[:, :count])
+        noise = self.misfit(z) / np.sqrt(self.problem.recorded_numbers)
+        _, values, rows = np.linalg.svd(seen, full_matrices=False)
+        return rows, noise / np.maximum(values, 1e-300)
 
     def ended(
         self, z: Array, evaluations: int = 0, ended: Ended = Ended.STOPPED, promised: float = np.inf

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
 
-_STEP, _FORWARD = 1e-3, 1e-6
+_STEP, _FORWARD = 1e-3, 1e-7
 #: Uncertainties that are not parameters of `make`.
 DELAY, LIMIT = "extra_delay", "u_max"
 # Scale of the logarithm of a free parameter.

@@ -52,7 +52,7 @@ def distorted(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array
 
 
 def undistorted(signal: Array, errors: Array) -> Array:
-    """Recorded outputs (samples, c) without their `errors` (kinds, c); NaN outside the recording."""
+    """Outputs (samples, c) without their `errors` (kinds, c); NaN where not recorded."""
     time = np.arange(len(signal))
     found = (signal - errors[OFFSET] - errors[DRIFT] * time[:, None]) / (1 + errors[SCALE])
     for column, error in enumerate(errors.T):
