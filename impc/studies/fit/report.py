@@ -228,6 +228,7 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
             *aim_sentences(result),
             Quiet(f"{_HIDDEN} The numbers below are for troubleshooting only."),
             Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
+            *findings.error_findings(result),
         ]
     settled = [_lasting(result, one) for one in lasting_responses(result.estimate)]
     lasting = (
