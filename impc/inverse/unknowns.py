@@ -165,7 +165,6 @@ class Unknowns:
         self.controller, self.trial = slice(0, first), slice(first, last)
         self.parameters = slice(last, last + len(problem.logarithms))
         self.start = np.concatenate([law.start, np.zeros(self.parameters.stop - first)])
-        self.refused: list[str] = []
         self.last: tuple[bytes, Linear, Compressed] | None = None
         self.near: TerminalSet | None = None
 
@@ -225,12 +224,9 @@ class Unknowns:
         problem, part = self.problem_at(z), z[self.controller]
         try:
             controller = self.law.controller(problem, part, None, self.correction)
-        except ImpcError as error:
-            self.refused.append(str(error))
+        except ImpcError:
             return None
         residual, reason = controlled_residual(problem, controller, self.correction)
-        if reason:
-            self.refused.append(reason)
         return None if reason else residual
 
     def evaluated(self, z: Array) -> tuple[Linear, Compressed]:
@@ -247,8 +243,6 @@ class Unknowns:
                 shared = len(part) + len(problem.logarithms)
                 found = unusable(problem, shared, str(error))
             self.near = found.terminal or self.near
-            if found.reason:
-                self.refused.append(found.reason)
             self.last = key, found, self._compressed(found)
         return self.last[1:]
 
