@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,9 +24,8 @@ if TYPE_CHECKING:
 
 Part = TypeVar("Part")
 
-# Names of stages that decide which problem an estimate belongs to.
+# Name of the stage whose body the other stages have.
 _WHOLE = "inverse_mpc"
-_LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class FitMemory(Steps):
                 posed = posed.at(np.array(posed.starts), found, np.array(posed.errors))
             if len(kept["logarithms"]) < len(posed.logarithms):
                 posed = posed.with_body_fixed()
-            return decode_estimate(_seen(posed, name, METHODS[kept["method"]]), kept)
+            return decode_estimate(_seen(posed, METHODS[kept["method"]]), kept)
 
         return self.get(name, compute, decode, encode_estimate)
 
@@ -81,12 +79,8 @@ def open_memory(
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 
 
-def _seen(problem: Problem, stage: str, method: Method) -> Problem:
-    """The problem that the method of a stage solves."""
-    left_out = _LEFT_OUT.match(stage)
-    posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
-    return (
-        posed
-        if method.name in ("inverse_mpc", "structured")
-        else method.restrict(posed.with_nuisance_fixed())
-    )
+def _seen(problem: Problem, method: Method) -> Problem:
+    """The problem that a method solves."""
+    if method.name in ("inverse_mpc", "structured"):
+        return problem
+    return method.restrict(problem.with_nuisance_fixed())
