@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 
 Part = TypeVar("Part")
 
-# Name of the stage whose body the other stages have.
+# Names of stages that decide which problem an estimate belongs to.
 _WHOLE = "inverse_mpc"
+_LEFT_OUT = re.compile(r"without (\d+)")
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class FitMemory(Steps):
                 posed = posed.at(np.array(posed.starts), found, np.array(posed.errors))
             if len(kept["logarithms"]) < len(posed.logarithms):
                 posed = posed.with_body_fixed()
-            return decode_estimate(_seen(posed, METHODS[kept["method"]]), kept)
+            return decode_estimate(_seen(posed, name, METHODS[kept["method"]]), kept)
 
         return self.get(name, compute, decode, encode_estimate)
 
@@ -79,8 +81,10 @@ def open_memory(
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 
 
-def _seen(problem: Problem, method: Method) -> Problem:
-    """The problem that a method solves."""
+def _seen(problem: Problem, stage: str, method: Method) -> Problem:
+    """The problem that the method of a stage solves."""
+    left_out = _LEFT_OUT.match(stage)
+    posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
     if method.name in ("inverse_mpc", "structured"):
-        return problem
-    return method.restrict(problem.with_nuisance_fixed())
+        return posed
+    return method.restrict(posed.with_nuisance_fixed())
