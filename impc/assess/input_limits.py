@@ -30,9 +30,9 @@ from impc.errors import InputError
 from impc.inverse.laws import GainLaw
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import simulated
-from impc.inverse.residuals import along_bounds, evaluate
+from impc.inverse.residuals import along_bounds
 from impc.inverse.search import refine_gain
-from impc.inverse.unknowns import Unknowns
+from impc.inverse.unknowns import Unknowns, linear_at
 from impc.model.bounds import Bounds, bound_rows
 
 if TYPE_CHECKING:
@@ -178,9 +178,9 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
 def _colour_factor(fit: Fitted, control: int) -> float:
     """Variance of the limit for autocorrelated residuals, relative to white ones."""
     problem, K, S = fit.problem, np.array(fit.K), np.array(fit.S)
-    found = evaluate(problem, K, S)
-    others = found.dK.reshape(len(found.residual), -1)
-    basis, _ = np.linalg.qr(others)
+    law = GainLaw(problem, K, S)
+    found = linear_at(problem, law, law.start)
+    basis, _ = np.linalg.qr(found.parts(problem)[0][:, : K.size])
     column = on_limit(problem, K, S, float(problem.bounds.u_max[control]), control)
     column = column - basis @ (basis.T @ column)
     residuals, columns = by_trial(problem, found.residual), by_trial(problem, column[:, None])

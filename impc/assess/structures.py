@@ -211,11 +211,9 @@ class StructureTest(Frozen):
 
 def structure_test(at: Tangent) -> StructureTest:
     """Score test of a structure at its fit against an unrestricted gain."""
-    on_gain, on_metric = at.gain_columns()
     fitted = at.span(np.array(at.on_cost_weights[:, at.moving]))
-    beyond = fitted.without(np.hstack([on_gain, on_metric, at.found.dparameters]))
-    gain = beyond[:, : on_gain.shape[1]]
-    left, sizes, _ = np.linalg.svd(gain, full_matrices=False)
+    beyond = fitted.without(np.array(at.on_law[:, : at.solution.K.size]))
+    left, sizes, _ = np.linalg.svd(beyond, full_matrices=False)
     identified = sizes > at.noise / IDENTIFIED
     U = left[:, identified]
     exact = EXPLAINED * recorded_size(at.problem)

@@ -67,31 +67,24 @@ class Linear:
         """Residual of all trials (r,)."""
         return np.concatenate(self.residuals)
 
+    def parts(self, problem: Problem) -> tuple[Array, Array, Array]:
+        """Derivatives (r, k) by the controller, the parameters, and the unknowns of the trial."""
+        table = np.concatenate(self.tables) if len(self.tables) > 1 else self.tables[0]
+        first = self.shared - len(problem.logarithms)
+        return table[:, :first], table[:, first : self.shared], table[:, self.shared :]
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Residual and derivatives at one gain and metric, by their entries."""
+    def with_prior(self, problem: Problem, noise: float) -> Linear:
+        """With one row per parameter with a stated uncertainty, scaled by the noise SD `noise`.
 
-    residual: Array  # (r,), simulated minus recorded outputs, each divided by its scale
-    dK: Array  # (r, m, n)
-    dS: Array  # (r, m, m), with respect to the metric scaled as in `Controller`
-    # (r, own), with respect to the unknowns of the trial to which the row belongs
-    own: Array
-    # (r, k), with respect to the logarithms of the physical parameters; k may be 0
-    dparameters: Array
-    reason: str  # Why a simulation stopped; empty if all trials are complete
-    active: int  # Samples with an active bound
-    weakly_active: int  # Samples at which the derivative is one-sided
-    terminal: TerminalSet | None  # Terminal set, reused as a starting point by the next evaluation
-
-    def along_gain(self, T: Array, G: Array) -> Array:
-        """Derivative (r, mn) with respect to G^-1 K T (whitened coordinates T (n, n), G (m, m))."""
-        return np.asarray(self.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T))
-
-    def along_metric(self, metric: Array, changes: Array) -> Array:
-        """Derivative (r, k) along `changes` (k, m, m) of the unscaled `metric` (m, m)."""
-        scaled = scaled_changes(metric, changes).reshape(len(changes), metric.size)
-        return np.asarray(self.dS.reshape(len(self.residual), -1) @ scaled.T)
+        A parameter q away from its nominal value counts as a residual of q / SD noise SDs.
+        """
+        slopes = noise * np.diag(1 / problem.parameter_units)[problem.stated]
+        if len(slopes) == 0:
+            return self
+        below = np.zeros((len(slopes), self.tables[0].shape[1]))
+        below[:, self.shared - len(problem.logarithms) : self.shared] = slopes
+        residuals = (*self.residuals, slopes @ problem.logarithms)
+        return replace(self, residuals=residuals, tables=(*self.tables, below))
 
 
 def linearise(
@@ -142,49 +135,6 @@ def linearise(
     )
 
 
-def evaluate(
-    problem: Problem,
-    gain: Array,
-    metric: Array,
-    near: TerminalSet | None = None,
-    correction: Correction | None = None,
-) -> Evaluation:
-    """Residual and derivatives by all entries of a `gain` (m, n) and a `metric` (m, m).
-
-    A gain that does not stabilise the plant, or a loop that diverges, gives a large finite residual
-    and a reason, so that a search can reject the step. `near` as in `controller_for`, `correction`
-    as in `linearise`.
-    """
-    m, n = gain.shape
-    entries, pairs = m * n, m * (m + 1) // 2 if m > 1 else 0
-    shared = entries + pairs + len(problem.logarithms)
-    try:
-        law = {"K": np.eye(entries, shared).reshape(m, n, shared), "S": np.zeros((m, m, shared))}
-        rows, columns = np.tril_indices(m)
-        if pairs:
-            places = np.arange(entries, entries + pairs)
-            law["S"][rows, columns, places] = law["S"][columns, rows, places] = 1.0
-        controller = stable_controller(problem, gain, metric, near, correction)
-        found = linearise(problem, controller, law, correction)
-    except ImpcError as error:
-        if problem.terminal_weight is not None:
-            raise
-        found = unusable(problem, shared, str(error))
-    table = np.concatenate(found.tables) if len(found.tables) > 1 else found.tables[0]
-    parts = np.split(table, [entries, entries + pairs, shared], axis=1)
-    return Evaluation(
-        found.residual,
-        parts[0].reshape(-1, m, n),
-        _symmetric(parts[1], m),
-        parts[3],
-        parts[2],
-        found.reason,
-        found.active,
-        found.weakly_active,
-        found.terminal,
-    )
-
-
 def stable_controller(
     problem: Problem,
     gain: Array,
@@ -205,24 +155,8 @@ def stable_controller(
     return controller_for(problem, gain, metric, near)
 
 
-def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evaluation:
-    """Append one row per parameter with a stated uncertainty, scaled by the noise SD `noise`.
-
-    A parameter q away from its nominal value counts as a residual of q / SD noise SDs.
-    """
-    k = int(np.count_nonzero(problem.stated))
-    if k == 0:
-        return found
-    slopes = noise * np.diag(1 / problem.parameter_units)[problem.stated]
-    below = {"residual": slopes @ problem.logarithms, "dparameters": slopes}
-    for name in ("dK", "dS", "own"):
-        below[name] = np.zeros((k, *getattr(found, name).shape[1:]))
-    parts = {name: np.concatenate([getattr(found, name), part]) for name, part in below.items()}
-    return replace(found, **parts)
-
-
 def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
-    """2-norm of the residual and "", or infinity and the reason; faster than `evaluate`."""
+    """2-norm of the residual and "", or infinity and the reason; faster than `linearise`."""
     residual, reason = residual_or_reason(problem, gain, metric)
     return np.inf if reason else float(np.linalg.norm(residual)), reason
 
@@ -393,17 +327,6 @@ def along_bounds(problem: Problem, gain: Array, metric: Array, moves: Array) -> 
         _, moved = run_loop(prepared, drive, seen=problem.scaled_outputs)
         parts.append(np.concatenate(measured_slope(problem, trial, moved)))
     return np.concatenate(parts)
-
-
-def _symmetric(columns: Array, m: int) -> Array:
-    """Derivatives along symmetric directions, expanded to (r, m, m)."""
-    dS = np.zeros((len(columns), m, m))
-    if m > 1:
-        # An off-diagonal direction moves two entries: each gets half of the derivative.
-        rows, places = np.tril_indices(m)
-        dS[:, rows, places] = columns * np.where(rows == places, 1.0, 0.5)
-        dS[:, places, rows] = dS[:, rows, places]
-    return dS
 
 
 def _scale(problem: Problem, trial: Recording) -> float:

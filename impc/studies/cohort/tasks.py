@@ -18,7 +18,7 @@ import psutil
 
 from impc.arrays import frozen
 from impc.assess.assessments import assessed, evaluate_method
-from impc.assess.intent_statements import intent
+from impc.assess.intent import intent
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import bootstrap_model, replicate

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.assess.intent_statements import Statement
     from impc.assess.printed_gain import Interval
+    from impc.assess.weights_ranges import Statement
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult
 

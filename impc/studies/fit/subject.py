@@ -22,8 +22,8 @@ from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
 from impc.assess.frequency_response import frequency_response
 from impc.assess.input_limits import LimitCurve, limit_curve
+from impc.assess.intent import intent
 from impc.assess.intent_draws import drawn_gains
-from impc.assess.intent_statements import intent
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure

@@ -13,7 +13,7 @@ import pytest
 from experiments.benchmarks.workloads import seat
 from experiments.simulated_subjects import noisy_recordings
 from experiments.uncertain_body import cart_person
-from impc.assess.intent_statements import dominant_sentence, intent
+from impc.assess.intent import dominant_sentence, intent
 from impc.assess.variance_accounted_for import predicted, vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
