@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.checking import checked, replace
+from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Status
@@ -351,7 +351,6 @@ def scaled_changes(metric: Array, changes: Array) -> Array:
     return np.asarray(len(metric) / trace * (changes - shares * metric))
 
 
-@checked
 def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set."""
     controller = weights_controller(problem, weights, hard=True)
