@@ -27,6 +27,7 @@ FILES = (
     "tests/studies/selection/test_methods.py",
     "tests/assess/test_variance_accounted_for.py",
     "tests/control/test_closed_loop.py",
+    "tests/inverse/test_derivatives.py",
     "tests/inverse/test_equivalent_weights.py",
     "tests/control/test_exact_mpc.py",
     "tests/inverse/test_noisy_fit.py",

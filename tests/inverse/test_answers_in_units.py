@@ -8,7 +8,6 @@ import pytest
 
 import impc
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.search import fit_gain
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.model.plant import change_coordinates
 from tests.support import example_problem, random_problem
@@ -29,42 +28,29 @@ def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
             assert found[line].evaluations < 1.5 * plain[line].evaluations + 3
 
 
-def in_units(problem: impc.Problem, states: np.ndarray, inputs: np.ndarray) -> impc.Problem:
-    """x = diag(states) z, u = diag(inputs) v."""
-    T, G = np.diag(states), np.diag(inputs)
-    moved, (trial,) = change_coordinates(problem.plant, T, G), problem.recordings
-    names = [f"u{i}" for i in range(moved.m)]
+@pytest.mark.parametrize(
+    ("states", "inputs"),
+    [*((one, one) for one in UNITS), (np.array([1e-3, 1.0, 1e3, 10.0]), np.array([100.0, 0.01]))],
+)
+def test_two_inputs_do_not_depend_on_units(states: np.ndarray, inputs: np.ndarray) -> None:
+    """With x = diag(states) z and u = diag(inputs) v the gain becomes G^-1 K T."""
+    controller, problem = random_problem(2, 2)
+    T, G, (trial,) = np.eye(4) * states, np.eye(2) * inputs, problem.recordings
+    moved = change_coordinates(problem.plant, T, G)
     B = np.hstack([moved.B, moved.E])
-    system = control.ss(moved.A, B, np.eye(moved.n), 0, True, inputs=[*names, "d0"])
-    plant = impc.Plant(system, names)
-    z = np.linalg.solve(problem.plant.C @ T, trial.outputs.T).T
-    again = impc.Recording(plant, z, trial.disturbance)
-    bounds = impc.Bounds(plant, u_min=-1 / inputs, u_max=1 / inputs)
-    return impc.Problem(plant, bounds, problem.horizon, (again,), terminal_set=False)
-
-
-@pytest.mark.parametrize("scale", UNITS)
-def test_two_inputs_do_not_depend_on_a_common_unit(scale: float) -> None:
-    controller, problem = random_problem(2, 2)
-    plant, (trial,) = problem.plant, problem.recordings
-    bounds = impc.Bounds(plant, u_min=-scale, u_max=scale)
-    scaled = impc.Recording(plant, scale * trial.outputs, scale * trial.disturbance)
-    other = impc.Problem(plant, bounds, 5, (scaled,), terminal_set=False)
-    found = inverse_mpc_reduced(other)
+    plant = impc.Plant(control.ss(moved.A, B, np.eye(4), 0, True, inputs=["u0", "u1", "d0"]),
+                       ["u0", "u1"])  # fmt: skip
+    again = impc.Recording(plant, trial.outputs @ np.linalg.inv(T), trial.disturbance)
+    limit = 1 / np.diag(G)
+    bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
+    other = impc.Problem(plant, bounds, problem.horizon, (again,), terminal_set=False)
+    found, expected = inverse_mpc_reduced(other), np.linalg.solve(G, controller.K @ T)
     assert found.explained
-    np.testing.assert_allclose(found.gain, controller.K, rtol=1e-9, atol=1e-10)
-    assert found.evaluations < 2 * inverse_mpc_reduced(problem).evaluations
-    np.testing.assert_allclose(fit_controller(other).gain, controller.K, rtol=1e-8, atol=1e-9)
-
-
-def test_states_and_inputs_in_units_of_their_own() -> None:
-    """States and inputs in different units: the gain becomes G^-1 K T."""
-    controller, problem = random_problem(2, 2)
-    states, inputs = np.array([1e-3, 1.0, 1e3, 10.0]), np.array([100.0, 0.01])
-    found = fit_gain(in_units(problem, states, inputs))
-    assert found.explained
-    expected = controller.K * states / inputs[:, None]
-    np.testing.assert_allclose(found.K / expected, np.ones_like(expected), rtol=1e-9)
+    np.testing.assert_allclose(found.gain / expected, np.ones((2, 4)), rtol=1e-9)
+    allowed = inverse_mpc_reduced(problem).evaluations * (1 if np.isscalar(states) else 2)
+    assert found.evaluations <= allowed
+    fitted = fit_controller(other).gain
+    np.testing.assert_allclose(fitted / expected, np.ones((2, 4)), rtol=1e-8)
 
 
 def test_output_scale_is_the_size_of_each_output() -> None:

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 import impc
-from experiments.search_problems import Known, random_problem, stick, stick_problem
+from experiments.search_problems import Known, random_problem, stick_problem
 from experiments.search_study import is_right, warned
-from impc.control.closed_loop import simulate
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.residuals import residual_only
 from impc.inverse.search import refine_gain
 from impc.inverse.table31 import inverse_mpc_reduced
 from tests.support import differences, example_plant, plant_of, posed, regulator
+from tests.support import random_problem as saturated_problem
 
 SLOW = pytest.mark.slow
 HELD = plant_of([[1.1, 0.2], [0, 0.9]], [[0], [1]])
@@ -61,40 +62,31 @@ def test_known_problems(kind: str, wanted: int, wrong: int, silent: int) -> None
     assert sum(not warned(found) for found in missed) <= silent
 
 
-def test_a_noisy_stick_ends_at_its_gain() -> None:
-    """50 samples per second: the noisy angle in degrees, and pushes."""
-    system, rng = stick(), np.random.default_rng(1)
-    push = np.repeat(rng.choice([-1.5, 0.0, 1.5], 60), 10)
-    x, angle = np.zeros(2), []
-    for d in push:
-        finger = np.clip(25 * x[0] + 7 * x[1], -1.2, 1.2)
-        angle.append(np.degrees(x[0]) + 0.02 * rng.standard_normal())
-        x = system.A @ x + system.B @ [finger, d]
-    plant = impc.Plant(system, ["finger"])
-    trial = impc.Recording(plant, np.radians(angle), push)
-    settings = impc.FitSettings(horizon=15, u_max=1.2)
-    found = impc.fit(impc.fit_problem(plant, [trial], settings))
-    assert np.allclose(found.gain, [[-25, -7]], rtol=2e-3)
-    assert found.converged
-    assert found.fit.white
-    residual = found.misfit**2 / len(angle)
-    assert residual == pytest.approx(np.radians(0.02) ** 2 / np.var(trial.outputs), rel=0.1)
-
-
-def test_a_stick_that_falls_with_any_other_gain_has_its_weights() -> None:
-    """No starting regulator, nor weights near one, can be simulated."""
+def test_a_stick_that_falls_with_any_other_gain_ends_at_its_gain() -> None:
+    """50 samples a second, error 0.02 degrees; no other regulator can be simulated."""
     known = stick_problem(418)
     assert known is not None
-    found = fit_controller(known.problem)
+    found, (trial,) = fit_controller(known.problem), known.problem.recordings
     assert is_right(known, found)
     for one in (found, inverse_mpc_reduced(known.problem)):
         assert np.allclose(one.gain, known.K, rtol=2e-3)
+    assert found.converged
+    assert found.fit.white
+    residual = found.misfit**2 / trial.samples
+    assert residual == pytest.approx(np.radians(0.02) ** 2 / np.mean(trial.outputs**2), rel=0.1)
+
+
+def test_weights_are_those_of_the_gain_that_fits_best() -> None:
+    """Noisy controller: a search from the truth finds no smaller misfit."""
+    known = next(first_of("stick", 1))
+    best = refine_gain(known.problem, known.K, known.S)
+    assert fit_controller(known.problem).noise <= best.misfit * (1 + 1e-4)
 
 
 def test_a_command_always_at_its_bound_identifies_nothing() -> None:
     """Any larger gain gives the same recording."""
     law = regulator(HELD, np.eye(2), 0.1, 4)
-    run = simulate(law, impc.scenario(HELD, [5.0, 5.0], 10))
+    run = law.simulate([5.0, 5.0], 10)
     assert np.all(np.abs(np.abs(run.u) - 0.1) < 1e-9)
     found = impc.fit(posed(law, impc.Recording(HELD, run.x), unknown_start=False))
     assert found.explained
@@ -103,23 +95,58 @@ def test_a_command_always_at_its_bound_identifies_nothing() -> None:
     assert any("identify 0 of the 2 directions" in doubt for doubt in found.doubts)
 
 
+def started(problem: impc.Problem, start: impc.Weights) -> tuple[float, float]:
+    """Misfit of a start, and of the estimate from it."""
+    solution = impc.solve_lqr(problem.plant, start)
+    begun = float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
+    return begun, impc.fit(problem, start=start).misfit
+
+
+@pytest.mark.parametrize(("limit", "rank"), [(50.0, 0), (0.25, 2)])
+def test_directions_of_the_metric_are_counted_and_said(limit: float, rank: int) -> None:
+    """Exact trials from eight states; the limit decides how often inputs are saturated."""
+    rng = np.random.default_rng(3)
+    plant = plant_of(rng.normal(size=(3, 3)) / 2, rng.normal(size=(3, 2)))
+    weights = impc.Weights(np.eye(3), [[1.0, 0.3], [0.3, 2.0]])
+    law = regulator(plant, weights.Q, limit, 5, weights.R)
+    starts = np.random.default_rng(1).normal(size=(8, 3))
+    trials = [impc.Recording(plant, law.simulate(x0, 15).x) for x0 in starts]
+    problem = posed(law, *trials, terminal_set=False)
+    found = impc.fit(problem)
+    assert found.explained
+    assert found.fit.metric_rank == rank
+    said = f"identify {rank} of the 2 directions of the metric S"
+    assert (said in found.summary()) == (rank < 2)
+    # Independent: whether another metric with this gain gives another movement.
+    other = np.array(found.metric) + np.diag([0.0, np.trace(found.metric) / 4])
+    moved = residual_only(found.problem, np.array(found.gain), other)
+    assert (np.linalg.norm(moved) > 1e-6) == (rank > 0)
+    free = impc.fit(problem, "feedback_gain", start=found)
+    assert not any("metric" in text for text in free.doubts)  # without bounds
+    begun, ended = started(problem, weights)
+    assert ended <= begun + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_estimate_is_worse_than_the_start_that_was_given(seed: int) -> None:
+    _, problem = saturated_problem(seed, 2)
+    begun, ended = started(problem, impc.Weights(np.eye(problem.plant.n), np.eye(2)))
+    assert ended <= begun * (1 + 1e-9)
+
+
 @pytest.mark.full
 def test_the_rank_is_that_of_the_derivative() -> None:
     """One trial with two inputs and 12 outputs, against singular values of finite differences."""
     known = next(first_of("half, short", 1))
     found = fit_controller(known.problem)
     problem, K = found.problem, np.array(found.gain)
-    plant, x0 = problem.plant, np.array(problem.recordings[0].x0)
+    start = np.array(problem.recordings[0].x0)
 
-    def outputs(unknowns: np.ndarray) -> np.ndarray:
-        gain, start = unknowns[: K.size].reshape(K.shape), unknowns[K.size :]
-        law = impc.Controller.from_gain(
-            plant, gain, problem.bounds, problem.horizon, metric=found.metric, terminal_set=False
-        )
-        drive = impc.scenario(plant, start, len(problem.recordings[0].outputs) - 1)
-        return np.asarray(simulate(law, drive).x @ plant.C.T)
+    def residual(unknowns: np.ndarray) -> np.ndarray:
+        gain, x0 = np.split(unknowns, [K.size])
+        return residual_only(problem.at(x0[None], np.zeros(0)), gain.reshape(K.shape), found.metric)
 
-    on_gain, on_start = np.split(differences(outputs, [*K.ravel(), *x0]), [K.size], axis=1)
+    on_gain, on_start = np.split(differences(residual, [*K.ravel(), *start]), [K.size], axis=1)
     left = on_gain - on_start @ np.linalg.lstsq(on_start, on_gain)[0]
     values = np.linalg.svd(left, compute_uv=False)
     assert found.fit.rank <= np.count_nonzero(values > 1e-7 * values[0])
@@ -138,8 +165,7 @@ def test_a_start_that_is_not_the_first_sample_is_searched() -> None:
     found = impc.fit(problem)
     assert np.allclose(found.problem.recordings[0].x0, [1.5, 0.5], atol=0.05)
     assert np.allclose(found.gain, law.K, rtol=0.1)
-    exact = impc.Problem(HELD, impc.Bounds(HELD, u_min=-1, u_max=1), 4, [impc.Recording(HELD, x)])
-    assert not exact.unknown_start
+    assert not posed(regulator(HELD, np.eye(2), 1, 4), impc.Recording(HELD, x)).unknown_start
 
 
 @pytest.mark.parametrize(("x0", "horizon"), [((-1.9, -2.6), 2), ((0.6, 1.4), 1)])
@@ -161,11 +187,3 @@ def test_an_infeasible_terminal_set_is_named() -> None:
     law = regulator(example_plant(), np.eye(2), 1, 2, terminal_set=True)
     with pytest.warns(match="terminal set.*terminal_set=False"):
         law.simulate([3.0, 3.0], 3)
-
-
-def test_weights_are_those_of_the_gain_that_fits_best() -> None:
-    """Noisy optimal controller: a search from the truth finds no smaller misfit."""
-    known = next(first_of("stick", 1))
-    found = fit_controller(known.problem)
-    best = refine_gain(known.problem, known.K, known.S)
-    assert found.noise <= best.misfit * (1 + 1e-4)

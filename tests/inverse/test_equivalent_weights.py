@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import control
 import numpy as np
 import pytest
@@ -11,21 +13,16 @@ from hypothesis import strategies as st
 import impc
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
-from impc.inverse.equivalent_weights import (
-    SLACK,
-    EquivalentWeights,
-    analytic_centre,
-    inverse_factor,
-    weights_margin,
-)
-from impc.inverse.solution_set import GainFibre, split_blocks
+from impc.inverse.equivalent_weights import SLACK, analytic_centre, inverse_factor, weights_margin
+from impc.inverse.solution_set import GainFibre
 from impc.model.weights import condition_number
-from tests.support import draws, example_plant, plant_of
+from tests.support import draws, example_plant, plant_of, random_weights
 
 INTEGRATOR = plant_of([[1, 1], [0, 1]], [[0.5], [1]])
 GAIN = [[1.351294, -0.836590]]  # of the example
+NO_WEIGHTS_GAIN = [[1.21183, -0.71277]]
 
-# Priess et al. 2015, the feasible example (T1), continuous.
+# Priess et al. 2015, the feasible example (T1), continuous: plant, gain, and weights.
 PRIESS = plant_of(
     [[0, 1, 7, 9], [4, -8, -5, -3], [8, -7, 7, -6], [10, -5, -5, -5]],
     [[2, 2, 5, -9], [-1, 1, 5, -9], [-3, 9, -3, 1], [7, -4, 1, 6]],
@@ -35,13 +32,20 @@ PRIESS_GAIN = [
     [2.376, -1.328, 1.188, 1.847], [4.294, -0.8621, 3.77, 1.509],
     [-2.279, 1.366, -2.067, -1.323], [-2.7, -0.06092, -2.036, -0.7217],
 ]  # fmt: skip
+PRIESS_Q = [
+    [13.6214, -1.173, 4.0657, 2.7301], [-1.173, 7.3251, 3.4964, -2.4546],
+    [4.0657, 3.4964, 4.9217, 0.1421], [2.7301, -2.4546, 0.1421, 4.4088],
+]  # fmt: skip
+PRIESS_R = [
+    [10.5486, 0.3483, 6.5105, -1.7114], [0.3483, 4.3186, 1.8088, 3.5052],
+    [6.5105, 1.8088, 6.9223, -0.4818], [-1.7114, 3.5052, -0.4818, 6.5442],
+]  # fmt: skip
 
 
 def random_case(seed: int, n: int, m: int, dt: float) -> tuple[impc.Plant, impc.Weights]:
     rng = np.random.default_rng(seed)
     plant = plant_of(rng.normal(size=(n, n)), rng.normal(size=(n, m)), dt=dt)
-    q, r = rng.normal(size=(n, n)), rng.normal(size=(m, m))
-    return plant, impc.Weights(q @ q.T + 0.1 * np.eye(n), r @ r.T + 0.1 * np.eye(m))
+    return plant, impc.Weights(random_weights(rng, n), random_weights(rng, m))
 
 
 def fibre_of(plant: impc.Plant, weights: impc.Weights) -> GainFibre:
@@ -55,44 +59,33 @@ def rescaled(plant: impc.Plant, states: Array) -> impc.Plant:
     return impc.Plant(control.ss(A, B, C, 0, plant.dt, inputs=plant.m))
 
 
-def test_published_example_has_the_least_condition_number_of_the_reference() -> None:
-    found = impc.least_condition_weights(impc.gain_fibre(PRIESS, PRIESS_GAIN))
-    assert found.least is not None
-    assert found.least == pytest.approx(15.84287, abs=5e-6)
-    assert found.least <= found.condition <= found.least * (1 + 2 * SLACK)
-    assert found.gain_error < 1e-11
-    assert found.gap is not None
-    assert found.gap < 1e-8
-    scaled = found.weights.block / np.linalg.eigvalsh(found.weights.block)[0]
-    Q = [
-        [13.6214, -1.173, 4.0657, 2.7301], [-1.173, 7.3251, 3.4964, -2.4546],
-        [4.0657, 3.4964, 4.9217, 0.1421], [2.7301, -2.4546, 0.1421, 4.4088],
-    ]  # fmt: skip
-    R = [
-        [10.5486, 0.3483, 6.5105, -1.7114], [0.3483, 4.3186, 1.8088, 3.5052],
-        [6.5105, 1.8088, 6.9223, -0.4818], [-1.7114, 3.5052, -0.4818, 6.5442],
-    ]  # fmt: skip
-    # The reference is within 1e-5 of the least condition; here the least norm within 1e-5.
-    np.testing.assert_allclose(scaled[:4, :4], Q, atol=15 * np.sqrt(SLACK))
-    np.testing.assert_allclose(scaled[4:, 4:], R, atol=15 * np.sqrt(SLACK))
-
-
 @pytest.mark.parametrize(
-    ("plant", "gain", "condition", "Q"),
+    ("plant", "gain", "condition", "within", "Q", "R"),
     [
-        (INTEGRATOR, [[0.434483, 1.028466]], 1.0, [[1, 0], [0, 1]]),
-        (INTEGRATOR, [[0.692029, 1.226288]], 4.0, [[4, 0], [0, 1]]),
-        (example_plant(), GAIN, 3.2588, np.divide(
-            [[1.32597, 0.39116], [0.39116, 1.46938]], 3.25881)),
+        (INTEGRATOR, [[0.434483, 1.028466]], 1.0, 7e-5, np.eye(2), 1.0),
+        (INTEGRATOR, [[0.692029, 1.226288]], 4.0, 7e-5, np.diag([4.0, 1.0]), 1.0),
+        (example_plant(), GAIN, 3.25881, 5e-6, [[1.32597, 0.39116], [0.39116, 1.46938]], 3.25881),
+        (PRIESS, PRIESS_GAIN, 15.84287, 5e-6, PRIESS_Q, PRIESS_R),
     ],
-)  # fmt: skip
-def test_least_condition_of_the_examples(
-    plant: impc.Plant, gain: list[list[float]], condition: float, Q: Array
+)
+def test_least_condition_of_published_examples(
+    plant: impc.Plant, gain: Any, condition: float, within: float, Q: Any, R: Any
 ) -> None:
     found = impc.least_condition_weights(impc.gain_fibre(plant, gain))
-    assert found.condition == pytest.approx(condition, abs=7e-5)  # the gain has six decimals
-    np.testing.assert_allclose(found.weights.Q, Q, atol=np.sqrt(SLACK) / 5)
-    assert found.gain_error < 1e-14
+    assert found.least is not None
+    assert found.least == pytest.approx(condition, abs=within)  # the gains are rounded
+    assert found.least * (1 - 1e-14) <= found.condition <= found.least * (1 + 2 * SLACK)
+    assert found.gain_error < (1e-14 if plant.discrete else 1e-11)
+    assert found.gap is not None
+    assert found.gap < 1e-8
+    lmi = impc.inverse_lqr_lmi(plant, gain)
+    assert lmi.feasible
+    assert lmi.condition == pytest.approx(found.condition)
+    # Largest eigenvalues: the reference is within 1e-5 of the least condition; here the least norm.
+    size = np.sqrt(SLACK) * (condition / 5 if plant.discrete else 15)
+    scaled, n = found.weights.block / np.linalg.eigvalsh(found.weights.block)[0], plant.n
+    np.testing.assert_allclose(scaled[:n, :n], Q, atol=size)
+    np.testing.assert_allclose(scaled[n:, n:], R, atol=size)
 
 
 def test_least_condition_and_centre_agree_with_a_fine_grid_over_the_fibre() -> None:
@@ -112,51 +105,43 @@ def test_least_condition_and_centre_agree_with_a_fine_grid_over_the_fibre() -> N
     np.testing.assert_allclose(analytic_centre(fibre).weights.Q, best, rtol=1e-3)
 
 
-@pytest.mark.parametrize(("m", "dt"), [(1, 1.0), (2, 1.0), (2, 0)])
-@draws(8)
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 5))
-def test_the_fibre_contains_the_truth_and_nothing_with_another_gain(
-    m: int, dt: float, seed: int, n: int
+@pytest.mark.parametrize("dt", [0, 1.0])
+@pytest.mark.parametrize("m", [1, 2, 3])
+@draws(5)
+@given(seed=st.integers(0, 2**32 - 1), more=st.integers(1, 3))
+def test_a_fibre_is_all_weights_of_a_gain_and_of_a_metric(
+    m: int, dt: float, seed: int, more: int
 ) -> None:
+    """It contains the truth and nothing with another gain; S matters up to its scale.
+
+    S K A^-1 B = B'PB is symmetric: the gain leaves m of the m(m+1)/2 entries of S free.
+    """
+    n = m + more
     plant, truth = random_case(seed, n, m, dt)
-    fibre = fibre_of(plant, truth)
-    X, basis = fibre.to_natural(truth), fibre.natural_basis()
-    inside = np.tensordot(np.tensordot(basis, X, 2), basis, 1)
-    assert np.linalg.norm(X - inside) < 1e-8 * np.linalg.norm(X)
-    found = impc.least_condition_weights(fibre)
-    assert found.condition <= condition_number(truth) * (1 + 1e-8)
-    members: list[EquivalentWeights] = [found, *impc.other_weights(fibre, 3)]
-    assert max(member.gain_error for member in members) < 1e-7
-
-
-@draws(8)
-@given(seed=st.integers(0, 2**32 - 1), dt=st.sampled_from([0, 1.0]))
-def test_a_metric_narrows_the_fibre_to_weights_with_that_metric(seed: int, dt: float) -> None:
-    plant, truth = random_case(seed, 4, 2, dt)
     solution = impc.solve_lqr(plant, truth)
-    # Only S up to scale may matter.
-    fibre = impc.gain_fibre(plant, solution.K, 3.0 * solution.S)
-    assert fibre.dimension == fibre_of(plant, truth).dimension - 1  # m - 1: see the next test
-    found = impc.least_condition_weights(fibre)
-    assert found.condition <= condition_number(truth) * (1 + 1e-8)
+    numbers = n * (n + 1) // 2 + m * (m + 1) // 2 - n * m
+    for metric, dimension in ((None, numbers), (3.0 * solution.S, numbers - (m - 1))):
+        fibre = impc.gain_fibre(plant, solution.K, metric)
+        assert fibre.dimension == dimension
+        X, basis = fibre.to_natural(truth), fibre.natural_basis()
+        inside = np.tensordot(np.tensordot(basis, X, 2), basis, 1)
+        assert np.linalg.norm(X - inside) < 1e-8 * np.linalg.norm(X)
+        found = impc.least_condition_weights(fibre)
+        assert found.least is not None
+        assert found.least <= condition_number(truth) * (1 + 1e-8)
+        assert found.condition <= found.least * (1 + 2 * SLACK)
+        for member in (found, *impc.other_weights(fibre, 3)):
+            assert member.gain_error < 1e-7
     S, true = impc.solve_lqr(plant, found.weights).S, solution.S
     np.testing.assert_allclose(S / np.trace(S), true / np.trace(true), rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize(("n", "m"), [(3, 2), (4, 2), (5, 3), (6, 3)])
-def test_gain_and_metric_determine_m_minus_1_numbers_more_than_the_gain(n: int, m: int) -> None:
-    """S K A^-1 B = B'PB is symmetric: the gain leaves m of the m(m+1)/2 entries of S free."""
-    plant, truth = random_case(1, n, m, 1.0)
-    solution = impc.solve_lqr(plant, truth)
-    numbers = n * (n + 1) // 2 + m * (m + 1) // 2
-    assert impc.gain_fibre(plant, solution.K).dimension == numbers - n * m
-    fibre = impc.gain_fibre(plant, solution.K, solution.S)
-    assert fibre.dimension == numbers - n * m - (m - 1)
-
-
-def test_seat_plant() -> None:
-    work = seat(1, 1.0)
-    fibre = fibre_of(work.problem.plant, work.weights)
+def test_seat_plant_in_two_units() -> None:
+    """Margin and centre do not depend on the units, the least condition does."""
+    work, scale = seat(1, 1.0), np.diag(np.logspace(-3, 2, 10))
+    plant, truth = work.problem.plant, work.weights
+    moved = impc.Weights(scale @ truth.Q @ scale, truth.R)
+    fibre, other = fibre_of(plant, truth), fibre_of(rescaled(plant, scale), moved)
     assert fibre.dimension == 46
     assert fibre.singular_values[-1] > 1e-3 * fibre.singular_values[0]
     found = impc.least_condition_weights(fibre)
@@ -164,7 +149,7 @@ def test_seat_plant() -> None:
     assert found.condition == pytest.approx(2.368523e7, rel=1e-4)
     assert found.gap is not None
     assert found.gap < 1e-6
-    assert found.condition < condition_number(work.weights)
+    assert found.condition < condition_number(truth)
     centre, *others = analytic_centre(fibre), *impc.other_weights(fibre)
     assert len(others) == 2
     for member in (found, centre, *others):
@@ -172,19 +157,10 @@ def test_seat_plant() -> None:
     eigenvalues, vectors = np.linalg.eigh(centre.weights.Q)
     np.testing.assert_allclose(eigenvalues[-3:], [2.8e4, 9.5e4, 8.9e5], rtol=0.05)
     np.testing.assert_allclose(np.abs(vectors[:2, -1]), [0.625, 0.779], atol=0.01)
-
-
-def test_margin_and_centre_do_not_depend_on_units_but_the_least_condition_does() -> None:
-    work, scale = seat(1, 1.0), np.diag(np.logspace(-3, 2, 10))
-    plant, truth = work.problem.plant, work.weights
-    moved = impc.Weights(scale @ truth.Q @ scale, truth.R)
-    fibres = fibre_of(plant, truth), fibre_of(rescaled(plant, scale), moved)
-    first, second = (weights_margin(fibre).margin for fibre in fibres)
-    assert second == pytest.approx(first, rel=1e-6)
-    centre, again = (analytic_centre(fibre).weights for fibre in fibres)
-    np.testing.assert_allclose(scale @ centre.Q @ scale, again.Q, rtol=1e-5, atol=1e-6)
-    lowest = [impc.least_condition_weights(fibre).condition for fibre in fibres]
-    assert not np.isclose(lowest[0], lowest[1], rtol=0.5)
+    assert weights_margin(other).margin == pytest.approx(weights_margin(fibre).margin, rel=1e-6)
+    again = analytic_centre(other).weights
+    np.testing.assert_allclose(scale @ centre.weights.Q @ scale, again.Q, rtol=1e-5, atol=1e-6)
+    assert impc.least_condition_weights(other).condition != pytest.approx(found.condition, rel=0.5)
 
 
 def test_analytic_centre_with_two_inputs_does_not_depend_on_their_coordinates() -> None:
@@ -198,7 +174,7 @@ def test_analytic_centre_with_two_inputs_does_not_depend_on_their_coordinates() 
 
 
 def test_a_gain_that_no_weights_have() -> None:
-    fibre = impc.gain_fibre(example_plant(), [[1.21183, -0.71277]])
+    fibre = impc.gain_fibre(example_plant(), NO_WEIGHTS_GAIN)
     found = weights_margin(fibre)
     assert not found.exist
     assert found.weights is None
@@ -251,15 +227,6 @@ def test_others_are_unlike_and_a_single_member_has_none() -> None:
     assert impc.other_weights(single) == ()
     pair = analytic_centre(single).weights, impc.least_condition_weights(single).weights
     assert impc.weight_error(*pair) < 1e-9
-
-
-def test_basis_is_orthonormal_in_natural_coordinates() -> None:
-    fibre = impc.gain_fibre(PRIESS, PRIESS_GAIN)
-    basis = fibre.natural_basis()
-    assert basis.shape == (4, 8, 8)
-    np.testing.assert_allclose(np.tensordot(basis, basis, ((1, 2), (1, 2))), np.eye(4), atol=1e-9)
-    X = fibre.to_natural(impc.least_condition_weights(fibre).weights)
-    np.testing.assert_allclose(split_blocks(X, 4).Q, X[:4, :4], atol=1e-12)
 
 
 def test_the_reported_weights_do_not_depend_on_rounding() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ import impc
 from experiments.misfit_ceiling import short_of_truth
 from experiments.printed_intervals import carts, fit, noisy_recording, random_recording
 from experiments.printed_intervals import regulator as cart_regulator
-from impc.assess.bounded_weights import weights_set
 from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import simulate
@@ -21,9 +20,9 @@ from impc.inverse.laws import GainLaw
 from impc.inverse.metric_family import metric_family
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.search import fit_gain, refine_gain
-from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.inverse.unknowns import Unknowns
+from impc.model.weights import condition_number
 from tests.support import extrapolated_jacobian, plant_of, posed, random_problem, regulator, slopes
 
 FULL, SLOW = pytest.mark.full, pytest.mark.slow
@@ -47,52 +46,59 @@ def missed(problem: impc.Problem, weights: impc.Weights) -> float:
     return float(np.linalg.norm(error) / np.linalg.norm(trial.outputs / scale))
 
 
-def outcomes(path: str, m: int, seeds: range) -> dict[int, str]:
-    """For problems that are not reproduced: "said so", or the misfit without a warning."""
-    outcome = {}
-    for seed in seeds:
-        _, problem = random_problem(seed, m)
-        try:
-            found = PATHS[path](problem)
-        except impc.ImpcError as error:
-            outcome[seed] = f"said so: {error}"
-            continue
-        assert path != "reduced" or found.explained == (not found.reason)
-        miss = missed(problem, found.stage_weights)
-        if miss > REPRODUCED:
-            outcome[seed] = f"missed by {miss:.2g}" if found.explained else "said so"
-    return outcome
+def fault(path: str, m: int, seed: int) -> str:
+    """Empty if reported weights reproduce the recording; "said so", or what is silently wrong.
+
+    The reduced form also has to find the metric as far as it is identified, and to report the
+    weights of least condition of the true gain with a metric that the recording cannot distinguish.
+    """
+    controller, problem = random_problem(seed, m)
+    try:
+        found = PATHS[path](problem)
+    except impc.ImpcError as error:
+        return f"said so: {error}"
+    assert path != "reduced" or found.explained == (not found.reason)
+    miss = missed(problem, found.stage_weights)
+    if miss > REPRODUCED:
+        return f"missed by {miss:.2g}" if found.explained else "said so"
+    if path == "reduced":
+        span, S = found.metrics.reshape(len(found.metrics), -1).T, np.ravel(controller.S)
+        beyond = S - span @ np.linalg.lstsq(span, S)[0]
+        fibre = impc.gain_fibre(problem.plant, controller.K, found.metrics)
+        best = impc.least_condition_weights(fibre).condition
+        if np.linalg.norm(beyond) > 1e-6 * np.linalg.norm(S):
+            return "another metric"
+        if abs(condition_number(found.stage_weights) / best - 1) > 1e-4:
+            return "not the least condition"
+    return ""
 
 
 @pytest.mark.parametrize(
-    ("path", "m", "seeds"),
+    ("path", "m", "seeds", "allowed"),
     [
-        # Seeds 0 to 4 had a misfit of 0.1 to 60 % and were reported as exact.
-        ("fit", 2, range(5)),
-        ("reduced", 2, range(5)),
-        pytest.param("fit", 3, range(5), marks=FULL),
-        pytest.param("reduced", 3, range(5), marks=FULL),
+        # Seeds 0 to 4 of two inputs had a misfit of 0.1 to 60 % and were reported as exact.
+        ("fit", 2, range(5), 0),
+        ("reduced", 1, range(10), 0),
+        ("reduced", 2, range(10), 0),
+        pytest.param("fit", 3, range(5), 0, marks=FULL),
+        pytest.param("reduced", 3, range(5), 0, marks=FULL),
         # Seeds 2 and 8 converged to misfits of 8e-5 and 3e-5.
-        pytest.param("direct", 2, range(2, 3), marks=SLOW),
-        pytest.param("direct", 2, range(8, 9), marks=SLOW),
-        pytest.param("direct", 3, range(1, 2), marks=FULL),
+        pytest.param("direct", 2, [2, 8], 0, marks=SLOW),
+        pytest.param("direct", 3, [1], 0, marks=FULL),
         # The last two started at an eigenvalue of -1e-9 and raised a WeightsError.
-        pytest.param("direct", 2, range(96, 97), marks=FULL),
-        ("direct", 3, range(70, 71)),
+        pytest.param("direct", 2, [96], 0, marks=FULL),
+        ("direct", 3, [70], 0),
+        *(pytest.param(path, m, range(300), 3, marks=SLOW) for path in PATHS for m in (2, 3)),
+        pytest.param("reduced", 1, range(100), 1, marks=SLOW),
     ],
 )
-def test_reported_weights_reproduce_the_recording(path: str, m: int, seeds: range) -> None:
-    assert outcomes(path, m, seeds) == {}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("m", [2, 3])
-@pytest.mark.parametrize("path", sorted(PATHS))
-def test_ninety_nine_in_a_hundred_are_reproduced_and_no_miss_is_silent(path: str, m: int) -> None:
-    found = outcomes(path, m, range(300))
-    print(path, m, found)
-    assert all(text.startswith("said so") for text in found.values())
-    assert len(found) <= 3
+def test_reported_weights_reproduce_the_recording(
+    path: str, m: int, seeds: Iterable[int], allowed: int
+) -> None:
+    faults = {seed: text for seed in seeds if (text := fault(path, m, seed))}
+    print(path, m, faults)
+    assert all(text.startswith("said so") for text in faults.values())
+    assert len(faults) <= allowed
 
 
 @pytest.mark.parametrize(("m", "seed"), [(2, 3), (3, 2)])
@@ -114,14 +120,18 @@ def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
     assert missed(problem, impc.least_condition_weights(free).weights) > 1e-3
 
 
-def test_set_of_weights_has_the_metric_in_it() -> None:
-    _, problem = random_problem(0, 2)
-    fitted, (n, m) = fit_controller(problem), (problem.plant.n, problem.plant.m)
-    assert len(fitted.metrics) == 1
-    numbers = n * (n + 1) // 2 + m * (m + 1) // 2
-    fibre = impc.gain_fibre(problem.plant, np.array(fitted.gain), np.array(fitted.metrics))
-    # n m + m - 1 directions are identified; one further is the scale.
-    assert len(weights_set(fibre).level) == numbers - (n * m + m - 1) - 1
+def test_active_bounds_identify_the_metric() -> None:
+    """n m + m - 1 directions (docs/why/theory.md); otherwise only those of the gain."""
+    controller, problem = random_problem(1, 2)
+    found, S = inverse_mpc_reduced(problem), np.array(controller.S)
+    np.testing.assert_allclose(found.gain, controller.K, atol=1e-6)
+    np.testing.assert_allclose(found.metric / np.trace(found.metric), S / np.trace(S), atol=1e-6)
+    assert len(found.metrics) == 1
+    counts = impc.identifiability(problem, found.stage_weights)
+    assert (counts.free, counts.rank) == (8, 3 * 2 + 2 - 1)
+    calm = controller.simulate([1e-3, 0, 0], 15, disturbance=np.zeros(15)).x
+    quiet = posed(controller, impc.Recording(problem.plant, calm), terminal_set=False)
+    assert len(weights_behind(fit_gain(quiet)).metrics) > 1
 
 
 def test_fibre_of_a_metric_in_a_span() -> None:
@@ -146,27 +156,20 @@ def test_a_step_at_which_the_solver_breaks_off_is_tried_shorter() -> None:
     assert found.misfit <= 1.05 * found.noise
 
 
-def asymmetry(plant: impc.Plant, gain: np.ndarray, metric: np.ndarray) -> float:
-    """Relative asymmetry of S K A^-1 B, which is B'PB for a pair of weights."""
-    product = metric @ gain @ np.linalg.solve(plant.A, plant.B)
-    return float(np.linalg.norm(product - product.T) / np.linalg.norm(product))
-
-
 # At (3, 5) the inputs outnumber the states.
 @pytest.mark.parametrize(("m", "seed"), [(2, 1), (2, 4), (3, 0), (3, 4), (3, 5)])
 def test_the_family_of_metrics_is_that_of_weights(m: int, seed: int) -> None:
-    """Every member is consistent with the gain, and the true metric is a member."""
+    """S K A^-1 B = B'PB of every member is symmetric, and the true metric is a member."""
     controller, problem = random_problem(seed, m)
-    K, S = np.array(controller.K), np.array(controller.S)
-    family = metric_family(problem.plant, K)
+    plant, K, S = problem.plant, np.array(controller.K), np.array(controller.S)
+    family, rng = metric_family(plant, K), np.random.default_rng(seed)
     assert family is not None
-    rng = np.random.default_rng(seed)
-    for _ in range(5):
-        assert asymmetry(problem.plant, K, family.metric(rng.standard_normal(family.count))) < 1e-9
+    for z in rng.standard_normal((5, family.count)):
+        product = family.metric(z) @ K @ np.linalg.solve(plant.A, plant.B)
+        assert np.linalg.norm(product - product.T) < 1e-9 * np.linalg.norm(product)
     np.testing.assert_allclose(family.metric(family.nearest(S)), S, rtol=1e-7, atol=1e-9)
-    z = 0.3 * rng.standard_normal(family.count)
-    found = np.reshape(family.changes(z), (family.count, -1)).T
-    expected = extrapolated_jacobian(family.metric, z)
+    found = np.reshape(family.changes(0.3 * z), (family.count, -1)).T
+    expected = extrapolated_jacobian(family.metric, 0.3 * z)
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
 
 
@@ -194,20 +197,6 @@ def test_two_motors_of_one_joint(method: str, B: list[list[float]]) -> None:
     np.testing.assert_allclose(found.stage_weights.block, np.eye(4), atol=1e-4)
 
 
-@pytest.mark.parametrize(("m", "seed"), [(2, 1), (3, 4)])
-def test_coordinates_know_how_gain_and_metric_change(m: int, seed: int) -> None:
-    controller, problem = random_problem(seed, m)
-    space = Unknowns(problem, GainLaw(problem, np.array(controller.K), np.array(controller.S)))
-    z = space.start + 0.1 * np.random.default_rng(seed).standard_normal(len(space.start))
-
-    def point(z: np.ndarray) -> np.ndarray:
-        moved = space.unpack(z)
-        return np.concatenate([moved.K.ravel(), m * moved.S.ravel() / np.trace(moved.S)])
-
-    found = np.hstack([np.reshape(part, (len(z), -1)) for part in space.changes(z)]).T
-    np.testing.assert_allclose(found, extrapolated_jacobian(point, z), rtol=1e-7, atol=1e-8)
-
-
 def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
     """Margin below 1e-9: known members are recovered, none is invented without one."""
     plant = random_problem(2, 2)[1].plant
@@ -221,16 +210,14 @@ def test_weights_at_the_edge_of_those_that_a_program_finds() -> None:
 def test_a_noisy_fit_stays_where_it_ended() -> None:
     """Regression: restarted at its own solution, the gain moved by a fifth of its error."""
     controller, clean = random_problem(1, 2)
-    (trial,) = clean.recordings
-    scale = np.asarray(clean.output_scale)
-    noise = 0.15 * scale * np.random.default_rng(1).standard_normal(trial.outputs.shape)
-    noisy = impc.Recording(clean.plant, trial.outputs + noise, trial.disturbance, trial.x0)
-    problem = impc.replace(clean, recordings=(noisy,))
+    (trial,), rng = clean.recordings, np.random.default_rng(1)
+    noise = 0.15 * clean.output_scale * rng.standard_normal(trial.outputs.shape)
+    problem = impc.replace(clean, recordings=(impc.replace(trial, outputs=trial.outputs + noise),))
     found = fit_controller(problem)
     again, free = fit_controller(problem, found.weights), fit_gain(problem)
-    T, G = natural_coordinates(clean.plant, np.array(controller.K))
+    law = GainLaw(problem, np.array(controller.K), np.array(controller.S))
     moved, error = (
-        float(np.linalg.norm(np.linalg.solve(G, difference @ T)))
+        float(np.linalg.norm(law.natural(difference)))
         for difference in (again.gain - found.gain, free.K - controller.K)
     )
     assert found.converged
@@ -240,10 +227,10 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     # them would lower chi-squared by less than 0.1.
     printed = gain_estimate(found)
     at = printed.problem, np.array(printed.K), np.array(printed.S)
-    (residual, on_entries, *_), linear = slopes(*at), gain_covariance(*at)
-    T, G = natural_coordinates(clean.plant, np.array(printed.K))
-    on_gain = on_entries @ np.kron(G, np.linalg.inv(T).T)
-    along = on_gain @ linear.directions[linear.identified].T
+    (residual, on_gain, *_), linear = slopes(*at), gain_covariance(*at)
+    law = GainLaw(*at)
+    along = on_gain @ law.gains.reshape(len(law.gains), -1).T
+    along = along @ linear.directions[linear.identified].T
     step = along @ np.linalg.lstsq(along, residual)[0]
     assert step @ step < 0.1 * printed.misfit**2 / len(residual)
 

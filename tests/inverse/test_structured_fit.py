@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import control
@@ -12,13 +11,10 @@ import pytest
 import impc
 import plants
 from experiments.printed_intervals import carts, with_noise
-from impc.inverse.laws import WeightLaw
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.structured import fit_structure, search_from
-from impc.inverse.unknowns import Unknowns
-from tests.support import extrapolated_jacobian, nelder_mead, posed
+from tests.support import nelder_mead, posed, regulator
 
-SEAT = np.log([6e3, 9e3, 6e2, 4e2])
 BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 ONE = np.log([4.0, 1.0])
 
@@ -27,18 +23,9 @@ def pushed(
     structure: impc.Structure, plant: impc.Plant, cost_weights: Any, samples: int = 300
 ) -> tuple[impc.Controller, np.ndarray]:
     """Controller of the structure, and a push that drives it to its limits."""
-    bounds, rng = impc.Bounds(plant, u_min=-1, u_max=1), np.random.default_rng(5)
+    rng, weights = np.random.default_rng(5), structure.weights(cost_weights)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (samples // 10, plant.E.shape[1])), 10, axis=0)
-    weights = structure.weights(cost_weights)
-    return impc.Controller(plant, weights, bounds, 6, terminal_set=False), push
-
-
-@functools.cache
-def exact_cart() -> tuple[impc.Controller, impc.Recording]:
-    plant = carts(1)
-    truth, push = pushed(impc.Structure(plant), plant, ONE)
-    run = truth.simulate(np.zeros(2), disturbance=push)
-    return truth, impc.Recording(plant, (run.x @ plant.C.T)[:-1], push)
+    return regulator(plant, weights.Q, 1, 6, weights.R), push
 
 
 def size_of(problem: impc.Problem, structure: impc.Structure, cost_weights: Any) -> float:
@@ -49,43 +36,15 @@ def size_of(problem: impc.Problem, structure: impc.Structure, cost_weights: Any)
 def test_the_prices_of_the_seat_without_noise() -> None:
     """Ten seconds, from a gain that is 5 % wrong; the search starts at Bryson's rule."""
     plant = impc.Plant(plants.seated_balance_plant(), ["command"])
-    shape = impc.Structure(plant, "diagonal", over=BODY)
-    truth = impc.Controller(plant, shape.weights(SEAT), impc.Bounds(plant), 20, terminal_set=False)
+    shape, wanted = impc.Structure(plant, "diagonal", over=BODY), np.log([6e3, 9e3, 6e2, 4e2])
+    truth = regulator(plant, shape.weights(wanted).Q, np.inf, 20)
     torque = plants.ternary_torque(duration=10.0, rate=100)
     run = truth.simulate(np.zeros(plant.n), disturbance=torque)
-    trial = impc.Recording(plant, (run.x @ plant.C.T)[:-1], torque)
+    trial = impc.Recording(plant, run.outputs[:-1], torque)
     problem = posed(truth, trial, terminal_set=False, unknown_start=True, structure=shape)
     found = fit_structure(problem, shape, 1.05 * truth.K, np.array(truth.S))
-    assert np.max(np.abs(found.cost_weights - SEAT)) < 1e-6
+    assert np.max(np.abs(found.cost_weights - wanted)) < 1e-6
     assert found.misfit < 1e-9 * np.sqrt(2000)
-
-
-@pytest.mark.parametrize("family", [False, True])
-def test_derivatives_through_the_riccati_equation(family: bool) -> None:
-    """Two inputs at their limits; with a family the plant changes the gain too."""
-    plant = carts(2)
-    structure = impc.Structure(plant, ["x[0]", "x[1] - x[0]", "x[2]", "x[3]"], "full")
-    cost_weights = np.concatenate([np.log([4.0, 5.0, 1.0, 1.0]), [0.1, 0.2]])
-    truth, push = pushed(structure, plant, cost_weights)
-    trial = with_noise(truth, push, np.random.default_rng(0), 90.0, 0.0)
-
-    def stronger(values: np.ndarray) -> impc.Plant:
-        made = control.ss(
-            plant.A, np.hstack([values[0] * plant.B, plant.E]), plant.C, 0, plant.dt,
-            inputs=[*plant.controls, *plant.disturbances], outputs=list(plant.outputs),
-        )  # fmt: skip
-        return impc.Plant(made, list(plant.controls))
-
-    known = {"family": impc.PlantFamily(stronger, ["strength"], [1.0])} if family else {}
-    problem = posed(truth, trial, terminal_set=False, unknown_start=True, **known)
-    space = Unknowns(problem, WeightLaw(structure, cost_weights + 0.3))
-    z = space.start + 0.05
-    exact = space.at(z).jacobian.T @ space.at(z).residual
-    (slope,) = extrapolated_jacobian(
-        lambda z: np.array(np.sum(space.at(z).residual ** 2) / 2), z, 1e-4
-    )
-    # Kinks where a limit becomes active: 1e-6 of the gradient.
-    assert exact == pytest.approx(slope, rel=1e-4, abs=1e-5 * np.max(np.abs(exact)))
 
 
 def test_a_price_that_is_not_needed_is_zero() -> None:
@@ -124,10 +83,10 @@ def test_no_search_without_derivatives_does_better() -> None:
 
 def test_the_method_of_the_registry() -> None:
     """Through `impc.fit`, with an estimate that has its cost weights."""
-    truth, trial = exact_cart()
-    structure = impc.Structure(truth.plant)
-    problem = posed(truth, trial, terminal_set=False, structure=structure)
-    found = impc.fit(problem, "structured")
+    plant, structure = carts(1), impc.Structure(carts(1))
+    truth, push = pushed(structure, plant, ONE)
+    trial = impc.Recording(plant, truth.simulate([0, 0], disturbance=push).outputs[:-1], push)
+    found = impc.fit(posed(truth, trial, terminal_set=False, structure=structure), "structured")
     assert found.explained
     assert found.cost_weights is not None
     np.testing.assert_allclose(found.cost_weights, ONE, atol=1e-6)
@@ -144,9 +103,8 @@ def test_no_regulator_that_can_be_simulated() -> None:
     """Push far beyond the limit: the plant diverges for all cost weights."""
     system = control.ss([[3.0]], [[1.0, 1.0]], [[1.0]], 0, 1, inputs=["u", "push"])
     plant = impc.Plant(system, ["u"])
-    structure, bounds = impc.Structure(plant), impc.Bounds(plant, u_min=-1, u_max=1)
-    truth = impc.Controller(plant, structure.weights(np.zeros(1)), bounds, 3)
+    truth = regulator(plant, 1, 1, 3)
     trial = impc.Recording(plant, np.zeros((900, 1)), np.full(900, 50.0))
     problem = posed(truth, trial, terminal_set=False)
     with pytest.raises(impc.SolverError, match="no controller of this structure can be simulated"):
-        fit_structure(problem, structure, np.array(truth.K), np.array(truth.S))
+        fit_structure(problem, impc.Structure(plant), np.array(truth.K), np.array(truth.S))

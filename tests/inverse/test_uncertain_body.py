@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,15 @@ import pytest
 import scipy.linalg
 
 import impc
-from experiments.uncertain_body import HORIZON, LIMIT, Person, cart, cart_person, noise
+from experiments.uncertain_body import HORIZON, LIMIT, Person, cart, cart_person
 from impc.arrays import Array
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import ResidualNoise
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import GainEstimate, gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
 from impc.inverse.problem import noise_of_residual
 from impc.inverse.residuals import residual_only
-from tests.support import differences, posed, regulator, slopes
+from tests.support import posed, regulator, slopes
 
 KNOWN = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
 SEAT = "plants:seated_balance_for"
@@ -38,65 +37,22 @@ def pushes(rng: np.random.Generator, size: float, count: int = 25, held: int = 1
     return np.asarray(size * np.repeat(rng.choice([-1.0, 0, 1], count), held))
 
 
-@functools.cache
-def saturated() -> tuple[impc.Problem, Array]:
-    """Recordings partly at the limit, of the family with all four unknowns."""
-    made = family()
-    plant, rng, trials = made.make(made.nominal), np.random.default_rng(3), []
-    law = regulator(plant, np.diag([4.0, 1.0, 0.01]), 0.42, HORIZON)
-    for _ in range(2):
-        push = pushes(rng, 0.3)
-        y = law.simulate([0, 0, 0], disturbance=push).x[:-1, :1]
-        trials.append(impc.Recording(plant, y + 0.1 * y.std() * noise(rng, 400, 1, 0.0), push))
-    return posed(law, *trials, family=made, unknown_start=True), np.array(law.K)
-
-
-@functools.cache
 def person(seed: int = 1, error: str = "none") -> Person:
     found = cart_person(seed, 99, 0.0, error)
     assert found is not None
     return found
 
 
-@functools.cache
-def fitted() -> impc.Estimate:
-    return impc.fit(person().problem)
-
-
-@functools.cache
-def seated() -> tuple[impc.Problem, Array]:
-    """The nonlinear body of the seat, at 4 Nm."""
-    made = seat_family()
-    assert made is not None
-    plant = made.make(made.nominal)
-    assert plant.body is not None
-    v, Q = np.array([0.70, 0.65, 0.22, 0.20]), 1e-2 * np.eye(10)
-    Q[:4, :4] += 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    law = regulator(plant, Q, 6, 10)
-    push = pushes(np.random.default_rng(0), 3.0, 20, 25)
-    trial = impc.Recording(plant, law.simulate(np.zeros(10), disturbance=push).outputs[:-1], push)
-    return posed(law, trial, family=made, unknown_start=True), np.array(law.K)
-
-
-@pytest.mark.parametrize(
-    ("made", "at", "step", "size"),
-    [(saturated, [0.02, -0.01, 0.1, 0.03], 1e-5, 1e-7), (seated, [0.01] * 13, 1e-4, 1e-5)],
-)
-def test_derivatives_by_parameters_delay_and_limit(
-    made: Any, at: list[float], step: float, size: float
-) -> None:
-    problem, K = made()
-    found = slopes(problem.at(problem.starts, np.array(at)), K, np.eye(1))[2]
-    rough = differences(
-        lambda q: residual_only(problem.at(problem.starts, q), K, np.eye(1)), at, step
-    )
-    for place in range(len(at)):
-        largest = np.max(np.abs(rough[:, place]))
-        np.testing.assert_allclose(found[:, place], rough[:, place], atol=size * largest)
+@pytest.fixture(scope="module")
+def fitted() -> GainEstimate:
+    return gain_estimate(impc.fit(person().problem))
 
 
 def test_values_of_delay_and_limit_are_in_their_units() -> None:
-    problem, _ = saturated()
+    made = family()
+    plant = made.make(made.nominal)
+    law = regulator(plant, np.eye(3), 0.42, HORIZON)
+    problem = posed(law, impc.Recording(plant, np.ones((9, 1))), family=made)
     assert problem.parameter_names == ("fall", "damp", "extra_delay", "u_max.u")
     assert problem.family is not None
     values = problem.family.values(np.log([1.0, 1.0, 1.5, 1.1]))
@@ -105,10 +61,9 @@ def test_values_of_delay_and_limit_are_in_their_units() -> None:
     np.testing.assert_allclose(moved.bounds.u_max, [1.1 * 0.42])
 
 
-def test_the_covariance_is_that_of_the_joint_curvature() -> None:
+def test_the_covariance_is_that_of_the_joint_curvature(fitted: GainEstimate) -> None:
     """White residuals: inverse of J'J / s^2 + prior from all columns; to 1e-6."""
-    found = gain_estimate(fitted())
-    problem, K, S = found.problem, np.array(found.K), np.array(found.S)
+    problem, K, S = fitted.problem, np.array(fitted.K), np.array(fitted.S)
     residual, on_gain, on_parameters, own = slopes(problem, K, S)
     own = scipy.linalg.block_diag(*np.split(own, np.cumsum(problem.trial_sizes)[:-1]))
     J = np.hstack([on_gain, on_parameters, own])
@@ -125,10 +80,9 @@ def test_the_covariance_is_that_of_the_joint_curvature() -> None:
     np.testing.assert_allclose(linear.shares.reshape(2, 2), shares, rtol=1e-6)
 
 
-def test_the_fit_is_the_mode_of_the_posterior() -> None:
+def test_the_fit_is_the_mode_of_the_posterior(fitted: GainEstimate) -> None:
     """N log |r|^2 + |q / d|^2 is no smaller nearby (20 directions of gain and body)."""
-    found = gain_estimate(fitted())
-    problem, K = found.problem, np.array(found.K)
+    problem, K = fitted.problem, np.array(fitted.K)
     logs, count = np.array(problem.logarithms), problem.recorded_numbers
 
     def objective(gain: Array, q: Array) -> float:
@@ -136,7 +90,7 @@ def test_the_fit_is_the_mode_of_the_posterior() -> None:
         return count * float(np.log(r @ r)) + float(np.sum((q / 0.03) ** 2))
 
     best, rng = objective(K, logs), np.random.default_rng(0)
-    deviations = np.array(found.covariance.entries)
+    deviations = np.array(fitted.covariance.entries)
     for _ in range(20):
         step = rng.standard_normal((2, 2))
         there = objective(K + 0.3 * deviations * step[:1], logs + 0.3 * 0.03 * step[1])
