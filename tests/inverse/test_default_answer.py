@@ -1,10 +1,11 @@
-"""The default search on problems with known solutions."""
+"""The default search on problems with known solutions, in any units."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import count, islice
 
+import control
 import numpy as np
 import pytest
 
@@ -15,50 +16,45 @@ from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import residual_only
 from impc.inverse.search import refine_gain
 from impc.inverse.table31 import inverse_mpc_reduced
-from tests.support import differences, example_plant, plant_of, posed, regulator
+from impc.model.plant import change_coordinates
+from tests.support import (
+    differences,
+    example_plant,
+    example_problem,
+    plant_of,
+    posed,
+    regulator,
+)
 from tests.support import random_problem as saturated_problem
 
-SLOW = pytest.mark.slow
 HELD = plant_of([[1.1, 0.2], [0, 0.9]], [[0], [1]])
-KINDS: dict[str, Callable[[int], Known | None]] = {
-    "stick": stick_problem,
-    "one input": random_problem,
-    "two inputs": lambda seed: random_problem(seed, 2),
-    "three inputs": lambda seed: random_problem(seed, 3),
-    "half": lambda seed: random_problem(seed, half=True),
-    "half, two inputs": lambda seed: random_problem(seed, 2, half=True),
-    "half, short": lambda seed: random_problem(seed, 2, half=True, samples=12),
+#: Maker by seed; numbers of problems in the fast and in the slow test; of the latter, at most so
+#: many are wrong, and at most so many of these carry no warning.
+KINDS: dict[str, tuple[Callable[[int], Known | None], int, int, int, int]] = {
+    "stick": (stick_problem, 3, 100, 2, 0),
+    "one input": (random_problem, 20, 200, 2, 2),
+    "two inputs": (lambda seed: random_problem(seed, 2), 3, 100, 1, 1),
+    "three inputs": (lambda seed: random_problem(seed, 3), 3, 100, 1, 1),
+    # From an unknown state.
+    "half": (lambda seed: random_problem(seed, half=True), 3, 67, 6, 0),
+    "half, two inputs": (lambda seed: random_problem(seed, 2, half=True), 1, 50, 5, 5),
 }
 
 
-def first_of(kind: str, wanted: int) -> Iterator[Known]:
+def first_of(make: Callable[[int], Known | None], wanted: int) -> Iterator[Known]:
     """First problems of a kind with 5 to 45 % of the samples at the limit."""
-    made = (KINDS[kind](seed) for seed in count())
+    made = map(make, count())
     return islice((one for one in made if one and 0.05 <= one.saturated < 0.45), wanted)
 
 
-@pytest.mark.parametrize(
-    ("kind", "wanted", "wrong", "silent"),
-    [
-        ("stick", 3, 0, 0),
-        pytest.param("stick", 100, 2, 0, marks=SLOW),
-        ("one input", 20, 0, 0),
-        pytest.param("one input", 200, 2, 2, marks=SLOW),
-        ("two inputs", 3, 0, 0),
-        pytest.param("two inputs", 100, 1, 1, marks=SLOW),
-        ("three inputs", 3, 0, 0),
-        pytest.param("three inputs", 100, 1, 1, marks=SLOW),
-        # From an unknown state.
-        ("half", 3, 0, 0),
-        pytest.param("half", 67, 6, 0, marks=SLOW),
-        pytest.param("half, two inputs", 50, 5, 5, marks=SLOW),
-    ],
-)
-def test_known_problems(kind: str, wanted: int, wrong: int, silent: int) -> None:
-    """At most `wrong` results are wrong, and at most `silent` of these carry no warning."""
-    pairs = [(known, fit_controller(known.problem)) for known in first_of(kind, wanted)]
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_known_problems(kind: str, slow: bool) -> None:
+    make, few, many, wrong, silent = KINDS[kind]
+    pairs = [(known, fit_controller(known.problem))
+             for known in first_of(make, many if slow else few)]  # fmt: skip
     missed = [found for known, found in pairs if not is_right(known, found)]
-    assert len(missed) <= wrong
+    assert len(missed) <= (wrong if slow else 0)
     assert sum(not warned(found) for found in missed) <= silent
 
 
@@ -78,7 +74,7 @@ def test_a_stick_that_falls_with_any_other_gain_ends_at_its_gain() -> None:
 
 def test_weights_are_those_of_the_gain_that_fits_best() -> None:
     """Noisy controller: a search from the truth finds no smaller misfit."""
-    known = next(first_of("stick", 1))
+    known = next(first_of(stick_problem, 1))
     best = refine_gain(known.problem, known.K, known.S)
     assert fit_controller(known.problem).noise <= best.misfit * (1 + 1e-4)
 
@@ -93,13 +89,6 @@ def test_a_command_always_at_its_bound_identifies_nothing() -> None:
     assert found.fit.rank == 0
     assert impc.identifiability(found.problem, found.stage_weights).rank == 0
     assert any("identify 0 of the 2 directions" in doubt for doubt in found.doubts)
-
-
-def started(problem: impc.Problem, start: impc.Weights) -> tuple[float, float]:
-    """Misfit of a start, and of the estimate from it."""
-    solution = impc.solve_lqr(problem.plant, start)
-    begun = float(np.linalg.norm(residual_only(problem, solution.K, solution.S)))
-    return begun, impc.fit(problem, start=start).misfit
 
 
 @pytest.mark.parametrize(("limit", "rank"), [(50.0, 0), (0.25, 2)])
@@ -123,21 +112,14 @@ def test_directions_of_the_metric_are_counted_and_said(limit: float, rank: int) 
     assert (np.linalg.norm(moved) > 1e-6) == (rank > 0)
     free = impc.fit(problem, "feedback_gain", start=found)
     assert not any("metric" in text for text in free.doubts)  # without bounds
-    begun, ended = started(problem, weights)
-    assert ended <= begun + 1e-9
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_no_estimate_is_worse_than_the_start_that_was_given(seed: int) -> None:
-    _, problem = saturated_problem(seed, 2)
-    begun, ended = started(problem, impc.Weights(np.eye(problem.plant.n), np.eye(2)))
-    assert ended <= begun * (1 + 1e-9)
+    begun = np.linalg.norm(residual_only(problem, np.array(law.K), np.array(law.S)))
+    assert impc.fit(problem, start=weights).misfit <= begun + 1e-9
 
 
 @pytest.mark.full
 def test_the_rank_is_that_of_the_derivative() -> None:
     """One trial with two inputs and 12 outputs, against singular values of finite differences."""
-    known = next(first_of("half, short", 1))
+    known = next(first_of(lambda seed: random_problem(seed, 2, half=True, samples=12), 1))
     found = fit_controller(known.problem)
     problem, K = found.problem, np.array(found.gain)
     start = np.array(problem.recordings[0].x0)
@@ -187,3 +169,53 @@ def test_an_infeasible_terminal_set_is_named() -> None:
     law = regulator(example_plant(), np.eye(2), 1, 2, terminal_set=True)
     with pytest.warns(match="terminal set.*terminal_set=False"):
         law.simulate([3.0, 3.0], 3)
+
+
+UNITS = [1e-12, 1e-5, 1e5, 1e12]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
+    plain = impc.table_3_1(example_problem(name))
+    truth = impc.solve_lqr(example_problem(name).plant, impc.Weights(np.eye(2), 1)).K
+    for scale in [1.0, *UNITS]:
+        found = impc.table_3_1(example_problem(name, scale))
+        assert found["inverse_mpc"].explained
+        np.testing.assert_allclose(found["inverse_mpc"].gain, truth, rtol=1e-9)
+        for line in ("feedback_gain", "inverse_mpc"):
+            assert found[line].evaluations < 1.5 * plain[line].evaluations + 3
+
+
+@pytest.mark.parametrize(
+    ("states", "inputs"),
+    [*((one, one) for one in UNITS), (np.array([1e-3, 1.0, 1e3, 10.0]), np.array([100.0, 0.01]))],
+)
+def test_two_inputs_do_not_depend_on_units(states: np.ndarray, inputs: np.ndarray) -> None:
+    """With x = diag(states) z and u = diag(inputs) v the gain becomes G^-1 K T."""
+    controller, problem = saturated_problem(2, 2)
+    T, G, (trial,) = np.eye(4) * states, np.eye(2) * inputs, problem.recordings
+    moved = change_coordinates(problem.plant, T, G)
+    B = np.hstack([moved.B, moved.E])
+    plant = impc.Plant(control.ss(moved.A, B, np.eye(4), 0, True, inputs=["u0", "u1", "d0"]),
+                       ["u0", "u1"])  # fmt: skip
+    again = impc.Recording(plant, trial.outputs @ np.linalg.inv(T), trial.disturbance)
+    limit = 1 / np.diag(G)
+    bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
+    other = impc.Problem(plant, bounds, problem.horizon, (again,), terminal_set=False)
+    found, expected = inverse_mpc_reduced(other), np.linalg.solve(G, controller.K @ T)
+    assert found.explained
+    np.testing.assert_allclose(found.gain / expected, np.ones((2, 4)), rtol=1e-9)
+    allowed = inverse_mpc_reduced(problem).evaluations * (1 if np.isscalar(states) else 2)
+    assert found.evaluations <= allowed
+    fitted = fit_controller(other).gain
+    np.testing.assert_allclose(fitted / expected, np.ones((2, 4)), rtol=1e-8)
+
+
+def test_output_scale_is_the_size_of_each_output() -> None:
+    problem = example_problem("A")
+    size = np.sqrt(np.mean(problem.recordings[0].outputs ** 2, axis=0))
+    np.testing.assert_allclose(problem.output_scale, size, rtol=1e-12)
+    silent = impc.Recording(problem.plant, np.array([[0.0, 3.0], [0.0, 4.0]]))
+    quiet = impc.Problem(problem.plant, problem.bounds, 3, (silent,))
+    np.testing.assert_allclose(quiet.output_scale, [np.sqrt(12.5)] * 2, rtol=1e-12)

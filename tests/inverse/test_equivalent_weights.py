@@ -1,7 +1,8 @@
-"""Equivalent weights of a gain, and the choice among them."""
+"""Equivalent weights of a gain, the choice among them, and bounds of semidefinite programs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import control
@@ -14,6 +15,7 @@ import impc
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.inverse.equivalent_weights import SLACK, analytic_centre, inverse_factor, weights_margin
+from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_each, solve_semidefinite
 from impc.inverse.solution_set import GainFibre
 from impc.model.weights import condition_number
 from tests.support import draws, example_plant, plant_of, random_weights
@@ -118,11 +120,15 @@ def test_a_fibre_is_all_weights_of_a_gain_and_of_a_metric(
     """
     n = m + more
     plant, truth = random_case(seed, n, m, dt)
-    solution = impc.solve_lqr(plant, truth)
-    numbers = n * (n + 1) // 2 + m * (m + 1) // 2 - n * m
-    for metric, dimension in ((None, numbers), (3.0 * solution.S, numbers - (m - 1))):
-        fibre = impc.gain_fibre(plant, solution.K, metric)
-        assert fibre.dimension == dimension
+    solution, unit = impc.solve_lqr(plant, truth), np.eye(m)
+    S, numbers = np.array(solution.S), n * (n + 1) // 2 + m * (m + 1) // 2 - n * m
+    every = np.array([np.outer(a, b) + np.outer(b, a) for a in unit for b in unit])
+    for metrics, dimension in (
+        (every, numbers), (None, numbers), (3.0 * S[None], numbers - (m - 1)),
+        (np.array([S, np.diag(unit[0])]), None),
+    ):  # fmt: skip
+        fibre = impc.gain_fibre(plant, solution.K, metrics)
+        assert dimension in {fibre.dimension, None}
         X, basis = fibre.to_natural(truth), fibre.natural_basis()
         inside = np.tensordot(np.tensordot(basis, X, 2), basis, 1)
         assert np.linalg.norm(X - inside) < 1e-8 * np.linalg.norm(X)
@@ -132,8 +138,10 @@ def test_a_fibre_is_all_weights_of_a_gain_and_of_a_metric(
         assert found.condition <= found.least * (1 + 2 * SLACK)
         for member in (found, *impc.other_weights(fibre, 3)):
             assert member.gain_error < 1e-7
-    S, true = impc.solve_lqr(plant, found.weights).S, solution.S
-    np.testing.assert_allclose(S / np.trace(S), true / np.trace(true), rtol=1e-6, atol=1e-8)
+            span = (every if metrics is None else metrics).reshape(-1, m * m).T
+            metric = impc.solve_lqr(plant, member.weights).S.ravel()
+            left = metric - span @ np.linalg.lstsq(span, metric)[0]
+            assert np.linalg.norm(left) < 1e-8 * np.linalg.norm(metric)
 
 
 def test_seat_plant_in_two_units() -> None:
@@ -250,3 +258,65 @@ def test_weights_on_the_border_of_the_set_are_refused() -> None:
     fibre = fibre_of(plant_of([[1.1, 0.1], [0, 0.9]], [[0], [1]]), impc.Weights(np.eye(2), 1))
     with pytest.raises(impc.SolverError, match="singular to working precision"):
         inverse_factor(fibre, impc.Weights(np.diag([1.0, 0.0]), 1))
+
+
+@pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-4, 1e-6, 1e-9])
+def test_a_bound_is_never_above_the_largest_eigenvalue(tolerance: float) -> None:
+    """min s with s I >= M is the largest eigenvalue."""
+    rng = np.random.default_rng(4)
+    for size in (1, 2, 5, 9):
+        for scale in (1e-3, 1.0, 1e3):
+            M = scale * random_weights(rng, size)
+            truth = float(np.linalg.eigvalsh(M)[-1])
+            cone = matrix_inequality(-M, np.eye(size)[None])
+            reach = np.array([10 * truth])
+            found = solve_semidefinite(np.ones(1), [cone], reach=reach, tolerance=tolerance)
+            assert found.bound <= truth * (1 + 1e-14)
+            assert found.bound >= truth - 30 * tolerance * max(1.0, truth)
+
+
+def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
+    """min s with ||a + V'y|| <= s is the distance of a to a subspace (least squares)."""
+    rng = np.random.default_rng(5)
+    for tolerance in (1e-1, 1e-4, 1e-8):
+        V, a = rng.normal(size=(3, 8)), rng.normal(size=8)
+        best = np.linalg.lstsq(V.T, -a)[0]
+        truth = float(np.linalg.norm(a + V.T @ best))
+        cone = norm_bound(np.vstack([V, np.zeros((1, 8))]), np.eye(4)[3], offset=a)
+        found = solve_semidefinite(
+            np.eye(4)[3], [cone], reach=np.full(4, 10.0), tolerance=tolerance
+        )
+        assert found.bound <= truth * (1 + 1e-14)
+        assert found.bound >= truth - 100 * tolerance
+
+
+def test_each_objective_over_the_same_cone_has_its_own_end() -> None:
+    """min c'y over the disc |y| <= 1 is -|c| for each of several objectives."""
+    rng = np.random.default_rng(6)
+    basis = np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+    cone = matrix_inequality(np.eye(2), basis)
+    objectives = rng.normal(size=(20, 2)) * 10 ** rng.uniform(-3, 1, size=(20, 1))
+    sizes = np.linalg.norm(objectives, axis=1)
+    found = solve_each(objectives, [cone], reach=np.full(2, 2.0))
+    for objective, size, one in zip(objectives, sizes, found, strict=True):
+        np.testing.assert_allclose(one.y, -objective / size, atol=2e-5)
+        assert -size * (1 + 1e-8) <= one.bound <= -size * (1 - 1e-14)
+
+
+def test_a_solver_that_breaks_off_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Rust panic becomes a SolverError; other non-Exceptions, such as an interrupt, pass."""
+
+    def broken(kind: type[BaseException]) -> Callable[..., None]:
+        def solver(*_: object) -> None:
+            raise kind("Eigval error: Eigen(1)")
+
+        return solver
+
+    cone = matrix_inequality(np.eye(2), np.eye(2)[None])
+    panic = type("PanicException", (BaseException,), {})
+    monkeypatch.setattr("clarabel.DefaultSolver", broken(panic))
+    with pytest.raises(impc.SolverError, match="Clarabel: Eigval error"):
+        solve_semidefinite(np.ones(1), [cone])
+    monkeypatch.setattr("clarabel.DefaultSolver", broken(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        solve_semidefinite(np.ones(1), [cone])

@@ -17,14 +17,16 @@ import scipy.signal
 import impc
 import plants
 from experiments.benchmarks.workloads import Workload, seat
-from experiments.coverage import cart, true_controller
+from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.simulated_subjects import simulated_subject
 from experiments.two_link_standing import GAIN, standing_problem
 from impc.assess.assessments import evaluate_method
 from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import simulate
+from impc.inverse.cross_check import cross_checked
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.search import fit_gain, refine_gain, with_fitted_starts
 from impc.model.riccati import stabilises
 from impc.output_feedback.simulation import simulate_person
@@ -47,8 +49,8 @@ def clean(limit: float, trials: int = 2) -> tuple[Workload, impc.Problem]:
 
 
 @functools.cache
-def fitted(limit: float, trials: int = 2) -> impc.Estimate:
-    return fit_controller(clean(limit, trials)[1])
+def fitted(limit: float) -> impc.Estimate:
+    return fit_controller(clean(limit)[1])
 
 
 def explained(found: impc.Estimate) -> float:
@@ -106,21 +108,16 @@ def test_noisy_subjects_reach_the_ceiling(limit: float, count: int, each: bool) 
 
 def test_initial_states_are_found() -> None:
     """True controller, initial guess at rest: found to the rounding of a short trial."""
-    work, _ = clean(6.0, 1)
-    controller, plant = work.controller, work.problem.plant
-    x = simulate(controller, work.drives[0]).x
-    x0 = x[500 + np.random.default_rng(7).integers(100)]
-    drive = impc.scenario(plant, x0, disturbance=work.drives[0].disturbance[500:1500])
-    run = simulate(controller, drive)
-    trial = impc.Recording(plant, run.x @ plant.C.T, np.vstack([drive.disturbance, [[0.0]]]))
-    problem = impc.replace(work.problem, recordings=(trial,), unknown_start=True)
-    (found,) = with_fitted_starts(
-        problem, np.array(controller.K), np.array(controller.S)
-    ).recordings
+    work, problem = clean(6.0, 1)
+    law, (drive,), (trial,) = work.controller, work.drives, problem.recordings
+    x, k = simulate(law, drive).x, 500 + int(np.random.default_rng(7).integers(100))
+    cut = impc.Recording(law.plant, trial.outputs[k : k + 1001], trial.disturbance[k : k + 1001])
+    problem = impc.replace(problem, recordings=(cut,), unknown_start=True)
+    (found,) = with_fitted_starts(problem, np.array(law.K), np.array(law.S)).recordings
     size = np.sqrt(np.mean(x**2, axis=0))
-    np.testing.assert_allclose(found.x0[:4], x0[:4], atol=1e-6 * float(np.max(size[:4])))
-    seen = simulate(controller, impc.scenario(plant, found.x0, disturbance=drive.disturbance))
-    np.testing.assert_allclose(seen.x @ plant.C.T, trial.outputs, atol=1e-8)
+    np.testing.assert_allclose(found.x0[:4], x[k, :4], atol=1e-6 * float(np.max(size[:4])))
+    seen = law.simulate(found.x0, disturbance=cut.disturbance[:-1])
+    np.testing.assert_allclose(seen.outputs, cut.outputs, atol=1e-8)
 
 
 @pytest.mark.full
@@ -231,3 +228,47 @@ def test_memory_grows_as_the_trials_do(name: str) -> None:
 
     peak(60)  # warm-up: compiled code and caches do not count
     assert peak(180) < 4.5 * peak(60)
+
+
+METHODS = ("feedback_gain", "inverse_lqr_gradient", "inverse_lqr_output", "inverse_mpc")
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, impc.Estimate]:
+    """Noisy cart at its limit."""
+    settings = impc.FitSettings(horizon=10, u_max=1.0)
+    start = impc.fit(impc.fit_problem(cart(), [noisy_trial(1, 0.0)], settings))
+    return {name: impc.fit(start.problem, name, start=start) for name in METHODS}
+
+
+@pytest.mark.parametrize(
+    ("worse", "rel"), [(("inverse_lqr_output", "feedback_gain"), 2e-3), (("inverse_mpc",), 1e-4)]
+)
+def test_a_method_that_loses_begins_again(
+    found: dict[str, impc.Estimate], worse: tuple[str, ...], rel: float
+) -> None:
+    """Poor weights for inverse MPC, and for the search without bounds."""
+    changed = {name: found[name] for name in ("feedback_gain", "inverse_lqr_output", "inverse_mpc")}
+    poor = impc.solve_lqr(cart(), impc.Weights(np.eye(2) * 50, 1))
+    for name in worse:
+        K, S, one = np.array(poor.K), np.array(poor.S), found[name]
+        left = misfit_or_reason(one.problem, K, S)[0]
+        assert left > 1.01 * one.misfit
+        changed[name] = impc.replace(one, K=K, S=S, weights=poor.weights, misfit=left)
+    checked = cross_checked(found["inverse_mpc"].problem, changed)
+    for name, one in checked.items():
+        assert one.misfit <= found[name].misfit * (1 + rel)
+        assert not one.fit.beaten_by
+
+
+def test_no_answer_is_beaten_and_nested_models_are_ordered(found: dict[str, impc.Estimate]) -> None:
+    """The free gain fits no worse than weights without bounds; each is best in its model."""
+    checked = cross_checked(found["inverse_mpc"].problem, found)
+    output = checked["inverse_lqr_output"]
+    assert checked["feedback_gain"].misfit <= output.misfit * (1 + 1e-3)
+    assert output.misfit <= checked["inverse_lqr_gradient"].misfit * (1 + 1e-3)
+    for own in (checked["inverse_mpc"], output):
+        for other in checked.values():
+            if other.weights is not None:
+                left = misfit_or_reason(own.problem, np.array(other.gain), np.array(other.metric))
+                assert own.misfit <= left[0] * (1 + 1e-3)

@@ -134,20 +134,6 @@ def test_active_bounds_identify_the_metric() -> None:
     assert len(weights_behind(fit_gain(quiet)).metrics) > 1
 
 
-def test_fibre_of_a_metric_in_a_span() -> None:
-    """R + B'PB of every member is in the span; the span of all metrics is no restriction."""
-    controller, problem = random_problem(2, 3)
-    plant, K = problem.plant, controller.K
-    pair = np.array([controller.S, np.diag([1.0, 0.0, 0.0])])
-    fibre, span = impc.gain_fibre(plant, K, pair), pair.reshape(2, -1).T
-    for one in (impc.least_condition_weights(fibre), *impc.other_weights(fibre, 2)):
-        S = impc.solve_lqr(plant, one.weights).S.ravel()
-        left = S - span @ np.linalg.lstsq(span, S)[0]
-        assert np.linalg.norm(left) < 1e-8 * np.linalg.norm(S)
-    every = np.array([np.outer(a, b) + np.outer(b, a) for a in np.eye(3) for b in np.eye(3)])
-    assert impc.gain_fibre(plant, K, every).dimension == impc.gain_fibre(plant, K).dimension
-
-
 def test_a_step_at_which_the_solver_breaks_off_is_tried_shorter() -> None:
     """Regression: Clarabel panics here on eigenvalues that LAPACK does not find."""
     controller = cart_regulator(carts(2))
