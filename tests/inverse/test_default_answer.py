@@ -63,20 +63,13 @@ def test_a_stick_that_falls_with_any_other_gain_ends_at_its_gain() -> None:
     known = stick_problem(418)
     assert known is not None
     found, (trial,) = fit_controller(known.problem), known.problem.recordings
-    assert is_right(known, found)
+    assert found.noise <= refine_gain(known.problem, known.K, known.S).misfit * (1 + 1e-4)
     for one in (found, inverse_mpc_reduced(known.problem)):
         assert np.allclose(one.gain, known.K, rtol=2e-3)
     assert found.converged
     assert found.fit.white
     residual = found.misfit**2 / trial.samples
     assert residual == pytest.approx(np.radians(0.02) ** 2 / np.mean(trial.outputs**2), rel=0.1)
-
-
-def test_weights_are_those_of_the_gain_that_fits_best() -> None:
-    """Noisy controller: a search from the truth finds no smaller misfit."""
-    known = next(first_of(stick_problem, 1))
-    best = refine_gain(known.problem, known.K, known.S)
-    assert fit_controller(known.problem).noise <= best.misfit * (1 + 1e-4)
 
 
 def test_a_command_always_at_its_bound_identifies_nothing() -> None:

@@ -19,9 +19,9 @@ from impc.inverse.unknowns import linear_at
 from impc.model.weights import condition_number
 from impc.studies.example.cases import CASES, CaseResult
 from tests import support
+from tests.inverse.test_equivalent_weights import NO_WEIGHTS_GAIN
 
 IDENTITY = impc.Weights(np.eye(2), 1)
-NO_WEIGHTS_GAIN = np.array([[1.21183, -0.71277]])
 
 
 def of_block(problem: impc.Problem, block: Array) -> Array:
@@ -61,25 +61,23 @@ def test_the_dissertations_comparison_shows_in_case_A(case_a: CaseResult) -> Non
     assert (counts.rank, counts.free, counts.chosen) == (2, 3, 1)
 
 
-def bounded_problem(inputs: int) -> tuple[impc.Problem, impc.Weights]:
-    """Terminal set, gain and metric follow the weights; bounds of inputs and states are active."""
-    rng = np.random.default_rng(inputs)
-    plant = support.random_plant(rng, 3, inputs, 1.1)
-    weights = impc.Weights(support.random_weights(rng, 3), support.random_weights(rng, inputs))
-    bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.4, x_min=-2, x_max=2)
-    law = impc.Controller(plant, weights, bounds, 3)
-    for size in 5 * 0.9 ** np.arange(60):
-        run = simulate(law, impc.scenario(plant, size * np.ones(3), 15))
-        if run.complete and impc.Status.ACTIVE in run.status:
-            break
-    return support.posed(law, impc.Recording(plant, 0.9 * run.x, x0=run.x[0])), weights
-
-
 @pytest.mark.parametrize("inputs", [0, 1, 2])
 def test_singular_values_are_those_of_differences(inputs: int) -> None:
-    """Of the example (0), and of random problems."""
-    example = support.example_problem("A"), IDENTITY
-    problem, weights = bounded_problem(inputs) if inputs else example
+    """Of the example (0), and of random problems at bounds of inputs and states.
+
+    Terminal set, gain and metric follow the weights.
+    """
+    problem, weights, rng = support.example_problem("A"), IDENTITY, np.random.default_rng(inputs)
+    if inputs:
+        plant = support.random_plant(rng, 3, inputs, 1.1)
+        weights = impc.Weights(support.random_weights(rng, 3), support.random_weights(rng, inputs))
+        bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.4, x_min=-2, x_max=2)
+        law = impc.Controller(plant, weights, bounds, 3)
+        for size in 5 * 0.9 ** np.arange(60):
+            run = simulate(law, impc.scenario(plant, size * np.ones(3), 15))
+            if run.complete and impc.Status.ACTIVE in run.status:
+                break
+        problem = support.posed(law, impc.Recording(plant, 0.9 * run.x, x0=run.x[0]))
     (n, m), L = (problem.plant.n, problem.plant.m), np.linalg.cholesky(weights.block)
     basis = L @ block_basis(n, m) @ L.T
     columns = support.extrapolated_jacobian(
@@ -143,8 +141,7 @@ def test_squared_misfit_trades_and_the_norm_does_not() -> None:
     """Exact data, true weights away from the identity (docs/why/theory.md)."""
     plant, Q = support.example_plant(), [[4.0, 0.5], [0.5, 1.0]]
     law = support.regulator(plant, Q, 1, 3, R=2.0, terminal_set=True)
-    run = impc.require_complete(law, simulate(law, impc.scenario(plant, [2, 3], 20)))
-    problem = support.posed(law, impc.Recording(plant, run.x))
+    problem = support.posed(law, impc.Recording(plant, law.simulate([2, 3], 20).x))
     reduced = table31.inverse_mpc_reduced(problem)
     assert np.linalg.norm(reduced.gain - law.K) < 1e-9
     true = condition_number(impc.Weights(Q, 2.0))
@@ -160,8 +157,7 @@ def test_squared_misfit_trades_and_the_norm_does_not() -> None:
 def test_a_gain_no_weights_have_is_said_and_the_direct_form_continues() -> None:
     plant, bounds = support.example_plant(), support.example_problem("A").bounds
     law = impc.Controller.from_gain(plant, NO_WEIGHTS_GAIN, bounds, 3)
-    run = impc.require_complete(law, simulate(law, impc.scenario(plant, [0.5, 0.7], 20)))
-    problem = support.posed(law, impc.Recording(plant, run.x))
+    problem = support.posed(law, impc.Recording(plant, law.simulate([0.5, 0.7], 20).x))
     found = table31.inverse_mpc_reduced(problem)
     np.testing.assert_allclose(found.gain, NO_WEIGHTS_GAIN, atol=1e-7)
     assert "weights" in found.reason
@@ -177,9 +173,9 @@ def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so() ->
     bounds = impc.Bounds(plant, u_min=-1, u_max=1, x_min=-0.5, x_max=0.5)
     true = impc.Controller(plant, impc.Weights(np.eye(3), 1), bounds, 6, softening=1e6)
     push = 0.8 * rng.normal(size=40)
-    run = simulate(true, impc.scenario(plant, 0.2 * np.ones(3), disturbance=push))
+    run = true.simulate(0.2 * np.ones(3), disturbance=push)
     assert impc.Status.SOFTENED in run.status
-    problem = support.posed(true, impc.Recording(plant, run.x, np.append(push, 0.0)), softening=1e6)
+    problem = support.posed(true, impc.Recording(plant, run.x, push), softening=1e6)
     found = table31.inverse_mpc_reduced(problem)
     assert not keeps_hard(problem, found.stage_weights)
     np.testing.assert_allclose(found.gain, true.K, atol=1e-6)

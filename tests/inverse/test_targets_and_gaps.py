@@ -19,13 +19,13 @@ STEPS, HORIZON = 80, 6
 TRUE = np.diag([4.0, 0.3])
 
 
-def cart(**more: Any) -> impc.Plant:
+def cart() -> impc.Plant:
     """Mass on a weak spring with a push and wind as disturbances."""
     system = control.ss(
         [[1, 0.1], [-0.02, 0.97]], [[0, 0], [0.1, 0.1]], np.eye(2), 0, 0.1,
         states=["x", "v"], inputs=["push", "wind"], outputs=["x", "v"],
     )  # fmt: skip
-    return impc.Plant(system, controls=["push"], **more)
+    return impc.Plant(system, controls=["push"])
 
 
 def steps(seed: int) -> Array:
