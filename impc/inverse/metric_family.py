@@ -24,7 +24,7 @@ import scipy.optimize
 
 from impc.arrays import Array
 from impc.inverse.laws import GainLaw
-from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.residuals import misfit_or_reason, unusable
 from impc.inverse.unknowns import linear_at
 
 if TYPE_CHECKING:
@@ -172,10 +172,16 @@ def _searched(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> 
     def at(z: Array) -> tuple[Array, Array]:
         if z.tobytes() not in last:
             last.clear()
-            law, changes = GainLaw(problem, gain, family.metric(z)), family.changes(z)
-            found = linear_at(problem, law, law.start)
-            along = law.along(np.zeros((len(changes), *gain.shape)), changes)
-            last[z.tobytes()] = found.residual, found.parts(problem)[0] @ along.T
+            S, changes = family.metric(z), family.changes(z)
+            try:
+                law = GainLaw(problem, gain, S)
+            except np.linalg.LinAlgError:  # singular to rounding: the search rejects the step
+                far = unusable(problem, 0, "the metric is singular").residual
+                last[z.tobytes()] = far, np.zeros((len(far), len(changes)))
+            else:
+                found = linear_at(problem, law, law.start)
+                along = law.along(np.zeros((len(changes), *gain.shape)), changes)
+                last[z.tobytes()] = found.residual, found.parts(problem)[0] @ along.T
         return last[z.tobytes()]
 
     def residual(z: Array) -> Array:

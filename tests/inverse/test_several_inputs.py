@@ -57,7 +57,7 @@ def fault(path: str, m: int, seed: int) -> str:
         return f"said so: {error}"
     assert path != "reduced" or found.explained == (not found.reason)
     miss = missed(problem, found.stage_weights)
-    if miss > REPRODUCED:
+    if miss > REPRODUCED or not found.explained:
         return f"missed by {miss:.2g}" if found.explained else "said so"
     if path == "reduced":
         span, S = found.metrics.reshape(len(found.metrics), -1).T, np.ravel(controller.S)
@@ -78,6 +78,8 @@ def fault(path: str, m: int, seed: int) -> str:
         ("fit", 2, range(5), 0),
         ("reduced", 1, range(10), 0),
         ("reduced", 2, range(10), 0),
+        # More inputs than states: the search of the metric passed a singular one and raised.
+        ("reduced", 3, [25], 0),
         pytest.param("fit", 3, range(5), 0, marks=FULL),
         pytest.param("reduced", 3, range(5), 0, marks=FULL),
         # Seeds 2 and 8 converged to misfits of 8e-5 and 3e-5.
