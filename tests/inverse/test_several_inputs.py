@@ -47,8 +47,8 @@ def missed(problem: impc.Problem, weights: impc.Weights) -> float:
 def fault(path: str, m: int, seed: int) -> str:
     """Empty if reported weights reproduce the recording; "said so", or what is silently wrong.
 
-    The reduced form also has to find the metric as far as it is identified, and to report the
-    weights of least condition of the true gain with a metric that the recording cannot distinguish.
+    With one and two inputs the reduced form also has to find the metric as far as it is identified,
+    and the least condition of the true gain with a metric that the recording cannot distinguish.
     """
     controller, problem = random_problem(seed, m)
     try:
@@ -59,7 +59,7 @@ def fault(path: str, m: int, seed: int) -> str:
     miss = missed(problem, found.stage_weights)
     if miss > REPRODUCED or not found.explained:
         return f"missed by {miss:.2g}" if found.explained else "said so"
-    if path == "reduced":
+    if path == "reduced" and m < 3:
         span, S = found.metrics.reshape(len(found.metrics), -1).T, np.ravel(controller.S)
         beyond = S - span @ np.linalg.lstsq(span, S)[0]
         fibre = impc.gain_fibre(problem.plant, controller.K, found.metrics)
