@@ -1,4 +1,4 @@
-"""Structured fit near its solution: covariance of the weights, quadratic form of the misfit.
+"""Structured fit near its solution: derivatives, and covariance of the weights.
 
 As `covariance` for a gain: with J_t the derivative of the outputs at sample t by the unknowns,
 after projection on initial states and physical parameters,
@@ -8,25 +8,14 @@ after projection on initial states and physical parameters,
 for log cost weights, and for correlations where products of features have cost weights
 (`Structure.reported`). A physical parameter moves the gain because the weights stay fixed. A cost
 weight of zero is at its bound and left out; `weight_profiles` gives its upper end.
-
-The recordings identify a gain; the nonlinear part is the map from cost weights to gains. Near a fit
-the misfit is therefore a quadratic form of gain and metric, computed from one simulation,
-
-    m^2(z) = |q + R (k(z) - k)|^2 + rest,       k = (K, S),
-
-R and q the triangular factor and residual in the columns of k after projection on initial states
-and parameters (to first order); `rest` is the part that no nearby gain explains.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED, by_trial, spread_of_rows
@@ -35,12 +24,10 @@ from impc.assess.long_run_covariance import (
     residual_noise,
     white_noise,
 )
-from impc.errors import WeightsError
 from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED
 from impc.inverse.laws import GainLaw, regulator_slopes
 from impc.inverse.problem import noise_of_residual
-from impc.inverse.residuals import scaled_changes
 from impc.inverse.unknowns import linear_at
 from impc.model.riccati import solve_lqr
 
@@ -58,9 +45,6 @@ if TYPE_CHECKING:
 IDENTIFIED_FACTOR = 10.0
 # Share of an unknown in a direction without a value, below which it is rounding.
 _SHARE = 1e-3
-# Prior SD of a log cost weight about the fit: far wider than any finite interval.
-_SPREAD = 20.0
-_TRIES = 30
 
 
 @dataclass(frozen=True)
@@ -105,11 +89,6 @@ class Tangent(Frozen):
         """Covariance (k, k) of columns' residual for this noise."""
         return spread_of_rows(self.problem, noise, columns, self.noise)
 
-    @functools.cached_property
-    def quadratic(self) -> LocalQuadratic:
-        """Quadratic approximation of the misfit here."""
-        return LocalQuadratic(self)
-
 
 def tangent(
     structure: Structure, problem: Problem, cost_weights: Array, noise: float | None = None
@@ -142,77 +121,6 @@ def tangent(
         frozen(on_parameters + seen[:, count:]),
         size,
     )
-
-
-class LocalQuadratic:
-    """Quadratic form of gain and metric that approximates the misfit near a tangent."""
-
-    def __init__(self, at: Tangent) -> None:
-        #: Trace of the metric over m.
-        self.at, self.scale = at, float(np.trace(at.solution.S)) / at.problem.plant.m
-        seen = at.without_nuisance(np.array(at.on_law))
-        residual = at.without_nuisance(np.array(at.residual)[:, None])[:, 0]
-        self.triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
-        # R'q = columns' residual.
-        self.inside = np.linalg.pinv(self.triangle.T) @ (seen.T @ residual)
-        self.rest = float(residual @ residual - self.inside @ self.inside)
-
-    def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
-        """Least m^2 from z over steps along columns, and its minimiser.
-
-        With `aim`, the distance to that regulator takes the place of the misfit.
-        """
-        moving = np.isfinite(z)
-        offset, rest = self.inside, self.rest
-        if aim is not None:
-            offset, rest = -self._away(aim), 0.0
-        weight, rows = self.at.noise / _SPREAD, len(self.triangle)
-
-        def moved(step: Array) -> Array:
-            there = z.copy()
-            there[moving] += along @ step
-            return there
-
-        @functools.lru_cache(maxsize=1)  # scipy asks for residual and derivative separately
-        def seen(numbers: tuple[float, ...]) -> tuple[Array, Array]:
-            step = np.array(numbers)
-            prior = weight * np.eye(len(step))
-            try:
-                value, slopes = self._form(moved(step), moving)
-            except WeightsError:  # a derivative is used only at the start: the search ends there
-                far = np.full(rows + len(step), 1e6 * self.at.noise)
-                return far, np.vstack([np.zeros((rows, len(step))), prior])
-            return np.append(offset + value, weight * step), np.vstack([slopes @ along, prior])
-
-        def residual(step: Array) -> Array:
-            return seen(tuple(step))[0]
-
-        def derivative(step: Array) -> Array:
-            return seen(tuple(step))[1]
-
-        step: Array = np.zeros(along.shape[1])
-        if len(step):
-            step = scipy.optimize.least_squares(
-                residual, step, jac=derivative, ftol=1e-6, max_nfev=_TRIES
-            ).x
-        data = residual(step)[:rows]
-        return float(data @ data) + rest, moved(step)
-
-    def _form(self, z: Array, moving: Array) -> tuple[Array, Array]:
-        """R (k(z) - k) and its derivative by the free unknowns."""
-        problem, structure = self.at.problem.with_nuisance_fixed(), self.at.structure
-        solution = solve_lqr(problem.plant, structure.weights(z))
-        dK, dS = regulator_slopes(problem, structure, z, solution)
-        turned = self.scale * scaled_changes(np.array(solution.S), dS[moving])
-        return self._away(solution), self.triangle @ self.at.law.along(dK[moving], turned).T
-
-    def _away(self, solution: LqrSolution) -> Array:
-        """R (k - k(fit)) of another regulator."""
-        here, S = self.at.solution, np.array(solution.S)
-        metric = self.scale * len(S) / np.trace(S) * S - here.S
-        return np.asarray(
-            self.triangle @ self.at.law.along((solution.K - here.K)[None], metric[None])[0]
-        )
 
 
 @dataclass(frozen=True)

@@ -225,26 +225,28 @@ def structure_test(at: Tangent) -> StructureTest:
         statistic,
         freedom,
         float(scipy.stats.chi2.sf(statistic, freedom)),
-        _powers(at, float(np.trace(V)) / freedom, freedom),
+        _powers(at, U, V),
     )
 
 
-def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]:
-    """Power of the test against cross terms, from their distance to the structure."""
-    structure = at.structure
+def _powers(at: Tangent, U: Array, V: Array) -> tuple[CrossTerm, ...]:
+    """Power of the test against cross terms, to first order."""
+    structure, given = at.structure, at.solution
     if structure.coupled:
         return ()
-    penalised = np.flatnonzero(at.moving[: len(structure.labels)])
+    penalised, freedom = np.flatnonzero(at.moving[: len(structure.labels)]), len(V)
     quantile = float(scipy.stats.chi2.ppf(1 - SIGNIFICANCE, freedom))
     found = []
     for i, j in itertools.combinations(penalised, 2):
         one, other = structure.features[i], structure.features[j]
         half = _CROSS * np.exp((at.cost_weights[i] + at.cost_weights[j]) / 2)
-        given = at.solution.weights
-        crossed = Weights(given.Q + half * (np.outer(one, other) + np.outer(other, one)), given.R)
+        crossed = Weights(
+            given.weights.Q + half * (np.outer(one, other) + np.outer(other, one)), given.weights.R
+        )
         there = solve_lqr(at.problem.plant, crossed)
-        cost_weights = np.array(at.cost_weights)
-        apart, _ = at.quadratic.least(cost_weights, np.eye(int(np.sum(at.moving))), there)
-        power = float(scipy.stats.ncx2.sf(quantile, freedom, apart / variance))
+        change = at.law.along((there.K - given.K)[None], (there.S - given.S)[None])[0]
+        apart = U.T @ (at.on_law @ change)
+        distance = float(apart @ np.linalg.solve(V, apart))
+        power = float(scipy.stats.ncx2.sf(quantile, freedom, distance))
         found.append(CrossTerm(structure.labels[i], structure.labels[j], power))
     return tuple(found)
