@@ -33,7 +33,6 @@ from impc.assess.variance_accounted_for import (
     held_out_vafs,
     innovation_roots,
     innovations_criterion,
-    residuals_of,
 )
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
 from impc.inverse.problem import EXPLAINED, recorded_size
@@ -134,20 +133,10 @@ def assess_structure(
         structure_test(at),
         own.vaf,
         frozen(np.mean(left, axis=0) if left else nothing),
-        criterion_of(found, innovation_roots(near), int(np.count_nonzero(covariance.identified))),
+        innovations_criterion(
+            found, innovation_roots(near), int(np.count_nonzero(covariance.identified))
+        ),
     )
-
-
-def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
-    """Akaike's criterion: innovations for `roots` (p,), plus 2 per identified unknown.
-
-    Noise of 1e-9 of the output scale is added, so that rounding makes no difference.
-    """
-    floor = np.random.default_rng(0)
-    residuals = [
-        part + EXPLAINED * floor.standard_normal(part.shape) for part in residuals_of(found)
-    ]
-    return innovations_criterion(residuals, roots) + 2 * identified
 
 
 def _moving(cost_weights: Array) -> Array:
