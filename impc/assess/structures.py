@@ -198,7 +198,7 @@ class StructureTest(Frozen):
 
 def structure_test(at: Tangent) -> StructureTest:
     """Score test of a structure at its fit against an unrestricted gain."""
-    fitted = at.span(np.array(at.on_cost_weights[:, at.moving]))
+    fitted = at.span(np.array(at.on_parameters), np.array(at.on_cost_weights[:, at.moving]))
     beyond = fitted.without(np.array(at.on_law[:, : at.solution.K.size]))
     left, sizes, _ = np.linalg.svd(beyond, full_matrices=False)
     identified = sizes > at.noise / IDENTIFIED

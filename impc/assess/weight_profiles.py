@@ -9,7 +9,7 @@ R and q the triangular factor and residual in the columns of k after projection 
 and parameters (to first order); `rest` is the part that no nearby gain explains.
 
 With a combination a'z of the unknowns fixed at v, all other cost weights are refitted: in the form
-of the nearest fit, then in that at its end. With the least misfit m(v),
+of the nearest fit, then in that at its end, until it stays. With the least misfit m(v),
 
     D(v) = (m^2(v) - m^2(v*)) / (s^2 f),
 
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 _SPREAD, _TRIES = 20.0, 30
 # Largest change of a log cost weight that is tried: beyond a factor of e^12 there is no end.
 _FARTHEST = 12.0
+# A fit has converged where it falls short of its form by this share of D; largest number of forms.
+_STAYS, _ROUNDS = 0.02, 8
 
 
 class LocalQuadratic:
@@ -129,7 +131,7 @@ class WeightProfiles:
 
     def __init__(self, at: Tangent, covariance: WeightCovariance) -> None:
         self.at, self.covariance, self.form = at, covariance, LocalQuadratic(at)
-        samples, every = len(at.residual), np.eye(int(np.sum(at.moving)))
+        samples, every = at.problem.recorded_numbers, np.eye(int(np.sum(at.moving)))
         self.variance = at.noise**2 * samples / max(samples - covariance.rank, 1)
         self.base = self.form.least(np.array(at.cost_weights), every)[0] / self.variance
 
@@ -192,21 +194,28 @@ class _Curve(Curve[_Point]):
         return self.end(QUANTILE * wider**2, offsets)
 
     def fit(self, value: float, near: tuple[float, _Point]) -> _Point | None:
-        """Refit all else: in the form of a nearby fit, then in that at its end."""
+        """Refit all else in the form of a nearby fit, then in that at the end, until it stays."""
         offset, point = near
         moving, at = np.isfinite(point.z), self.profiles.at
         own, z = self.row[moving], point.z.copy()
         z[moving] += (value - offset) / float(own @ own) * own
-        z = self._least(point.form, z)[1]
-        try:
-            there = tangent(at.structure, at.problem, z, at.noise)
-        except WeightsError:
-            return None
-        if there.reason:
-            return None
-        form = LocalQuadratic(there)
-        least, z = self._least(form, z)
-        return _Point(least / self.profiles.variance, z, form)
+        form, variance, best = point.form, self.profiles.variance, None
+        for _ in range(_ROUNDS):
+            predicted, z = self._least(form, z)
+            try:
+                there = tangent(at.structure, at.problem, z, at.noise)
+            except WeightsError:
+                break
+            if there.reason:
+                break
+            form = LocalQuadratic(there)
+            least = form.least(z, np.zeros((int(np.sum(np.isfinite(z))), 0)))[0] / variance
+            if best is not None and least > best.objective:
+                break
+            best = _Point(least, z, form)
+            if least - predicted / variance <= _STAYS * (QUANTILE + least):
+                break
+        return best
 
     def _least(self, form: LocalQuadratic, z: Array) -> tuple[float, Array]:
         """Least m^2 with the combination as at z (count,), and its minimiser."""
