@@ -155,8 +155,10 @@ def summarise_weights(
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
-    ends = [found.least, *(end for item in ranges.values() for end in (item.least, item.most))]
-    first, *others = [dominant_direction(sizes[:, None] * one.weights.Q * sizes) for one in ends]
+    ends = [end.weights for item in ranges.values() for end in (item.least, item.most)]
+    first, *others = [
+        dominant_direction(sizes[:, None] * one.Q * sizes) for one in (found.least.weights, *ends)
+    ]
     angle = max(angle_between(first, other) for other in others)
     statements = pair_statements(found, sizes, names) if len(names) > 1 else ()
 

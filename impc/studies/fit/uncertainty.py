@@ -86,7 +86,7 @@ def assess(
     for name in settings.profiles:
         stage = f"profile of {name}"
         profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
-        intervals += [] if profile is None else [profile.interval]
+        intervals += [] if profile is None else [profile]
         done(stage)
     limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
@@ -94,7 +94,8 @@ def assess(
         limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
         if limit is not None:
             limits.append(limit)
-            intervals.append(_limit_interval(limit, name))
+            ends = limit.value, limit.low, limit.high
+            intervals.append(Interval(f"u_max.{name}", "profile", LEVEL, *ends))
         done(f"limit of {name}")
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
@@ -104,10 +105,6 @@ def assess(
     replicates = functools.partial(_bootstrap, estimate, settings, done, remember)
     intervals += attempt("bootstrap", replicates, ())
     return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
-
-
-def _limit_interval(found: LimitEstimate, control: str) -> Interval:
-    return Interval(f"u_max.{control}", "profile", found.level, found.value, found.low, found.high)
 
 
 def _bootstrap(
