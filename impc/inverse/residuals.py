@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.checking import checked, replace
+from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Status
@@ -106,12 +106,8 @@ def linearise(
     along = _directions(problem, controller, law, differential)
     seen = _Seen.of(problem, correction)
     if correction is not None and seen.moves is not None:
-        along = replace(along, x0=correction.kept(problem) @ along.x0)
-    if seen.moves is not None:
         E = np.zeros((problem.plant.n, seen.moves[2].shape[1], along.count))
-        E[:, : along.E.shape[1]] = along.E
-        _along_pushed(problem, E, shared)
-        along = replace(along, E=E)
+        along = replace(along, x0=correction.kept(problem) @ along.x0, E=E)
     prepared, outputs = (
         prepare_loop(controller, along, seen.moves),
         seen.weighting @ problem.plant.C,
@@ -119,7 +115,13 @@ def linearise(
     residuals, tables, reason, active, weakly_active = [], [], "", 0, 0
     commands = len(problem.measured) > len(problem.plant.C)
     for trial, drive in zip(problem.recordings, seen.drives, strict=True):
-        run, moved = run_loop(prepared, drive, proved=False, seen=outputs, inputs=commands)
+        run, moved = run_loop(
+            *(prepared, drive),
+            proved=False,
+            seen=outputs,
+            inputs=commands,
+            pushed=_pushed(problem, trial),
+        )
         weakly_active += run.weakly_active
         active += int(np.count_nonzero(run.status != Status.FREE))
         difference = seen.off(problem, trial, run)
@@ -194,7 +196,7 @@ def _runs(
     problem: Problem, controller: Controller, correction: Correction | None = None
 ) -> Iterator[tuple[Simulation, Array]]:
     """Simulation and residual (samples, q) of each trial, without derivatives."""
-    seen = _Seen.of(problem, correction, errors=False)
+    seen = _Seen.of(problem, correction)
     prepared = prepare_loop(controller, directions(controller, 0), seen.moves)
     for trial, drive in zip(problem.recordings, seen.drives, strict=True):
         run, _ = run_loop(prepared, drive, proved=False)
@@ -212,24 +214,12 @@ class _Seen:
     plain: bool = True  # Whether that only divides by the scales
 
     @classmethod
-    def of(cls, problem: Problem, correction: Correction | None, *, errors: bool = True) -> _Seen:
-        """With the derivatives by `errors` of disturbances as further disturbances."""
-        if correction is not None:
-            moves, drives = correction.moves(problem), correction.drives(problem)
-            return cls(moves, drives, correction.weighting(problem), plain=False)
-        plant, weighting = problem.plant, np.diag(1 / problem.output_scale)
-        pushed = _pushed(problem) if errors else []
-        if not pushed:
-            return cls(None, scenarios(problem), weighting)
-        drives = []
-        for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-            slopes = distorted(trial.disturbance[:-1], trial.errors[:, len(plant.C) :], held=True)[
-                1
-            ]
-            more = [slopes[:, column, kind, None] for _, kind, column in pushed]
-            drives.append(replace(drive, disturbance=np.hstack([drive.disturbance, *more])))
-        E = np.hstack([plant.E, np.zeros((plant.n, len(pushed)))])
-        return cls((plant.A, plant.B, E), drives, weighting)
+    def of(cls, problem: Problem, correction: Correction | None) -> _Seen:
+        """As simulations, or as predictions with a `correction`."""
+        if correction is None:
+            return cls(None, scenarios(problem), np.diag(1 / problem.output_scale))
+        moves, drives = correction.moves(problem), correction.drives(problem)
+        return cls(moves, drives, correction.weighting(problem), plain=False)
 
     def off(self, problem: Problem, trial: Recording, run: Simulation) -> Array:
         """(Simulated - recorded) / scale, shape (samples, q); zero for missing values."""
@@ -240,21 +230,17 @@ class _Seen:
         return np.hstack([found[:, :p] @ W.T, found[:, p:] / problem.scale[p:]])
 
 
-def _pushed(problem: Problem) -> list[tuple[int, int, int]]:
-    """Searched errors of disturbances: place among the errors, kind and disturbance."""
-    p = len(problem.plant.outputs)
-    return [
-        (place, kind, column - p)
-        for place, (kind, column) in enumerate(problem.error_places)
-        if column >= p
-    ]
-
-
-def _along_pushed(problem: Problem, E: Array, shared: int) -> None:
-    """Write the directions of E (n, d + errors, count) that errors of disturbances add."""
-    first = shared + problem.searched_states
-    for further, (place, _, column) in enumerate(_pushed(problem)):
-        E[:, problem.plant.E.shape[1] + further, first + place] = problem.plant.E[:, column]
+def _pushed(problem: Problem, trial: Recording) -> Array | None:
+    """Derivatives of the disturbance (steps, d, errors) by errors of signals; None if zero."""
+    p, places = len(problem.plant.outputs), problem.error_places
+    if not any(column >= p for _, column in places):
+        return None
+    slopes = distorted(trial.disturbance[:-1], trial.errors[:, p:], held=True)[1]
+    found = np.zeros((*slopes.shape[:2], len(places)))
+    for place, (kind, column) in enumerate(places):
+        if column >= p:
+            found[:, column - p, place] = slopes[:, column - p, kind]
+    return found
 
 
 def _directions(
@@ -365,7 +351,6 @@ def scaled_changes(metric: Array, changes: Array) -> Array:
     return np.asarray(len(metric) / trace * (changes - shares * metric))
 
 
-@checked
 def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set."""
     controller = weights_controller(problem, weights, hard=True)

@@ -108,7 +108,6 @@ class BoundRows(Value):
         return np.where(own, self.b, 0.0)
 
 
-@checked
 def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
     """Return the finite bounds as rows."""
     limits = np.concatenate([bounds.u_max, bounds.u_min, bounds.x_max, bounds.x_min])

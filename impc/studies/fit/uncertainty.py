@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.input_limits import input_limit
-from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals
+from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals, gain_estimate
 from impc.assess.profiles import profile_likelihood, require_numbers
 from impc.assess.resampling import bootstrap_intervals, replicate
 from impc.assess.variance_accounted_for import (
-    held_out_vafs,
     innovation_roots,
     innovations_criterion,
+    left_out,
 )
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -185,10 +185,9 @@ def verdict(one: Alternative, other: Alternative) -> str:
 def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:
     try:
         found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
-        weights = found.weights
-        held = held_out_vafs(
-            problem, lambda index: fit_controller(problem.leaving_out(index), weights), settle
-        )
+        estimate, count = gain_estimate(found), len(problem.recordings)
+        places = range(count if count > 1 else 0)
+        held = [left_out(found, estimate, index, settle).vaf for index in places]
     except (WeightsError, SolverError) as error:
         return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
     aic = innovations_criterion(found, roots)
