@@ -85,7 +85,7 @@ def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
             if curve.tried[offset] is None:  # nor is a lower limit feasible
                 break
         curve.refine(_RESOLUTION)
-        if abs(curve.best) < _STAYS:
+        if abs(curve.best) < _STAYS or curve.rise(np.inf) < QUANTILE:
             break
         # A gain fitted under a wrong limit is a poor start.
         grid, start = _NEAR, float(start * np.exp(curve.best))
