@@ -21,7 +21,7 @@ from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent import intent
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.resampling import bootstrap_model, replicate
+from impc.assess.resampling import replicate
 from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out, saturated_share
 from impc.assess.weights_test import weights_test
@@ -129,8 +129,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     started = time.perf_counter()
     problem, settings = unit_problem(task)
     here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "errors")))
-    model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
-    found = replicate(model, index, settings.seed)
+    found = replicate(here, np.array(fit["K"]), np.array(fit["S"]), index, settings.seed)
     return _finished({"K": found.K, "parameters": found.parameters}, started)
 
 
