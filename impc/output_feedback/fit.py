@@ -12,7 +12,7 @@ from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.problem import require_riccati
 from impc.output_feedback.observer import LEVELS
-from impc.output_feedback.search import maximise
+from impc.output_feedback.search import ROUGH, maximise
 from impc.output_feedback.unknowns import (
     Iterate,
     NoisyUnknowns,
@@ -166,7 +166,7 @@ def fit_output_feedback(
             # First stage: the gain is fixed.
             rest, none = np.eye(len(theta))[:, space.gain :], np.zeros(len(theta))
             budget = min(_FIRST, max_evaluations)
-            begun.append(_End(space, *maximise(space, space.at(theta), budget, rest, none)))
+            begun.append(_End(space, *maximise(space, space.at(theta), budget, rest, none, ROUGH)))
         except ImpcError as error:
             reasons.append(error)
     if not begun:
@@ -251,7 +251,7 @@ def _retried(end: _End, budget: int) -> _End:
     there = space.tried(theta) if len(space.senses) and budget > _LOOK else None
     if there is None:
         return end
-    there, unseen, spent, _ = maximise(space, there, _LOOK, unseen=end.unseen)
+    there, unseen, spent, _ = maximise(space, there, _LOOK, unseen=end.unseen, promise=ROUGH)
     if there.value <= end.place.value + _HIGHER:
         return end._replace(spent=end.spent + spent)
     beside = _searched(_End(space, there, unseen, 0, False), budget - spent)
@@ -263,7 +263,7 @@ def _searched(start: _End, budget: int) -> _End:
     space, place, spent = start.space, start.place, 0
     while spent < budget:
         none, part = np.zeros(len(place.theta)), min(_ROUND, budget - spent + 1)
-        place, _, more, _ = maximise(space, place, part, unseen=none)
+        place, _, more, _ = maximise(space, place, part, unseen=none, promise=ROUGH)
         spent += more - 1
         moved = np.linalg.norm((place.theta - space.center)[: space.gain])
         if moved <= _NEAR * space.request.spread:

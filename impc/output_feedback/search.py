@@ -1,10 +1,7 @@
-"""Maximise the fit objective by Fisher scoring with box-shaped trust regions.
+"""Maximise the fit objective: the minimiser of inverse MPC, with Fisher information as curvature.
 
-    maximise  g's - s'I s / 2    over  |s_i| <= radius
-
-with the gradient g and the expected information I; the radius follows from the actual increase. A
-step scaled as a whole is held back by a noise SD that tends to zero: on the seat it needed hundreds
-of iterations.
+The REML term has no exact gradient: the search learns it along the noise SDs by Broyden's update,
+and computes it by differences where it ends.
 """
 
 from __future__ import annotations
@@ -14,33 +11,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import lsq_linear
 
 from impc.arrays import Array
+from impc.inverse.minimiser import Prior, Rows, Stop, minimise
 
 if TYPE_CHECKING:
     from impc.output_feedback.unknowns import Iterate, NoisyUnknowns
 
-# Predicted increase in nats below which a search has converged: a hundredth of a standard error in
-# any direction without prior, a tenth with it, as the gradient of the REML term is inexact.
-_SETTLED, _ENOUGH = 1e-4, 5e-3
-# The likelihood jumps where a later stage of a plan reaches a bound: for a seat at its limit by 0.5
-# nat within one standard error. Steps are accepted as for a function with that error (Sun and
-# Nocedal 2023), and a search stops after so many steps without an increase by so much: converged
-# if the predicted increase at the best point is below 0.5 nat.
-_ROUGH, _PATIENCE, _PROGRESS = 0.5, 4, 0.05
+# Promised decrease of -2 log posterior below which a search has converged: a hundredth of a
+# standard error in any direction without prior, a tenth with it, as the gradient of the REML term
+# is inexact.
+_SETTLED, _ENOUGH = 2e-4, 1e-2
+#: The likelihood jumps where a later stage of a plan reaches a bound, for a seat at its limit by
+#: 0.5 nat within one standard error: a search that is stuck has converged below this promise.
+ROUGH = 1.0
 # A further round with the REML gradient by differences is skipped if the last gained less.
 _WON = 0.25
 # Close to instability the information of the first state spans 35 digits: adding this share of each
 # diagonal keeps the matrix positive definite.
 _ROUNDING = 1e-12
-# Follow the ridge of coordinates that are no noise SDs above this predicted increase, nats.
-_BESIDE = 0.05
 # Difference step of a log noise SD; squared step at which Broyden's update is halved.
 _DIFFERENCE, _DAMPING = 0.1, 0.1
-# Largest and smallest step of any coordinate; factor for initial states, in which the likelihood
-# without bounds is quadratic.
-_STEP, _SHORTEST, _AFAR = 1.0, 1e-3, 100.0
 
 
 def maximise(
@@ -49,6 +40,7 @@ def maximise(
     budget: int,
     along: Array | None = None,
     unseen: Array | None = None,
+    promise: float | None = None,
 ) -> tuple[Iterate, Array, int, bool]:
     """Best iterate, its REML gradient `unseen` (q,), evaluations used, and whether converged.
 
@@ -56,78 +48,63 @@ def maximise(
     gradient is never computed by differences.
     """
     way = np.eye(len(begin.theta)) if along is None else along
-    others = way[:, ~np.any(way[space.own :] != 0, axis=0)]
-    reach = _reach(space, way)
-    enough, progress = (_ENOUGH, _PROGRESS) if space.used else (_SETTLED, _SETTLED)
-    here = best = begin
-    differences = space.used and unseen is None
-    unseen = np.zeros(len(begin.theta)) if unseen is None else unseen
-    # Objective at the last evaluation of the REML gradient by differences, nats.
-    known = -np.inf
-    radius, spent, stale, left = _STEP, 1, 0, np.inf
+    promise = promise or (_ENOUGH if space.used else _SETTLED)
+    differences, evaluated = space.used and unseen is None, len(space.scales)
+    here, spent, u, v = begin, 1, np.zeros(way.shape[1]), np.zeros((1, 0))
+    unseen = np.zeros(len(way)) if unseen is None else unseen
     while True:
-        gradient, curvature = space.parabola(here, unseen)
-        down, curvature = way.T @ gradient, way.T @ curvature @ way
-        predicted = boxed_step(down, curvature, np.inf)[1]
-        if here is best:
-            left = predicted
-        if predicted < enough or stale == _PATIENCE or radius < _SHORTEST or spent >= budget:
-            if best.value <= known + _WON or spent >= budget or not differences:
-                return best, unseen, spent, left < _ROUGH
-            here, unseen, known = best, reml_slope(space, best), best.value
-            # One or two evaluations per noise SD.
-            radius, spent, stale = _STEP, spent + len(space.scales), 0
-            continue
-        step, within = boxed_step(down, curvature, radius * reach)
-        length = float(np.max(np.abs(step) / reach))
-        there, spent = space.tried(here.theta + way @ step), spent + 1
-        if there is not None and space.used and spent < budget:
-            there, more = _followed(space, there, others, unseen)
-            spent += more
-        # Ratio of actual to predicted increase, both enlarged by the size of the jumps.
-        share = -1.0 if there is None else (there.value - here.value + _ROUGH) / (within + _ROUGH)
-        if there is None or share < 0.25:
-            radius = length / 4
-            continue
-        if share > 0.75:
-            radius = min(max(radius, 2 * length), _STEP)
-        stale = 0 if there.value > best.value + progress else stale + 1
-        best = there if there.value > best.value else best
-        unseen, here = updated_slope(space, unseen, here, there), there
+        if differences and spent + evaluated < budget:
+            unseen, spent = reml_slope(space, here), spent + evaluated
+        model, known = Objective(space, here, way, unseen), here.value
+        stop = Stop(promise, 0.0, budget - spent + 1, costly=True)
+        end = minimise(model, Prior(u, v, u, 0.0), (u, v), stop)
+        here, unseen, spent = model.found(end.u), model.unseen, spent + model.spent
+        if not differences or here.value <= known + _WON or spent >= budget:
+            return here, unseen, spent, end.converged or end.promised < ROUGH
 
 
-def _reach(space: NoisyUnknowns, way: Array) -> Array:
-    """Factor (r,) for the largest step along each of some directions (q, r)."""
-    return np.where(np.any(way[space.shared : space.after] != 0, axis=0), _AFAR, 1.0)
+class Objective:
+    """-2 log posterior along directions `way` (q, r) from a point, for the minimiser."""
 
+    def __init__(self, space: NoisyUnknowns, begin: Iterate, way: Array, unseen: Array) -> None:
+        self.space, self.begin, self.way, self.unseen = space, begin, way, unseen
+        #: Iterate of the last rows, and the one evaluated last; evaluations.
+        self.here, self.last, self.spent = begin, begin, 0
 
-def _followed(
-    space: NoisyUnknowns, here: Iterate, others: Array, unseen: Array
-) -> tuple[Iterate, int]:
-    """Step onto the ridge of the coordinates `others` (q, r), not noise SDs; evaluations used."""
-    # The ridge bends with the noise SDs, on the seat by many standard errors.
-    slope, bend = space.parabola(here, unseen)
-    radius = _STEP * _reach(space, others)
-    step, predicted = boxed_step(others.T @ slope, others.T @ bend @ others, radius)
-    if predicted < _BESIDE:
-        return here, 0
-    there = space.tried(here.theta + others @ step)
-    if there is None or there.value + there.lost < here.value + here.lost:
-        return here, 1
-    return there, 1
+    def found(self, u: Array) -> Iterate:
+        """Iterate at `u` (r,), evaluated before."""
+        theta = self.begin.theta + self.way @ u
+        return next(one for one in (self.last, self.here) if np.array_equal(one.theta, theta))
 
+    def rows(self, u: Array, v: Array) -> Rows | None:
+        """Factor F of the curvature, F'F, and the residual r of the gradient, F'r."""
+        if not np.isfinite(self.value(u, v)):
+            return None
+        here = self.found(u)
+        self.unseen = updated_slope(self.space, self.unseen, self.here, here)
+        self.here = here
+        gradient, curvature = self.space.parabola(here, self.unseen)
+        gradient, curvature = self.way.T @ gradient, self.way.T @ curvature @ self.way
+        unit = np.sqrt(np.diag(curvature))
+        scaled = curvature / np.outer(unit, unit) + _ROUNDING * np.eye(len(unit))
+        root = np.linalg.cholesky(scaled)
+        residual = -scipy.linalg.solve_triangular(root, gradient / unit, lower=True)
+        none = np.zeros((1, len(unit), 0))
+        return Rows(residual[None], (root.T * unit)[None], none, -2 * here.value, 1.0)
 
-def boxed_step(gradient: Array, curvature: Array, radius: Array | float) -> tuple[Array, float]:
-    """Step with the largest predicted increase g's - s'C s / 2 in the box |s_i| <= radius.
+    def value(self, u: Array, _v: Array) -> float:
+        """-2 log posterior; infinite where it is undefined."""
+        theta = self.begin.theta + self.way @ u
+        if not any(np.array_equal(one.theta, theta) for one in (self.last, self.here)):
+            self.spent += 1
+            there = self.space.tried(theta)
+            if there is None:
+                return np.inf
+            self.last = there
+        return -2 * self.found(u).value
 
-    `gradient` (q,); `curvature` (q, q); `radius` (q,); returns (q,).
-    """
-    unit = 1 / np.sqrt(np.diag(curvature))
-    scaled = unit[:, None] * curvature * unit + _ROUNDING * np.eye(len(unit))
-    root = np.linalg.cholesky(scaled)
-    goal = scipy.linalg.solve_triangular(root, unit * gradient, lower=True)
-    step = unit * lsq_linear(root.T, goal, (-radius / unit, radius / unit), method="bvls").x
-    return step, float(gradient @ step - step @ curvature @ step / 2)
+    def bend(self, _du: Array, _dv: Array, _share: float) -> None:
+        """No geodesic acceleration: it needs a second derivative of the residual."""
 
 
 def reml_slope(space: NoisyUnknowns, here: Iterate) -> Array:

@@ -279,13 +279,18 @@ class NoisyUnknowns:
         return freed
 
     def parabola(self, here: Iterate, unseen: Array) -> tuple[Array, Array]:
-        """Gradient (q,) and negative Hessian (q, q), positive definite, of the objective.
+        """Gradient (q,) and curvature (q, q), positive definite, of the objective.
 
-        `unseen` (q,): gradient of the REML term.
+        The gradient by a log noise SD is added to its curvature, so that no step moves it by more
+        than one: far from the maximum the information is too small by any factor. `unseen` (q,):
+        gradient of the REML term.
         """
         slope, bend = self.slopes(here.theta)
         gradient = here.identified.gradient + slope + unseen
-        return gradient, here.identified.information + bend + _FLAT * np.eye(len(gradient))
+        curvature = here.identified.information + bend
+        own = np.arange(self.own, len(gradient))
+        curvature[own, own] += np.abs(gradient[own])
+        return gradient, curvature + _FLAT * np.eye(len(gradient))
 
     def lost(self, theta: Array, identified: LikelihoodTerms) -> float:
         """REML term at theta (q,) in nats."""
