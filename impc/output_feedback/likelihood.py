@@ -28,8 +28,8 @@ from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.output_feedback.compiled_filter import Belief, Clip, FilterParts, Likelihood, run_filter
-from impc.output_feedback.joint_loop import joint_directions, joint_loop
 from impc.output_feedback.observer import Body, filter_changes, stationary_filter
+from impc.output_feedback.simulation import joint_directions, joint_loop
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.model.recordings import Recording
-    from impc.output_feedback.joint_loop import JointLoop
+    from impc.output_feedback.compiled_filter import JointLoop
     from impc.output_feedback.observer import Observer
 
 # Status of samples at which the likelihood is undefined.

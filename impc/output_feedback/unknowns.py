@@ -31,7 +31,6 @@ from impc.inverse.problem import controller_for
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.starts import regulators
 from impc.inverse.unknowns import Point, Unknowns
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
 
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
-    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.output_feedback.compiled_filter import Likelihood
     from impc.output_feedback.observer import Observer
@@ -61,10 +59,6 @@ _BARRIER = 0.5
 _UNLIKE = 0.25
 # Noise-free recordings have no residual: noise SDs start at this share of the outputs.
 _LEAST = 1e-6
-# Increase of the log cost weights at the second start: a low cost weight and noisy senses both
-# delay the response, and a search from least squares, which assumes exact senses, may end at the
-# first.
-_FAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -370,18 +364,6 @@ def space_at(problem: Problem, request: Request, origin: dict[str, Any]) -> Nois
     point = Point(kept["K"], kept["S"], problem.at(kept["starts"], kept["logarithms"]))
     weights = None if origin["cost_weights"] is None else kept["cost_weights"]
     return NoisyUnknowns(gain_space(point, weights), request, kept["levels"])
-
-
-def starting_points(
-    found: Estimate, problem: Problem, request: Request
-) -> list[tuple[list[Point], Array | None]]:
-    """Points from which a fit starts, and their cost weights (count,), if these are estimated."""
-    first = [Point(np.array(found.gain), np.array(found.metric), problem)]
-    if found.cost_weights is None:
-        others = [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)]
-        return [(first, None), (others, None)]
-    larger = [(first, np.array(found.cost_weights) + _FAR)] if request.observer.estimates else []
-    return [(first, found.cost_weights), *larger]
 
 
 class Sizes(NamedTuple):

@@ -23,12 +23,10 @@ from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.structure import Structure
 from impc.output_feedback import likelihood
-from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback, reml_slope
 from impc.output_feedback.intervals import person_covariance
-from impc.output_feedback.models import decode_model, encode_model
+from impc.output_feedback.models import PersonModel, decode_model, encode_model
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.page import PersonModel
-from impc.output_feedback.search import reml_slope
 from impc.output_feedback.unknowns import NoisyUnknowns
 from tests.output_feedback.fits import cart, fitted, law, least_squares, posed
 from tests.support import extrapolated_slope

@@ -18,7 +18,6 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.output_feedback.compiled_filter import Likelihood
-from impc.output_feedback.joint_loop import joint_loop
 from impc.output_feedback.likelihood import (
     NoiseDirections,
     PreparedFilter,
@@ -26,7 +25,7 @@ from impc.output_feedback.likelihood import (
     prepare_filter,
 )
 from impc.output_feedback.observer import Observer, believed_filter
-from impc.output_feedback.simulation import PersonTrial, simulate_person
+from impc.output_feedback.simulation import PersonTrial, joint_loop, simulate_person
 from tests.support import extrapolated_slope
 
 if TYPE_CHECKING:

@@ -16,7 +16,13 @@ from experiments.noisy_people_score import blind
 from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import InputError
-from impc.output_feedback.fit import fit_output_feedback
+from impc.output_feedback.fit import (
+    Objective,
+    fit_output_feedback,
+    maximise,
+    reml_slope,
+    updated_slope,
+)
 from impc.output_feedback.intervals import (
     confusion,
     entry_intervals,
@@ -27,7 +33,6 @@ from impc.output_feedback.intervals import (
     profile,
 )
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.search import Objective, maximise, reml_slope, updated_slope
 from impc.output_feedback.unknowns import NoisyUnknowns
 from tests.output_feedback.fits import cart, fitted, posed, unknown_truth
 
