@@ -22,9 +22,10 @@ from tqdm import tqdm
 from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
+from impc.assess.printed_gain import gain_estimate
 from impc.assess.structured_weights import tangent
 from impc.assess.structures import StructureFit, assess_structure, criterion_of
-from impc.assess.variance_accounted_for import innovation_roots, left_out_vaf, vaf
+from impc.assess.variance_accounted_for import innovation_roots, left_out, vaf
 from impc.assess.weight_profiles import WeightProfiles
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
@@ -120,10 +121,8 @@ def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
     runs = [simulate(near.controller(), drive) for drive in scenarios(near.problem)]
     simulated = np.concatenate([run.x @ near.problem.plant.C.T for run in runs])
     recorded = np.concatenate([trial.outputs for trial in problem.recordings])
-    held = []
-    for index in range(len(problem.recordings)):
-        other = fit_controller(problem.leaving_out(index), near.stage_weights)
-        held.append(left_out_vaf(other, problem.recordings[index], 1.0).vaf)
+    estimate, places = gain_estimate(near), range(len(problem.recordings))
+    held = [left_out(near, estimate, index, 1.0).vaf for index in places]
     at = near.problem, np.array(near.gain), np.array(near.metric)
     identified = int(np.count_nonzero(gain_covariance(*at).identified))
     roots = innovation_roots(near)

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
-from impc.inverse.problem import Problem
+from impc.inverse.problem import Problem, controller_for
+from impc.inverse.residuals import linearise
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
@@ -95,6 +96,13 @@ def differences(function: Callable[[Any], Any], at: Any, step: float = 1e-6) -> 
         move = unit.reshape(at.shape)
         columns.append(np.ravel((function(at + move) - function(at - move)) / (2 * step)))
     return np.array(columns).T
+
+
+def slopes(problem: Problem, K: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Residual (r,), and its derivatives by entries of K, parameters and those of the trial."""
+    law = {"K": np.eye(K.size, K.size + len(problem.logarithms)).reshape(*K.shape, -1)}
+    found = linearise(problem, controller_for(problem, K, S), law)
+    return found.residual, *found.parts(problem)
 
 
 def plant_of(A: Any, B: Any, C: Any = None, dt: float = 1.0) -> Plant:

@@ -12,7 +12,8 @@ import numpy as np
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import side_by_side
 from experiments.benchmarks.workloads import Workload, example
-from impc.inverse.residuals import evaluate
+from impc.inverse.laws import GainLaw
+from impc.inverse.unknowns import linear_at
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
@@ -30,9 +31,10 @@ def layer_rows(runs: int, _: Path) -> list[Row]:
         return [Row(what, against, None, None, "", note)]
     work = example()
     solution = solve_lqr(work.problem.plant, work.weights)
+    law = GainLaw(work.problem, np.array(solution.K), np.array(solution.S))
     timings = side_by_side(
         {
-            "own": lambda: evaluate(work.problem, solution.K, solution.S),
+            "own": lambda: linear_at(work.problem, law, law.start),
             "layer": _layer(work),
         },
         max(3, runs // 2),

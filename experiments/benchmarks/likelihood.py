@@ -20,8 +20,7 @@ from experiments.benchmarks.workloads import seat
 from experiments.noisy_people import recorded, subject
 from impc.checking import replace
 from impc.inverse.laws import GainLaw
-from impc.inverse.residuals import evaluate
-from impc.inverse.unknowns import Point, Unknowns
+from impc.inverse.unknowns import Point, Unknowns, linear_at
 from impc.output_feedback.unknowns import NoisyUnknowns, Request, gain_space
 
 if TYPE_CHECKING:
@@ -36,11 +35,13 @@ __all__ = ["likelihood_rows"]
 def likelihood_rows(runs: int, _: Path) -> list[Row]:
     """Rows for three trials of 30 s at the limit, with derivatives by gain and initial states."""
     who, work = subject("seat", 0, "both", 90.0, 6.0), seat(3)
-    law, problem = who.controller, recorded(who, 0).problem
-    given = problem, np.array(law.K), np.array(law.S)
+    problem = recorded(who, 0).problem
+    given = problem, np.array(who.controller.K), np.array(who.controller.S)
+    law = GainLaw(*given)
     kept = _at_the_truth(who, problem)
-    free = NoisyUnknowns(Unknowns(problem, GainLaw(*given)), Request(who.person, who.recorder))
-    known = np.array(work.controller.K), np.array(work.controller.S)
+    free = NoisyUnknowns(Unknowns(problem, law), Request(who.person, who.recorder))
+    loose = replace(work.problem, unknown_start=True)
+    known = GainLaw(loose, np.array(work.controller.K), np.array(work.controller.S))
     far = subject("seat", 0, "both", 90.0, 70.0)
     free_of_limits = _at_the_truth(far, recorded(far, 0).problem)
     cases: dict[str, Callable[[], object]] = {
@@ -48,8 +49,8 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
         "kept": partial(kept.identified, kept.start),
         "free": partial(free.identified, free.start),
         "value": partial(kept.value, kept.start),
-        "W2": partial(evaluate, replace(work.problem, unknown_start=True), *known),
-        "person": partial(evaluate, problem, np.array(law.K), np.array(law.S)),
+        "W2": partial(linear_at, loose, known, known.start),
+        "person": partial(linear_at, problem, law, law.start),
     }
     timings = side_by_side(cases, 4 * runs, time.process_time)
     wall = side_by_side({name: cases[name] for name in ("kept", "W2")}, 4 * runs)

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.benchmarks.workloads import seat
-from impc.inverse.residuals import evaluate
+from impc.inverse.laws import GainLaw
 from impc.inverse.table31 import inverse_mpc_reduced
+from impc.inverse.unknowns import linear_at
 
 __all__ = ["peak_megabytes"]
 
@@ -31,7 +32,8 @@ if __name__ == "__main__":
     if work is not None and asked == "fit":
         inverse_mpc_reduced(work.problem)
     elif work is not None:
-        evaluate(work.problem, np.array(work.controller.K), np.array(work.controller.S))
+        law = GainLaw(work.problem, np.array(work.controller.K), np.array(work.controller.S))
+        linear_at(work.problem, law, law.start)
     # Peak of this program alone (Linux only); ru_maxrss would include its parent.
     status = Path("/proc/self/status").read_text(encoding="ascii")
     print(float(status.split("VmHWM:")[1].split()[0]) / 1024)

@@ -15,9 +15,9 @@ import numpy as np
 import scipy.optimize
 
 from experiments.certificates import cholesky_parameters, weights_from_parameters
-from impc.inverse.proximal_search import Residual, weight_jacobian
-from impc.inverse.residuals import evaluate
-from impc.inverse.table31 import CONDITION_WEIGHT, inverse_mpc
+from impc.inverse.proximal_search import weight_jacobian
+from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.table31 import CONDITION_WEIGHT, closed_loop_residual, inverse_mpc
 from impc.model.riccati import solve_lqr
 from impc.model.weights import condition_number
 
@@ -65,8 +65,8 @@ def smooth_surrogate(problem: Problem, start: Weights) -> Route:
         parameters, simulations = found.x, simulations + int(found.nfev)
     weights = weights_from_parameters(parameters, plant.n, plant.m)
     solution = solve_lqr(plant, weights)
-    misfit = np.linalg.norm(evaluate(problem, solution.K, solution.S).residual)
-    objective = float(misfit) + CONDITION_WEIGHT * condition_number(weights)
+    misfit, _ = misfit_or_reason(problem, solution.K, solution.S)
+    objective = misfit + CONDITION_WEIGHT * condition_number(weights)
     return Route(weights, objective, simulations, time.perf_counter() - begin)
 
 
@@ -77,12 +77,10 @@ def _surrogate(
     n, m = plant.n, plant.m
     weights = weights_from_parameters(parameters, n, m)
     solution = solve_lqr(plant, weights)
-    found = evaluate(problem, solution.K, solution.S)
+    found, _ = closed_loop_residual(problem, solution)
     basis = _directions(parameters, n, m)
-    jacobian = weight_jacobian(
-        solution, Residual(found.residual, found.dK, found.dS, usable=True), basis
-    )
-    size = float(np.sqrt(found.residual @ found.residual + softness**2))
+    jacobian = weight_jacobian(solution, found, basis)
+    size = float(np.sqrt(found.values @ found.values + softness**2))
     values, vectors = np.linalg.eigh(weights.block)
     scaled = values / values[-1]
     largest = float(np.sum(scaled**power) ** (1 / power)) * values[-1]
@@ -93,7 +91,7 @@ def _surrogate(
     on_smallest = smallest * inverse**power / np.sum(inverse**power) / values
     on_values = kappa * (on_largest / largest - on_smallest / smallest)
     on_block = (vectors * on_values) @ vectors.T
-    gradient = jacobian.T @ found.residual / size
+    gradient = jacobian.T @ found.values / size
     gradient += CONDITION_WEIGHT * np.tensordot(basis, on_block, 2)
     return size + CONDITION_WEIGHT * kappa, gradient
 

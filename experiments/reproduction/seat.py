@@ -179,7 +179,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "(3.23)",
             "x = Tz with the eigenvectors of Q: T'QT is diagonal.",
-            ("impc.assess.intent_statements:intent",),
+            ("impc.assess.intent:intent",),
             f"Off the diagonal at most {off:.0e} of the largest eigenvalue, {values[-1]:.2e}.",
             agrees(off < 1e-9),
         ),
@@ -187,7 +187,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             "(3.26)",
             "The dominant cost: a sum of angles and rates of one sign, angles above rates.",
             (
-                "impc.assess.intent_statements:intent",
+                "impc.assess.intent:intent",
                 "impc.inverse.equivalent_weights",
                 "impc.assess.bounded_weights",
             ),
@@ -204,7 +204,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 3.6",
             "The delay states come second in the intent.",
-            ("impc.assess.intent_statements:intent",),
+            ("impc.assess.intent:intent",),
             f"Second eigenvalue {values[-2]:.2e}; true ones {true_values[-1]:.2e},"
             f" {true_values[-2]:.2e}.",
             Verdict.NOT,
@@ -214,7 +214,7 @@ def _intent(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 3.6",
             "The states were penalised much more than the control effort.",
-            ("impc.assess.intent_statements:intent",),
+            ("impc.assess.intent:intent",),
             f"Largest eigenvalue {values[-1]:.1e} rad^-2 against R = 1 (N m)^-2.",
             Verdict.IN_KIND,
             "The ratio has units: with angles in degrees it is smaller by 3283.",

@@ -29,18 +29,17 @@ from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
 from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED, determined
-from impc.inverse.laws import metric_directions
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import noise_of_residual
 from impc.inverse.refit import IDENTIFIED
-from impc.inverse.residuals import evaluate, residual_only, residual_or_reason, with_prior_rows
-from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.residuals import residual_only, residual_or_reason
+from impc.inverse.unknowns import linear_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.inverse.columns import TrialSpan
     from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Evaluation
 
 #: An entry is individually identified if an error of one whitened unit in all unidentified
 #: directions shifts it by less than this share of its standard error. At shares of 0.2 to 0.25, 90
@@ -110,7 +109,6 @@ def gain_covariance(
     noise: Callable[[list[Array], TrialSpan], ResidualNoise] = residual_noise,
     *,
     curvature: bool = False,
-    evaluation: Evaluation | None = None,
     scale: float | None = None,
 ) -> GainCovariance:
     """Covariance of a gain fitted by least squares, and of the parameters fitted with it.
@@ -118,18 +116,20 @@ def gain_covariance(
     `scale` is the noise SD; None: that of the residual.
     """
     m, n = problem.plant.m, problem.plant.n
-    T, G = natural_coordinates(problem.plant, gain)
-    found = evaluation or evaluate(problem, gain, metric)
+    law = GainLaw(problem, gain, metric)
+    found = linear_at(problem, law, law.start)
     rows = len(found.residual)
     scale = noise_of_residual(problem, found.residual) if scale is None else scale
-    found = with_prior_rows(problem, found, scale)
-    in_units = np.kron(G, np.linalg.inv(T).T)
-    on_gain = found.dK.reshape(-1, m * n) @ in_units
-    metric_columns = _identified_metric(found.along_metric(metric, metric_directions(metric)))
+    slopes, on_parameters, own = found.with_prior(problem, scale).parts(problem)
+    on_gain, on_metric = slopes[:, : m * n], _identified_metric(slopes[:, m * n :])
+    in_units = law.gains.reshape(m * n, m * n).T
+
+    def span(*shared: Array) -> TrialSpan:
+        return trial_span(own, problem.row_sizes, np.hstack(shared))
+
     # Project the gain columns on the complement of the others: this gives the block of the inverse
     # of H.
-    rest = _span(problem, found, metric_columns, found.dparameters)
-    others = _span(problem, found, on_gain, metric_columns)
+    rest, others = span(on_metric, on_parameters), span(on_gain, on_metric)
     seen = rest.without(on_gain)
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     usable = determined(problem, values)
@@ -151,18 +151,17 @@ def gain_covariance(
     shares = np.zeros((m * n, 0))
     if np.any(problem.stated):
         known = directions[deviations < IDENTIFIED]
-        seen = np.hstack([on_gain @ known.T, found.dparameters])
-        along = _span(problem, found, metric_columns).without(seen)
+        along = span(on_metric).without(np.hstack([on_gain @ known.T, on_parameters]))
         shares = _shares(along, in_units @ known.T)[:, problem.stated]
     return GainCovariance(
-        frozen(T),
-        frozen(G),
+        frozen(law.T),
+        frozen(law.G),
         frozen(values),
         frozen(directions),
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, found.dparameters, others, colour, scale)),
+        frozen(_parameter_deviations(problem, on_parameters, others, colour, scale)),
         frozen(shares.reshape(m, n, shares.shape[1])),
         colour,
         frozen(spread),
@@ -234,11 +233,6 @@ def _identified_metric(alone: Array) -> Array:
     metric, sizes, _ = np.linalg.svd(alone, full_matrices=False)
     # Unidentified S (inputs that never saturate) leaves rounding of 1e-15.
     return np.asarray(metric[:, sizes > _SEEN * np.max(sizes, initial=0.0)])
-
-
-def _span(problem: Problem, found: Evaluation, *shared: Array) -> TrialSpan:
-    """Span of initial states, offsets and the columns `shared`."""
-    return trial_span(found.own, problem.row_sizes, np.hstack(shared))
 
 
 def _parameter_deviations(

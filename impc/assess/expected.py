@@ -212,7 +212,9 @@ def _limits(at: Tangent, colour: ResidualNoise) -> Array:
         family = problem.family
         own = [k for k, of in family.limits(problem.plant) if of == control] if family else []
         rest = frozen(np.delete(np.array(at.on_parameters), own, axis=1))
-        seen = replace(at, on_parameters=rest).without_nuisance(column[:, None], *at.gain_columns())
+        seen = replace(at, on_parameters=rest).without_nuisance(
+            column[:, None], np.array(at.on_law)
+        )
         size = float(seen[:, 0] @ seen[:, 0])
         if size > _UNSEEN * len(column):
             spread = at.spread(colour, seen / size)

@@ -19,7 +19,6 @@ from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.checking import replace
 from impc.inverse.minimiser import Ended
 from impc.inverse.refit import refit
-from impc.inverse.residuals import evaluate
 from impc.model.continuous_gain import continuous_gain
 from impc.model.plant import UNKNOWN, gain_unit
 
@@ -57,14 +56,13 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
     """Estimate the identified gain of a fit, and its covariance."""
     end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     problem, at = end.problem, (end.K, end.S)
-    found, fixed = evaluate(problem, *at), problem.with_body_fixed()
-    alone = replace(found, dparameters=found.dparameters[:, ~problem.stated])
+    fixed = problem.with_body_fixed()
     return GainEstimate(
         problem,
         *at,
         end.misfit,
-        gain_covariance(problem, *at, curvature=True, evaluation=found),
-        None if fixed is problem else gain_covariance(fixed, *at, curvature=True, evaluation=alone),
+        gain_covariance(problem, *at, curvature=True),
+        None if fixed is problem else gain_covariance(fixed, *at, curvature=True),
         end.ended,
         end.promised,
     )

@@ -38,10 +38,10 @@ from impc.assess.long_run_covariance import (
 from impc.errors import WeightsError
 from impc.inverse.columns import trial_span
 from impc.inverse.estimates import DETERMINED
-from impc.inverse.laws import metric_directions, regulator_slopes
+from impc.inverse.laws import GainLaw, regulator_slopes
 from impc.inverse.problem import noise_of_residual
-from impc.inverse.residuals import evaluate, scaled_changes, with_prior_rows
-from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.residuals import scaled_changes
+from impc.inverse.unknowns import linear_at
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
     from impc.inverse.columns import TrialSpan
     from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Evaluation
     from impc.model.riccati import LqrSolution
     from impc.model.structure import Structure
 
@@ -73,7 +72,10 @@ class Tangent(Frozen):
     solution: LqrSolution  # Riccati solution of the weights
     cost_weights: Array  # Unknowns (count,); minus infinity is a cost weight of zero
     residual: Array  # (r,)
-    found: Evaluation
+    reason: str  # Why a simulation stopped; empty if all trials are complete
+    law: GainLaw  # At gain and metric of the solution
+    on_law: Array  # Derivative by whitened gain and metric (r, c), by initial states and errors
+    own: Array
     # Derivative by the unknowns (r, count), or by the cost weight itself where it is zero
     on_cost_weights: Array
     on_parameters: Array  # By the parameters at fixed weights (r, k)
@@ -91,7 +93,7 @@ class Tangent(Frozen):
     def span(self, *beside: Array) -> TrialSpan:
         """Span of initial states, parameters and columns `beside` (r, b)."""
         sizes = self.problem.row_sizes
-        return trial_span(self.found.own, sizes, np.hstack([self.on_parameters, *beside]))
+        return trial_span(self.own, sizes, np.hstack([self.on_parameters, *beside]))
 
     def colour(self, model: NoiseModel, fitted: TrialSpan) -> ResidualNoise:
         """Autocorrelation model of the residuals after a fit of the span."""
@@ -102,13 +104,6 @@ class Tangent(Frozen):
     def spread(self, noise: ResidualNoise, columns: Array) -> Array:
         """Covariance (k, k) of columns' residual for this noise."""
         return spread_of_rows(self.problem, noise, columns, self.noise)
-
-    def gain_columns(self) -> tuple[Array, Array]:
-        """Derivatives by gain and metric."""
-        gain, metric = np.array(self.solution.K), np.array(self.solution.S)
-        T, G = natural_coordinates(self.problem.plant, gain)
-        on_metric = self.found.along_metric(metric, metric_directions(metric))
-        return self.found.along_gain(T, G), on_metric
 
     @functools.cached_property
     def quadratic(self) -> LocalQuadratic:
@@ -125,13 +120,13 @@ def tangent(
     """
     solution = solve_lqr(problem.plant, structure.weights(cost_weights))
     K, S = np.array(solution.K), np.array(solution.S)
-    found = evaluate(problem, K, S)
+    law = GainLaw(problem, K, S)
+    found = linear_at(problem, law, law.start)
     size = float(np.sqrt(np.mean(found.residual**2))) if noise is None else noise
     scale = noise_of_residual(problem, found.residual) if noise is None else noise
-    found = with_prior_rows(problem, found, scale)
-    dK, dS = regulator_slopes(problem, structure, cost_weights, solution)
-    seen = found.dK.reshape(len(found.residual), -1) @ dK.reshape(len(dK), K.size).T
-    seen += found.along_metric(S, dS)
+    found = found.with_prior(problem, scale)
+    on_law, on_parameters, own = found.parts(problem)
+    seen = on_law @ law.along(*regulator_slopes(problem, structure, cost_weights, solution)).T
     count = structure.count
     return Tangent(
         structure,
@@ -139,9 +134,12 @@ def tangent(
         solution,
         frozen(cost_weights),
         frozen(found.residual),
-        found,
+        found.reason,
+        law,
+        frozen(on_law),
+        frozen(own),
         frozen(seen[:, :count]),
-        frozen(found.dparameters + seen[:, count:]),
+        frozen(on_parameters + seen[:, count:]),
         size,
     )
 
@@ -150,19 +148,14 @@ class LocalQuadratic:
     """Quadratic form of gain and metric that approximates the misfit near a tangent."""
 
     def __init__(self, at: Tangent) -> None:
-        self.at = at
-        # Whitened units of the gain: best conditioned.
-        T, G = natural_coordinates(at.problem.plant, np.array(at.solution.K))
-        metric = at.found.dS.reshape(len(at.residual), -1)
-        seen = at.without_nuisance(np.hstack([at.found.along_gain(T, G), metric]))
+        #: Trace of the metric over m.
+        self.at, self.scale = at, float(np.trace(at.solution.S)) / at.problem.plant.m
+        seen = at.without_nuisance(np.array(at.on_law))
         residual = at.without_nuisance(np.array(at.residual)[:, None])[:, 0]
-        triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
+        self.triangle: Array = np.asarray(np.linalg.qr(seen, mode="r"), dtype=np.float64)
         # R'q = columns' residual.
-        self.inside = np.linalg.pinv(triangle.T) @ (seen.T @ residual)
+        self.inside = np.linalg.pinv(self.triangle.T) @ (seen.T @ residual)
         self.rest = float(residual @ residual - self.inside @ self.inside)
-        units = np.kron(np.linalg.inv(G), T.T), np.eye(metric.shape[1])
-        self.triangle = triangle @ scipy.linalg.block_diag(*units)
-        self.here = _gain_and_metric(at.solution)
 
     def least(self, z: Array, along: Array, aim: LqrSolution | None = None) -> tuple[float, Array]:
         """Least m^2 from z over steps along columns, and its minimiser.
@@ -172,7 +165,7 @@ class LocalQuadratic:
         moving = np.isfinite(z)
         offset, rest = self.inside, self.rest
         if aim is not None:
-            offset, rest = self.triangle @ (self.here - _gain_and_metric(aim)), 0.0
+            offset, rest = -self._away(aim), 0.0
         weight, rows = self.at.noise / _SPREAD, len(self.triangle)
 
         def moved(step: Array) -> Array:
@@ -210,16 +203,16 @@ class LocalQuadratic:
         problem, structure = self.at.problem.with_nuisance_fixed(), self.at.structure
         solution = solve_lqr(problem.plant, structure.weights(z))
         dK, dS = regulator_slopes(problem, structure, z, solution)
-        turned = scaled_changes(np.array(solution.S), dS[moving])
-        count = len(turned)
-        slopes = np.hstack([dK[moving].reshape(count, -1), turned.reshape(count, -1)])
-        return self.triangle @ (_gain_and_metric(solution) - self.here), self.triangle @ slopes.T
+        turned = self.scale * scaled_changes(np.array(solution.S), dS[moving])
+        return self._away(solution), self.triangle @ self.at.law.along(dK[moving], turned).T
 
-
-def _gain_and_metric(solution: LqrSolution) -> Array:
-    """Entries of the gain, and of the metric scaled to trace m."""
-    S = np.array(solution.S)
-    return np.append(solution.K, S * len(S) / np.trace(S))
+    def _away(self, solution: LqrSolution) -> Array:
+        """R (k - k(fit)) of another regulator."""
+        here, S = self.at.solution, np.array(solution.S)
+        metric = self.scale * len(S) / np.trace(S) * S - here.S
+        return np.asarray(
+            self.triangle @ self.at.law.along((solution.K - here.K)[None], metric[None])[0]
+        )
 
 
 @dataclass(frozen=True)

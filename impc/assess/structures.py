@@ -30,15 +30,15 @@ from impc.assess.assessments import evaluate_method
 from impc.assess.long_run_covariance import residual_noise
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.variance_accounted_for import (
-    held_out_vafs,
     innovation_roots,
     innovations_criterion,
+    predicted,
     residuals_of,
 )
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
 from impc.inverse.problem import EXPLAINED, recorded_size
 from impc.inverse.refit import IDENTIFIED
-from impc.inverse.structured import feature_sizes, search_from, structured_estimate
+from impc.inverse.structured import feature_sizes, search_from
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from impc.assess.structured_weights import Tangent
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.model.recordings import Recording
     from impc.model.structure import Structure
 
 
@@ -114,12 +115,13 @@ def assess_structure(
     own = evaluate_method(found, there.bounds)
     started = problem.at(there.starts, there.logarithms, there.errors)
 
-    def fit_without(index: int) -> Estimate:
-        others = started.leaving_out(index)
-        end = search_from(others, structure, _moving(cost_weights))
-        return structured_estimate(others, structure, end)
+    def left_out(index: int, trial: Recording) -> Array:
+        """VAF (p,) of a trial under the cost weights that the others have."""
+        end = search_from(started.leaving_out(index), structure, _moving(cost_weights))
+        return np.array(predicted(end.problem, end.K, end.S, trial, settle).vaf)
 
-    left = held_out_vafs(problem, fit_without, settle) if held_out else []
+    trials = problem.recordings if held_out and len(problem.recordings) > 1 else ()
+    left = [left_out(index, trial) for index, trial in enumerate(trials)]
     nothing = np.full(len(problem.plant.outputs), np.nan)
     intervals, ratios = _intervals(at, covariance, sizes)
     return StructureFit(
@@ -209,11 +211,9 @@ class StructureTest(Frozen):
 
 def structure_test(at: Tangent) -> StructureTest:
     """Score test of a structure at its fit against an unrestricted gain."""
-    on_gain, on_metric = at.gain_columns()
     fitted = at.span(np.array(at.on_cost_weights[:, at.moving]))
-    beyond = fitted.without(np.hstack([on_gain, on_metric, at.found.dparameters]))
-    gain = beyond[:, : on_gain.shape[1]]
-    left, sizes, _ = np.linalg.svd(gain, full_matrices=False)
+    beyond = fitted.without(np.array(at.on_law[:, : at.solution.K.size]))
+    left, sizes, _ = np.linalg.svd(beyond, full_matrices=False)
     identified = sizes > at.noise / IDENTIFIED
     U = left[:, identified]
     exact = EXPLAINED * recorded_size(at.problem)

@@ -24,12 +24,12 @@ from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.errors import InputError
 from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.refit import refit
 from impc.inverse.residuals import residual_only
 from impc.inverse.search import with_fitted_starts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from impc.assess.printed_gain import GainEstimate
     from impc.control.simulation import Simulation
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 # One second of lags reveals a missed rhythm; at least ten lags.
 _LEAST_LAGS = 10
+# Decrease that a refit without a trial may leave out.
+_PROMISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -151,14 +153,28 @@ class HeldOut(Frozen):
     centred_vaf: Array  # With means removed, % (p,)
 
 
-def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
-    """VAF of a held-out trial under the controller fitted without it."""
-    gain, metric = np.array(other.gain), np.array(other.metric)
-    fixed = other.problem.with_nuisance_fixed()
-    alone = replace(fixed, recordings=(trial,), signal_errors=other.problem.signal_errors)
+def left_out(fitted: Estimate, estimate: GainEstimate, index: int, settle: float) -> HeldOut:
+    """Predict a trial with the gain that the other trials have.
+
+    The gain of the weights moves by what a refit of the identified gain without the trial changes.
+    """
+    others = estimate.problem.with_body_fixed().leaving_out(index)
+    K, S = np.array(estimate.K), np.array(estimate.S)
+    change = refit(others, K, S, _PROMISE).K - K
+    trial = fitted.problem.recordings[index]
+    return predicted(fitted.problem, fitted.gain + change, np.array(fitted.metric), trial, settle)
+
+
+def predicted(
+    problem: Problem, gain: Array, metric: Array, trial: Recording, settle: float
+) -> HeldOut:
+    """Agreement of a trial with its prediction by a gain (m, n) and metric (m, m)."""
+    alone = replace(
+        problem.with_nuisance_fixed(), recordings=(trial,), signal_errors=problem.signal_errors
+    )
     first = round(settle / alone.plant.dt)
     started = alone
-    if other.problem.unknown_start:
+    if problem.unknown_start:
         started = with_fitted_starts(alone, gain, metric, max(first, alone.plant.n))
     run = simulate(controller_for(started, gain, metric), scenarios(started)[0])
     recorded = started.recordings[0].corrected[first:]
@@ -167,17 +183,6 @@ def left_out_vaf(other: Estimate, trial: Recording, settle: float) -> HeldOut:
         nothing = frozen(np.full(recorded.shape[1], np.nan))
         return HeldOut(nothing, nothing)
     return HeldOut(frozen(vaf(recorded, simulated)), frozen(centred_vaf(recorded, simulated)))
-
-
-def held_out_vafs(
-    problem: Problem, fit_without: Callable[[int], Estimate], settle: float
-) -> list[Array]:
-    """VAF (p,) of each trial under the fit without it; empty with one trial."""
-    count = len(problem.recordings)
-    return [
-        np.array(left_out_vaf(fit_without(index), trial, settle).vaf)
-        for index, trial in enumerate(problem.recordings if count > 1 else ())
-    ]
 
 
 def residuals_of(found: Estimate) -> list[Array]:

@@ -141,7 +141,7 @@ class WeightProfiles:
             there = tangent(self.at.structure, self.at.problem, cost_weights, self.at.noise)
         except WeightsError:
             return None
-        return None if there.found.reason else there.quadratic
+        return None if there.reason else there.quadratic
 
     def _crossing(
         self, form: LocalQuadratic, line: _Line, here: Array, quantile: float

@@ -1,7 +1,12 @@
-"""Summary of the set of equivalent weights, for reports.
+"""Statements on cost that hold for all equivalent weights, and the ranges of their entries.
 
-All numbers are over the weights with the gain whose condition number, in the units of the plant, is
-at most a multiple of the least (`weights_set`; docs/why/equivalent_weights.md).
+All weights with the fitted gain and a condition number up to a multiple of the least, in the units
+of the plant, explain the recordings equally well (`weights_set`; docs/why/equivalent_weights.md). A
+statement is useful if it holds for every one of them.
+
+    cost       d_i^2 Q_ii: cost of a typical excursion d_i of state i
+    order      cost of i above cost of j: the sign of a linear function, decided exactly
+    sense      Q_ij above or below zero: equal or opposite signs of two states cost more
 
 A statement over all weights with *the* fitted gain ignores the uncertainty of that gain, so it is
 checked with drawn gains too (`intent_draws`). The range of 39 draws covers the next one in 38 of 40
@@ -11,17 +16,14 @@ least 38 of the 39 drawn gains.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.assess.bounded_weights import entry_ranges, linear_maxima, linear_ranges, weights_set
-from impc.assess.intent_statements import (
-    pair_statements,
-    statement_function,
-    widest_dominant_angle,
-)
+from impc.assess.intent import angle_between, dominant_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.solution_set import gain_fibre
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from impc.arrays import Array
-    from impc.assess.intent_statements import Statement
+    from impc.assess.bounded_weights import WeightsSet
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
@@ -41,6 +43,59 @@ _RATIO = 10.0
 _NAMED = 4
 # Tolerance of the programs for a drawn gain: the range of 39 draws is itself approximate.
 _ROUGH = 1e-6
+# A range that ends this close to zero, relative to its width, leaves the sign undecided.
+_TOUCHES = 1e-6
+# 38 of 39 draws.
+_AGREE = 38 / 39 - 1e-9
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A statement about two states."""
+
+    kind: str  # "order" or "sense"
+    first: str  # Names of the states
+    second: str
+    holds: bool | None  # True or False if all members agree; otherwise None
+    # Range of the linear function whose sign decides, over the cost of `first` in the member of
+    # least condition number
+    low: float
+    high: float
+    confidence: float | None = None  # Share of the drawn gains that agree; None if not checked
+
+    @property
+    def made(self) -> bool:
+        """Whether the statement is supported at 95 %: at least 38 of 39 drawn gains agree."""
+        return self.confidence is not None and self.confidence >= _AGREE
+
+
+def statement_function(plant: Plant, sizes: Array, kind: str, first: str, second: str) -> Array:
+    """Linear function of blkdiag(Q, R) that is positive if a statement holds (n + m, n + m)."""
+    i, j = plant.states.index(first), plant.states.index(second)
+    function = np.zeros((plant.n + plant.m, plant.n + plant.m))
+    if kind == "order":
+        function[i, i], function[j, j] = sizes[i] ** 2, -(sizes[j] ** 2)
+    else:
+        function[i, j] = function[j, i] = sizes[i] * sizes[j] / 2
+    return function
+
+
+def pair_statements(
+    found: WeightsSet, sizes: Array, states: tuple[str, ...]
+) -> tuple[Statement, ...]:
+    """Order and sense of every pair of the given states; no member goes beyond their ranges."""
+    plant, pairs = found.fibre.plant, list(itertools.combinations(states, 2))
+    asked = [(kind, *pair) for kind in ("order", "sense") for pair in pairs]
+    functions = [statement_function(plant, sizes, *one) for one in asked]
+    statements = []
+    for one, ends in zip(asked, linear_ranges(found, np.array(functions)), strict=True):
+        low, high = ends.least.bound, ends.most.bound
+        touches = _TOUCHES * max(abs(low), abs(high))
+        holds = True if low > touches else False if high < -touches else None
+        index = plant.states.index(one[1])
+        unit = float(found.least.weights.Q[index, index] * sizes[index] ** 2)
+        statements.append(Statement(*one, holds, low / unit, high / unit))
+    return tuple(statements)
 
 
 @dataclass(frozen=True)
@@ -79,8 +134,9 @@ class WeightsSummary:
 
     entries: tuple[EntryRange, ...]  # Entries of the states that are recorded or cost most
     statements: tuple[Statement, ...]  # Order and sense of these states
-    # Widest angle found between the dominant directions of D Q D of the least-condition member and
-    # another, degrees; D = typical sizes of the states
+    # Widest angle between the dominant directions of D Q D of the least-condition member and of the
+    # members at the ends of the ranges, degrees; D = typical sizes of the states. Others may turn
+    # further.
     widest_angle: float
     drawn: int  # Number of drawn gains
     cost_weights: tuple[WeightRange, ...]  # Costs of the named states; empty without draws
@@ -99,8 +155,12 @@ def summarise_weights(
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
     ranges = entry_ranges(found, named)
-    angle, _ = widest_dominant_angle(found, sizes)
-    statements = pair_statements(found, sizes, names, ranges)
+    ends = [end.weights for item in ranges.values() for end in (item.least, item.most)]
+    first, *others = [
+        dominant_direction(sizes[:, None] * one.Q * sizes) for one in (found.least.weights, *ends)
+    ]
+    angle = max(angle_between(first, other) for other in others)
+    statements = pair_statements(found, sizes, names) if len(names) > 1 else ()
 
     def set_of(drawn: LqrSolution) -> DrawnSet:
         return _set_of_gain(plant, drawn, metrics, sizes, names, statements)

@@ -31,24 +31,21 @@ import scipy.special
 from impc.arrays import Array, frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
-from impc.inverse.columns import triangular_rows
 from impc.inverse.equivalent_weights import other_weights, weights_margin
 from impc.inverse.estimates import ROUNDING, Identifiability, OtherWeights
 from impc.inverse.problem import misfit, recorded_size, simulated
-from impc.inverse.proximal_search import Residual, weight_jacobian
+from impc.inverse.proximal_search import weight_jacobian
 from impc.inverse.proximal_step import block_basis
-from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import gain_fibre
+from impc.inverse.table31 import closed_loop_residual
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
     from impc.assess.printed_gain import GainEstimate
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Evaluation
     from impc.inverse.solution_set import GainFibre
     from impc.model.plant import Plant
-    from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
 
@@ -186,10 +183,11 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
     """
     plant = problem.plant
     solution = solve_lqr(plant, weights)
-    found = evaluate(problem, solution.K, solution.S)
     factor = np.linalg.cholesky(weights.block)
     basis = factor @ block_basis(plant.n, plant.m) @ factor.T
-    values = _singular_values(solution, found, basis)
+    found, _ = closed_loop_residual(problem, solution)
+    slopes = weight_jacobian(solution, found, basis)
+    values = np.asarray(np.linalg.svd(slopes, compute_uv=False))
     least = max(_DETERMINED * values[0], ROUNDING * recorded_size(problem))
     rank = int(np.count_nonzero(values > least))
     free = len(basis) - 1
@@ -203,21 +201,6 @@ def identifiability(problem: Problem, weights: Weights) -> Identifiability:
 def estimate_identifiability(estimate: Estimate) -> Identifiability:
     """Count the weight directions that the recordings identify; see `impc.identifiability`."""
     return identifiability(estimate.problem, estimate.stage_weights)
-
-
-def _singular_values(solution: LqrSolution, found: Evaluation, basis: Array) -> Array:
-    """Singular values of the derivative by a `basis` of the weights, from compressed rows."""
-    parts = [found.dK, found.dS]
-    rows = triangular_rows([part.reshape(len(part), -1) for part in parts])
-    first = int(np.prod(found.dK.shape[1:]))
-    dK, dS = (
-        columns.reshape(len(rows), *part.shape[1:])
-        for columns, part in zip((rows[:, :first], rows[:, first:]), parts, strict=True)
-    )
-    residual = Residual(np.zeros(len(rows)), dK, dS, usable=True)
-    values = np.linalg.svd(weight_jacobian(solution, residual, basis), compute_uv=False)
-    # Further directions do not move the outputs.
-    return np.pad(values, (0, min(len(found.residual), len(basis)) - len(values)))
 
 
 def _others(problem: Problem, fibre: GainFibre) -> tuple[OtherWeights, ...]:

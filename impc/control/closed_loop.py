@@ -126,13 +126,16 @@ def prepare_loop(
     stages = controller.horizon if whole else first_stages(controller.horizon, controller.solver)
     rows, moved = _rows(controller, along, stages)
     inverse = np.asarray(np.linalg.inv(controller.S), dtype=np.float64)
+    plant_moves = along.A, along.B, along.E
+    if any(along.bodies):  # then `pushes` has all that moves the next state
+        plant_moves = np.zeros_like(along.A), np.zeros_like(along.B), np.zeros_like(along.E)
     return PreparedLoop(
         controller,
         along,
         rows,
         moved,
         _writable(A, B, E, controller.K, inverse),
-        _writable(along.A, along.B, along.E, along.K, along.S),
+        _writable(*plant_moves, along.K, along.S),
         np.minimum(-controller.bounds.u_min, controller.bounds.u_max),
         None if controller.solver == COMPILED else build_program(controller.solver, rows),
         stages,
@@ -168,6 +171,7 @@ def run_loop(
     proved: bool = True,
     seen: Array | None = None,
     inputs: bool = True,
+    pushed: Array | None = None,
 ) -> tuple[Simulation, Sensitivity]:
     """Simulate one recording of a prepared loop, with its derivatives.
 
@@ -176,7 +180,8 @@ def run_loop(
     derivatives of the controller at each sample separately. Without `proved` the simulation ends at
     the first unsolved sample, without a proof of infeasibility. With `seen` (q, n), which saves
     memory, `Sensitivity.x` has the derivatives of seen x, (steps + 1, q, p), in place of those of
-    all states; without `inputs` those of the inputs are not kept.
+    all states; without `inputs` those of the inputs are not kept. `pushed` (steps, d, q) are the
+    derivatives of the disturbance along the last q directions.
     """
     plant, along = prepared.controller.plant, prepared.along
     steps, n, m, p = given.steps, plant.n, plant.m, along.count
@@ -192,7 +197,9 @@ def run_loop(
     drive = (
         body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
         _pushes(prepared, given),
-        *(np.array(given.disturbance), aim, _divergence(prepared.matrices.E, given)),
+        np.array(given.disturbance),
+        np.zeros((steps, 0, 0)) if pushed is None else np.ascontiguousarray(pushed),
+        *(aim, _divergence(prepared.matrices.E, given)),
     )
     t, weakly_active, work = 0, 0, None
     while True:
@@ -227,10 +234,9 @@ def run_loop(
 
 
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
-    """Contribution of the body's parameters to the derivatives along the trajectory."""
+    """Contribution of nearby bodies to the derivatives along the trajectory."""
     controller, along = prepared.controller, prepared.along
-    moving = any(along.bodies) or np.any(along.A) or np.any(along.B) or np.any(along.E)
-    if controller.plant.body is None or not moving:
+    if not any(along.bodies):
         return np.zeros((0, controller.plant.n, along.count))
     run, _ = run_loop(prepare_loop(controller, directions(controller, 0)), given)
     return pushes(along, run.x[:-1], run.u, given.disturbance)

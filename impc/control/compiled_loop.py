@@ -81,6 +81,7 @@ def run(
     body: BodyTape,
     pushes: Buffer,
     disturbance: Buffer,
+    pushed: Buffer,
     aim: Aim,
     divergence: float,
     unit: Buffer,
@@ -92,10 +93,12 @@ def run(
 ) -> tuple[int, int]:
     """Simulate from sample `first`, with derivatives along p directions (p may be 0).
 
-    `disturbance` (steps, d); `unit` (m,).
+    `disturbance` (steps, d), `pushed` (steps, d, q) its derivatives along the last q directions;
+    `pushes` (steps, n, p), or empty, what else moves the next state; `unit` (m,).
     """
     loop, dloop, rows, drows, body = _borrow((loop, dloop, rows, drows, body))
     pushes, disturbance, aim, unit, work = _borrow((pushes, disturbance, aim, unit, work))
+    pushed = _borrow(pushed)
     x, u, dx, du, seen, dy, status, lam = _borrow(trace)
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
@@ -116,12 +119,14 @@ def run(
             weakly_active += near
         if body.address:
             move_body(body, x[t], u[t], disturbance[t], at, moved, x[t + 1], ahead)
-            if len(pushes):
-                ahead += pushes[t]
+            _push(body.slopes, x.shape[1] + u.shape[1], pushed[t], ahead)
         else:
-            _advance(
-                loop, dloop, plant_moves, disturbance[t], x[t], at, u[t], moved, x[t + 1], ahead
-            )
+            _advance(loop, disturbance[t], x[t], at, u[t], moved, x[t + 1], ahead)
+            _push(loop.E, 0, pushed[t], ahead)
+        if plant_moves:
+            _move_plant(dloop, disturbance[t], x[t], u[t], ahead)
+        if len(pushes):
+            ahead += pushes[t]
         if local:
             ahead[:] = dx[0]
         if not _largest(x[t + 1]) < divergence:
@@ -155,8 +160,6 @@ def _observe(seen: Buffer, dx: Buffer, dy: Buffer) -> None:
 @njit(cache=True, inline="always")
 def _advance(
     loop: LoopMatrices,
-    dloop: LoopMatrices,
-    plant_moves: bool,
     disturbance: Buffer,
     x: Buffer,
     dx: Buffer,
@@ -165,7 +168,7 @@ def _advance(
     following: Buffer,
     dfollowing: Buffer,
 ) -> None:
-    """Compute x+ = A x + B u + E d, `following`, and its derivative."""
+    """Compute x+ = A x + B u + E d, `following`, and its derivative for a fixed plant."""
     n = len(x)
     for i in range(n):
         following[i] = dot(loop.A[i], x) + dot(loop.B[i], u) + dot(loop.E[i], disturbance)
@@ -176,13 +179,29 @@ def _advance(
                 add(loop.A[i, j], dx[j], ahead)
         for j in range(len(u)):
             add(loop.B[i, j], du[j], ahead)
-        if plant_moves:
-            for j in range(n):
-                add(x[j], dloop.A[i, j], ahead)
-            for j in range(len(u)):
-                add(u[j], dloop.B[i, j], ahead)
-            for j in range(len(disturbance)):
-                add(disturbance[j], dloop.E[i, j], ahead)
+
+
+@njit(cache=True, inline="always")
+def _move_plant(
+    dloop: LoopMatrices, disturbance: Buffer, x: Buffer, u: Buffer, dfollowing: Buffer
+) -> None:
+    """Add dA x + dB u + dE d to the derivative of the next state."""
+    for i in range(len(x)):
+        for j in range(len(x)):
+            add(x[j], dloop.A[i, j], dfollowing[i])
+        for j in range(len(u)):
+            add(u[j], dloop.B[i, j], dfollowing[i])
+        for j in range(len(disturbance)):
+            add(disturbance[j], dloop.E[i, j], dfollowing[i])
+
+
+@njit(cache=True, inline="always")
+def _push(slopes: Buffer, column: int, pushed: Buffer, dfollowing: Buffer) -> None:
+    """Add slopes[:, column :] pushed, `pushed` (d, q), to the last q derivatives."""
+    first = dfollowing.shape[1] - pushed.shape[1]
+    for i in range(len(dfollowing)):
+        for j in range(len(pushed)):
+            add(slopes[i, column + j], pushed[j], dfollowing[i, first:])
 
 
 @njit(cache=True)

@@ -18,7 +18,7 @@ from impc.control.controller import Controller
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
 from impc.inverse.columns import trial_span
-from impc.inverse.laws import metric_directions
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import (
     controller_for,
     explains,
@@ -28,8 +28,7 @@ from impc.inverse.problem import (
     recorded_size,
     simulated,
 )
-from impc.inverse.residuals import evaluate, with_prior_rows
-from impc.inverse.solution_set import natural_coordinates
+from impc.inverse.unknowns import linear_at
 from impc.model.bounds import bound_rows
 from impc.model.riccati import stabilises
 from impc.model.weights import Weights, normalised
@@ -442,21 +441,16 @@ def goodness(
 
 def gain_ranks(problem: Problem, gain: Array, metric: Array) -> tuple[int, int]:
     """Numbers of directions of a `gain` (m, n) and of a `metric` (m, m) that the data identify."""
-    found = evaluate(problem, gain, metric)
+    law = GainLaw(problem, gain, metric, whitened=stabilises(problem.plant, gain))
+    found = linear_at(problem, law, law.start)
     if found.reason:
         return 0, 0
-    found = with_prior_rows(problem, found, noise_of_residual(problem, found.residual))
-    plant = problem.plant
-    stable = stabilises(plant, gain)
-    T, G = natural_coordinates(plant, gain) if stable else (np.eye(plant.n), np.eye(plant.m))
-    on_gain = found.along_gain(T, G)
-    on_metric = found.along_metric(metric, metric_directions(metric))
-    parts = (on_gain, on_metric), (on_metric, on_gain)
-    ranks = []
-    for own, other in parts:
-        beside = np.hstack([other, found.dparameters])
-        left = trial_span(found.own, problem.row_sizes, beside).without(own)
-        values = np.asarray(np.linalg.svd(left, compute_uv=False), dtype=np.float64)
+    noise = noise_of_residual(problem, found.residual)
+    slopes, on_parameters, trial = found.with_prior(problem, noise).parts(problem)
+    blocks, ranks = np.split(slopes, [gain.size], axis=1), []
+    for own, other in (blocks, blocks[::-1]):
+        beside = trial_span(trial, problem.row_sizes, np.hstack([other, on_parameters]))
+        values = np.asarray(np.linalg.svd(beside.without(own), compute_uv=False))
         ranks.append(int(np.count_nonzero(determined(problem, values))) if values.size else 0)
     return ranks[0], ranks[1]
 

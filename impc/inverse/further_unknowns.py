@@ -11,7 +11,7 @@ import numpy as np
 
 from impc.arrays import frozen
 from impc.checking import replace
-from impc.model.plant_family import DELAY, PlantFamily, plant_at
+from impc.model.plant_family import DELAY, LIMIT, PlantFamily, plant_at
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -31,6 +31,18 @@ def with_limit_unknown(problem: Problem) -> Problem | None:
         return None
     family = replace(_family(problem), limit_deviation=_LIMIT).with_limits(problem.plant, bounds)
     return _posed(problem, family)
+
+
+def with_free_limit(problem: Problem, control: int, start: float) -> Problem:
+    """Free the symmetric limit of one control, from `start`; a stated one keeps its prior."""
+    plant, name = problem.plant, f"{LIMIT}.{problem.plant.controls[control]}"
+    if problem.family is not None and name in problem.parameter_names:
+        index, logarithms = problem.parameter_names.index(name), np.array(problem.logarithms)
+        logarithms[index] = np.log(start / problem.family.nominal[index])
+        return problem.at(problem.starts, logarithms, problem.errors)
+    family = _family(problem).wider([name], [start], [np.inf])
+    bounds = family.bounds_at(plant, problem.bounds, np.append(problem.logarithms, 0.0))
+    return _posed(problem, family, bounds=bounds)
 
 
 def with_delay_unknown(problem: Problem) -> Problem | None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.inverse.problem import controller_for, weights_controller
+from impc.inverse.problem import controller_for, require_riccati, weights_controller
 from impc.inverse.residuals import scaled_changes, stable_controller
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.plant_family import plant_differential
@@ -68,14 +68,25 @@ class FixedLaw:
 
 
 class GainLaw:
-    """Combinations of `gains` (k, m, n), by default all, and a metric, about a gain."""
+    """Combinations of `gains` (k, m, n), by default all, and a metric, about a gain.
+
+    The gain must stabilise, or the coordinates be those of the plant instead of `whitened` ones.
+    """
 
     def __init__(
-        self, problem: Problem, gain: Array, metric: Array, gains: Array | None = None
+        self,
+        problem: Problem,
+        gain: Array,
+        metric: Array,
+        gains: Array | None = None,
+        *,
+        whitened: bool = True,
     ) -> None:
+        require_riccati(problem)
         m, n = gain.shape
         self.given = gain, metric
-        self.T, self.G = natural_coordinates(problem.plant, gain)
+        plain = np.eye(n), np.eye(m)
+        self.T, self.G = natural_coordinates(problem.plant, gain) if whitened else plain
         if gains is None:
             gains = self.G @ np.eye(m * n).reshape(-1, m, n) @ np.linalg.inv(self.T)
         self.gains = gains
@@ -91,6 +102,16 @@ class GainLaw:
     def natural(self, gains: Array) -> Array:
         """G^-1 K T (..., m, n) of gains K (..., m, n)."""
         return np.asarray(np.linalg.solve(self.G, gains @ self.T))
+
+    def along(self, gains: Array, metrics: Array) -> Array:
+        """Changes (k, count) of the start by those of all gains (k, m, n), metrics (k, m, m)."""
+        m = len(self.first)
+        factor = np.linalg.inv(self.first)
+        moved = factor @ (m / np.trace(self.given[1]) * metrics) @ factor.T
+        moved = moved - moved[:, :1, :1] * np.eye(m)  # the scale of a metric has no effect
+        moved = moved / (1 + np.eye(m))
+        steps = moved[:, self.tril[0], self.tril[1]][:, 1:]
+        return np.hstack([self.natural(gains).reshape(len(gains), -1), steps])
 
     def reference(self, _problem: Problem) -> Array:
         """The gain that defines the whitened coordinates."""
@@ -211,12 +232,6 @@ def regulator_slopes(
         dQ = np.concatenate([dQ, np.zeros((moved, *dQ.shape[1:]))])
         dR = np.concatenate([dR, np.zeros((moved, *dR.shape[1:]))])
     return regulator_changes(solution, dQ, dR, dA, dB)
-
-
-def metric_directions(metric: Array) -> Array:
-    """Directions (k, m, m) of a metric (m, m) without its scale, in its own units."""
-    first: Array = np.asarray(np.linalg.cholesky(metric), dtype=np.float64)
-    return _factor_changes(first, first)
 
 
 def _factor_changes(first: Array, lower: Array) -> Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -130,9 +131,19 @@ def of_fitted_gain(problem: Problem, start: Estimate, found: Fitted) -> Estimate
     return of_gain("feedback_gain", problem, start, K, seen=seen, evaluations=evaluations)
 
 
-@functools.lru_cache(maxsize=4)
+# Methods run in threads: the second one waits for what the first one computes.
+_one_at_a_time = threading.Lock()
+
+
 def _feedback(start: Estimate) -> Fitted:
-    """Best gain without bounds, shared by five methods.
+    """Best gain without bounds, shared by five methods."""
+    with _one_at_a_time:
+        return _searched_feedback(start)
+
+
+@functools.lru_cache(maxsize=4)
+def _searched_feedback(start: Estimate) -> Fitted:
+    """Best gain without bounds.
 
     The search is repeated from its own solution, because the prior is centred at the start. Without
     bounds the best gain may be unstable (saturated commands); it then has no whitened coordinates.

@@ -23,7 +23,9 @@ import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array
-from impc.inverse.residuals import evaluate, misfit_or_reason
+from impc.inverse.laws import GainLaw
+from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.unknowns import linear_at
 
 if TYPE_CHECKING:
     from impc.inverse.problem import Problem
@@ -132,11 +134,12 @@ def fitted_metric(
 def unidentified_metrics(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> Array:
     """Metric at z (count,), then directions (k, m, m) that the recordings do not identify."""
     S, changes = family.metric(z), family.changes(z)
-    found = evaluate(problem, gain, S)
-    seen = found.along_metric(S, changes)
+    law = GainLaw(problem, gain, S)
+    slopes = linear_at(problem, law, law.start).parts(problem)[0]
+    seen = slopes @ law.along(np.zeros((len(changes), *gain.shape)), changes).T
     # SVD of the triangle: that of all samples would need quadratic memory.
     _, values, rows = np.linalg.svd(np.linalg.qr(seen, mode="r"))
-    size = float(np.linalg.norm(found.dK.reshape(len(found.residual), -1) @ np.ravel(gain)))
+    size = float(np.linalg.norm(slopes @ law.along(gain[None], np.zeros((1, *S.shape)))[0]))
     identified = np.count_nonzero(values > _IDENTIFIED * max(size, float(np.max(values))))
     free = np.tensordot(rows[identified:], changes, 1).reshape(-1, S.size)
     # Remove the direction of the scale.
@@ -169,9 +172,10 @@ def _searched(problem: Problem, gain: Array, family: MetricFamily, z: Array) -> 
     def at(z: Array) -> tuple[Array, Array]:
         if z.tobytes() not in last:
             last.clear()
-            S = family.metric(z)
-            found = evaluate(problem, gain, S)
-            last[z.tobytes()] = found.residual, found.along_metric(S, family.changes(z))
+            law, changes = GainLaw(problem, gain, family.metric(z)), family.changes(z)
+            found = linear_at(problem, law, law.start)
+            along = law.along(np.zeros((len(changes), *gain.shape)), changes)
+            last[z.tobytes()] = found.residual, found.parts(problem)[0] @ along.T
         return last[z.tobytes()]
 
     def residual(z: Array) -> Array:

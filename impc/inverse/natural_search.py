@@ -23,9 +23,10 @@ from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.columns import triangular_rows
 from impc.inverse.equivalent_weights import least_condition_weights
+from impc.inverse.laws import GainLaw
 from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
-from impc.inverse.residuals import evaluate
 from impc.inverse.solution_set import gain_fibre, natural_coordinates, pair_blocks, split_blocks
+from impc.inverse.unknowns import linear_at
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
@@ -134,22 +135,15 @@ def _residual(
 
     def residual(solution: LqrSolution) -> Residual:
         nonlocal near
-        metric = v.T @ solution.S @ v
-        found = evaluate(known, G @ solution.K @ z, metric, near)
+        law = GainLaw(known, G @ solution.K @ z, v.T @ solution.S @ v)
+        found = linear_at(known, law, law.start, near)
         near = found.terminal or near
         # Triangular factor: the search uses only norms and inner products.
-        m, n = known.plant.m, known.plant.n
-        table = triangular_rows(
-            [found.dK.reshape(-1, m * n), found.dS.reshape(-1, m * m), found.residual[:, None]]
-        )
-        table = table / noise
-        dK = np.asarray(G.T @ table[:, : m * n].reshape(-1, m, n) @ z.T)
-        dS = v @ table[:, m * n : -1].reshape(-1, m, m) @ v.T * _scale_ratio(metric, solution.S)
-        return Residual(table[:, -1], dK, dS, usable=not found.reason)
+        rows = triangular_rows([found.parts(known)[0], found.residual[:, None]]) / noise
+
+        def along(dK: Array, dS: Array) -> Array:
+            return np.asarray(rows[:, :-1] @ law.along(G @ dK @ z, v.T @ dS @ v).T)
+
+        return Residual(rows[:, -1], along, usable=not found.reason)
 
     return residual
-
-
-def _scale_ratio(metric: Array, natural: Array) -> float:
-    """Ratio of the scales of both metrics, which are scaled to trace m for derivatives."""
-    return float(np.trace(natural) / np.trace(metric))

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.special
 
 from impc.arrays import Array
-from impc.checking import checked, replace
+from impc.checking import replace
 from impc.errors import ImpcError, InputError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, simulated_estimate
@@ -81,7 +81,6 @@ _SCALES = (1.0, 0.7, 1.4)
 _BEGINNINGS = 3
 
 
-@checked
 def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     """Fit the weights of the constrained controller to the recordings."""
 

@@ -387,9 +387,8 @@ def _error_pairs(
         if name not in known:
             said = f"choose from: {', '.join(known)}"
             raise InputError("signal_errors", f"no signal is named {name!r}", said)
-        dressed = plant.body is not None or plant.ahead or np.any(plant.observer)
-        if name in plant.disturbances and dressed:
-            problem = f"{name} drives a nonlinear body or is known to the controller"
+        if name in plant.disturbances and (plant.ahead or np.any(plant.observer)):
+            problem = f"{name} is known to the controller"
             raise InputError("signal_errors", problem, "estimate errors of outputs only")
     return tuple(dict.fromkeys(pairs))
 

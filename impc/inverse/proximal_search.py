@@ -29,6 +29,7 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
+from impc.inverse.residuals import scaled_changes
 from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
@@ -48,12 +49,12 @@ _LEAST_RADIUS = 1e-10
 
 @dataclass(frozen=True)
 class Residual(Frozen):
-    """Residual with its derivatives with respect to K and S."""
+    """Residual with its derivative."""
 
     values: Array  # (r,)
-    dK: Array  # (r, m, n)
-    dS: Array  # (r, m, m)
-    usable: bool  # Whether it could be computed; if not, the step is shortened
+    # Derivative (r, k) along changes of K (k, m, n) and of S (k, m, m)
+    along: Callable[[Array, Array], Array]
+    usable: bool = True  # Whether it could be computed; if not, the step is shortened
 
 
 @dataclass(frozen=True)
@@ -141,18 +142,15 @@ def weight_jacobian(solution: LqrSolution, residual: Residual, basis: Array) -> 
     """Derivative of the residual along directions of blkdiag(Q, R), shape (r, k)."""
     n = solution.plant.n
     dQ, dR = basis[:, :n, :n], basis[:, n:, n:]
-    gain = gain_gradients(solution)
-    dK = np.tensordot(gain.Q, dQ, ((2, 3), (1, 2))) + np.tensordot(gain.R, dR, ((2, 3), (1, 2)))
-    total = np.tensordot(residual.dK, dK, 2)
-    if solution.plant.m > 1 and np.any(residual.dS):
-        metric = metric_gradients(solution)
-        dS = np.tensordot(metric.Q, dQ, ((2, 3), (1, 2)))
-        dS += np.tensordot(metric.R, dR, ((2, 3), (1, 2)))
-        # The controller scales S to trace m.
-        scale = solution.plant.m / np.trace(solution.S)
-        traces = np.trace(dS, axis1=0, axis2=1) / np.trace(solution.S)
-        total += np.tensordot(residual.dS, scale * (dS - solution.S[..., None] * traces), 2)
-    return np.asarray(total)
+    both = [gain_gradients(solution)]
+    if solution.plant.discrete:
+        both.append(metric_gradients(solution))
+    changes = [
+        np.tensordot(dQ, found.Q, ((1, 2), (2, 3))) + np.tensordot(dR, found.R, ((1, 2), (2, 3)))
+        for found in both
+    ]
+    # In continuous time the metric is R.
+    return residual.along(changes[0], changes[1] if len(changes) > 1 else dR)
 
 
 @dataclass(frozen=True)
@@ -259,17 +257,18 @@ def auxiliary_weights(
     """
     m, size = plant.m, gain.size
     target = None if metric is None else m * metric / np.trace(metric)
-    rows = size if target is None else size + m * m
-    dK, dS = np.zeros((rows, *gain.shape)), np.zeros((rows, m, m))
-    dK[:size] = np.eye(size).reshape(size, *gain.shape)
-    dS[size:] = np.eye(m * m)[: rows - size].reshape(-1, m, m)
 
     def distance(solution: LqrSolution) -> Residual:
         beyond = (solution.K - gain).ravel()
-        if target is not None:
-            S = m * solution.S / np.trace(solution.S)
-            beyond = np.concatenate([beyond, (S - target).ravel()])
-        return Residual(beyond, dK, dS, usable=True)
+        if target is None:
+            return Residual(beyond, lambda dK, _: dK.reshape(-1, size).T)
+        S = np.array(solution.S)
+
+        def along(dK: Array, dS: Array) -> Array:
+            scaled = scaled_changes(S, dS).reshape(len(dS), -1)
+            return np.hstack([dK.reshape(-1, size), scaled]).T
+
+        return Residual(np.append(beyond, m * S / np.trace(S) - target), along)
 
     begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
     return conditioned_fit(
@@ -286,12 +285,11 @@ def weights_near(
 
     `form` (r, mn); `gain` (m, n).
     """
-    dK = np.concatenate([form, np.zeros((1, gain.size))]).reshape(-1, *gain.shape)
-    dS = np.zeros((len(dK), plant.m, plant.m))
+    rows = np.vstack([form, np.zeros(gain.size)])
 
     def distance(solution: LqrSolution) -> Residual:
         beyond = np.append(form @ (solution.K - gain).ravel(), 1.0)
-        return Residual(beyond, dK, dS, usable=True)
+        return Residual(beyond, lambda dK, _: rows @ dK.reshape(-1, gain.size).T)
 
     objective = Objective(distance, 1.0, condition_share, squared=True)
     return conditioned_fit(plant, objective, start, max_iterations=_STEPS, tolerance=_NEAR)

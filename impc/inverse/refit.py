@@ -24,7 +24,7 @@ import scipy.linalg
 from impc.arrays import Array
 from impc.checking import replace
 from impc.inverse.laws import GainLaw
-from impc.inverse.minimiser import PROMISE
+from impc.inverse.minimiser import PROMISE, Ended
 from impc.inverse.problem import explains, require_riccati
 from impc.inverse.search import stop_at
 from impc.inverse.unknowns import Unknowns
@@ -45,10 +45,13 @@ _ROUNDS, _EVALUATIONS = 12, 100
 _STAYS = 0.1
 
 
-def refit(problem: Problem, gain: Array, metric: Array) -> Fitted:
-    """Refit from a `gain` (m, n) and `metric` (m, m), at the other values of the problem."""
+def refit(problem: Problem, gain: Array, metric: Array, promise: float = 0.1 * PROMISE) -> Fitted:
+    """Refit from a `gain` (m, n) and `metric` (m, m), at the other values of the problem.
+
+    A round ends where an undamped step promises a decrease of at most `promise` in the objective.
+    """
     require_riccati(problem)
-    return _refitted(_Key(problem, gain.tobytes(), metric.tobytes()))
+    return _refitted(_Key(problem, gain.tobytes(), metric.tobytes()), promise)
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class _Key:
 
 
 @functools.lru_cache(maxsize=8)
-def _refitted(key: _Key) -> Fitted:
+def _refitted(key: _Key, promise: float) -> Fitted:
     problem, m = key.problem, key.problem.plant.m
     gain, metric = np.frombuffer(key.gain).reshape(m, -1), np.frombuffer(key.metric).reshape(m, m)
     law = GainLaw(problem, gain, metric)
@@ -82,7 +85,7 @@ def _refitted(key: _Key) -> Fitted:
         centre[space.controller] = law.at_gain(gain)
         there = space.search(
             space.start,
-            stop_at(problem, 0.1 * PROMISE, _EVALUATIONS),
+            stop_at(problem, promise, _EVALUATIONS),
             shared=np.repeat(
                 [*(errors >= IDENTIFIED), 1.0, 1 / _SPREAD],
                 [*np.ones(gain.size, int), beside, parameters],
@@ -95,7 +98,7 @@ def _refitted(key: _Key) -> Fitted:
         if not there.stabilises:  # no covariance there: keep the last gain
             break
         gained, end = end.objective - there.objective, there
-        if gained < _STAYS:
+        if gained < _STAYS or end.ended is Ended.STUCK:  # no step lowers it, whatever the prior
             break
         law = GainLaw(end.problem, np.array(end.K), np.array(end.S))
         space = Unknowns(end.problem, law)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.checking import checked, replace
+from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Status
@@ -67,31 +67,24 @@ class Linear:
         """Residual of all trials (r,)."""
         return np.concatenate(self.residuals)
 
+    def parts(self, problem: Problem) -> tuple[Array, Array, Array]:
+        """Derivatives (r, k) by the controller, the parameters, and the unknowns of the trial."""
+        table = np.concatenate(self.tables) if len(self.tables) > 1 else self.tables[0]
+        first = self.shared - len(problem.logarithms)
+        return table[:, :first], table[:, first : self.shared], table[:, self.shared :]
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Residual and derivatives at one gain and metric, by their entries."""
+    def with_prior(self, problem: Problem, noise: float) -> Linear:
+        """With one row per parameter with a stated uncertainty, scaled by the noise SD `noise`.
 
-    residual: Array  # (r,), simulated minus recorded outputs, each divided by its scale
-    dK: Array  # (r, m, n)
-    dS: Array  # (r, m, m), with respect to the metric scaled as in `Controller`
-    # (r, own), with respect to the unknowns of the trial to which the row belongs
-    own: Array
-    # (r, k), with respect to the logarithms of the physical parameters; k may be 0
-    dparameters: Array
-    reason: str  # Why a simulation stopped; empty if all trials are complete
-    active: int  # Samples with an active bound
-    weakly_active: int  # Samples at which the derivative is one-sided
-    terminal: TerminalSet | None  # Terminal set, reused as a starting point by the next evaluation
-
-    def along_gain(self, T: Array, G: Array) -> Array:
-        """Derivative (r, mn) with respect to G^-1 K T (whitened coordinates T (n, n), G (m, m))."""
-        return np.asarray(self.dK.reshape(len(self.residual), -1) @ np.kron(G, np.linalg.inv(T).T))
-
-    def along_metric(self, metric: Array, changes: Array) -> Array:
-        """Derivative (r, k) along `changes` (k, m, m) of the unscaled `metric` (m, m)."""
-        scaled = scaled_changes(metric, changes).reshape(len(changes), metric.size)
-        return np.asarray(self.dS.reshape(len(self.residual), -1) @ scaled.T)
+        A parameter q away from its nominal value counts as a residual of q / SD noise SDs.
+        """
+        slopes = noise * np.diag(1 / problem.parameter_units)[problem.stated]
+        if len(slopes) == 0:
+            return self
+        below = np.zeros((len(slopes), self.tables[0].shape[1]))
+        below[:, self.shared - len(problem.logarithms) : self.shared] = slopes
+        residuals = (*self.residuals, slopes @ problem.logarithms)
+        return replace(self, residuals=residuals, tables=(*self.tables, below))
 
 
 def linearise(
@@ -113,12 +106,8 @@ def linearise(
     along = _directions(problem, controller, law, differential)
     seen = _Seen.of(problem, correction)
     if correction is not None and seen.moves is not None:
-        along = replace(along, x0=correction.kept(problem) @ along.x0)
-    if seen.moves is not None:
         E = np.zeros((problem.plant.n, seen.moves[2].shape[1], along.count))
-        E[:, : along.E.shape[1]] = along.E
-        _along_pushed(problem, E, shared)
-        along = replace(along, E=E)
+        along = replace(along, x0=correction.kept(problem) @ along.x0, E=E)
     prepared, outputs = (
         prepare_loop(controller, along, seen.moves),
         seen.weighting @ problem.plant.C,
@@ -126,7 +115,13 @@ def linearise(
     residuals, tables, reason, active, weakly_active = [], [], "", 0, 0
     commands = len(problem.measured) > len(problem.plant.C)
     for trial, drive in zip(problem.recordings, seen.drives, strict=True):
-        run, moved = run_loop(prepared, drive, proved=False, seen=outputs, inputs=commands)
+        run, moved = run_loop(
+            *(prepared, drive),
+            proved=False,
+            seen=outputs,
+            inputs=commands,
+            pushed=_pushed(problem, trial),
+        )
         weakly_active += run.weakly_active
         active += int(np.count_nonzero(run.status != Status.FREE))
         difference = seen.off(problem, trial, run)
@@ -137,49 +132,6 @@ def linearise(
         tables.append(_table(problem, seen, trial, run, moved, shared, differential))
     return Linear(
         tuple(residuals), tuple(tables), shared, reason, active, weakly_active, controller.terminal
-    )
-
-
-def evaluate(
-    problem: Problem,
-    gain: Array,
-    metric: Array,
-    near: TerminalSet | None = None,
-    correction: Correction | None = None,
-) -> Evaluation:
-    """Residual and derivatives by all entries of a `gain` (m, n) and a `metric` (m, m).
-
-    A gain that does not stabilise the plant, or a loop that diverges, gives a large finite residual
-    and a reason, so that a search can reject the step. `near` as in `controller_for`, `correction`
-    as in `linearise`.
-    """
-    m, n = gain.shape
-    entries, pairs = m * n, m * (m + 1) // 2 if m > 1 else 0
-    shared = entries + pairs + len(problem.logarithms)
-    try:
-        law = {"K": np.eye(entries, shared).reshape(m, n, shared), "S": np.zeros((m, m, shared))}
-        rows, columns = np.tril_indices(m)
-        if pairs:
-            places = np.arange(entries, entries + pairs)
-            law["S"][rows, columns, places] = law["S"][columns, rows, places] = 1.0
-        controller = stable_controller(problem, gain, metric, near, correction)
-        found = linearise(problem, controller, law, correction)
-    except ImpcError as error:
-        if problem.terminal_weight is not None:
-            raise
-        found = unusable(problem, shared, str(error))
-    table = np.concatenate(found.tables) if len(found.tables) > 1 else found.tables[0]
-    parts = np.split(table, [entries, entries + pairs, shared], axis=1)
-    return Evaluation(
-        found.residual,
-        parts[0].reshape(-1, m, n),
-        _symmetric(parts[1], m),
-        parts[3],
-        parts[2],
-        found.reason,
-        found.active,
-        found.weakly_active,
-        found.terminal,
     )
 
 
@@ -203,24 +155,8 @@ def stable_controller(
     return controller_for(problem, gain, metric, near)
 
 
-def with_prior_rows(problem: Problem, found: Evaluation, noise: float) -> Evaluation:
-    """Append one row per parameter with a stated uncertainty, scaled by the noise SD `noise`.
-
-    A parameter q away from its nominal value counts as a residual of q / SD noise SDs.
-    """
-    k = int(np.count_nonzero(problem.stated))
-    if k == 0:
-        return found
-    slopes = noise * np.diag(1 / problem.parameter_units)[problem.stated]
-    below = {"residual": slopes @ problem.logarithms, "dparameters": slopes}
-    for name in ("dK", "dS", "own"):
-        below[name] = np.zeros((k, *getattr(found, name).shape[1:]))
-    parts = {name: np.concatenate([getattr(found, name), part]) for name, part in below.items()}
-    return replace(found, **parts)
-
-
 def misfit_or_reason(problem: Problem, gain: Array, metric: Array) -> tuple[float, str]:
-    """2-norm of the residual and "", or infinity and the reason; faster than `evaluate`."""
+    """2-norm of the residual and "", or infinity and the reason; faster than `linearise`."""
     residual, reason = residual_or_reason(problem, gain, metric)
     return np.inf if reason else float(np.linalg.norm(residual)), reason
 
@@ -260,7 +196,7 @@ def _runs(
     problem: Problem, controller: Controller, correction: Correction | None = None
 ) -> Iterator[tuple[Simulation, Array]]:
     """Simulation and residual (samples, q) of each trial, without derivatives."""
-    seen = _Seen.of(problem, correction, errors=False)
+    seen = _Seen.of(problem, correction)
     prepared = prepare_loop(controller, directions(controller, 0), seen.moves)
     for trial, drive in zip(problem.recordings, seen.drives, strict=True):
         run, _ = run_loop(prepared, drive, proved=False)
@@ -278,24 +214,12 @@ class _Seen:
     plain: bool = True  # Whether that only divides by the scales
 
     @classmethod
-    def of(cls, problem: Problem, correction: Correction | None, *, errors: bool = True) -> _Seen:
-        """With the derivatives by `errors` of disturbances as further disturbances."""
-        if correction is not None:
-            moves, drives = correction.moves(problem), correction.drives(problem)
-            return cls(moves, drives, correction.weighting(problem), plain=False)
-        plant, weighting = problem.plant, np.diag(1 / problem.output_scale)
-        pushed = _pushed(problem) if errors else []
-        if not pushed:
-            return cls(None, scenarios(problem), weighting)
-        drives = []
-        for trial, drive in zip(problem.recordings, scenarios(problem), strict=True):
-            slopes = distorted(trial.disturbance[:-1], trial.errors[:, len(plant.C) :], held=True)[
-                1
-            ]
-            more = [slopes[:, column, kind, None] for _, kind, column in pushed]
-            drives.append(replace(drive, disturbance=np.hstack([drive.disturbance, *more])))
-        E = np.hstack([plant.E, np.zeros((plant.n, len(pushed)))])
-        return cls((plant.A, plant.B, E), drives, weighting)
+    def of(cls, problem: Problem, correction: Correction | None) -> _Seen:
+        """As simulations, or as predictions with a `correction`."""
+        if correction is None:
+            return cls(None, scenarios(problem), np.diag(1 / problem.output_scale))
+        moves, drives = correction.moves(problem), correction.drives(problem)
+        return cls(moves, drives, correction.weighting(problem), plain=False)
 
     def off(self, problem: Problem, trial: Recording, run: Simulation) -> Array:
         """(Simulated - recorded) / scale, shape (samples, q); zero for missing values."""
@@ -306,21 +230,17 @@ class _Seen:
         return np.hstack([found[:, :p] @ W.T, found[:, p:] / problem.scale[p:]])
 
 
-def _pushed(problem: Problem) -> list[tuple[int, int, int]]:
-    """Searched errors of disturbances: place among the errors, kind and disturbance."""
-    p = len(problem.plant.outputs)
-    return [
-        (place, kind, column - p)
-        for place, (kind, column) in enumerate(problem.error_places)
-        if column >= p
-    ]
-
-
-def _along_pushed(problem: Problem, E: Array, shared: int) -> None:
-    """Write the directions of E (n, d + errors, count) that errors of disturbances add."""
-    first = shared + problem.searched_states
-    for further, (place, _, column) in enumerate(_pushed(problem)):
-        E[:, problem.plant.E.shape[1] + further, first + place] = problem.plant.E[:, column]
+def _pushed(problem: Problem, trial: Recording) -> Array | None:
+    """Derivatives of the disturbance (steps, d, errors) by errors of signals; None if zero."""
+    p, places = len(problem.plant.outputs), problem.error_places
+    if not any(column >= p for _, column in places):
+        return None
+    slopes = distorted(trial.disturbance[:-1], trial.errors[:, p:], held=True)[1]
+    found = np.zeros((*slopes.shape[:2], len(places)))
+    for place, (kind, column) in enumerate(places):
+        if column >= p:
+            found[:, column - p, place] = slopes[:, column - p, kind]
+    return found
 
 
 def _directions(
@@ -409,17 +329,6 @@ def along_bounds(problem: Problem, gain: Array, metric: Array, moves: Array) -> 
     return np.concatenate(parts)
 
 
-def _symmetric(columns: Array, m: int) -> Array:
-    """Derivatives along symmetric directions, expanded to (r, m, m)."""
-    dS = np.zeros((len(columns), m, m))
-    if m > 1:
-        # An off-diagonal direction moves two entries: each gets half of the derivative.
-        rows, places = np.tril_indices(m)
-        dS[:, rows, places] = columns * np.where(rows == places, 1.0, 0.5)
-        dS[:, places, rows] = dS[:, rows, places]
-    return dS
-
-
 def _scale(problem: Problem, trial: Recording) -> float:
     return float(np.sqrt(np.nanmean((trial.outputs / problem.output_scale) ** 2))) or 1.0
 
@@ -442,7 +351,6 @@ def scaled_changes(metric: Array, changes: Array) -> Array:
     return np.asarray(len(metric) / trace * (changes - shares * metric))
 
 
-@checked
 def verify_hard(problem: Problem, weights: Weights) -> list[Simulation]:
     """Simulate every recording with hard state bounds and terminal set."""
     controller = weights_controller(problem, weights, hard=True)

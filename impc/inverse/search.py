@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array
-from impc.checking import checked, replace
+from impc.checking import replace
 from impc.control.named_solver import COMPILED
 from impc.errors import ImpcError, SolverError
 from impc.inverse.inactive_samples import pair_of_inactive_samples
@@ -72,7 +72,6 @@ _BACK = 0.8
 _MORE, _ROUNDS, _DRAWN, _QUICK, _KEPT = 2, 2, 100, 4, 12
 
 
-@checked
 def fit_gain(problem: Problem) -> Fitted:
     """Fit K, S (several inputs), and unknown initial states, errors and parameters.
 
@@ -115,7 +114,6 @@ def fit_gain(problem: Problem) -> Fitted:
     return replace(best, evaluations=spent, unconfirmed=alone)
 
 
-@checked(max_evaluations=1, prior=0)
 def refine_gain(
     problem: Problem,
     gain: Array,

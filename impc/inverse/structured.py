@@ -28,10 +28,10 @@ from impc.errors import ImpcError, SolverError, WeightsError
 from impc.inverse.estimates import Estimate, determined, simulated_estimate
 from impc.inverse.laws import GainLaw, WeightLaw, regulator_slopes
 from impc.inverse.problem import EXPLAINED, explains, recorded_size, simulated
-from impc.inverse.residuals import controlled_residual, evaluate, scaled_changes
+from impc.inverse.residuals import controlled_residual
 from impc.inverse.search import stop_at
 from impc.inverse.starts import regulators
-from impc.inverse.unknowns import Unknowns
+from impc.inverse.unknowns import Unknowns, linear_at
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
 
@@ -152,12 +152,11 @@ def _without_zeros(posed: Problem, structure: Structure, end: Fitted, free: Bool
 
 def _least_seen(structure: Structure, end: Fitted, index: int) -> float:
     """Log cost weight that moves the outputs by one noise SD, all else fixed."""
-    problem, S = end.problem.with_nuisance_fixed(), np.array(end.S)
+    problem = end.problem.with_nuisance_fixed()
     solution = solve_lqr(problem.plant, structure.weights(_unknowns(end)))
     dK, dS = regulator_slopes(problem, structure, _unknowns(end), solution)
-    found = evaluate(problem, np.array(end.K), S)
-    column = np.tensordot(found.dK, dK[index], 2)
-    column = column + np.tensordot(found.dS, scaled_changes(S, dS)[index], 2)
+    law = GainLaw(problem, np.array(end.K), np.array(end.S))
+    column = linear_at(problem, law, law.start).parts(problem)[0] @ law.along(dK, dS)[index]
     noise = end.misfit / np.sqrt(problem.recorded_numbers)
     return float(np.log(noise / max(np.linalg.norm(column), 1e-300)))
 

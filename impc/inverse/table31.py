@@ -22,6 +22,7 @@ from impc.errors import SolverError
 from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
 from impc.inverse.proximal_search import (
     AUXILIARY_CONDITION_WEIGHT,
@@ -31,9 +32,9 @@ from impc.inverse.proximal_search import (
     conditioned_fit,
     definite,
 )
-from impc.inverse.residuals import evaluate
 from impc.inverse.search import fit_gain, refine_gain
 from impc.inverse.starts import regulators
+from impc.inverse.unknowns import linear_at
 from impc.model.riccati import solve_lqr
 
 if TYPE_CHECKING:
@@ -267,7 +268,7 @@ def _most_promising(problem: Problem) -> Weights:
     """Balanced regulator with the least misfit, complete simulation or not."""
 
     def distance(solution: LqrSolution) -> float:
-        return float(np.linalg.norm(evaluate(problem, solution.K, solution.S).residual))
+        return float(np.linalg.norm(closed_loop_residual(problem, solution)[0].values))
 
     return min(regulators(problem), key=distance).weights
 
@@ -277,8 +278,21 @@ def _closed_loop_residual(problem: Problem) -> Callable[[LqrSolution], Residual]
 
     def residual(solution: LqrSolution) -> Residual:
         nonlocal near
-        found = evaluate(problem, solution.K, solution.S, near)
-        near = found.terminal or near
-        return Residual(found.residual, found.dK, found.dS, usable=not found.reason)
+        found, terminal = closed_loop_residual(problem, solution, near)
+        near = terminal or near
+        return found
 
     return residual
+
+
+def closed_loop_residual(
+    problem: Problem, solution: LqrSolution, near: TerminalSet | None = None
+) -> tuple[Residual, TerminalSet | None]:
+    """Residual of a regulator with its bounds, and its terminal set."""
+    law = GainLaw(problem, np.array(solution.K), np.array(solution.S))
+    found = linear_at(problem, law, law.start, near)
+    slopes = found.parts(problem)[0]
+    residual = Residual(
+        found.residual, lambda dK, dS: slopes @ law.along(dK, dS).T, usable=not found.reason
+    )
+    return residual, found.terminal

@@ -75,6 +75,24 @@ class Law(Protocol):
         """Unknowns of the structure at `part`, if it has one."""
 
 
+def linear_at(
+    problem: Problem,
+    law: Law,
+    part: Array,
+    near: TerminalSet | None = None,
+    correction: Correction | None = None,
+) -> Linear:
+    """Residual and derivatives at the unknowns `part` (count,) of a controller.
+
+    Where a search may not simulate it, the residual is large and finite, with a reason.
+    """
+    try:
+        controller = law.controller(problem, part, near, correction)
+        return linearise(problem, controller, law.columns(problem, part), correction)
+    except ImpcError as error:
+        return unusable(problem, len(part) + len(problem.logarithms), str(error))
+
+
 @dataclass(frozen=True)
 class Point:
     """Values at a point of a search."""
@@ -235,13 +253,7 @@ class Unknowns:
         if self.last is None or self.last[0] != key:
             self.last = None  # free memory first: with hundreds of trials two would not fit
             problem, part = self.problem_at(z), z[self.controller]
-            try:
-                controller = self.law.controller(problem, part, self.near, self.correction)
-                law = self.law.columns(problem, part)
-                found = linearise(problem, controller, law, self.correction)
-            except ImpcError as error:
-                shared = len(part) + len(problem.logarithms)
-                found = unusable(problem, shared, str(error))
+            found = linear_at(problem, self.law, part, self.near, self.correction)
             self.near = found.terminal or self.near
             self.last = key, found, self._compressed(found)
         return self.last[1:]

@@ -105,7 +105,6 @@ class BoundRows(Value):
         return np.where((self.F[:, control] != 0) & ~self.on_state, self.b, 0.0)
 
 
-@checked
 def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:
     """Return the finite bounds as rows."""
     limits = np.concatenate([bounds.u_max, bounds.u_min, bounds.x_max, bounds.x_min])

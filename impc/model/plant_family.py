@@ -281,7 +281,6 @@ class PlantDifferential(NamedTuple):
     bodies: tuple[tuple[tuple[float, Body], ...], ...]
 
 
-@checked(logarithms="*")
 def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
     """Plant at nominal * exp(logarithms), logarithms (k,)."""
     return family.make(family.nominal * np.exp(logarithms))

@@ -23,10 +23,11 @@ from impc.inverse.further_unknowns import (
 )
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import Problem
-from impc.inverse.residuals import evaluate, residual_only
+from impc.inverse.residuals import residual_only
 from impc.inverse.unknowns import Unknowns
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings
+from tests.support import slopes
 
 
 @functools.cache
@@ -81,7 +82,7 @@ def test_the_column_of_a_delay_is_a_derivative() -> None:
     wider = with_delay_unknown(problem)
     assert wider is not None
     K = np.hstack([K, np.zeros((1, 1))])
-    expected = evaluate(wider, K, S).dparameters[:, 0]
+    expected = slopes(wider, K, S)[2][:, 0]
     # The planned commands include the delay, the forcing does not: columns differ at the limit.
     error = np.linalg.norm(column(DELAY)[:, 0] - expected) / np.linalg.norm(expected)
     assert error < 0.05
@@ -93,7 +94,7 @@ def test_the_column_of_a_delay_is_a_derivative() -> None:
 def test_columns_are_derivatives(name: str, wider: object) -> None:
     problem, K, S = problem_and_gain()
     assert callable(wider)
-    expected = evaluate(wider(problem), K, S).dparameters[:, 0]
+    expected = slopes(wider(problem), K, S)[2][:, 0]
     np.testing.assert_allclose(column(name)[:, 0], expected, atol=1e-6 * np.max(np.abs(expected)))
 
 

@@ -14,7 +14,7 @@ from impc.arrays import Array
 from impc.assess import printed_gain, resampling
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
-from impc.assess.profiles import profile_likelihood
+from impc.assess.profiles import FitCurve, profile_likelihood
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import misfit_or_reason
 from tests.assess.cart_fits import cart_fit, cart_gain, cart_problem
@@ -81,7 +81,7 @@ def test_bootstrap_and_profiles_agree_with_the_sandwich(root: float) -> None:
     )
     assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
     for item in sandwich:
-        profile, near = profile_likelihood(estimate, item.name).interval, item.high - item.low
+        profile, near = profile_likelihood(estimate, item.name), item.high - item.low
         assert profile.low == pytest.approx(item.low, abs=0.15 * near)
         assert profile.high == pytest.approx(item.high, abs=0.15 * near)
         assert profile.low < profile.value < profile.high  # type: ignore[operator]
@@ -99,18 +99,20 @@ def test_profile_against_brute_force(root: float) -> None:
     fitted = cart_fit(SEED, root=root)
     problem = impc.replace(fitted.problem, unknown_start=False)
     known = printed_gain.gain_estimate(impc.replace(fitted, problem=problem))
-    profile = profile_likelihood(known, printed_gain.entry_names(problem.plant)[0])
-    K, S = np.array(known.K)[0], np.array(known.S)
+    name, K, S = printed_gain.entry_names(problem.plant)[0], np.array(known.K)[0], np.array(known.S)
+    curve = FitCurve(problem, np.array(known.K), S, name)
+    away = 2 * known.covariance.entries[0, 0]
+    curve.loss(0.0)
+    curve.refine(0.01 * away, away)
 
     def least(first: float) -> float:
         gains = [np.array([[first, K[1] + step]]) for step in np.linspace(-0.5, 0.5, 401)]
         return min(misfit_or_reason(problem, gain, S)[0] ** 2 for gain in gains)
 
-    best = least(profile.values[int(np.argmin(profile.distances))])
+    best = least(K[0] + curve.best)
     variance = best / sum(trial.outputs.size for trial in problem.recordings)
-    factor = max((known.covariance.entries[0, 0] / white_covariance(known).entries[0, 0]) ** 2, 1.0)
-    distance = (least(profile.values[0]) - best) / (variance * factor)
-    assert profile.distances[0] == pytest.approx(distance, rel=0.05, abs=0.05)
+    distance = (least(K[0] - away) - best) / variance
+    assert curve.rise(-away) == pytest.approx(distance, rel=0.05, abs=0.05)
 
 
 def test_what_is_not_determined_has_no_end() -> None:
@@ -126,8 +128,8 @@ def test_what_is_not_determined_has_no_end() -> None:
         fit_controller(impc.fit_problem(plant, [again], settings))
     )
     names = printed_gain.entry_names(plant)
-    assert np.isinf(profile_likelihood(estimate, names[2]).interval.high)
-    assert np.isfinite(profile_likelihood(estimate, names[0]).interval.high)
+    assert np.isinf(profile_likelihood(estimate, names[2]).high)
+    assert np.isfinite(profile_likelihood(estimate, names[0]).high)
     assert estimate.covariance.individually_identified.tolist() == [[True, True, False]]
     with pytest.raises(impc.InputError, match=r"choose from: K\.force"):
         profile_likelihood(estimate, "mass")

@@ -127,7 +127,7 @@ def test_an_interval_ends_where_the_misfit_has_grown(
         assert grown == pytest.approx(3.84 * covariance.spread(row)[1] ** 2, rel=tolerance)
     if fit is fitted_scalar:  # the misfit stays above, and diverges below
         assert found.high == np.inf
-        assert tangent(at.structure, at.problem, np.array([found.low - 2.0])).found.reason
+        assert tangent(at.structure, at.problem, np.array([found.low - 2.0])).reason
 
 
 def _least(at: Tangent, value: float) -> float:
@@ -157,7 +157,7 @@ def _least(at: Tangent, value: float) -> float:
 def _start_columns(place: Tangent) -> Array:
     """Derivative by the initial state of every trial, zero outside the trial."""
     sizes = [trial.outputs.size for trial in place.problem.recordings]
-    parts = np.split(np.asarray(place.found.own), np.cumsum(sizes)[:-1])
+    parts = np.split(np.asarray(place.own), np.cumsum(sizes)[:-1])
     return np.asarray(scipy.linalg.block_diag(*parts))
 
 
@@ -195,7 +195,7 @@ def test_the_structure_that_holds_is_not_refused_and_a_cross_term_is() -> None:
 def test_the_statistic_is_the_one_step_fall_of_the_misfit() -> None:
     """White residuals: T is (U'e)^2 / s^2, against least squares with all gain columns."""
     at = fitted()
-    gain, metric = at.gain_columns()
+    gain, metric = np.split(at.on_law, [at.solution.K.size], axis=1)
     e, others = np.array(at.residual), (np.array(at.on_cost_weights), _start_columns(at))
     fall = _left(e, *others) - _left(e, gain, *others)
     assert metric.shape[1] >= 1

@@ -18,13 +18,12 @@ from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import simulate
 from impc.inverse.laws import GainLaw
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.residuals import evaluate
 from impc.inverse.search import fit_gain, with_fitted_starts
 from impc.inverse.unknowns import Unknowns
 from impc.model.plant_family import plant_at, plant_differential
 from impc.model.riccati import stabilises
 from impc.output_feedback.simulation import simulate_person
-from tests.support import differences, posed
+from tests.support import differences, posed, slopes
 
 FULL = pytest.mark.full
 TRUTH = plants.SeatedBalanceParameters()
@@ -187,13 +186,13 @@ def test_physical_parameters_are_found_with_the_gain() -> None:
 
 def test_an_evaluation_knows_what_a_problem_lacks() -> None:
     problem, _, K = seat_family()
-    found = evaluate(problem, K, np.eye(1))
-    assert found.own.shape == (len(found.residual), 10)
-    assert found.dparameters.shape == (len(found.residual), 2)
+    residual, on_gain, on_parameters, own = slopes(problem, K, np.eye(1))
+    assert own.shape == (len(residual), 10)
+    assert on_parameters.shape == (len(residual), 2)
     known = impc.replace(problem, unknown_start=False, family=None, logarithms=np.zeros(0))
-    other = evaluate(known, K, np.eye(1))
-    assert other.own.shape == (len(found.residual), 0)
-    np.testing.assert_array_equal(other.dK, found.dK)
+    other = slopes(known, K, np.eye(1))
+    assert other[3].shape == (len(residual), 0)
+    np.testing.assert_array_equal(other[1], on_gain)
     there = problem.at(np.ones((2, 10)), np.array([0.1, 0.0]))
     assert [trial.x0.tolist() for trial in there.recordings] == np.ones((2, 10)).tolist()
     assert not np.array_equal(there.plant.A, problem.plant.A)
@@ -208,8 +207,8 @@ def test_standard_deviations_of_a_linear_model_are_those_of_theory() -> None:
     noisy = trial.outputs + 1e-6 * problem.output_scale * white
     here = impc.replace(problem, recordings=(impc.replace(trial, outputs=noisy),))
     covariance = gain_covariance(here, K, np.array(fitted(70.0, 1).metric))
-    found = evaluate(here, K, np.eye(1))
-    J = np.hstack([found.dK.reshape(len(found.residual), -1), found.own])
+    _, on_gain, _, own = slopes(here, K, np.eye(1))
+    J = np.hstack([on_gain, own])
     scale = np.linalg.norm(J, axis=0)
     inverse = np.linalg.pinv((J / scale).T @ (J / scale), rcond=1e-15)
     theory = 1e-6 * np.sqrt(np.diag(inverse)) / scale

@@ -20,12 +20,11 @@ from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.laws import GainLaw
 from impc.inverse.metric_family import metric_family
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.residuals import evaluate
 from impc.inverse.search import fit_gain, refine_gain
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.inverse.unknowns import Unknowns
-from tests.support import extrapolated_jacobian, plant_of, posed, random_problem, regulator
+from tests.support import extrapolated_jacobian, plant_of, posed, random_problem, regulator, slopes
 
 FULL, SLOW = pytest.mark.full, pytest.mark.slow
 # Largest misfit of reported weights relative to the recorded outputs.
@@ -104,7 +103,8 @@ def test_metric_is_kept_along_what_is_told_of_it(m: int, seed: int) -> None:
     assert found.explained
     metrics = weights_behind(found).metrics
     assert len(metrics) == 1
-    seen = evaluate(problem, found.K, found.S).dS.reshape(-1, m * m)
+    space = Unknowns(problem, GainLaw(problem, found.K, found.S))
+    seen = space.evaluated(space.start)[0].parts(problem)[0][:, found.K.size :]
     values = np.linalg.svd(seen, compute_uv=False)
     assert np.count_nonzero(values > 1e-12 * values[0]) < m * (m + 1) // 2 - 1
     kept = impc.gain_fibre(problem.plant, controller.K, metrics)
@@ -240,12 +240,12 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     # them would lower chi-squared by less than 0.1.
     printed = gain_estimate(found)
     at = printed.problem, np.array(printed.K), np.array(printed.S)
-    here, linear = evaluate(*at), gain_covariance(*at)
+    (residual, on_entries, *_), linear = slopes(*at), gain_covariance(*at)
     T, G = natural_coordinates(clean.plant, np.array(printed.K))
-    on_gain = here.dK.reshape(len(here.residual), -1) @ np.kron(G, np.linalg.inv(T).T)
+    on_gain = on_entries @ np.kron(G, np.linalg.inv(T).T)
     along = on_gain @ linear.directions[linear.identified].T
-    step = along @ np.linalg.lstsq(along, here.residual)[0]
-    assert step @ step < 0.1 * printed.misfit**2 / len(here.residual)
+    step = along @ np.linalg.lstsq(along, residual)[0]
+    assert step @ step < 0.1 * printed.misfit**2 / len(residual)
 
 
 @pytest.mark.parametrize(

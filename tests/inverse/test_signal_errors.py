@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import casadi as ca
 import control
 import numpy as np
 import pytest
@@ -20,17 +21,25 @@ DT, SAMPLES, LIMIT, Q = 0.02, 300, 2.4, np.diag([40.0, 4.0])
 SIZES = (0.1, 2e-4, 0.1, 0.6, 2e-3)
 
 
-def pushed_mass() -> impc.Plant:
+def pushed_mass(*, bent: bool = False) -> impc.Plant:
+    """Pushed mass; `bent`: the spring is a sine, and pushes depend on the angle."""
     system = control.ss(
         [[0, 1], [4, -0.3]], [[0, 0], [1, 1]], np.eye(2), 0, states=["angle", "rate"],
         inputs=["torque", "push"], outputs=["angle", "rate"],
     )  # fmt: skip
-    return impc.Plant(control.c2d(system, DT, copy_names=True), controls=["torque"])
+    sampled = control.c2d(system, DT, copy_names=True)
+    x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
+    given = ca.vertcat(ca.sin(x[0]), x[1]), ca.vertcat(w[0], w[1] * (1 + 0.3 * x[0]))
+    ahead = ca.DM(sampled.A) @ given[0] + ca.DM(sampled.B) @ given[1]
+    body = ca.Function("bent", [x, w], [ahead]) if bent else None
+    return impc.Plant(sampled, controls=["torque"], body=body)
 
 
-def posed(errors: dict[str, list[str]], noise: float = 0.0) -> tuple[impc.Problem, np.ndarray]:
+def posed(
+    errors: dict[str, list[str]], noise: float = 0.0, *, bent: bool = False
+) -> tuple[impc.Problem, np.ndarray]:
     """A pushed mass at its limit at times, recorded with known errors; and these errors."""
-    plant, rng = pushed_mass(), np.random.default_rng(5)
+    plant, rng = pushed_mass(bent=bent), np.random.default_rng(5)
     law = regulator(plant, Q, LIMIT, 10)
     push = np.repeat(rng.choice([-2.0, 2.0], SAMPLES // 10), 10)[:, None]
     truth = np.zeros((len(KINDS), 3))
@@ -99,10 +108,11 @@ def test_derivatives_of_outputs_are_moved_with_them() -> None:
     )
 
 
+@pytest.mark.parametrize("bent", [False, True])
 @pytest.mark.parametrize("signal", ["angle", "push"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_column_of_the_search_is_a_difference(kind: str, signal: str) -> None:
-    problem, truth = posed({kind: [signal]})
+def test_every_column_of_the_search_is_a_difference(kind: str, signal: str, bent: bool) -> None:
+    problem, truth = posed({kind: [signal]}, bent=bent)
     errors = np.array([0.5 * truth])
     here = problem.at(problem.starts, problem.logarithms, errors)
     space = Unknowns(here, GainLaw(here, np.array([[9.0, 3.0]]), np.eye(1)))

@@ -12,11 +12,13 @@ from impc.control.closed_loop import simulate
 from impc.inverse import table31
 from impc.inverse.equivalent_weights import SLACK
 from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for
-from impc.inverse.proximal_search import Residual, weight_jacobian
+from impc.inverse.proximal_search import weight_jacobian
 from impc.inverse.proximal_step import block_basis
-from impc.inverse.residuals import evaluate, keeps_hard, residual_only
+from impc.inverse.residuals import Linear, keeps_hard, residual_only
 from impc.inverse.search import fit_gain
+from impc.inverse.unknowns import linear_at
 from impc.model.weights import condition_number
 from impc.studies.example.cases import CASES, CaseResult, run_case
 from plants import yalmip_example
@@ -31,6 +33,11 @@ def of_block(problem: impc.Problem, block: Array) -> Array:
     n = problem.plant.n
     solution = impc.solve_lqr(problem.plant, impc.Weights(block[:n, :n], block[n:, n:]))
     return residual_only(problem, solution.K, solution.S)
+
+
+def linear(problem: impc.Problem, gain: Array) -> Linear:
+    law = GainLaw(problem, gain, np.eye(1), whitened=False)
+    return linear_at(problem, law, law.start)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -178,8 +185,7 @@ def test_jacobian_in_the_weights_equals_central_differences(inputs: int) -> None
             break
     problem = support.posed(law, impc.Recording(plant, 0.9 * run.x, x0=run.x[0]))
     solution, basis = impc.solve_lqr(plant, weights), block_basis(3, inputs)
-    found = evaluate(problem, solution.K, solution.S)
-    at = Residual(found.residual, found.dK, found.dS, usable=True)
+    at, _ = table31.closed_loop_residual(problem, solution)
     exact, errors = weight_jacobian(solution, at, basis), []
     for step in (1e-5, 1e-6):
         rough = support.differences(
@@ -223,7 +229,7 @@ def test_a_recording_that_breaks_a_state_bound_is_fitted_softly_and_said_so() ->
 def test_iterates_that_do_not_stabilise_or_diverge_are_named_and_finite() -> None:
     """No gain at all, and one that makes too little use of the bounded input."""
     problem = support.example_problem("A")
-    found = evaluate(problem, np.zeros((1, 2)), np.eye(1))
+    found = linear(problem, np.zeros((1, 2)))
     assert "does not stabilise the plant" in found.reason
     assert np.all(np.isfinite(found.residual))
     assert np.linalg.norm(found.residual) > 1e3
@@ -231,7 +237,7 @@ def test_iterates_that_do_not_stabilise_or_diverge_are_named_and_finite() -> Non
     outputs = np.vstack([2.5 * problem.recordings[0].outputs, np.zeros((200, 2))])
     trial = impc.Recording(problem.plant, outputs)
     far = impc.Problem(problem.plant, problem.bounds, 3, (trial,), terminal_set=False)
-    found = evaluate(far, np.array([[1.02, -0.72]]), np.eye(1))
+    found = linear(far, np.array([[1.02, -0.72]]))
     assert found.reason.startswith("sample 60: ")
     assert np.all(np.isfinite(found.residual))
 

@@ -17,8 +17,8 @@ from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
 from impc.inverse.problem import noise_of_residual
-from impc.inverse.residuals import evaluate, residual_only
-from tests.support import differences, posed, regulator
+from impc.inverse.residuals import residual_only
+from tests.support import differences, posed, regulator, slopes
 
 KNOWN = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
 SEAT = "plants:seated_balance_for"
@@ -86,13 +86,13 @@ def test_derivatives_by_parameters_delay_and_limit(
     made: Any, at: list[float], step: float, size: float
 ) -> None:
     problem, K = made()
-    found = evaluate(problem.at(problem.starts, np.array(at)), K, np.eye(1)).dparameters
-    slopes = differences(
+    found = slopes(problem.at(problem.starts, np.array(at)), K, np.eye(1))[2]
+    rough = differences(
         lambda q: residual_only(problem.at(problem.starts, q), K, np.eye(1)), at, step
     )
     for place in range(len(at)):
-        largest = np.max(np.abs(slopes[:, place]))
-        np.testing.assert_allclose(found[:, place], slopes[:, place], atol=size * largest)
+        largest = np.max(np.abs(rough[:, place]))
+        np.testing.assert_allclose(found[:, place], rough[:, place], atol=size * largest)
 
 
 def test_values_of_delay_and_limit_are_in_their_units() -> None:
@@ -109,10 +109,10 @@ def test_the_covariance_is_that_of_the_joint_curvature() -> None:
     """White residuals: inverse of J'J / s^2 + prior from all columns; to 1e-6."""
     found = gain_estimate(fitted())
     problem, K, S = found.problem, np.array(found.K), np.array(found.S)
-    at = evaluate(problem, K, S)
-    own = scipy.linalg.block_diag(*np.split(at.own, np.cumsum(problem.trial_sizes)[:-1]))
-    J = np.hstack([at.dK.reshape(len(at.residual), -1), at.dparameters, own])
-    s = noise_of_residual(problem, at.residual)
+    residual, on_gain, on_parameters, own = slopes(problem, K, S)
+    own = scipy.linalg.block_diag(*np.split(own, np.cumsum(problem.trial_sizes)[:-1]))
+    J = np.hstack([on_gain, on_parameters, own])
+    s = noise_of_residual(problem, residual)
     H = J.T @ J / s**2
     H[2:4, 2:4] += np.diag(1 / 0.03**2 * np.ones(2))
     cov = np.linalg.inv(H)

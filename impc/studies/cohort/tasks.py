@@ -18,12 +18,12 @@ import psutil
 
 from impc.arrays import frozen
 from impc.assess.assessments import assessed, evaluate_method
-from impc.assess.intent_statements import intent
+from impc.assess.intent import intent
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.resampling import bootstrap_model, replicate
 from impc.assess.structures import assess_structure
-from impc.assess.variance_accounted_for import left_out_vaf, saturated_share
+from impc.assess.variance_accounted_for import left_out, saturated_share
 from impc.assess.weights_test import weights_test
 from impc.checking import replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
+    from impc.assess.printed_gain import GainEstimate
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
     from impc.inverse.estimates import Estimate
@@ -184,8 +185,8 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
 def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
     plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
     fit = evaluate_method(fitted, problem.bounds)
-    fit = replace(fit, held_out=_held_out(problem, fitted, settings))
     estimate = gain_estimate(fitted)
+    fit = replace(fit, held_out=_held_out(fitted, estimate, settings))
     sizes = state_sizes(fit.runs)
     readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
     family = estimate.problem.family
@@ -262,14 +263,14 @@ def _trajectory(fit: MethodFit) -> dict[str, Any]:
     }
 
 
-def _held_out(problem: Problem, fitted: Estimate, settings: FitSettings) -> Array:
+def _held_out(fitted: Estimate, estimate: GainEstimate, settings: FitSettings) -> Array:
     """VAF (trials, p) of each left-out trial, %; no rows if not requested or for one trial."""
-    count = len(problem.recordings)
-    rows = np.empty((count if settings.held_out and count > 1 else 0, len(problem.plant.outputs)))
-    for index in range(len(rows)):
-        other = fit_controller(fitted.problem.leaving_out(index), fitted.stage_weights)
-        rows[index] = left_out_vaf(other, problem.recordings[index], settings.settle).vaf
-    return frozen(rows)
+    count = len(fitted.problem.recordings)
+    found = [
+        left_out(fitted, estimate, index, settings.settle).vaf
+        for index in range(count if settings.held_out and count > 1 else 0)
+    ]
+    return frozen(np.reshape(found, (-1, len(fitted.problem.plant.outputs))))
 
 
 def _structure(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any] | None:

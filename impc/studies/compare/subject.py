@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.assess.assessments import evaluate_method
-from impc.assess.variance_accounted_for import left_out_vaf
+from impc.assess.variance_accounted_for import predicted
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
@@ -85,5 +85,7 @@ def _held_out(problem: Problem, estimates: list[Estimate | None], settle: float)
     rows = np.full((len(estimates), len(problem.plant.outputs)), np.nan)
     for index, estimate in enumerate(estimates):
         if estimate is not None and estimate.K is not None:
-            rows[index] = left_out_vaf(estimate, problem.recordings[index], settle).vaf
+            pair = np.array(estimate.gain), np.array(estimate.metric)
+            trial = problem.recordings[index]
+            rows[index] = predicted(estimate.problem, *pair, trial, settle).vaf
     return frozen(rows)

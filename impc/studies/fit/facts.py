@@ -12,8 +12,8 @@ from impc.reporting.shown_units import shown_unit, signal_name
 
 if TYPE_CHECKING:
     from impc.arrays import Array
-    from impc.assess.intent_statements import Statement
     from impc.assess.printed_gain import Interval
+    from impc.assess.weights_ranges import Statement
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult, LimitFound
 

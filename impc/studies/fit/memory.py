@@ -27,7 +27,7 @@ Part = TypeVar("Part")
 
 # Names of stages that decide which problem an estimate belongs to.
 _WHOLE = "inverse_mpc"
-_LEFT_OUT = re.compile(r"without (?:trial )?(\d+)")
+_LEFT_OUT = re.compile(r"without (\d+)")
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,6 @@ def _seen(problem: Problem, stage: str, method: Method) -> Problem:
     """The problem that the method of a stage solves."""
     left_out = _LEFT_OUT.match(stage)
     posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
-    return (
-        posed
-        if method.name in ("inverse_mpc", "structured")
-        else method.restrict(posed.with_nuisance_fixed())
-    )
+    if method.name in ("inverse_mpc", "structured"):
+        return posed
+    return method.restrict(posed.with_nuisance_fixed())

@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from impc.assess.ceiling import Ceiling
     from impc.assess.frequency_response import FrequencyResponse
     from impc.assess.input_limits import LimitCurve
-    from impc.assess.intent_statements import Intent, Statement
+    from impc.assess.intent import Intent
     from impc.assess.lack_of_fit import LackOfFit, ModelError
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
+    from impc.assess.weights_ranges import Statement
     from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate, Identifiability
     from impc.inverse.problem import Problem

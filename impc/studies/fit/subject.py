@@ -22,12 +22,12 @@ from impc.assess.ceiling import ceiling
 from impc.assess.command_table import command_regression
 from impc.assess.frequency_response import frequency_response
 from impc.assess.input_limits import LimitCurve, limit_curve
+from impc.assess.intent import intent
 from impc.assess.intent_draws import drawn_gains
-from impc.assess.intent_statements import intent
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structures import assess_structure, no_structure
-from impc.assess.variance_accounted_for import agreement, left_out_vaf
+from impc.assess.variance_accounted_for import agreement, left_out
 from impc.assess.weights_ranges import weights_summary_or_reason
 from impc.assess.weights_test import identifiability, weights_test
 from impc.checking import checked, replace
@@ -35,7 +35,6 @@ from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
-from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem, aims, simulated
 from impc.inverse.structured import fit_structured
 from impc.model.foresight import physical_states
@@ -53,7 +52,7 @@ from impc.studies.pool import threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from concurrent.futures import Future, ThreadPoolExecutor
+    from concurrent.futures import ThreadPoolExecutor
 
     import pandas as pd
 
@@ -233,7 +232,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
     fitted = found["inverse_mpc"]
     known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
     plant, K, metrics = known.plant, np.array(fitted.gain), np.array(fitted.metrics)
-    own = evaluate_method(fitted, problem.bounds)
+    *others, own = [evaluate_method(one, problem.bounds) for one in found.values()]
     sizes = state_sizes(own.runs)
     usable = bool(np.all(own.vaf >= LITTLE))
     doubted = lack[-1] is not None and lack[-1].alarm
@@ -248,7 +247,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         return weights_summary_or_reason(plant, K, metrics, sizes, draws, pool.map)
 
     methods, held_out, weights_found, curves = _beside_it(
-        problem, own, list(found.values())[:-1], settings, progress, attempt, whole_set
+        estimate, own, others, settings, progress, attempt, whole_set
     )
     structures = _structures(problem, settings, fitted, progress)
     after = progress.done, progress.replicate, attempt
@@ -329,9 +328,9 @@ def _estimates(
 
 
 def _beside_it(
-    problem: Problem,
+    estimate: GainEstimate,
     own: MethodFit,
-    others: list[Estimate],
+    others: list[MethodFit],
     settings: FitSettings,
     progress: FitProgress,
     attempt: Attempt,
@@ -343,33 +342,29 @@ def _beside_it(
     tuple[LimitCurve, ...],
 ]:
     """Other methods, left-out trials, limit curves and the set of weights, in parallel."""
-    methods, held_out = [own], []
+    held_out: list[HeldOut | None] = []
+    fitted, trials = own.estimate, len(own.estimate.problem.recordings)
     with threads(_THREADS) as pool:
-        pending = _left_out(pool, own.estimate, settings, progress)
-        limits = pool.submit(
-            attempt, "limit curve", functools.partial(_curves, own.estimate, own), ()
-        )
-        for found in others[::-1]:
-            methods.insert(0, evaluate_method(found, problem.bounds))
-            progress.done(found.method)
+        without = functools.partial(left_out, fitted, estimate, settle=settings.settle)
+        pending = [
+            pool.submit(attempt, _without(index), functools.partial(without, index), None)
+            for index in range(trials if _leaves_out(trials, settings) else 0)
+        ]
+        limits = pool.submit(attempt, "limit curve", functools.partial(_curves, fitted, own), ())
+        for found in others:
+            progress.done(found.estimate.method)
         found_set = whole_set(pool)
         progress.done("set of weights")
         for index, other in enumerate(pending):
-            predicted = functools.partial(
-                _predicted, other, problem.recordings[index], settings.settle
-            )
-            held_out.append(attempt(_without(index), predicted, None))
+            held_out.append(other.result())
             progress.done(_without(index))
         curves = limits.result()
-    if None in held_out:
-        held_out = []  # the table has rows for all trials or for none
-    if held_out:
-        methods[-1] = replace(own, held_out=frozen([item.vaf for item in held_out]))
-    return tuple(methods), tuple(held_out), found_set, curves
-
-
-def _predicted(other: Future[Estimate], trial: Recording, settle: float) -> HeldOut:
-    return left_out_vaf(other.result(), trial, settle)
+    held = tuple(one for one in held_out if one is not None)
+    if len(held) < len(held_out):
+        held = ()  # the table has rows for all trials or for none
+    if held:
+        own = replace(own, held_out=frozen([item.vaf for item in held]))
+    return (*others, own), held, found_set, curves
 
 
 def _person(
@@ -439,19 +434,6 @@ def _first_guess(plant: Plant, trial: Recording) -> Recording:
 
 def _leaves_out(trials: int, settings: FitSettings) -> bool:
     return settings.held_out and trials > 1
-
-
-def _left_out(
-    pool: ThreadPoolExecutor, fitted: Estimate, settings: FitSettings, progress: FitProgress
-) -> list[Future[Estimate]]:
-    """Fits to all trials except one, started at the fit to all trials; body parameters fixed."""
-    pending = []
-    for index in range(len(fitted.problem.recordings)):
-        if _leaves_out(len(fitted.problem.recordings), settings):
-            others = fitted.problem.with_body_fixed().leaving_out(index)
-            refit = functools.partial(fit_controller, others, fitted.stage_weights)
-            pending.append(pool.submit(progress.estimate, _without(index), refit))
-    return pending
 
 
 def _without(index: int) -> str:

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.input_limits import input_limit
-from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals
+from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals, gain_estimate
 from impc.assess.profiles import profile_likelihood, require_numbers
 from impc.assess.resampling import bootstrap_intervals, bootstrap_model, replicate
 from impc.assess.variance_accounted_for import (
-    held_out_vafs,
     innovation_roots,
     innovations_criterion,
+    left_out,
     residuals_of,
 )
 from impc.checking import replace
@@ -86,7 +86,7 @@ def assess(
     for name in settings.profiles:
         stage = f"profile of {name}"
         profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
-        intervals += [] if profile is None else [profile.interval]
+        intervals += [] if profile is None else [profile]
         done(stage)
     limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
@@ -94,7 +94,8 @@ def assess(
         limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
         if limit is not None:
             limits.append(limit)
-            intervals.append(_limit_interval(limit, name))
+            ends = limit.value, limit.low, limit.high
+            intervals.append(Interval(f"u_max.{name}", "profile", LEVEL, *ends))
         done(f"limit of {name}")
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
@@ -104,10 +105,6 @@ def assess(
     replicates = functools.partial(_bootstrap, estimate, settings, done, remember)
     intervals += attempt("bootstrap", replicates, ())
     return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
-
-
-def _limit_interval(found: LimitEstimate, control: str) -> Interval:
-    return Interval(f"u_max.{control}", "profile", found.level, found.value, found.low, found.high)
 
 
 def _bootstrap(
@@ -190,10 +187,9 @@ def verdict(one: Alternative, other: Alternative) -> str:
 def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:
     try:
         found = fitted if name == "as fitted" else fit_controller(problem, fitted.weights)
-        weights = found.weights
-        held = held_out_vafs(
-            problem, lambda index: fit_controller(problem.leaving_out(index), weights), settle
-        )
+        estimate, count = gain_estimate(found), len(problem.recordings)
+        places = range(count if count > 1 else 0)
+        held = [left_out(found, estimate, index, settle).vaf for index in places]
     except (WeightsError, SolverError) as error:
         return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
     aic = innovations_criterion(residuals_of(found), roots)
