@@ -404,11 +404,10 @@ class _Along:
         return replace(whole, shared=whole.shared @ self.columns, curved=curved)
 
     def value(self, u: Array, v: Array) -> float:
-        residual, count = (
-            self.space.residual(self.placed(u, v)),
-            self.space.problem.recorded_numbers,
-        )
-        return np.inf if residual is None else log_square(count, float(residual @ residual))
+        residual = self.space.residual(self.placed(u, v))
+        if residual is None:
+            return np.inf
+        return log_square(self.space.problem.recorded_numbers, float(residual @ residual))
 
     def bend(self, du: Array, dv: Array, share: float) -> tuple[Array, Array] | None:
         here = self.apart(self.here)
