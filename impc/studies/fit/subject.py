@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
-    from impc.output_feedback.page import PersonReport
+    from impc.output_feedback.models import PersonReport
     from impc.studies.fit.uncertainty import Attempt
 
 _THREADS = 2
