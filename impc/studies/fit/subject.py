@@ -19,16 +19,14 @@ from tqdm.auto import tqdm
 from impc.arrays import Array, frozen
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
-from impc.assess.command_table import command_regression
 from impc.assess.frequency_response import frequency_response
 from impc.assess.input_limits import LimitCurve, limit_curve
 from impc.assess.intent import intent
-from impc.assess.intent_draws import drawn_gains
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import command_regression, gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out
-from impc.assess.weights_ranges import weights_summary_or_reason
+from impc.assess.weights_ranges import drawn_gains, weights_summary_or_reason
 from impc.assess.weights_test import identifiability, weights_test
 from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
