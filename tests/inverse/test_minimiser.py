@@ -32,10 +32,14 @@ class Curved:
     def rows(self, u: np.ndarray, v: np.ndarray) -> Rows:
         self.last = u, v
         slope = np.cos(self.A @ u + np.einsum("twn,tn->tw", self.B, v))[..., None]
-        return Rows(self.residual(u, v), slope * self.A, slope * self.B, self.bent)
+        parts = self.residual(u, v), slope * self.A, slope * self.B
+        return Rows.of_white_noise(self.count, *parts, curved=self.bent)
 
     def square(self, u: np.ndarray, v: np.ndarray) -> float:
         return float(np.sum(self.residual(u, v) ** 2))
+
+    def value(self, u: np.ndarray, v: np.ndarray) -> float:
+        return float(self.count * np.log(max(self.square(u, v), 1e-300)))
 
     def bend(self, du: np.ndarray, dv: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
         u, v = self.last
@@ -130,7 +134,7 @@ class Creased(Curved):
         side = 1.0 if u[0] >= self.c.flat[0] else -1.0
         shared = np.zeros((1, 2, 1))
         shared[0, 1, 0] = side
-        return Rows(self.residual(u, v), shared, np.zeros((1, 2, 0)))
+        return Rows.of_white_noise(self.count, self.residual(u, v), shared, np.zeros((1, 2, 0)))
 
 
 def test_an_end_at_a_crease_is_no_minimum() -> None:
@@ -156,17 +160,18 @@ def test_a_search_that_ran_out_says_what_is_left() -> None:
 class ShortSteps:
     """Long steps are infeasible, and each short one gains the same little."""
 
-    count, tries, level = 1, 0, 1.0
+    tries, level = 0, 1.0
 
     def rows(self, _u: np.ndarray, _v: np.ndarray) -> Rows:
-        return Rows(np.full((1, 1), np.sqrt(self.level)), np.ones((1, 1, 1)), np.zeros((1, 1, 0)))
+        residual = np.full((1, 1), np.sqrt(self.level))
+        return Rows.of_white_noise(1, residual, np.ones((1, 1, 1)), np.zeros((1, 1, 0)))
 
-    def square(self, _u: np.ndarray, _v: np.ndarray) -> float:
+    def value(self, _u: np.ndarray, _v: np.ndarray) -> float:
         self.tries += 1
         if self.tries % 14:
             return np.inf
         self.level *= 1 - 1e-6
-        return self.level
+        return float(np.log(self.level))
 
     def bend(self, _du: np.ndarray, _dv: np.ndarray, _share: float) -> None:
         return None

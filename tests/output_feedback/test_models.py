@@ -11,9 +11,8 @@ import pytest
 from impc.inverse.methods import fit
 from impc.model.structure import Structure
 from impc.output_feedback.intervals import person_covariance
-from impc.output_feedback.models import person_report, prediction_errors
+from impc.output_feedback.models import PersonModel, person_report, prediction_errors
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.page import PersonModel
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
 from tests.inverse.test_regulator_span import late_body, late_problem

@@ -16,9 +16,8 @@ from impc.control.simulation import Status
 from impc.errors import InputError
 from impc.model.recordings import Recording
 from impc.output_feedback.fit import OutputFeedbackFit
-from impc.output_feedback.models import asked_observer
+from impc.output_feedback.models import PersonReport, asked_observer
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.page import PersonReport
 from impc.reporting.document import Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.rendering import plain

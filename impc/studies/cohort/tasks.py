@@ -31,6 +31,7 @@ from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.search import with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
@@ -116,6 +117,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
+    problem = with_jumps(problem)
     fitted = fit_controller(problem)
     with angles_in(task.configuration.report.angles):
         content = _described(problem, fitted, settings)
