@@ -2,16 +2,16 @@
 
 Noise is independent of the perturbation. If body or controller differ from the model, part of the
 residuals lies along the derivative of the outputs by that error. Each error that was not fitted is
-a group of columns c (r, d), made by a forcing f_t of the local loop, with the fitted trajectory x
-and the local gain G_t of the controller:
+a group of columns c (r, d). Errors of a recorded signal (`impc.model.signal_errors`) have the
+derivative of a search: offset and drift of an output in each trial; scale, time shift and clock of
+an output or a perturbation, the same in all trials. The others are made by a forcing f_t of the
+local loop, with the fitted trajectory x and the local gain G_t of the controller:
 
     dx_{t+1} = (A_t + B_t G_t) dx_t + f_t,      c_t = C dx_t:
 
     delay               f = -B (u_t - u_{t-1}), a command that arrives one sample late
     limit               derivative by the command limit
     lean                f = B in one trial, a constant push by or on the subject
-    offset              c = 1 in one output and trial, an error of the signal
-    perturbation        f = E d_t, its size or the inertia that it moves
     stiffness           f = E y_t and E (y_t - y_{t-1}), stiffness and damping where it acts
     further mode        f = E d_{t-l}, responses later than those of the model
     nonlinear body      f = (B, E) (y^2, y^3)
@@ -43,11 +43,9 @@ from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
 from impc.inverse.columns import trial_span
 from impc.inverse.further_unknowns import (
-    STRENGTH,
     with_delay_unknown,
+    with_errors_unknown,
     with_limit_unknown,
-    with_offsets_unknown,
-    with_strength_unknown,
 )
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
@@ -67,18 +65,13 @@ if TYPE_CHECKING:
 #: Probability of any alarm under a correct model, by these distributions. Trials close to a fall
 #: have heavier tails: at this level 4 % of 161 carts gave an alarm, at 0.05 7 %.
 LEVEL = 0.02
-DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
-PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
-MODE, NONLINEAR = "a further mode", "a nonlinear body"
+DELAY, LIMIT, LEAN = "delay", "limit", "lean"
+STIFFNESS, MODE, NONLINEAR = "stiffness or damping", "a further mode", "a nonlinear body"
 #: Names of the fitted parameters that replace a test, by their beginning.
-PARAMETERS = {DELAY: plant_family.DELAY, LIMIT: plant_family.LIMIT, PUSH: STRENGTH}
-_CURES = {
-    DELAY: with_delay_unknown,
-    LIMIT: with_limit_unknown,
-    LEAN: with_offsets_unknown,
-    OFFSET: with_offsets_unknown,
-    PUSH: with_strength_unknown,
-}
+PARAMETERS = {DELAY: plant_family.DELAY, LIMIT: plant_family.LIMIT}
+# Errors of signals that differ from trial to trial; those of devices are the same in all.
+_OF_A_TRIAL = ("offset", "drift")
+_OF_DEVICES = ("scale", "shift", "clock")
 # Later responses that are tested, in shares of the shortest trial.
 _LATER = (0.005, 0.01, 0.02, 0.04)
 # Least share of a column that the fit cannot compensate.
@@ -93,11 +86,11 @@ _EXACT, _FEWEST = 1e-7, 100
 class ModelError(Frozen):
     """One kind of model error, with its test."""
 
-    name: str
+    name: str  # Of an error of a signal: "shift.theta1"
     probability: float  # p-value
     evidence: float  # -log(p-value)
-    # Estimated size of the error and its standard error, in samples of delay or shares of a limit
-    # or perturbation; NaN for a group of several columns
+    # Estimated size of the error and its standard error, in samples or shares; NaN for a group of
+    # several columns
     size: float
     deviation: float
 
@@ -121,18 +114,24 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     if all(trial.has_gaps for trial in estimate.problem.recordings):
         return None
     problem, K, S = _some_trials(estimate.problem), np.array(estimate.K), np.array(estimate.S)
-    space = Unknowns(with_offsets_unknown(problem), GainLaw(problem, K, S))
+    signals = untested_errors(problem)
+    space = Unknowns(with_errors_unknown(problem, signals), GainLaw(problem, K, S))
     found = space.evaluated(space.start)[0]
     samples = sum(trial.samples for trial in problem.recordings)
     size = np.linalg.norm(found.residual) / np.sqrt(problem.recorded_numbers)
     if found.reason or samples < _FEWEST or size <= _EXACT:
         return None
-    offsets = [table[:, found.shared + problem.own_unknowns :] for table in found.tables]
-    every = _columns(problem, K, S) | {OFFSET: scipy.linalg.block_diag(*offsets)}
+    every = _columns(problem, K, S)
+    first = found.shared + problem.own_unknowns
+    for place, (kind, name) in enumerate(signals, first):
+        own = [table[:, [place]] for table in found.tables]
+        each = kind in _OF_A_TRIAL
+        every[f"{kind}.{name}"] = scipy.linalg.block_diag(*own) if each else np.concatenate(own)
     groups = {name: columns for name, columns in every.items() if columns.shape[1]}
     widths = [columns.shape[1] for columns in groups.values()]
     tested = _Tested(problem, found, np.hstack(list(groups.values())))
-    parts = np.split(np.arange(sum(widths)), np.cumsum(widths)[:-1])
+    ends = np.cumsum(widths)[:-1]
+    parts: list[IntArray] = np.split(np.arange(sum(widths)), ends)
     results = {name: tested.of(name, part) for name, part in zip(groups, parts, strict=True)}
     errors = sorted(
         (item for item in results.values() if item is not None), key=lambda item: -item.evidence
@@ -147,8 +146,31 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
 def with_culprit(problem: Problem, found: LackOfFit | None) -> Problem | None:
     """Problem with the unknown that the test suggests; None if there is none to add."""
     culprit = None if found is None else found.culprit
-    cure = None if culprit is None else _CURES.get(culprit.name)
-    return None if cure is None else cure(problem)
+    if culprit is None:
+        return None
+    if culprit.name in _CURES:
+        return _CURES[culprit.name](problem)
+    kind, _, name = culprit.name.partition(".")
+    return with_errors_unknown(problem, [(kind, name)]) if name else None
+
+
+def _with_offsets(problem: Problem) -> Problem:
+    """A lean looks like an offset of every output."""
+    return with_errors_unknown(problem, [("offset", name) for name in problem.plant.outputs])
+
+
+_CURES = {DELAY: with_delay_unknown, LIMIT: with_limit_unknown, LEAN: _with_offsets}
+
+
+def untested_errors(problem: Problem) -> list[tuple[str, str]]:
+    """Errors of recorded signals that are not fitted: pairs of a kind and a signal."""
+    plant, moved = problem.plant, np.zeros(0, bool)
+    if not plant.ahead and not np.any(plant.observer):
+        moved = np.any([np.any(trial.disturbance, axis=0) for trial in problem.recordings], axis=0)
+    pushes = [name for name, one in zip(plant.disturbances, moved, strict=False) if one]
+    found = [(kind, name) for kind in _OF_A_TRIAL for name in plant.outputs]
+    found += [(kind, name) for kind in _OF_DEVICES for name in (*plant.outputs, *pushes)]
+    return [pair for pair in found if pair not in problem.signal_errors]
 
 
 def _some_trials(problem: Problem) -> Problem:
@@ -263,7 +285,6 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
     forces = {
         DELAY: -B * late[:, None],
         LEAN: B,
-        PUSH: E * d[:, None],
         STIFFNESS: np.dstack([_crossed(E, y), _crossed(E, changes)]),
         MODE: np.dstack([E * signals[:, None] for signals in earlier]),
         NONLINEAR: np.dstack([_crossed(slopes, y**power) for slopes in (B, E) for power in (2, 3)]),

@@ -387,7 +387,7 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
         Pair(curves[0], residuals) if curves else residuals,
         Fold("Every trial in numbers", [findings.agreement_finding(result)]),
         Fold("Every trial, to explore", [chart]),
-        *([] if result.lack[-1] is None else [lack_finding(result.lack[-1])]),
+        *([] if result.lack[-1] is None else [lack_finding(result.given.plant, result.lack[-1])]),
     ]
 
 
