@@ -246,9 +246,12 @@ def _begun(
     for point in points:
         try:
             space = NoisyUnknowns(gain_space(point, cost_weights), request)
-            spaces.append((space.value(_guesses(space)[0]), space))
+            value = space.value(_guesses(space)[0])
         except ImpcError as error:
             reason = str(error)
+            continue
+        if np.isfinite(value):
+            spaces.append((value, space))
     if not spaces:
         raise SolverError("observer", f"no start has a likelihood: {reason}", "set other noise SDs")
     _, space = max(spaces, key=lambda one: one[0])
