@@ -20,8 +20,7 @@ from impc.errors import InputError
 from impc.inverse.further_unknowns import with_free_limit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import simulated
-from impc.inverse.residuals import along_bounds
-from impc.model.bounds import Bounds, bound_rows
+from impc.model.bounds import Bounds
 from impc.model.plant_family import LIMIT
 
 if TYPE_CHECKING:
@@ -121,14 +120,6 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
     runs = simulated(fitted.problem, fitted.gain, fitted.metric)
     command = np.concatenate([np.abs(run.applied[:, control]) for run in runs])
     return float(np.quantile(command, 0.995))
-
-
-def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control: int = 0) -> Array:
-    """Derivative of the residual by the symmetric limit of one input (r,)."""
-    rows = bound_rows(problem.bounds, problem.plant)
-    of_input = np.isclose(np.abs(rows.b), limit) & ~np.any(rows.E, axis=1)
-    moves = np.abs(rows.F[:, control]) * of_input
-    return along_bounds(problem, gain, metric, moves[:, None])[:, 0]
 
 
 @dataclass(frozen=True)

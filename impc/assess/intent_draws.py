@@ -18,9 +18,10 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
+from impc.errors import WeightsError
 from impc.inverse.proximal_step import block_basis
+from impc.inverse.solution_set import split_blocks
 from impc.model.riccati import gain_gradients, solve_lqr
-from impc.model.weights import Weights
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from impc.assess.covariance import GainCovariance
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
+    from impc.model.weights import Weights
 
 #: Number of draws whose range is a 95 % interval.
 DRAWS = 39
@@ -35,9 +37,6 @@ DRAWS = 39
 _DECADE = np.log(10.0)
 # Sampler steps between two draws.
 _STEPS = 6
-# Convergence of P: the next doubling would add the square of this share.
-_ENOUGH = 1e-9
-_DOUBLINGS = 60
 # Least standard error in whitened units: exact data are limited by rounding and search.
 _SHARPEST = 1e-6
 
@@ -61,15 +60,15 @@ def drawn_gains(
     wrong = covariance.along(centre.K - gain) / deviations
     mean = -spread * values * (left.T @ wrong)[: len(values)]
 
-    def weights_at(a: Array) -> tuple[Array, Array]:
+    def regulator(a: Array) -> LqrSolution:
         step = np.tensordot((mean + a) * spread, basis, 1)
-        X = factor @ scipy.linalg.expm(step) @ factor.T
-        return X[:n, :n], X[n:, n:]
+        return solve_lqr(plant, split_blocks(factor @ scipy.linalg.expm(step) @ factor.T, n))
 
     def excess(a: Array) -> float:
         """Log density relative to the linearised posterior, in which a ~ N(0, I)."""
-        K = _gain(plant, *weights_at(a))
-        if K is None:
+        try:
+            K = regulator(a).K
+        except WeightsError:
             return -np.inf
         off, far = covariance.along(K - gain) / deviations, (mean + a) * spread / _DECADE
         return float(a @ a - off @ off - far @ far) / 2
@@ -80,7 +79,7 @@ def drawn_gains(
     for _ in range(count):
         for _ in range(_STEPS):
             a, here = _slice(a, here, excess, rng)
-        drawn.append(solve_lqr(plant, Weights(*weights_at(a))))
+        drawn.append(regulator(a))
     return tuple(drawn)
 
 
@@ -99,25 +98,6 @@ def _directions(
     _, _, moving = np.linalg.svd(derivative, full_matrices=False)
     left, values, rows = np.linalg.svd(derivative @ moving.T / deviations[:, None])
     return np.tensordot(rows, np.tensordot(moving, basis, 1), 1), left, values
-
-
-def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
-    """K (m, n) to eight digits by doubling (Chu et al. 2004); None without convergence."""
-    A, B, P = plant.A, plant.B, Q
-    G = B @ np.linalg.solve(R, B.T)
-    n, unit = len(A), np.eye(len(A))
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(_DOUBLINGS):
-            right = np.linalg.solve(unit + G @ P, np.hstack([A, G]))
-            ahead, beside = right[:, :n], right[:, n:]
-            more = A.T @ P @ ahead
-            A, G, P = A @ ahead, G + A @ beside @ A.T, P + more
-            size = np.max(np.abs(P))
-            if not np.isfinite(size):
-                return None
-            if np.max(np.abs(more)) <= _ENOUGH * size:
-                return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ plant.A))
-    return None
 
 
 def _slice(

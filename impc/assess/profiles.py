@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from typing import TYPE_CHECKING
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -105,35 +106,27 @@ def standard_error(problem: Problem, gain: Array, metric: Array, name: str) -> t
     return coloured, max((coloured / white) ** 2, 1.0)
 
 
-class FitCurve:
-    """Cached fits with a number at offsets from its start; infinite offsets are far out."""
+class Fit(Protocol):
+    """A fit with one number fixed."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        gain: Array,
-        metric: Array,
-        name: str,
-        evaluations: int = _EVALUATIONS,
-    ) -> None:
-        law = GainLaw(problem, np.array(gain), np.array(metric))
-        self.space, row = Unknowns(problem, law), np.zeros(len(law.start) + len(problem.logarithms))
-        entries = entry_names(problem.plant)
-        if name in entries:
-            row[: len(law.gains)] = law.gains.reshape(len(law.gains), -1)[:, entries.index(name)]
-        else:
-            index = problem.parameter_names.index(name)
-            row[len(law.start) + index] = self.space.units[index]
-        parts = np.split(row / float(row @ row), [len(law.start)])
-        own = self.space.trials * self.space.own
-        self.step = np.concatenate([parts[0], np.zeros(own), parts[1]])
-        # Parameters stay columns of their own: the stated ones have a prior.
-        first, last = np.flatnonzero(row)[[0, -1]] + [0, 1]
-        null = scipy.linalg.null_space(row[None, first:last])
-        self.along = scipy.linalg.block_diag(np.eye(first), null, np.eye(len(row) - last))
-        self.stop = Stop(PROMISE, 0.0, evaluations)
-        self.start = 0.0, self.space.ended(self.space.start)
-        self.tried: dict[float, Fitted | None] = {}
+    @property
+    def objective(self) -> float:
+        """Least loss F."""
+
+
+F = TypeVar("F", bound=Fit)
+
+
+class Curve(ABC, Generic[F]):
+    """Cached fits with one number at offsets from a start."""
+
+    def __init__(self, start: F) -> None:
+        self.start = 0.0, start
+        self.tried: dict[float, F | None] = {}
+
+    @abstractmethod
+    def fit(self, value: float, near: tuple[float, F]) -> F | None:
+        """Fit at a value, given another value with its fit; None if it cannot be simulated."""
 
     @property
     def finite(self) -> list[float]:
@@ -145,7 +138,7 @@ class FitCurve:
         """Finite value with the least loss."""
         return min(self.finite, key=self.loss)
 
-    def at(self, value: float) -> Fitted:
+    def at(self, value: float) -> F:
         """Fit at a value; raises SolverError if it cannot be simulated."""
         found = self._at(value)
         if found is None:
@@ -187,14 +180,16 @@ class FitCurve:
         for _ in range(_ROUNDS):
             self.refine(accuracy, reach)
             origin = self.best
-            found = [self._end(rise, [origin, *values]) for values in sides(origin)]
+            found = [self.end(rise, [origin, *values]) for values in sides(origin)]
             if self.best == origin:
                 break
         return found
 
-    def _end(self, rise: float, values: Sequence[float]) -> float:
-        def excess(value: float) -> float:
-            return self.rise(value) - rise
+    def end(self, rise: float, values: Sequence[float]) -> float:
+        """Value at which F has risen by `rise`, between `values`; the last one without a rise."""
+
+        def excess(value: float) -> float:  # the root of a rise is almost linear
+            return float(np.sqrt(max(self.rise(value), 0.0)) - np.sqrt(rise))
 
         for inside, outside in itertools.pairwise(values):
             if np.isfinite(outside) and excess(outside) > 0:
@@ -202,14 +197,45 @@ class FitCurve:
                 return float(scipy.optimize.brentq(excess, inside, outside, xtol=accuracy))
         return values[-1]
 
-    def _at(self, value: float) -> Fitted | None:
+    def _at(self, value: float) -> F | None:
         if value not in self.tried:
             known = [(other, fit) for other, fit in self.tried.items() if fit is not None]
             near = min(known, key=lambda one: abs(_far(one[0]) - _far(value)), default=self.start)
-            self.tried[value] = self._fit(value, near) or self._fit(value, self.start)
+            self.tried[value] = self.fit(value, near) or self.fit(value, self.start)
         return self.tried[value]
 
-    def _fit(self, value: float, near: tuple[float, Fitted]) -> Fitted | None:
+
+class FitCurve(Curve["Fitted"]):
+    """Fits with a number of a gain at offsets from its start; infinite offsets are far out."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        gain: Array,
+        metric: Array,
+        name: str,
+        evaluations: int = _EVALUATIONS,
+    ) -> None:
+        law = GainLaw(problem, np.array(gain), np.array(metric))
+        self.space, row = Unknowns(problem, law), np.zeros(len(law.start) + len(problem.logarithms))
+        entries = entry_names(problem.plant)
+        if name in entries:
+            row[: len(law.gains)] = law.gains.reshape(len(law.gains), -1)[:, entries.index(name)]
+        else:
+            index = problem.parameter_names.index(name)
+            row[len(law.start) + index] = self.space.units[index]
+        parts = np.split(row / float(row @ row), [len(law.start)])
+        own = self.space.trials * self.space.own
+        self.step = np.concatenate([parts[0], np.zeros(own), parts[1]])
+        # Parameters stay columns of their own: the stated ones have a prior.
+        first, last = np.flatnonzero(row)[[0, -1]] + [0, 1]
+        null = scipy.linalg.null_space(row[None, first:last])
+        self.along = scipy.linalg.block_diag(np.eye(first), null, np.eye(len(row) - last))
+        self.stop = Stop(PROMISE, 0.0, evaluations)
+        super().__init__(self.space.ended(self.space.start))
+
+    def fit(self, value: float, near: tuple[float, Fitted]) -> Fitted | None:
+        """Refit all else, from a nearby fit."""
         z = np.array(near[1].z) + (_far(value) - _far(near[0])) * self.step
         with contextlib.suppress(SolverError, WeightsError):  # it diverges from there
             return self.space.search(z, self.stop, shared=_WEAK, own=_WEAK, along=self.along)

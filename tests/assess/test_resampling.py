@@ -40,8 +40,7 @@ def test_replicates_draw_what_is_known_of_the_body_again() -> None:
     at = printed_gain.gain_estimate(
         fit_controller(posed(law, trial, unknown_start=True, family=family))
     )
-    model = model_of(at)
-    repeated = [resampling.replicate(model, index, SEED) for index in range(40)]
+    repeated = [replicate(at, index) for index in range(40)]
     spread = np.std([np.log(one.K[0, 0] / at.K[0, 0]) for one in repeated])
     assert 0.07 < spread < 0.13
     found = resampling.bootstrap_intervals(at, repeated, "bootstrap", 0.95)
@@ -54,8 +53,8 @@ def first_order(root: float, samples: int, seed: int) -> Array:
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
 
 
-def model_of(at: printed_gain.GainEstimate) -> resampling.BootstrapModel:
-    return resampling.bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
+def replicate(at: printed_gain.GainEstimate, index: int, seed: int = SEED) -> resampling.Replicate:
+    return resampling.replicate(at.problem, np.array(at.K), np.array(at.S), index, seed)
 
 
 def white_covariance(estimate: printed_gain.GainEstimate) -> GainCovariance:
@@ -74,8 +73,7 @@ def test_bootstrap_and_profiles_agree_with_the_sandwich(root: float) -> None:
     """30 replicates, seed 4: widths within a third of the sandwich's; nearly quadratic profiles."""
     estimate = cart_gain(SEED, root=root)
     sandwich = printed_gain.covariance_intervals(estimate, estimate.covariance, "sandwich")
-    model = model_of(estimate)
-    found = [resampling.replicate(model, index, SEED) for index in range(30)]
+    found = [replicate(estimate, index) for index in range(30)]
     ratio = width(resampling.bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / width(
         sandwich
     )
@@ -138,37 +136,19 @@ def test_what_is_not_determined_has_no_end() -> None:
 @both_roots
 def test_a_replicate_depends_on_seed_and_number_only(root: float) -> None:
     at = cart_gain(SEED, root=root)
-    alone = resampling.replicate(model_of(at), 3, SEED)
-    model = model_of(at)
-    after = [resampling.replicate(model, index, SEED) for index in (2, 3)][1]
+    alone, after = replicate(at, 3), [replicate(at, index) for index in (2, 3)][1]
     np.testing.assert_array_equal(alone.K, after.K)
-    assert not np.array_equal(resampling.replicate(model, 3, SEED + 1).K, alone.K)
+    assert not np.array_equal(replicate(at, 3, SEED + 1).K, alone.K)
 
 
 @both_roots
-def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
-    root: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(root: float) -> None:
     """Against a full fit of the same draws (weights, then gain): within 0.01 standard errors."""
     at = cart_gain(SEED, root=root)
-    kept: list[list[Array]] = []
-    draw = resampling.block_residuals
-
-    def keep(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-        kept.append(draw(residuals, rng))
-        return kept[-1]
-
-    monkeypatch.setattr(resampling, "block_residuals", keep)
-    model = model_of(at)
-    found = resampling.replicate(model, 0, SEED)
-    trials = tuple(
-        impc.replace(trial, outputs=outputs + noise)
-        for trial, outputs, noise in zip(
-            at.problem.recordings, model.measured, kept[0], strict=True
-        )
-    )
+    rng = np.random.default_rng(np.random.SeedSequence(SEED, spawn_key=(0,)))
+    trials = resampling.resampled_trials(at.problem, np.array(at.K), np.array(at.S), rng)
     asked = impc.replace(cart_problem(SEED, root=root), recordings=trials)
-    whole = printed_gain.gain_estimate(fit_controller(asked))
+    found, whole = replicate(at, 0), printed_gain.gain_estimate(fit_controller(asked))
     assert np.all(np.abs(found.K - whole.K) < 0.01 * whole.covariance.entries)
     assert np.all(np.abs(found.K - at.K) > 0.01 * whole.covariance.entries)
 

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.assess.lack_of_fit import LIMIT
-from impc.assess.lasting_response import LastingResponse, lasting_responses
+from impc.assess.printed_gain import LastingResponse, lasting_responses
 from impc.control.named_solver import described
 from impc.inverse.minimiser import Ended
 from impc.reporting.document import (

@@ -36,6 +36,7 @@ from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.problem import Problem, aims, simulated
+from impc.inverse.search import with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.foresight import physical_states
 from impc.studies.fit.asked import (
@@ -224,6 +225,7 @@ def _attempt(failures: dict[str, str], stage: str, compute: Callable[[], Any], d
 def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> FitResult:
     started = time.perf_counter()
     failures: dict[str, str] = {}
+    problem = with_jumps(problem)
     attempt = functools.partial(_attempt, failures)
     problem, progress, fitted, estimate, lack = _first_fits(problem, progress, attempt)
     found = _estimates(problem, fitted, settings, progress)

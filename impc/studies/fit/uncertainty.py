@@ -17,12 +17,11 @@ import numpy as np
 from impc.assess.input_limits import input_limit
 from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals, gain_estimate
 from impc.assess.profiles import profile_likelihood, require_numbers
-from impc.assess.resampling import bootstrap_intervals, bootstrap_model, replicate
+from impc.assess.resampling import bootstrap_intervals, replicate
 from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
     left_out,
-    residuals_of,
 )
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -115,11 +114,10 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    model = bootstrap_model(estimate.problem, np.array(estimate.K), np.array(estimate.S))
-    found = []
+    found, at = [], (estimate.problem, np.array(estimate.K), np.array(estimate.S))
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
-        compute = functools.partial(replicate, model, index, settings.seed)
+        compute = functools.partial(replicate, *at, index, settings.seed)
         found.append(remember(name, compute))
         done(name)
     return bootstrap_intervals(estimate, found, "block", LEVEL)
@@ -192,6 +190,6 @@ def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Ar
         held = [left_out(found, estimate, index, settle).vaf for index in places]
     except (WeightsError, SolverError) as error:
         return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
-    aic = innovations_criterion(residuals_of(found), roots)
+    aic = innovations_criterion(found, roots)
     mean = float(np.mean(held)) if held else float("nan")
     return Alternative(name, problem.horizon, found.misfit, aic, mean, "")
