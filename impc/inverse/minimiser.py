@@ -39,6 +39,8 @@ _SHORTENED = 0.1
 # A search is stuck after this many rejected steps in a row, or if this many accepted ones together
 # lower F by less than this share of what is still promised.
 _TRIES, _CREEPING, _DELIVERED = 14, 3, 0.03
+# The same share where a value costs as much as derivatives.
+_HURRIED = 0.1
 # Damping of the step that counts as undamped: directions that nothing identifies stay.
 _NONE = 1e-10
 # Least squared norm of a column in the damping, relative to the largest.
@@ -158,7 +160,7 @@ def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop)
             if _gained(model, prior, here, (u, v), (last.du, last.dv)) > 0:
                 u, v = u + last.du, v + last.dv
             return End(u, v, spent, Ended.CONVERGED, promised)
-        if sum(gains[-_CREEPING:]) <= _DELIVERED * promised:
+        if sum(gains[-_CREEPING:]) <= (_HURRIED if stop.costly else _DELIVERED) * promised:
             return End(u, v, spent, Ended.STUCK, promised)
         if spent >= stop.evaluations:
             return End(u, v, spent, Ended.STOPPED, promised)

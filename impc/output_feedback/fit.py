@@ -63,8 +63,9 @@ _SETTLED, _ENOUGH = 2e-4, 1e-2
 # The likelihood jumps where a later stage of a plan reaches a bound, for a seat at its limit by
 # 0.5 nat within one standard error: a search that is stuck has converged below this promise.
 _ROUGH = 1.0
-# A further round with the REML gradient by differences is skipped if the last gained less.
-_WON = 0.25
+# A further round with the REML gradient by differences is skipped if the last gained less, in nats,
+# of a search that has converged and of one that has not.
+_WON, _PROGRESS = 0.25, 0.02
 # Close to instability the information of the first state spans 35 digits: adding this share of each
 # diagonal keeps the matrix positive definite.
 _ROUNDING = 1e-12
@@ -246,9 +247,12 @@ def _begun(
     for point in points:
         try:
             space = NoisyUnknowns(gain_space(point, cost_weights), request)
-            spaces.append((space.value(_guesses(space)[0]), space))
+            value = space.value(_guesses(space)[0])
         except ImpcError as error:
             reason = str(error)
+            continue
+        if np.isfinite(value):
+            spaces.append((value, space))
     if not spaces:
         raise SolverError("observer", f"no start has a likelihood: {reason}", "set other noise SDs")
     _, space = max(spaces, key=lambda one: one[0])
@@ -356,8 +360,10 @@ def maximise(
         stop = Stop(promise, 0.0, budget - spent + 1, costly=True)
         end = minimise(model, Prior(u, v, u, 0.0), (u, v), stop)
         here, unseen, spent = model.place(end.u) or here, model.unseen, spent + model.spent
-        if not differences or here.value <= known + _WON or spent >= budget:
-            return here, unseen, spent, end.converged or end.promised < _ROUGH
+        settled = end.converged or end.promised < _ROUGH
+        enough = _WON if settled else _PROGRESS
+        if not differences or here.value <= known + enough or spent >= budget:
+            return here, unseen, spent, settled
 
 
 class Objective:
