@@ -26,6 +26,7 @@ samples replaces it. Holm's correction keeps the level over all groups.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -41,6 +42,7 @@ from impc.checking import replace
 from impc.control.body_steps import slopes_along
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
+from impc.errors import ImpcError
 from impc.inverse.columns import trial_span
 from impc.inverse.further_unknowns import (
     with_delay_unknown,
@@ -49,6 +51,7 @@ from impc.inverse.further_unknowns import (
 )
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
+from impc.inverse.refit import refit
 from impc.inverse.residuals import along_bounds
 from impc.inverse.unknowns import Unknowns
 from impc.model import plant_family
@@ -78,6 +81,12 @@ _LATER = (0.005, 0.01, 0.02, 0.04)
 _LEFT = 1e-3
 # Largest number of trials tested.
 _MOST = 12
+# Errors of signals that are refitted after an alarm, decrease of the objective at which they end,
+# and the logarithm of the second limit at which one begins.
+_REFITTED, _PROMISE, _LOWER = 4, 1.0, -0.5
+# Decrease of -2 log L over -log(p) of the likeliest error that needs no further test: residuals are
+# coloured, so the former is several times the statistic of a test.
+_FAR = 20.0
 # Residuals below this share of the outputs are rounding; least number of samples.
 _EXACT, _FEWEST = 1e-7, 100
 
@@ -143,15 +152,62 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     )
 
 
-def with_culprit(problem: Problem, found: LackOfFit | None) -> Problem | None:
-    """Problem with the unknown that the test suggests; None if there is none to add."""
-    culprit = None if found is None else found.culprit
-    if culprit is None:
-        return None
-    if culprit.name in _CURES:
-        return _CURES[culprit.name](problem)
-    kind, _, name = culprit.name.partition(".")
-    return with_errors_unknown(problem, [(kind, name)]) if name else None
+def named_cause(
+    problem: Problem, estimate: GainEstimate, found: LackOfFit | None
+) -> tuple[LackOfFit | None, Problem | None, Problem | None]:
+    """Put the error first that a refit confirms; also the problem with it as a further unknown.
+
+    A test is linear about a fit that has compensated for part of the error, so the likely ones are
+    refitted from there. The one of least -2 log L is named if no test rejects its fit or if it
+    explains far more than the error of smallest p-value; otherwise the latter. The last problem has
+    the values at which that refit ended.
+    """
+    if found is None or not found.alarm:
+        return found, None, None
+    likely = [one for one in found.errors if "." in one.name][:_REFITTED]
+    likely += [one for one in found.errors if one.name in _CURES]
+    ends = [(one, end) for one in likely for end in _refitted(estimate, one.name)]
+    named, begin = found.errors[0], None
+    if ends:
+        best, end = min(ends, key=lambda pair: pair[1].objective)
+        again, here = lack_of_fit(end), GainLaw(estimate.problem, estimate.K, estimate.S)
+        space = Unknowns(estimate.problem, here)
+        fallen = space.ended(space.start).objective - end.objective
+        if again is None or not again.alarm or fallen > _FAR * named.evidence:
+            named, begin = best, end.problem
+    others = tuple(one for one in found.errors if one is not named)
+    further = _freed(problem, named.name)
+    if further is not None and begin is not None:
+        values = begin.starts, begin.logarithms, begin.errors
+        begin = further.at(*map(np.array, values))
+    return replace(found, errors=(named, *others)), further, begin or further
+
+
+def _refitted(estimate: GainEstimate, name: str) -> list[Fitted]:
+    """Refits with one more unknown from a fit; a limit begins at two values."""
+    there = _freed(estimate.problem, name)
+    if there is None:
+        return []
+    K, more = np.array(estimate.K), there.plant.n - estimate.problem.plant.n
+    K = np.hstack([K, np.zeros((len(K), more))])
+    begins = [there]
+    if name == LIMIT:
+        lower = np.array(there.logarithms)
+        lower[len(estimate.problem.logarithms) :] = _LOWER
+        begins.append(there.at(np.array(there.starts), lower, np.array(there.errors)))
+    ends = []
+    for begin in begins:
+        with contextlib.suppress(ImpcError):  # it cannot be simulated: no candidate
+            ends.append(refit(begin, K, np.array(estimate.S), _PROMISE))
+    return ends
+
+
+def _freed(problem: Problem, name: str) -> Problem | None:
+    """Problem with an error as a further unknown; None if that is not possible."""
+    if name in _CURES:
+        return _CURES[name](problem)
+    kind, _, signal = name.partition(".")
+    return with_errors_unknown(problem, [(kind, signal)]) if signal else None
 
 
 def _with_offsets(problem: Problem) -> Problem:
@@ -227,6 +283,8 @@ class _Tested:
         free = self._independent() - d + 1
         scaled = statistic * free / ((free + d - 1) * d)
         evidence = -float(scipy.stats.f.logsf(scaled, d, free))
+        if not np.isfinite(evidence):  # the tail of the distribution
+            evidence = (free + d) / 2 * float(np.log1p(scaled * d / free))
         size = deviation = np.nan
         if len(part) == 1:
             length = float(np.linalg.norm(self.seen[:, part[0]]))

@@ -22,7 +22,7 @@ from impc.assess.ceiling import ceiling
 from impc.assess.frequency_response import frequency_response
 from impc.assess.input_limits import LimitCurve, limit_curve
 from impc.assess.intent import intent
-from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
+from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, named_cause
 from impc.assess.printed_gain import command_regression, gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out
@@ -300,13 +300,16 @@ def _first_fits(
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
     """Inverse MPC, repeated with one more unknown if the tests of the model point to it."""
     lack: list[LackOfFit | None] = []
+    begin: Problem | None = problem
     while True:
-        fitted = progress.estimate("inverse_mpc", functools.partial(fit, problem))
+        fitted = progress.estimate("inverse_mpc", functools.partial(fit, begin or problem))
         estimate = gain_estimate(fitted)
         test = functools.partial(lack_of_fit, estimate)
-        lack.append(attempt("test of the model", test, None))
-        further = with_culprit(problem, lack[-1])
-        if further is None or len(lack) > 1:
+        found, further = attempt("test of the model", test, None), None
+        if not lack:
+            found, further, begin = named_cause(problem, estimate, found)
+        lack.append(found)
+        if further is None:
             progress.done("inverse MPC")
             return problem, progress, fitted, estimate, tuple(lack)
         problem, progress = further, progress.anew(further)
