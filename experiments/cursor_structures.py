@@ -24,8 +24,13 @@ from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.structured_weights import tangent
-from impc.assess.structures import StructureFit, assess_structure, criterion_of
-from impc.assess.variance_accounted_for import innovation_roots, left_out, vaf
+from impc.assess.structures import StructureFit, assess_structure
+from impc.assess.variance_accounted_for import (
+    innovation_roots,
+    innovations_criterion,
+    left_out,
+    vaf,
+)
 from impc.assess.weight_profiles import WeightProfiles
 from impc.control.closed_loop import simulate
 from impc.errors import SolverError, WeightsError
@@ -129,7 +134,8 @@ def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
     nothing = float("nan")
     return StructureRow(
         blur, "any weights", "", False, nothing, 0, float(vaf(recorded, simulated)[0]),
-        float(np.mean(held)), criterion_of(near, roots, identified), [], nothing, nothing, nothing,
+        float(np.mean(held)), innovations_criterion(near, roots, identified), [], nothing,
+        nothing, nothing,
     )  # fmt: skip
 
 

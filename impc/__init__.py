@@ -10,8 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from impc.assess.command_table import command_regression as command_regression
     from impc.assess.expected import expected_intervals as expected_intervals
+    from impc.assess.printed_gain import command_regression as command_regression
     from impc.assess.variance_accounted_for import vaf as vaf
     from impc.assess.weights_test import identifiability as identifiability
     from impc.checking import replace as replace
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
-    "assess.command_table": "command_regression",
+    "assess.printed_gain": "command_regression",
     "assess.expected": "expected_intervals",
     "assess.weights_test": "identifiability",
     "assess.variance_accounted_for": "vaf",

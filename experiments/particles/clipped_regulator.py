@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from impc.arrays import Array, Buffer
-from impc.output_feedback.joint_loop import joint_loop
+from impc.output_feedback.simulation import joint_loop
 
 if TYPE_CHECKING:
     from impc.model.bounds import Bounds

@@ -78,8 +78,8 @@ def _law(who: Subject, K: Array) -> Controller:
 
 
 def _filter(law: Controller, who: Subject) -> PreparedFilter:
-    plant, levels = law.plant, len(who.person.levels) + len(who.recorder)
-    none = NoiseDirections(np.zeros((*plant.C.shape, 0)), np.zeros((levels, 0)), 0)
+    levels = len(who.person.levels) + len(who.recorder)
+    none = NoiseDirections(np.zeros((levels, 0)), 0)
     return prepare_filter(law, who.person, who.recorder, directions(law, 0), none)
 
 

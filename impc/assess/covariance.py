@@ -20,8 +20,9 @@ second-order effect, with errors up to one whitened unit.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -36,11 +37,11 @@ from impc.inverse.residuals import residual_only, residual_or_reason
 from impc.inverse.unknowns import linear_at
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from impc.inverse.columns import TrialSpan
     from impc.inverse.problem import Problem
 
+#: Model of the residuals of each trial, given the span of the fitted columns.
+NoiseModel = Callable[[list[Array], "TrialSpan"], ResidualNoise]
 #: An entry is individually identified if an error of one whitened unit in all unidentified
 #: directions shifts it by less than this share of its standard error. At shares of 0.2 to 0.25, 90
 #: % of 275 intervals covered the true value (carts with three inputs, VAF 70 %).
@@ -102,11 +103,75 @@ class GainCovariance(Frozen):
         return np.asarray(self.foreign < FOREIGN)
 
 
+@dataclass(frozen=True)
+class Slopes(Frozen):
+    """Residual of a fit and its derivatives, all trials, rows of stated parameters last."""
+
+    problem: Problem  # At the fitted values
+    noise: float  # Noise SD; from recordings, the RMS residual
+    reason: str  # Why a simulation stopped; empty if all trials are complete
+    residual: Array  # (r,)
+    law: GainLaw  # At the fitted gain and metric
+    on_law: Array  # By whitened gain and metric (r, c), by parameters, by initial states and errors
+    on_parameters: Array
+    own: Array
+
+    def span(self, *shared: Array) -> TrialSpan:
+        """Span of initial states, errors and columns `shared` (r, k)."""
+        return trial_span(self.own, self.problem.row_sizes, np.hstack(shared))
+
+    def colour(self, model: NoiseModel, fitted: TrialSpan) -> ResidualNoise:
+        """Autocorrelation model of the residuals after a fit of the span."""
+        residuals = by_trial(self.problem, np.array(self.residual))
+        return model(residuals, fitted.upper(len(residuals), sum(self.problem.trial_sizes)))
+
+    def spread(self, noise: ResidualNoise, columns: Array) -> Array:
+        """Covariance (k, k) of columns' residual for this noise."""
+        return spread_of_rows(self.problem, noise, columns, self.noise)
+
+    def sandwich(self, seen: Array, rest: TrialSpan, model: NoiseModel) -> Sandwich:
+        """Covariance of unknowns with derivatives `seen` (r, q) after projection on the `rest`."""
+        _, values, directions = np.linalg.svd(seen, full_matrices=False)
+        usable = determined(self.problem, values)
+        unit = seen @ directions[usable].T / values[usable]
+        noise = self.colour(model, rest.plus(unit))
+        spread = self.spread(noise, unit / values[usable])
+        return Sandwich(values, directions, usable, unit, noise, spread)
+
+
+class Sandwich(NamedTuple):
+    """Covariance of unknowns along directions."""
+
+    values: Array  # Singular values of the derivative, largest first (a,), and directions (a, q)
+    directions: Array
+    usable: BoolArray  # Mask of the directions with a value (a,)
+    unit: Array  # Orthonormal derivatives along these (r, k), and their covariance (k, k)
+    noise: ResidualNoise
+    spread: Array
+
+    @property
+    def deviations(self) -> Array:
+        """Standard error along each direction (a,); infinite without a value."""
+        found = np.full(len(self.values), np.inf)
+        found[self.usable] = np.sqrt(np.maximum(np.diag(self.spread), 0.0))
+        return found
+
+
+def slopes_at(problem: Problem, gain: Array, metric: Array, noise: float | None = None) -> Slopes:
+    """Residual and derivatives at a gain; `noise` is the noise SD, None that of the residual."""
+    law = GainLaw(problem, gain, metric)
+    found = linear_at(problem, law, law.start)
+    noise = noise_of_residual(problem, found.residual) if noise is None else noise
+    found = found.with_prior(problem, noise)
+    parts = (frozen(part) for part in found.parts(problem))
+    return Slopes(problem, noise, found.reason, frozen(found.residual), law, *parts)
+
+
 def gain_covariance(
     problem: Problem,
     gain: Array,
     metric: Array,
-    noise: Callable[[list[Array], TrialSpan], ResidualNoise] = residual_noise,
+    noise: NoiseModel = residual_noise,
     *,
     curvature: bool = False,
     scale: float | None = None,
@@ -115,57 +180,49 @@ def gain_covariance(
 
     `scale` is the noise SD; None: that of the residual.
     """
-    m, n = problem.plant.m, problem.plant.n
-    law = GainLaw(problem, gain, metric)
-    found = linear_at(problem, law, law.start)
-    rows = len(found.residual)
-    scale = noise_of_residual(problem, found.residual) if scale is None else scale
-    slopes, on_parameters, own = found.with_prior(problem, scale).parts(problem)
-    on_gain, on_metric = slopes[:, : m * n], _identified_metric(slopes[:, m * n :])
-    in_units = law.gains.reshape(m * n, m * n).T
-
-    def span(*shared: Array) -> TrialSpan:
-        return trial_span(own, problem.row_sizes, np.hstack(shared))
-
+    at, (m, n) = slopes_at(problem, gain, metric, scale), gain.shape
+    on_gain, on_parameters = np.array(at.on_law[:, : m * n]), np.array(at.on_parameters)
+    on_metric = _identified_metric(at.on_law[:, m * n :])
+    in_units = at.law.gains.reshape(m * n, m * n).T
     # Project the gain columns on the complement of the others: this gives the block of the inverse
     # of H.
-    rest, others = span(on_metric, on_parameters), span(on_gain, on_metric)
-    seen = rest.without(on_gain)
-    _, values, directions = np.linalg.svd(seen, full_matrices=False)
-    usable = determined(problem, values)
-    unit = seen @ directions[usable].T / values[usable]
-    fitted = rest.plus(unit).upper(len(problem.recordings), rows)
-    colour = noise(by_trial(problem, found.residual), fitted)
-    spread = spread_of_rows(problem, colour, unit / values[usable], scale)
-    deviations = np.full(m * n, np.inf)
-    deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    rest = at.span(on_metric, on_parameters)
+    found = at.sandwich(rest.without(on_gain), rest, noise)
     if curvature:
-        identified = np.flatnonzero(deviations < IDENTIFIED)
-        reach = np.minimum(deviations, 1.0)[:, None] * directions
-        unidentified = reach[deviations >= IDENTIFIED]
-        shifts = _shifts(problem, gain, metric, (unidentified @ in_units.T).reshape(-1, m, n))
-        shifts = shifts @ unit[:rows, identified] / values[identified]
-        spread[np.ix_(identified, identified)] += shifts.T @ shifts / 2
-        deviations[usable] = np.sqrt(np.maximum(np.diag(spread), 0.0))
-    entries, foreign = _entries(in_units @ directions.T, deviations, spread)
+        found = _curved(at, gain, metric, in_units, found)
+    directions, deviations = found.directions, found.deviations
+    entries, foreign = _entries(in_units @ directions.T, deviations, found.spread)
     shares = np.zeros((m * n, 0))
     if np.any(problem.stated):
         known = directions[deviations < IDENTIFIED]
-        along = span(on_metric).without(np.hstack([on_gain @ known.T, on_parameters]))
+        along = at.span(on_metric).without(np.hstack([on_gain @ known.T, on_parameters]))
         shares = _shares(along, in_units @ known.T)[:, problem.stated]
+    others = at.span(on_gain, on_metric)
     return GainCovariance(
-        frozen(law.T),
-        frozen(law.G),
-        frozen(values),
+        frozen(at.law.T),
+        frozen(at.law.G),
+        frozen(found.values),
         frozen(directions),
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(problem, on_parameters, others, colour, scale)),
+        frozen(_parameter_deviations(at, others, found.noise)),
         frozen(shares.reshape(m, n, shares.shape[1])),
-        colour,
-        frozen(spread),
+        found.noise,
+        frozen(found.spread),
     )
+
+
+def _curved(at: Slopes, gain: Array, metric: Array, in_units: Array, found: Sandwich) -> Sandwich:
+    """Add the second-order effect of unidentified directions on the identified ones."""
+    deviations, spread = found.deviations, found.spread.copy()
+    identified = np.flatnonzero(deviations < IDENTIFIED)
+    reach = np.minimum(deviations, 1.0)[:, None] * found.directions
+    steps = reach[deviations >= IDENTIFIED] @ in_units.T
+    shifts = _shifts(at.problem, gain, metric, steps.reshape(-1, *gain.shape))
+    along = found.unit[: shifts.shape[1], identified] / found.values[identified]
+    spread[np.ix_(identified, identified)] += (shifts @ along).T @ (shifts @ along) / 2
+    return found._replace(spread=spread)
 
 
 def spread_of_rows(problem: Problem, noise: ResidualNoise, columns: Array, scale: float) -> Array:
@@ -235,10 +292,9 @@ def _identified_metric(alone: Array) -> Array:
     return np.asarray(metric[:, sizes > _SEEN * np.max(sizes, initial=0.0)])
 
 
-def _parameter_deviations(
-    problem: Problem, own: Array, others: TrialSpan, colour: ResidualNoise, scale: float
-) -> Array:
-    """Standard errors of the log-parameters with derivatives `own`, all else fitted too."""
+def _parameter_deviations(at: Slopes, others: TrialSpan, noise: ResidualNoise) -> Array:
+    """Standard errors of the log-parameters, all else fitted too."""
+    own = np.array(at.on_parameters)
     count = own.shape[1]
     if count == 0:
         return np.zeros(0)
@@ -246,6 +302,5 @@ def _parameter_deviations(
     _, values, directions = np.linalg.svd(seen, full_matrices=False)
     if values[-1] <= DETERMINED * np.linalg.norm(own, 2):
         return np.full(count, np.inf)
-    along = seen @ directions.T / values**2 @ directions
-    spread = spread_of_rows(problem, colour, along, scale)
+    spread = at.spread(noise, seen @ directions.T / values**2 @ directions)
     return np.sqrt(np.maximum(np.diag(spread), 0.0))

@@ -21,12 +21,13 @@ import numpy as np
 
 from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
 from impc.assess.covariance import GainCovariance, gain_covariance
-from impc.assess.input_limits import on_limit
 from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
 from impc.checking import checked, replace
 from impc.errors import InputError
+from impc.inverse.residuals import along_bounds
+from impc.model.bounds import bound_rows
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -204,11 +205,13 @@ def _limits(at: Tangent, colour: ResidualNoise) -> Array:
     """Standard errors of the log limits without their own prior, with a free gain."""
     problem, found = at.problem, np.full(at.problem.plant.m, np.inf)
     K, S = np.array(at.solution.K), np.array(at.solution.S)
+    rows = bound_rows(problem.bounds, problem.plant)
     for control, limit in enumerate(np.array(problem.bounds.u_max)):
         if not np.isfinite(limit):
             continue
         column = np.zeros(len(at.residual))
-        column[: sum(problem.trial_sizes)] = limit * on_limit(problem, K, S, limit, control)
+        moves = rows.along_limit(control)[:, None]
+        column[: sum(problem.trial_sizes)] = along_bounds(problem, K, S, moves)[:, 0]
         family = problem.family
         own = [k for k, of in family.limits(problem.plant) if of == control] if family else []
         rest = frozen(np.delete(np.array(at.on_parameters), own, axis=1))

@@ -1,14 +1,8 @@
 """Estimate the input limit, or report that the recordings do not reveal one.
 
-For a limit L the gain, initial states and parameters are refitted; m(L) is the misfit, m(inf) that
-without a limit. With the residual variance s^2 and the factor f by which autocorrelation widens the
-variance of L (f = 1 for white residuals),
-
-    D(L) = (m(L)^2 - m(L*)^2) / (s^2 f)
-
-is chi-squared with one degree of freedom at the true limit. If D(inf) is below its quantile the
-recordings do not identify whether there is a limit; they still give a lower end, the least L that D
-allows.
+A limit is one more physical parameter, so that its interval is a profile likelihood (`profiles`).
+If D without a limit is below its quantile, the recordings do not identify whether there is one;
+they still give a lower end, the least limit that D allows.
 """
 
 from __future__ import annotations
@@ -17,54 +11,44 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.special
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.assessments import simulated_vaf
-from impc.assess.covariance import by_trial
-from impc.assess.fit_curve import FitCurve
-from impc.assess.long_run_covariance import residual_noise, spread_of_sum, white_noise
-from impc.assess.printed_gain import LEVEL
+from impc.assess.profiles import QUANTILE, FitCurve, standard_error
 from impc.checking import replace
 from impc.errors import InputError
-from impc.inverse.laws import GainLaw
+from impc.inverse.further_unknowns import with_free_limit
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import simulated
-from impc.inverse.residuals import along_bounds
-from impc.inverse.search import refine_gain
-from impc.inverse.unknowns import Unknowns, linear_at
-from impc.model.bounds import Bounds, bound_rows
+from impc.model.bounds import Bounds
+from impc.model.plant_family import LIMIT
 
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.inverse.unknowns import Fitted
 
+# Largest number of rounds of limit and controller, and a change of the limit that ends them.
+_ROUNDS, _STAYS = 5, 0.01
 # Relative accuracy of the limit, also the first step towards an end of its interval.
 _RESOLUTION = 1e-4
-_GRID, _NEAR = np.geomspace(0.3, 1.05, 10), np.array([0.8, 0.9, 1.0, 1.1, 1.25])
-# Largest number of rounds of limit and controller, and of evaluations of a point.
-_ROUNDS, _EVALUATIONS = 5, 30
+_NEAR = np.array([1.25, 1.1, 1.0, 0.9, 0.8])
+# Limits tried first, relative to the largest command: without a limit a seated subject's fitted
+# command peaks at 200 times the true one. Each gain follows the one before.
+_GRID = np.geomspace(1.05, 0.003, 20)
 # Points of a curve for figures, relative to the limit of the fit, neighbours first. More
 # evaluations change the unexplained variance by a tenth and take three times as long.
 _SHARES, _FEW = (0.9, 0.75, 1.15, 1.5), 6
 
 
 @dataclass(frozen=True)
-class LimitEstimate(Frozen):
+class LimitEstimate:
     """Estimate of the limit of one input."""
 
     value: float | None  # Limit that fits best; None if not identified
-    low: float  # Interval; `high` is infinite if no limit is identified
+    low: float  # 95 % interval; `high` is infinite if no limit is identified
     high: float
-    level: float  # Confidence level between 0 and 1
-    # D(inf): loss of fit without a limit; compare with `quantile`
-    against_none: float
-    quantile: float  # Chi-squared quantile at that level
-    reason: str  # Result in words
-    # Limits tried (t,), in the unit of the input, and D at each (t,), for figures
-    limits: Array
-    distances: Array
+    against_none: float  # D without a limit; compare with `profiles.QUANTILE`
 
 
 def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
@@ -79,93 +63,56 @@ def with_limit(problem: Problem, limit: float, control: int = 0) -> Problem:
 
 
 def input_limit(fitted: Estimate, control: int = 0) -> LimitEstimate:
-    """Estimate the symmetric limit of one input; other limits stay fixed."""
-    if not 0 <= control < fitted.problem.plant.m:
+    """Estimate the symmetric limit of one input; other limits stay fixed.
+
+    The search starts at the given limit, or at the largest command if that does not reach it.
+    """
+    plant = fitted.problem.plant
+    if not 0 <= control < plant.m:
         raise InputError(
             "control",
-            f"expected an index below {fitted.problem.plant.m}, got {control}",
+            f"expected an index below {plant.m}, got {control}",
             "choose an input of the plant",
         )
-    curve, near = _searched(fitted, control)
-    curve.at(np.inf)  # raises if nothing can be simulated without a limit
-    best = curve.at(curve.best)
-    top = max(_typical_peak(near, control), curve.best)
-    unit = best.misfit**2 / near.problem.recorded_numbers * _colour_factor(best, control)
-    quantile = float(scipy.special.chdtri(1, 1 - LEVEL))
-
-    def sides(value: float) -> tuple[list[float], list[float]]:
-        above = _towards(value, 1.5 * top) if curve.rise(np.inf) > quantile * unit else [np.inf]
-        return _towards(value, 0.3 * value), above
-
-    low, high = curve.ends(quantile * unit, sides, _RESOLUTION * curve.best)
-    value, none = curve.best, curve.rise(np.inf) / unit
-    determined = none > quantile
-    if determined:
-        reason = f"a limit of {value:.3g} explains the recordings better than none"
-    else:
-        reason = (
-            f"the fit without a limit is not significantly worse; a limit, if there is one, is at "
-            f"least {low:.3g}; without a limit the fitted command peaks at {top:.3g}"
-        )
-    return LimitEstimate(
-        value if determined else None,
-        low,
-        high,
-        LEVEL,
-        none,
-        quantile,
-        reason,
-        frozen(curve.finite),
-        frozen([curve.rise(limit) / unit for limit in curve.finite]),
-    )
-
-
-def _towards(value: float, end: float) -> list[float]:
-    """Values from one towards another, in steps that double."""
-    steps = _RESOLUTION * value * (2.0 ** np.arange(1, 60) - 1)
-    steps = steps[steps < abs(end - value)]
-    return [*(value + np.sign(end - value) * steps).tolist(), end]
-
-
-def _searched(fitted: Estimate, control: int) -> tuple[FitCurve, Estimate]:
-    """Fits about the best limit, and the estimate at which they start.
-
-    The search starts at the given limit, or if the command does not reach it at the best of a grid
-    below the largest command. Each round searches near the last limit and refits the controller
-    at the limit found, because a gain fitted under a wrong limit is a poor start.
-    """
-
-    def searched(near: Estimate, grid: Array) -> FitCurve:
-        curve = _fits(near.problem, near.gain, near.metric, control, _EVALUATIONS)
-        for limit in grid.tolist():
-            curve.loss(limit)
-        curve.refine(_RESOLUTION * curve.best)
-        return curve
-
-    limit, near = float(fitted.problem.bounds.u_max[control]), fitted
-    peak = _typical_peak(fitted, control)
-    if peak < (1 - 1e-6) * limit:
-        limit = searched(near, peak * _GRID).best
-        near = fit_controller(with_limit(fitted.problem, limit, control))
+    given, peak = float(fitted.problem.bounds.u_max[control]), _typical_peak(fitted, control)
+    grid, start = (_NEAR, given) if peak >= (1 - 1e-6) * given else (_GRID, peak)
+    name = f"{LIMIT}.{plant.controls[control]}"
     for _ in range(_ROUNDS):
-        curve = searched(near, limit * _NEAR)
-        before, limit = limit, curve.best
-        if abs(limit - before) < 0.01 * before:
+        problem = with_free_limit(fitted.problem, control, start)
+        curve = FitCurve(problem, fitted.gain, fitted.metric, name)
+        for offset in np.log(grid).tolist():
+            curve.loss(offset)
+            if curve.tried[offset] is None:  # nor is a lower limit feasible
+                break
+        curve.refine(_RESOLUTION)
+        if abs(curve.best) < _STAYS or curve.rise(np.inf) < QUANTILE:
             break
-        near = fit_controller(with_limit(fitted.problem, limit, control))
-    return curve, near
+        # A gain fitted under a wrong limit is a poor start.
+        grid, start = _NEAR, float(start * np.exp(curve.best))
+        fitted = fit_controller(with_limit(fitted.problem, start, control))
+    curve.at(np.inf)  # raises if nothing can be simulated without a limit
+    best, top = (
+        curve.at(curve.best),
+        max(np.log(_typical_peak(fitted, control) / start), curve.best),
+    )
+    factor = standard_error(best.problem, best.K, best.S, name)[1]
+
+    def sides(offset: float) -> tuple[list[float], list[float]]:
+        known = curve.rise(np.inf) > QUANTILE * factor
+        above = _outwards(offset, top + np.log(1.5)) if known else [np.inf]
+        return _outwards(offset, offset + np.log(0.3)), above
+
+    low, high = curve.ends(QUANTILE * factor, sides, _RESOLUTION, float(np.log(_NEAR[0])))
+    none, ends = curve.rise(np.inf) / factor, [float(start * np.exp(end)) for end in (low, high)]
+    value = float(start * np.exp(curve.best)) if none > QUANTILE else None
+    return LimitEstimate(value, ends[0], ends[1], none)
 
 
-def _fits(problem: Problem, gain: Array, metric: Array, control: int, evaluations: int) -> FitCurve:
-    """Fits at limits of one control."""
-
-    def fit(limit: float, _near: float, start: Fitted) -> Fitted:
-        posed, K, S = with_limit(start.problem, limit, control), start.K, start.S
-        return refine_gain(posed, np.array(K), np.array(S), max_evaluations=evaluations, prior=1.0)
-
-    space = Unknowns(problem, GainLaw(problem, np.array(gain), np.array(metric)))
-    given = float(problem.bounds.u_max[control]), space.ended(space.start)
-    return FitCurve(fit, given, lambda end: end.misfit**2)
+def _outwards(offset: float, end: float) -> list[float]:
+    """Offsets towards an end, in steps that double."""
+    steps = _RESOLUTION * (2.0 ** np.arange(1, 60) - 1)
+    steps = steps[steps < abs(end - offset)]
+    return [*(offset + np.sign(end - offset) * steps).tolist(), end]
 
 
 def _typical_peak(fitted: Estimate, control: int) -> float:
@@ -173,30 +120,6 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
     runs = simulated(fitted.problem, fitted.gain, fitted.metric)
     command = np.concatenate([np.abs(run.applied[:, control]) for run in runs])
     return float(np.quantile(command, 0.995))
-
-
-def _colour_factor(fit: Fitted, control: int) -> float:
-    """Variance of the limit for autocorrelated residuals, relative to white ones."""
-    problem, K, S = fit.problem, np.array(fit.K), np.array(fit.S)
-    law = GainLaw(problem, K, S)
-    found = linear_at(problem, law, law.start)
-    basis, _ = np.linalg.qr(found.parts(problem)[0][:, : K.size])
-    column = on_limit(problem, K, S, float(problem.bounds.u_max[control]), control)
-    column = column - basis @ (basis.T @ column)
-    residuals, columns = by_trial(problem, found.residual), by_trial(problem, column[:, None])
-    if not np.any(column):
-        return 1.0
-    coloured = spread_of_sum(residual_noise(residuals), columns)[0, 0]
-    white = spread_of_sum(white_noise(residuals), columns)[0, 0]
-    return float(max(coloured / white, 1.0)) if white > 0 else 1.0
-
-
-def on_limit(problem: Problem, gain: Array, metric: Array, limit: float, control: int = 0) -> Array:
-    """Derivative of the residual by the symmetric limit of one input (r,)."""
-    rows = bound_rows(problem.bounds, problem.plant)
-    of_input = np.isclose(np.abs(rows.b), limit) & ~np.any(rows.E, axis=1)
-    moves = np.abs(rows.F[:, control]) * of_input
-    return along_bounds(problem, gain, metric, moves[:, None])[:, 0]
 
 
 @dataclass(frozen=True)
@@ -230,13 +153,15 @@ def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
     given = float(problem.bounds.u_max[control])
     if not np.isfinite(given) or problem.bounds.u_min[control] != -given or problem.plant.commands:
         return None
-    curve = _fits(problem, fitted.gain, fitted.metric, control, _FEW)
-    curve.tried[given] = curve.start[1]
-    for share in _SHARES:
-        curve.loss(share * given)
-    unexplained = [_unexplained(curve.tried[limit], len(problem.plant.C)) for limit in curve.finite]
+    problem = with_free_limit(problem, control, given)
     name = problem.plant.controls[control]
-    return LimitCurve(name, given, frozen(curve.finite), frozen(unexplained))
+    curve = FitCurve(problem, fitted.gain, fitted.metric, f"{LIMIT}.{name}", _FEW)
+    curve.tried[0.0] = curve.start[1]
+    for share in _SHARES:
+        curve.loss(float(np.log(share)))
+    limits = given * np.exp(curve.finite)
+    unexplained = [_unexplained(curve.tried[at], len(problem.plant.C)) for at in curve.finite]
+    return LimitCurve(name, given, frozen(limits), frozen(unexplained))
 
 
 def _unexplained(found: Fitted | None, outputs: int) -> Array:

@@ -2,16 +2,16 @@
 
 Noise is independent of the perturbation. If body or controller differ from the model, part of the
 residuals lies along the derivative of the outputs by that error. Each error that was not fitted is
-a group of columns c (r, d), made by a forcing f_t of the local loop, with the fitted trajectory x
-and the local gain G_t of the controller:
+a group of columns c (r, d). Errors of a recorded signal (`impc.model.signal_errors`) have the
+derivative of a search: offset and drift of an output in each trial; scale, time shift and clock of
+an output or a perturbation, the same in all trials. The others are made by a forcing f_t of the
+local loop, with the fitted trajectory x and the local gain G_t of the controller:
 
     dx_{t+1} = (A_t + B_t G_t) dx_t + f_t,      c_t = C dx_t:
 
     delay               f = -B (u_t - u_{t-1}), a command that arrives one sample late
     limit               derivative by the command limit
     lean                f = B in one trial, a constant push by or on the subject
-    offset              c = 1 in one output and trial, an error of the signal
-    perturbation        f = E d_t, its size or the inertia that it moves
     stiffness           f = E y_t and E (y_t - y_{t-1}), stiffness and damping where it acts
     further mode        f = E d_{t-l}, responses later than those of the model
     nonlinear body      f = (B, E) (y^2, y^3)
@@ -26,6 +26,7 @@ samples replaces it. Holm's correction keeps the level over all groups.
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -41,16 +42,16 @@ from impc.checking import replace
 from impc.control.body_steps import slopes_along
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
+from impc.errors import ImpcError
 from impc.inverse.columns import trial_span
 from impc.inverse.further_unknowns import (
-    STRENGTH,
     with_delay_unknown,
+    with_errors_unknown,
     with_limit_unknown,
-    with_offsets_unknown,
-    with_strength_unknown,
 )
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
+from impc.inverse.refit import refit
 from impc.inverse.residuals import along_bounds
 from impc.inverse.unknowns import Unknowns
 from impc.model import plant_family
@@ -67,24 +68,25 @@ if TYPE_CHECKING:
 #: Probability of any alarm under a correct model, by these distributions. Trials close to a fall
 #: have heavier tails: at this level 4 % of 161 carts gave an alarm, at 0.05 7 %.
 LEVEL = 0.02
-DELAY, LIMIT, LEAN, OFFSET = "delay", "limit", "lean", "offset"
-PUSH, STIFFNESS = "size of the perturbation", "stiffness or damping"
-MODE, NONLINEAR = "a further mode", "a nonlinear body"
+DELAY, LIMIT, LEAN = "delay", "limit", "lean"
+STIFFNESS, MODE, NONLINEAR = "stiffness or damping", "a further mode", "a nonlinear body"
 #: Names of the fitted parameters that replace a test, by their beginning.
-PARAMETERS = {DELAY: plant_family.DELAY, LIMIT: plant_family.LIMIT, PUSH: STRENGTH}
-_CURES = {
-    DELAY: with_delay_unknown,
-    LIMIT: with_limit_unknown,
-    LEAN: with_offsets_unknown,
-    OFFSET: with_offsets_unknown,
-    PUSH: with_strength_unknown,
-}
+PARAMETERS = {DELAY: plant_family.DELAY, LIMIT: plant_family.LIMIT}
+# Errors of signals that differ from trial to trial; those of devices are the same in all.
+_OF_A_TRIAL = ("offset", "drift")
+_OF_DEVICES = ("scale", "shift", "clock")
 # Later responses that are tested, in shares of the shortest trial.
 _LATER = (0.005, 0.01, 0.02, 0.04)
 # Least share of a column that the fit cannot compensate.
 _LEFT = 1e-3
 # Largest number of trials tested.
 _MOST = 12
+# Errors of signals that are refitted after an alarm, decrease of the objective at which they end,
+# and the logarithm of the second limit at which one begins.
+_REFITTED, _PROMISE, _LOWER = 4, 1.0, -0.5
+# Decrease of -2 log L over -log(p) of the likeliest error that needs no further test: residuals are
+# coloured, so the former is several times the statistic of a test.
+_FAR = 20.0
 # Residuals below this share of the outputs are rounding; least number of samples.
 _EXACT, _FEWEST = 1e-7, 100
 
@@ -93,11 +95,11 @@ _EXACT, _FEWEST = 1e-7, 100
 class ModelError(Frozen):
     """One kind of model error, with its test."""
 
-    name: str
+    name: str  # Of an error of a signal: "shift.theta1"
     probability: float  # p-value
     evidence: float  # -log(p-value)
-    # Estimated size of the error and its standard error, in samples of delay or shares of a limit
-    # or perturbation; NaN for a group of several columns
+    # Estimated size of the error and its standard error, in samples or shares; NaN for a group of
+    # several columns
     size: float
     deviation: float
 
@@ -121,18 +123,24 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     if all(trial.has_gaps for trial in estimate.problem.recordings):
         return None
     problem, K, S = _some_trials(estimate.problem), np.array(estimate.K), np.array(estimate.S)
-    space = Unknowns(with_offsets_unknown(problem), GainLaw(problem, K, S))
+    signals = untested_errors(problem)
+    space = Unknowns(with_errors_unknown(problem, signals), GainLaw(problem, K, S))
     found = space.evaluated(space.start)[0]
     samples = sum(trial.samples for trial in problem.recordings)
     size = np.linalg.norm(found.residual) / np.sqrt(problem.recorded_numbers)
     if found.reason or samples < _FEWEST or size <= _EXACT:
         return None
-    offsets = [table[:, found.shared + problem.own_unknowns :] for table in found.tables]
-    every = _columns(problem, K, S) | {OFFSET: scipy.linalg.block_diag(*offsets)}
+    every = _columns(problem, K, S)
+    first = found.shared + problem.own_unknowns
+    for place, (kind, name) in enumerate(signals, first):
+        own = [table[:, [place]] for table in found.tables]
+        each = kind in _OF_A_TRIAL
+        every[f"{kind}.{name}"] = scipy.linalg.block_diag(*own) if each else np.concatenate(own)
     groups = {name: columns for name, columns in every.items() if columns.shape[1]}
     widths = [columns.shape[1] for columns in groups.values()]
     tested = _Tested(problem, found, np.hstack(list(groups.values())))
-    parts = np.split(np.arange(sum(widths)), np.cumsum(widths)[:-1])
+    ends = np.cumsum(widths)[:-1]
+    parts: list[IntArray] = np.split(np.arange(sum(widths)), ends)
     results = {name: tested.of(name, part) for name, part in zip(groups, parts, strict=True)}
     errors = sorted(
         (item for item in results.values() if item is not None), key=lambda item: -item.evidence
@@ -144,11 +152,81 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     )
 
 
-def with_culprit(problem: Problem, found: LackOfFit | None) -> Problem | None:
-    """Problem with the unknown that the test suggests; None if there is none to add."""
-    culprit = None if found is None else found.culprit
-    cure = None if culprit is None else _CURES.get(culprit.name)
-    return None if cure is None else cure(problem)
+def named_cause(
+    problem: Problem, estimate: GainEstimate, found: LackOfFit | None
+) -> tuple[LackOfFit | None, Problem | None, Problem | None]:
+    """Put the error first that a refit confirms; also the problem with it as a further unknown.
+
+    A test is linear about a fit that has compensated for part of the error, so the likely ones are
+    refitted from there. The one of least -2 log L is named if no test rejects its fit or if it
+    explains far more than the error of smallest p-value; otherwise the latter. The last problem has
+    the values at which that refit ended.
+    """
+    if found is None or not found.alarm:
+        return found, None, None
+    likely = [one for one in found.errors if "." in one.name][:_REFITTED]
+    likely += [one for one in found.errors if one.name in _CURES]
+    ends = [(one, end) for one in likely for end in _refitted(estimate, one.name)]
+    named, begin = found.errors[0], None
+    if ends:
+        best, end = min(ends, key=lambda pair: pair[1].objective)
+        again, here = lack_of_fit(end), GainLaw(estimate.problem, estimate.K, estimate.S)
+        space = Unknowns(estimate.problem, here)
+        fallen = space.ended(space.start).objective - end.objective
+        if again is None or not again.alarm or fallen > _FAR * named.evidence:
+            named, begin = best, end.problem
+    others = tuple(one for one in found.errors if one is not named)
+    further = _freed(problem, named.name)
+    if further is not None and begin is not None:
+        values = begin.starts, begin.logarithms, begin.errors
+        begin = further.at(*map(np.array, values))
+    return replace(found, errors=(named, *others)), further, begin or further
+
+
+def _refitted(estimate: GainEstimate, name: str) -> list[Fitted]:
+    """Refits with one more unknown from a fit; a limit begins at two values."""
+    there = _freed(estimate.problem, name)
+    if there is None:
+        return []
+    K, more = np.array(estimate.K), there.plant.n - estimate.problem.plant.n
+    K = np.hstack([K, np.zeros((len(K), more))])
+    begins = [there]
+    if name == LIMIT:
+        lower = np.array(there.logarithms)
+        lower[len(estimate.problem.logarithms) :] = _LOWER
+        begins.append(there.at(np.array(there.starts), lower, np.array(there.errors)))
+    ends = []
+    for begin in begins:
+        with contextlib.suppress(ImpcError):  # it cannot be simulated: no candidate
+            ends.append(refit(begin, K, np.array(estimate.S), _PROMISE))
+    return ends
+
+
+def _freed(problem: Problem, name: str) -> Problem | None:
+    """Problem with an error as a further unknown; None if that is not possible."""
+    if name in _CURES:
+        return _CURES[name](problem)
+    kind, _, signal = name.partition(".")
+    return with_errors_unknown(problem, [(kind, signal)]) if signal else None
+
+
+def _with_offsets(problem: Problem) -> Problem:
+    """A lean looks like an offset of every output."""
+    return with_errors_unknown(problem, [("offset", name) for name in problem.plant.outputs])
+
+
+_CURES = {DELAY: with_delay_unknown, LIMIT: with_limit_unknown, LEAN: _with_offsets}
+
+
+def untested_errors(problem: Problem) -> list[tuple[str, str]]:
+    """Errors of recorded signals that are not fitted: pairs of a kind and a signal."""
+    plant, moved = problem.plant, np.zeros(0, bool)
+    if not plant.ahead and not np.any(plant.observer):
+        moved = np.any([np.any(trial.disturbance, axis=0) for trial in problem.recordings], axis=0)
+    pushes = [name for name, one in zip(plant.disturbances, moved, strict=False) if one]
+    found = [(kind, name) for kind in _OF_A_TRIAL for name in plant.outputs]
+    found += [(kind, name) for kind in _OF_DEVICES for name in (*plant.outputs, *pushes)]
+    return [pair for pair in found if pair not in problem.signal_errors]
 
 
 def _some_trials(problem: Problem) -> Problem:
@@ -205,6 +283,8 @@ class _Tested:
         free = self._independent() - d + 1
         scaled = statistic * free / ((free + d - 1) * d)
         evidence = -float(scipy.stats.f.logsf(scaled, d, free))
+        if not np.isfinite(evidence):  # the tail of the distribution
+            evidence = (free + d) / 2 * float(np.log1p(scaled * d / free))
         size = deviation = np.nan
         if len(part) == 1:
             length = float(np.linalg.norm(self.seen[:, part[0]]))
@@ -263,7 +343,6 @@ def _forced(problem: Problem, trial: Recording, run: Simulation, local: Array) -
     forces = {
         DELAY: -B * late[:, None],
         LEAN: B,
-        PUSH: E * d[:, None],
         STIFFNESS: np.dstack([_crossed(E, y), _crossed(E, changes)]),
         MODE: np.dstack([E * signals[:, None] for signals in earlier]),
         NONLINEAR: np.dstack([_crossed(slopes, y**power) for slopes in (B, E) for power in (2, 3)]),

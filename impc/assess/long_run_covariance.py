@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 _LARGEST_ROOT = 0.97
 # Samples before the first in which noise still matters: 0.97^250 is 5e-4.
 _BEFORE = 250
-# Up to this number of lags direct sums are faster than Fourier transforms.
-_FEW_LAGS = 32
 # Iterations of the correction for the fit, which depends on the estimated S.
 _ROUNDS = 3
 
@@ -159,17 +157,6 @@ def _filtered(columns: Array, root: Array) -> Array:
 
 def _coloured(columns: Array, gammas: Array) -> Array:
     """sum_s Gamma_{t-s} columns_s for columns (samples, p, k), Gamma_{-l} = Gamma_l'."""
-    if len(gammas) > _FEW_LAGS:
-        return _convolved(columns, gammas)
-    result = gammas[0] @ columns
-    for lag in range(1, min(len(gammas), len(columns))):
-        result[lag:] += gammas[lag] @ columns[:-lag]
-        result[:-lag] += gammas[lag].T @ columns[lag:]
-    return np.asarray(result)
-
-
-def _convolved(columns: Array, gammas: Array) -> Array:
-    """As `_coloured`, by Fourier transforms."""
     lags = len(gammas) - 1
     both = np.concatenate([np.swapaxes(gammas[:0:-1], 1, 2), gammas])  # lags -L .. L
     result = np.zeros_like(columns)

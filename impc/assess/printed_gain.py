@@ -14,9 +14,11 @@ import numpy as np
 import scipy.linalg
 import scipy.special
 
-from impc.arrays import Array
-from impc.assess.covariance import GainCovariance, gain_covariance
-from impc.checking import replace
+from impc.arrays import Array, BoolArray
+from impc.assess.covariance import FOREIGN, TWO_SIDED, GainCovariance, gain_covariance
+from impc.assess.long_run_covariance import residual_noise, spread_of_sum
+from impc.checking import checked, replace
+from impc.inverse.command_regression import regress_commands
 from impc.inverse.minimiser import Ended
 from impc.inverse.refit import refit
 from impc.model.continuous_gain import continuous_gain
@@ -25,8 +27,6 @@ from impc.model.plant import UNKNOWN, gain_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-    from impc.arrays import Array
-    from impc.assess.covariance import GainCovariance
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
@@ -181,3 +181,122 @@ def _table(found: GainEstimate) -> pd.DataFrame:
     ]
     heads = ["name", "unit", "value", "low", "high", "identified"]
     return pd.DataFrame(rows, columns=heads).set_index("name")
+
+
+@checked
+def command_regression(estimate: Estimate) -> pd.DataFrame:
+    """Compare a fitted gain with the gain by regression on recorded commands.
+
+    Only samples count at which the fitted controller has no active bound over its horizon. The 95 %
+    intervals assume recording noise in the commands (any autocorrelation) and white noise of the
+    subject; coloured noise is correlated with the states and biases them. Noise in recorded states
+    shrinks the regression gain. If both gains differ by much, an assumption of one of them fails.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Fit of recordings with commands.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per entry of the gain, by name: `unit`, `fitted`, `regression`, `low`, `high`.
+
+    Raises
+    ------
+    DataError
+        If no commands were recorded.
+    SolverError
+        If the samples with inactive bounds do not determine a gain, or the plant driven by the
+        commands does not follow the recordings.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1))
+    >>> bounds = impc.Bounds(plant, u_min=-0.3, u_max=0.3)
+    >>> truth = impc.Controller(plant, impc.Weights(1, 1), bounds, horizon=3)
+    >>> run = truth.simulate([1.0], steps=20)
+    >>> trial = impc.Recording(plant, run.x, commands=run.u)
+    >>> found = impc.fit(impc.Problem(plant, bounds, 3, [trial]))
+    >>> impc.command_regression(found).round(3).loc["K.u[0].x[0]", "regression"]
+    np.float64(0.538)
+    """
+    import pandas as pd  # noqa: PLC0415  # a third of a second
+
+    plant = estimate.problem.plant
+    found = regress_commands(estimate.problem, estimate.gain, estimate.metric)
+    table = np.concatenate(found.deviations)
+    inverse = np.linalg.inv(table.T @ table)
+    # Row t of the sum is (1 (x) x_t (X'X)^-1): an entry of K by an entry of the residual.
+    along = [np.einsum("tn,ij->tijn", part @ inverse, np.eye(plant.m)) for part in found.deviations]
+    columns = [part.reshape(len(part), plant.m, -1) for part in along]
+    spread = spread_of_sum(residual_noise(found.residuals), columns)
+    half = scipy.special.ndtri(0.5 + LEVEL / 2) * np.sqrt(np.diag(spread))
+    values = np.ravel(found.K)
+    return pd.DataFrame(
+        {
+            "unit": [gain_unit(plant, u, x) for u in plant.controls for x in plant.states],
+            "fitted": np.ravel(estimate.gain),
+            "regression": values,
+            "low": values - half,
+            "high": values + half,
+        },
+        index=pd.Index(entry_names(plant), name="name"),
+    )
+
+
+@dataclass(frozen=True)
+class LastingResponse:
+    """Steady opposing command of one control for a state held at 1, all others at rest."""
+
+    state: str
+    control: str
+    value: float
+    low: float  # 95 % interval
+    high: float
+    identified: bool
+
+
+def follows_command(plant: Plant) -> BoolArray:
+    """Mask of the states (n,) driven by the command alone, such as nerves and muscles."""
+    inside = ~np.any(plant.E != 0, axis=1) & ~np.any(plant.C != 0, axis=0)
+    while True:
+        left = inside & ~np.any(plant.A[:, ~inside] != 0, axis=1)
+        if np.array_equal(left, inside):
+            return np.asarray(inside)
+        inside = left
+
+
+def lasting_responses(estimate: GainEstimate) -> tuple[LastingResponse, ...]:
+    """For each output that is a state; empty if no state is driven by the command alone.
+
+    States that only the command drives (delay, muscle) settle under a constant u at x_a = D u,
+    D = (I - A_aa)^-1 B_a, and u = -K_i x_i - K_a x_a gives u = -(I + K_a D)^-1 K_i x_i. The
+    interval follows from the covariance of the gain to first order.
+    """
+    plant, K = estimate.problem.plant, np.array(estimate.K)
+    inner = follows_command(plant)
+    outer = [int(np.argmax(row != 0)) for row in plant.C if np.count_nonzero(row) == 1]
+    if not np.any(inner) or not outer:
+        return ()
+    settled = np.eye(int(np.count_nonzero(inner))) - plant.A[np.ix_(inner, inner)]
+    if np.linalg.cond(settled) > 1 / np.finfo(float).eps:  # integrates the command
+        return ()
+    D = np.linalg.solve(settled, plant.B[inner])
+    W = np.linalg.inv(np.eye(plant.m) + K[:, inner] @ D)
+    found = []
+    for state in outer:
+        values = W @ K[:, state]
+        slopes = np.zeros((plant.m, plant.n))
+        slopes[:, state], slopes[:, inner] = 1.0, -(D @ values)
+        rows = (W[:, :, None] * slopes[None]).reshape(plant.m, -1)
+        errors, foreign = estimate.covariance.combinations(rows)
+        for k, control in enumerate(plant.controls):
+            value, half = float(values[k]), TWO_SIDED * float(errors[k])
+            identified = bool(foreign[k] < FOREIGN)
+            name = plant.states[state]
+            ends = value - half, value + half
+            found.append(LastingResponse(name, control, value, *ends, identified))
+    return tuple(found)

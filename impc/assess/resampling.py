@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from impc.assess.printed_gain import GainEstimate
     from impc.inverse.problem import Problem
+    from impc.model.recordings import Recording
 
 
 @dataclass(frozen=True)
@@ -37,39 +38,29 @@ class Replicate(Frozen):
     parameters: Array  # Physical parameters in their units (k,)
 
 
-@dataclass(frozen=True)
-class BootstrapModel(Frozen):
-    """Estimate from which replicates are drawn."""
-
-    problem: Problem  # At the estimated initial states and parameters
-    K: Array  # (m, n)
-    S: Array  # (m, m)
-    measured: tuple[Array, ...]  # Noise-free simulation, (samples, q) per trial
-
-
-def bootstrap_model(problem: Problem, gain: Array, metric: Array) -> BootstrapModel:
-    """Simulate an estimate once for all replicates; `gain` (m, n); `metric` (m, m)."""
-    runs = simulated(problem, gain, metric)
-    pairs = zip(problem.recordings, runs, strict=True)
-    measured = tuple(frozen(modelled(problem, trial, run)) for trial, run in pairs)
-    return BootstrapModel(problem, frozen(gain), frozen(metric), measured)
-
-
-def replicate(model: BootstrapModel, index: int, seed: int) -> Replicate:
-    """Replicate with number `index`."""
-    recordings = model.problem.recordings
+def replicate(problem: Problem, gain: Array, metric: Array, index: int, seed: int) -> Replicate:
+    """Replicate number `index` of an estimate: `problem` at its values, and its controller."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index,)))
-    pairs = list(zip(recordings, model.measured, strict=True))
-    residuals = [np.nan_to_num(recorded(model.problem, one) - values) for one, values in pairs]
-    drawn, p = block_residuals(residuals, rng), len(model.problem.plant.outputs)
+    trials = resampled_trials(problem, gain, metric, rng)
+    again = replace(_body_measured_again(problem, rng), recordings=trials)
+    found = refit(again, gain, metric)
+    return Replicate(found.K, frozen(found.parameters))
+
+
+def resampled_trials(
+    problem: Problem, gain: Array, metric: Array, rng: np.random.Generator
+) -> tuple[Recording, ...]:
+    """Recordings as simulated by an estimate, with resampled residuals."""
+    runs, p = simulated(problem, gain, metric), len(problem.plant.outputs)
+    pairs = [(one, modelled(problem, one, run))
+             for one, run in zip(problem.recordings, runs, strict=True)]  # fmt: skip
+    residuals = [np.nan_to_num(recorded(problem, one) - values) for one, values in pairs]
     trials = []
-    for (trial, values), noise in zip(pairs, drawn, strict=True):
-        new = values + noise + 0 * recorded(model.problem, trial)  # missing values stay missing
+    for (trial, values), noise in zip(pairs, block_residuals(residuals, rng), strict=True):
+        new = values + noise + 0 * recorded(problem, trial)  # missing values stay missing
         commands = new[:, p:] if len(trial.commands) else trial.commands
         trials.append(replace(trial, outputs=frozen(new[:, :p]), commands=frozen(commands)))
-    problem = _body_measured_again(model.problem, rng)
-    again = refit(replace(problem, recordings=tuple(trials)), model.K, model.S)
-    return Replicate(again.K, frozen(again.parameters))
+    return tuple(trials)
 
 
 def _body_measured_again(problem: Problem, rng: np.random.Generator) -> Problem:

@@ -33,7 +33,6 @@ from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
     predicted,
-    residuals_of,
 )
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
 from impc.inverse.problem import EXPLAINED, recorded_size
@@ -136,20 +135,10 @@ def assess_structure(
         structure_test(at),
         own.vaf,
         frozen(np.mean(left, axis=0) if left else nothing),
-        criterion_of(found, innovation_roots(near), int(np.count_nonzero(covariance.identified))),
+        innovations_criterion(
+            found, innovation_roots(near), int(np.count_nonzero(covariance.identified))
+        ),
     )
-
-
-def criterion_of(found: Estimate, roots: Array, identified: int) -> float:
-    """Akaike's criterion: innovations for `roots` (p,), plus 2 per identified unknown.
-
-    Noise of 1e-9 of the output scale is added, so that rounding makes no difference.
-    """
-    floor = np.random.default_rng(0)
-    residuals = [
-        part + EXPLAINED * floor.standard_normal(part.shape) for part in residuals_of(found)
-    ]
-    return innovations_criterion(residuals, roots) + 2 * identified
 
 
 def _moving(cost_weights: Array) -> Array:
@@ -211,7 +200,7 @@ class StructureTest(Frozen):
 
 def structure_test(at: Tangent) -> StructureTest:
     """Score test of a structure at its fit against an unrestricted gain."""
-    fitted = at.span(np.array(at.on_cost_weights[:, at.moving]))
+    fitted = at.span(np.array(at.on_parameters), np.array(at.on_cost_weights[:, at.moving]))
     beyond = fitted.without(np.array(at.on_law[:, : at.solution.K.size]))
     left, sizes, _ = np.linalg.svd(beyond, full_matrices=False)
     identified = sizes > at.noise / IDENTIFIED
@@ -227,26 +216,28 @@ def structure_test(at: Tangent) -> StructureTest:
         statistic,
         freedom,
         float(scipy.stats.chi2.sf(statistic, freedom)),
-        _powers(at, float(np.trace(V)) / freedom, freedom),
+        _powers(at, U, V),
     )
 
 
-def _powers(at: Tangent, variance: float, freedom: int) -> tuple[CrossTerm, ...]:
-    """Power of the test against cross terms, from their distance to the structure."""
-    structure = at.structure
+def _powers(at: Tangent, U: Array, V: Array) -> tuple[CrossTerm, ...]:
+    """Power of the test against cross terms, to first order."""
+    structure, given = at.structure, at.solution
     if structure.coupled:
         return ()
-    penalised = np.flatnonzero(at.moving[: len(structure.labels)])
+    penalised, freedom = np.flatnonzero(at.moving[: len(structure.labels)]), len(V)
     quantile = float(scipy.stats.chi2.ppf(1 - SIGNIFICANCE, freedom))
     found = []
     for i, j in itertools.combinations(penalised, 2):
         one, other = structure.features[i], structure.features[j]
         half = _CROSS * np.exp((at.cost_weights[i] + at.cost_weights[j]) / 2)
-        given = at.solution.weights
-        crossed = Weights(given.Q + half * (np.outer(one, other) + np.outer(other, one)), given.R)
+        crossed = Weights(
+            given.weights.Q + half * (np.outer(one, other) + np.outer(other, one)), given.weights.R
+        )
         there = solve_lqr(at.problem.plant, crossed)
-        cost_weights = np.array(at.cost_weights)
-        apart, _ = at.quadratic.least(cost_weights, np.eye(int(np.sum(at.moving))), there)
-        power = float(scipy.stats.ncx2.sf(quantile, freedom, apart / variance))
+        change = at.law.along((there.K - given.K)[None], (there.S - given.S)[None])[0]
+        apart = U.T @ (at.on_law @ change)
+        distance = float(apart @ np.linalg.solve(V, apart))
+        power = float(scipy.stats.ncx2.sf(quantile, freedom, distance))
         found.append(CrossTerm(structure.labels[i], structure.labels[j], power))
     return tuple(found)

@@ -23,7 +23,7 @@ from impc.assess.long_run_covariance import residual_noise
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.errors import InputError
-from impc.inverse.problem import controller_for, scenarios
+from impc.inverse.problem import EXPLAINED, controller_for, scenarios
 from impc.inverse.refit import refit
 from impc.inverse.residuals import residual_only
 from impc.inverse.search import with_fitted_starts
@@ -195,8 +195,13 @@ def innovation_roots(found: Estimate) -> Array:
     return np.asarray(residual_noise(residuals_of(found)).root)
 
 
-def innovations_criterion(residuals: list[Array], roots: Array) -> float:
-    """Akaike's criterion of residuals (samples, p) per trial, without the term 2 k."""
-    innovations = np.concatenate([part[1:] - roots * part[:-1] for part in residuals])
+def innovations_criterion(found: Estimate, roots: Array, identified: int = 0) -> float:
+    """Akaike's criterion: innovations for `roots` (p,), plus 2 per identified unknown.
+
+    Noise of 1e-9 of the output scale is added, so that rounding makes no difference.
+    """
+    floor = np.random.default_rng(0)
+    parts = [one + EXPLAINED * floor.standard_normal(one.shape) for one in residuals_of(found)]
+    innovations = np.concatenate([part[1:] - roots * part[:-1] for part in parts])
     covariance = innovations.T @ innovations / len(innovations)
-    return float(len(innovations) * np.linalg.slogdet(covariance)[1])
+    return float(len(innovations) * np.linalg.slogdet(covariance)[1]) + 2 * identified

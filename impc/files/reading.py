@@ -20,6 +20,7 @@ from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest
 from impc.files.formats import read_table
 from impc.files.resampling import (
+    first_common,
     held_means,
     held_values,
     instants,
@@ -27,6 +28,7 @@ from impc.files.resampling import (
     same_rate,
     shifted,
 )
+from impc.files.steps import steps_of
 from impc.files.units import si_unit
 from impc.model.foresight import physical_disturbances, physical_states
 from impc.model.plant import UNKNOWN
@@ -48,6 +50,8 @@ _OFFSET, _DRIFT = 0.12, 0.25
 _SAMPLES_A_STATE = 5
 # Largest share of missing samples in a resampled value that still counts as measured.
 _LOST = 0.05
+# Spread of the jumps of a push by its samples, in samples of the plant, that matters to a fit.
+_JITTER = 0.05
 
 
 @checked
@@ -142,7 +146,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     checks.too_few(table.source, samples, _SAMPLES_A_STATE * physical_states(plant))
     findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
     findings += [clock.note] if clock.note else []
-    series, lost, targets, found = _clocked(table, clock, configuration, plant)
+    series, lost, targets, finer, found = _clocked(table, clock, configuration, plant)
     findings += found
     samples = len(series[plant.outputs[0]])
     findings += _slower(table.source, clock, plant)
@@ -161,6 +165,11 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     commands = np.column_stack([series.get(name, nothing) for name in controls])
     if plant.commands:  # the controls are changes of the commands
         commands = np.diff(commands, axis=0, prepend=np.nan)
+    other = None
+    if finer and not plant.ahead:
+        other = disturbance.copy()
+        for name, values in finer.items():
+            other[:, plant.disturbances.index(name)] = values
     return Recording(
         plant,
         np.column_stack([series[name] for name in plant.outputs]),
@@ -168,6 +177,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
         np.zeros(plant.n),
         target=targets,
         commands=commands if any(name in series for name in controls) else None,
+        finer=other,
         label=label,
         findings=tuple(findings),
     )
@@ -175,8 +185,8 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 
 def _clocked(
     table: Table, clock: Clock, configuration: Configuration, plant: Plant
-) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], list[str]]:
-    """Signals, their missing share and targets, at the plant's rate; and findings."""
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], dict[str, Array], list[str]]:
+    """Signals, their missing share, targets and finer pushes, at the plant's rate; findings."""
     recorded, signals, findings = configuration.recording, configuration.signals, list[str]()
     acting = [name for name in plant.disturbances if name in signals]
     commands = [name for name in plant.commands or plant.controls if name in signals]
@@ -196,12 +206,19 @@ def _clocked(
             even[name, "target"], found = _target(table, clock, name, configuration)
             findings += found
     shifts = _shifts(table.source, clock, configuration, (name for name, _ in even))
-    even = shifted(even, {key: 0.0 if key[1] == "target" else shifts[key[0]] for key in even})
+    late = {key: 0.0 if key[1] == "target" else shifts[key[0]] for key in even}
+    first, jumps = first_common(late), {name: steps_of(even[name, ""]) for name in acting}
+    even = shifted(even, late)
     clocked: dict[str, dict[str, Array]] = {"": {}, "lost": {}, "target": {}}
+    finer: dict[str, Array] = {}
     for (name, kind), values in even.items():
         resample = instants if name in plant.outputs else held_means
         resample = held_values if kind == "target" else resample
         clocked[kind][name] = resample(values, clock.period, plant.dt)
+        steps = jumps.get(name)
+        if steps is not None and steps.jitter * clock.period > _JITTER * plant.dt:
+            steps = steps.delayed(shifts[name] - first)
+            finer[name] = held_means(values, clock.period, plant.dt, steps)
     targets = clocked["target"]
     samples = len(clocked[""][plant.outputs[0]])
     for name in configuration.aimed:
@@ -209,7 +226,7 @@ def _clocked(
         if isinstance(at, float | int):
             size = signals[name].sign * si_unit(signals[name].unit).factor
             targets[name] = np.full(samples, size * (at - signals[name].offset))
-    return clocked[""], clocked["lost"], targets, findings
+    return clocked[""], clocked["lost"], targets, finer, findings
 
 
 def _target(

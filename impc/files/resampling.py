@@ -5,7 +5,8 @@ disturbance is its mean over [k dt, (k + 1) dt), so that the plant receives the 
 x_j recorded at t_j = j T,
 
     y_k = sum_j h(k dt - t_j) x_j / sum_j h(k dt - t_j)
-    d_k = (1 / dt) integral of x from k dt to (k + 1) dt, x linear between its samples
+    d_k = (1 / dt) integral of x from k dt to (k + 1) dt, x linear between its samples,
+          or constant between jumps on a lattice (`impc.files.steps`)
 
 where h is a sinc with a Kaiser window, which is even and adds no phase (docs/howto/recordings.md).
 Beyond its ends x is continued by point reflection, 2 x_0 - x_j.
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from impc.arrays import Array
+    from impc.files.steps import Steps
 
 # Stopband attenuation in dB; the largest passband ripple is 10^(-70/20) = 3e-4.
 _ATTENUATION = 70.0
@@ -44,7 +46,7 @@ def shifted(series: Mapping[Key, Array], samples: Mapping[Key, float]) -> dict[K
 
     Fractions of a sample are interpolated linearly.
     """
-    first = max(0, *map(math.ceil, samples.values()))
+    first = first_common(samples)
     size = min(map(len, series.values()))
     last = size - 1 + min(0, *map(math.floor, samples.values()))
     places = np.arange(first, last + 1)
@@ -54,6 +56,11 @@ def shifted(series: Mapping[Key, Array], samples: Mapping[Key, float]) -> dict[K
         else np.interp(places - samples[name], np.arange(len(values)), values)
         for name, values in series.items()
     }
+
+
+def first_common(samples: Mapping[Key, float]) -> int:
+    """First sample at which all series, delayed by so many `samples`, are recorded."""
+    return max(0, *map(math.ceil, samples.values()))
 
 
 def resampled_samples(samples: int, period: float, dt: float) -> int:
@@ -84,13 +91,17 @@ def instants(values: Array, period: float, dt: float) -> Array:
     return result
 
 
-def held_means(values: Array, period: float, dt: float) -> Array:
+def held_means(values: Array, period: float, dt: float, steps: Steps | None = None) -> Array:
     """Means of `values` (samples,), recorded every `period` s, over [k dt, (k + 1) dt).
 
-    The signal is linear between its samples. The last interval extends beyond the recording, where
-    the last value is held.
+    The signal is linear between its samples, or has the `steps`. The last interval extends beyond
+    the recording, where the last value is held.
     """
-    if same_rate(len(values), period, dt):
+    same = same_rate(len(values), period, dt)
+    if steps is not None:
+        count = len(values) if same else resampled_samples(len(values), period, dt)
+        return steps.means(np.asarray(np.arange(count + 1) * (1.0 if same else dt / period)))
+    if same:
         return values
     extra = int(np.ceil(dt / period)) + 1
     held = np.concatenate([values, np.full(extra, values[-1])])

@@ -255,6 +255,7 @@ def _recording(kept: Mapping[str, Any], plant: Plant) -> Recording:
         "findings": tuple(kept["findings"]),
         "signals": tuple(kept["signals"]),
         "commands": np.reshape(kept["commands"], (-1, plant.m)),
+        "finer": np.reshape(kept["finer"], (len(kept["finer"]), plant.E.shape[1])),
         "target": np.reshape(kept["target"], (len(kept["outputs"]), -1)),
     }
     found: Recording = _filled(Recording, values)

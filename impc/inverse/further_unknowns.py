@@ -1,6 +1,7 @@
-"""Free one more unknown of a problem for a test: limit, delay, offsets, perturbation.
+"""Free one more unknown of a problem for a test: limit, delay, an error of a signal.
 
-Each has a prior at the value of the model, wide compared with the precision of the recordings.
+Limit and delay have a prior at the value of the model, wide compared with the precision of the
+recordings.
 """
 
 from __future__ import annotations
@@ -11,17 +12,15 @@ import numpy as np
 
 from impc.arrays import frozen
 from impc.checking import replace
-from impc.model.plant_family import DELAY, PlantFamily, plant_at
+from impc.model.plant_family import DELAY, LIMIT, PlantFamily, plant_at
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
+    from collections.abc import Sequence
 
-#: Name of the parameter: size of the perturbation relative to the recorded one.
-STRENGTH = "perturbation"
-# Prior SDs: relative for limit and perturbation size, in samples for the delay.
-_LIMIT, _STRENGTH, _DELAY = 0.3, 0.3, 1.0
+    from impc.inverse.problem import Problem
+
+# Prior SDs: relative for the limit, in samples for the delay.
+_LIMIT, _DELAY = 0.3, 1.0
 
 
 def with_limit_unknown(problem: Problem) -> Problem | None:
@@ -31,6 +30,18 @@ def with_limit_unknown(problem: Problem) -> Problem | None:
         return None
     family = replace(_family(problem), limit_deviation=_LIMIT).with_limits(problem.plant, bounds)
     return _posed(problem, family)
+
+
+def with_free_limit(problem: Problem, control: int, start: float) -> Problem:
+    """Free the symmetric limit of one control, from `start`; a stated one keeps its prior."""
+    plant, name = problem.plant, f"{LIMIT}.{problem.plant.controls[control]}"
+    if problem.family is not None and name in problem.parameter_names:
+        index, logarithms = problem.parameter_names.index(name), np.array(problem.logarithms)
+        logarithms[index] = np.log(start / problem.family.nominal[index])
+        return problem.at(problem.starts, logarithms, problem.errors)
+    family = _family(problem).wider([name], [start], [np.inf])
+    bounds = family.bounds_at(plant, problem.bounds, np.append(problem.logarithms, 0.0))
+    return _posed(problem, family, bounds=bounds)
 
 
 def with_delay_unknown(problem: Problem) -> Problem | None:
@@ -57,23 +68,9 @@ def with_delay_unknown(problem: Problem) -> Problem | None:
     return _posed(problem, family, **parts)
 
 
-def with_offsets_unknown(problem: Problem) -> Problem:
-    """Free a constant offset of every output in every trial; new ones come last."""
-    offsets = [("offset", name) for name in problem.plant.outputs]
-    return replace(problem, signal_errors=tuple(dict.fromkeys([*problem.signal_errors, *offsets])))
-
-
-def with_strength_unknown(problem: Problem) -> Problem | None:
-    """Free one common scale factor of all disturbances; None if already free or known ahead."""
-    if problem.plant.ahead or STRENGTH in problem.parameter_names:
-        return None
-
-    def stronger(plant: Plant, factor: Array) -> Plant:
-        E = factor[0] * plant.E
-        body = plant.body and plant.body.moved(0 * plant.A, 0 * plant.B, E - plant.E)
-        return replace(plant, E=frozen(E), body=body)
-
-    return _posed(problem, _family(problem).wider([STRENGTH], [1.0], [_STRENGTH], stronger))
+def with_errors_unknown(problem: Problem, errors: Sequence[tuple[str, str]]) -> Problem:
+    """Free errors of signals, pairs of a kind and a signal, in every trial; new ones last."""
+    return replace(problem, signal_errors=tuple(dict.fromkeys([*problem.signal_errors, *errors])))
 
 
 def _family(problem: Problem) -> PlantFamily:

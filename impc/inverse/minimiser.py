@@ -1,10 +1,14 @@
 """Levenberg-Marquardt with a normal prior, for shared and trial-specific unknowns.
 
-    F(u, v) = N log |r(u, v)|^2 + |w_u (u - u_0)|^2 + |w_v (v - v_0)|^2,   r of N entries
+    F(u, v) = -2 log L(u, v) + |w_u (u - u_0)|^2 + |w_v (v - v_0)|^2
 
-F is -2 log posterior for white noise of unknown variance |r|^2 / N, up to a constant. Columns of
-v_i are zero outside trial i, so each v_i is eliminated by a QR factorisation of its own trial: time
-and memory grow linearly with the number of trials.
+F is -2 log posterior, up to a constant. Half the gradient of -2 log L is J'r / s, and half its
+curvature is approximated by J'J / s. For N residuals r of white noise of unknown variance,
+-2 log L = N log |r|^2 and s = |r|^2 / N. Any other likelihood gives a factor J of its Fisher
+information, the r that belongs to its score, and s = 1.
+
+Columns of v_i are zero outside trial i, so each v_i is eliminated by a QR factorisation of its own
+trial: time and memory grow linearly with the number of trials.
 
 A search has converged where the undamped Gauss-Newton step promises less than `Stop.promise`. It is
 stuck where steps of any length no longer lower F although more is promised: at a crease, where the
@@ -30,9 +34,13 @@ if TYPE_CHECKING:
 # Initial and least damping; its factors after a rejected or poor and after a good step, by ratios
 # of the gained to the predicted decrease.
 _DAMPING, _LEAST, _UP, _DOWN, _GOOD, _POOR = 1e-3, 1e-12, 6.0, 0.2, 0.5, 0.1
+# Least damping after a rejected step that cost as much as derivatives.
+_SHORTENED = 0.1
 # A search is stuck after this many rejected steps in a row, or if this many accepted ones together
 # lower F by less than this share of what is still promised.
 _TRIES, _CREEPING, _DELIVERED = 14, 3, 0.03
+# The same share where a value costs as much as derivatives.
+_HURRIED = 0.1
 # Damping of the step that counts as undamped: directions that nothing identifies stay.
 _NONE = 1e-10
 # Least squared norm of a column in the damping, relative to the largest.
@@ -61,12 +69,22 @@ class Rows:
     # Derivatives with respect to u, (trials, w, a), and to the v of the trial, (trials, w, n)
     shared: Array
     own: Array
+    value: float  # -2 log L
+    variance: float  # s
     curved: bool = False  # Whether steps from here use geodesic acceleration
+
+    @classmethod
+    def of_white_noise(
+        cls, count: int, residual: Array, shared: Array, own: Array, *, curved: bool = False
+    ) -> Rows:
+        """Rows of `count` residuals of unknown variance."""
+        square = _square(residual)
+        return cls(residual, shared, own, log_square(count, square), square / count, curved)
 
     @property
     def square(self) -> float:
         """Squared 2-norm of the residual."""
-        return float(np.sum(self.residual**2))
+        return _square(self.residual)
 
 
 @dataclass(frozen=True)
@@ -90,6 +108,9 @@ class Stop:
     promise: float  # Decrease of F by an undamped step below which the search has converged
     square: float  # Squared residual at rounding level
     evaluations: int  # Largest number of evaluations with derivatives
+    # Whether a value costs as much as derivatives: rejected steps are shortened at once, and ones
+    # that promise less than half of `promise` are not tried
+    costly: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,17 +130,13 @@ class End:
 
 
 class Model(Protocol):
-    """Residual as a function of u (a,) and v (trials, n)."""
-
-    @property
-    def count(self) -> int:
-        """Number of residuals N."""
+    """Likelihood as a function of u (a,) and v (trials, n)."""
 
     def rows(self, u: Array, v: Array) -> Rows | None:
         """Residual and derivatives at `u` (a,), `v` (trials, n); None if infeasible."""
 
-    def square(self, u: Array, v: Array) -> float:
-        """Squared residual at `u` (a,), `v` (trials, n); infinite if infeasible."""
+    def value(self, u: Array, v: Array) -> float:
+        """-2 log L at `u` (a,), `v` (trials, n); infinite if infeasible."""
 
     def bend(self, du: Array, dv: Array, share: float) -> tuple[Array, Array] | None:
         """J' (r(z + share d) - r(z)) at the last point z of `rows`, d = (`du`, `dv`)."""
@@ -136,27 +153,29 @@ def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop)
             return End(u, v, spent, Ended.INFEASIBLE, np.inf)
         if here.square <= stop.square:
             return End(u, v, spent, Ended.EXACT, 0.0)
-        variance = here.square / model.count
-        scale = _scaled(here, prior, variance, scale)
-        last = _Step(here, prior, (u, v), variance, _NONE, scale)
+        scale = _scaled(here, prior, scale)
+        last = _Step(here, prior, (u, v), _NONE, scale)
         promised = last.predicted
         if promised <= stop.promise:
             if _gained(model, prior, here, (u, v), (last.du, last.dv)) > 0:
                 u, v = u + last.du, v + last.dv
             return End(u, v, spent, Ended.CONVERGED, promised)
-        if sum(gains[-_CREEPING:]) <= _DELIVERED * promised:
+        if sum(gains[-_CREEPING:]) <= (_HURRIED if stop.costly else _DELIVERED) * promised:
             return End(u, v, spent, Ended.STUCK, promised)
         if spent >= stop.evaluations:
             return End(u, v, spent, Ended.STOPPED, promised)
+        moved, gained = None, -np.inf
         for _ in range(_TRIES):
-            step = _Step(here, prior, (u, v), variance, damping, scale)
+            step = _Step(here, prior, (u, v), damping, scale)
+            if stop.costly and step.predicted < stop.promise / 2:
+                break
             moved = step.bent(model) if here.curved else (step.du, step.dv)
             gained = -np.inf
             if moved is not None:
                 gained = _gained(model, prior, here, (u, v), moved)
             if gained > 0:
                 break
-            damping = max(_UP * damping, 1e-8)
+            damping = max(_UP * damping, _SHORTENED if stop.costly else 1e-8)
         if moved is None or gained <= 0:
             return End(u, v, spent, Ended.STUCK, promised)
         # A tiny step can predict 0 in rounding, and is poor then.
@@ -172,17 +191,13 @@ def _gained(
 ) -> float:
     """Decrease of F by a step from `at`."""
     u, v = at[0] + moved[0], at[1] + moved[1]
-    there = max(model.square(u, v), 1e-300)
-    fallen = model.count * (np.log(here.square) - np.log(there))
-    return float(fallen + prior.square(*at) - prior.square(u, v))
+    return here.value - model.value(u, v) + prior.square(*at) - prior.square(u, v)
 
 
-def _scaled(
-    here: Rows, prior: Prior, variance: float, before: tuple[Array, Array]
-) -> tuple[Array, Array]:
+def _scaled(here: Rows, prior: Prior, before: tuple[Array, Array]) -> tuple[Array, Array]:
     """Squared column norms for the damping; a norm shrinks by at most half per step."""
-    shared = np.sum(here.shared**2, axis=(0, 1)) + variance * prior.shared**2
-    own = np.sum(here.own**2, axis=1) + variance * np.square(prior.own)
+    shared = np.sum(here.shared**2, axis=(0, 1)) + here.variance * prior.shared**2
+    own = np.sum(here.own**2, axis=1) + here.variance * np.square(prior.own)
     floor = _FLOOR * max(np.max(shared, initial=0.0), np.max(own, initial=0.0)) + 1e-300
     return (
         np.maximum(before[0] / 2, np.maximum(shared, floor)),
@@ -201,11 +216,10 @@ class _Step:
         here: Rows,
         prior: Prior,
         at: tuple[Array, Array],
-        variance: float,
         damping: float,
         scale: tuple[Array, Array],
     ) -> None:
-        (trials, n), a = at[1].shape, len(at[0])
+        (trials, n), a, variance = at[1].shape, len(at[0]), here.variance
         self.weights = (
             np.sqrt(variance * prior.shared**2 + damping * scale[0]),
             np.sqrt(variance * np.square(prior.own) + damping * scale[1]),
@@ -264,6 +278,11 @@ class _Step:
         y_v = np.linalg.solve(np.swapaxes(self.own, 1, 2), v[..., None])[..., 0]
         y_u = np.linalg.solve(self.shared.T, u - np.einsum("tna,tn->a", self.beside, y_v))
         return self._back(np.asarray(y_u), np.asarray(y_v))
+
+
+def log_square(count: int, square: float) -> float:
+    """-2 log L of `count` residuals of white noise of unknown variance."""
+    return float(count * np.log(max(square, 1e-300)))
 
 
 def _square(values: Array) -> float:

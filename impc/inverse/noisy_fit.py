@@ -50,6 +50,7 @@ from impc.inverse.search import (
     free_gain,
     noise_of,
     with_fitted_starts,
+    with_jumps,
 )
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starts import regulators
@@ -83,6 +84,7 @@ _BEGINNINGS = 3
 
 def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
     """Fit the weights of the constrained controller to the recordings."""
+    problem = with_jumps(problem)
 
     def fit(posed: Problem) -> Estimate:
         found = _fitted(posed, start)

@@ -29,7 +29,7 @@ from impc.inverse.minimiser import PROMISE, Stop
 from impc.inverse.prediction import correction
 from impc.inverse.problem import EXPLAINED, recorded_size, require_riccati
 from impc.inverse.residuals import misfit_or_reason
-from impc.inverse.starts import balanced_regulator, drawn_starts
+from impc.inverse.starts import balanced_regulator, drawn_starts, regulators
 from impc.inverse.unknowns import Unknowns
 from impc.model.riccati import solve_lqr, stabilises
 
@@ -136,6 +136,22 @@ def refine_gain(
     return space.search(
         space.start, stop_at(problem, promise, max_evaluations), shared=prior, own=prior
     )
+
+
+def with_jumps(problem: Problem) -> Problem:
+    """Copy with the pushes, recorded or finer, with which the recordings are predicted better."""
+    if not any(len(trial.finer) for trial in problem.recordings):
+        return problem
+    other = [trial.finer if len(trial.finer) else trial.disturbance for trial in problem.recordings]
+    posed = []
+    for pushes in ([trial.disturbance for trial in problem.recordings], other):
+        trials = [
+            replace(trial, disturbance=push, finer=trial.finer[:0])
+            for trial, push in zip(problem.recordings, pushes, strict=True)
+        ]
+        posed.append(replace(problem, recordings=tuple(trials)))
+    begin = regulators(posed[0])[0]
+    return min(posed, key=lambda one: _predicted(one, begin, _RATIOS[0])[1])
 
 
 def free_gain(problem: Problem, begin: Weights) -> Fitted:

@@ -14,7 +14,7 @@ the plant, extend its `PlantFamily`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -24,7 +24,7 @@ import scipy.linalg
 from impc.arrays import Array, Frozen, frozen
 from impc.errors import ImpcError
 from impc.inverse.columns import triangular_rows
-from impc.inverse.minimiser import Ended, Prior, Rows, minimise
+from impc.inverse.minimiser import Ended, Prior, Rows, log_square, minimise
 from impc.inverse.problem import explains, noise_of_residual, recorded_size, simulated
 from impc.inverse.residuals import controlled_residual, linearise, unusable
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
@@ -273,7 +273,9 @@ class Unknowns:
         on_shared, own, residual = np.split(table, [shared, shared + self.own], axis=2)
         first = self.controller.stop
         on_shared = on_shared * np.concatenate([np.ones(first), self.units])
-        return Compressed(Rows(residual[..., 0], on_shared, own @ self.own_unit), first)
+        count = self.problem.recorded_numbers
+        whole = Rows.of_white_noise(count, residual[..., 0], on_shared, own @ self.own_unit)
+        return Compressed(whole, first)
 
     def pulled(self, z: Array, change: Array) -> Array:
         """J'c (q,) of a change c (r,) of the residual, J the derivative at z (q,)."""
@@ -378,7 +380,6 @@ class _Along:
         self.columns = np.eye(count) if along is None else along
         self.shape = (space.trials, space.own) if space.own else (1, 0)
         self.begin = self.apart(z)
-        self.count = space.problem.recorded_numbers
         self.here = z
 
     def apart(self, z: Array) -> tuple[Array, Array]:
@@ -400,11 +401,13 @@ class _Along:
         # acceleration solved 20 of 30 random exact problems (half of the outputs), straight steps
         # 14.
         curved = self.space.problem.plant.m > 1 or found.active == 0
-        return Rows(whole.residual, whole.shared @ self.columns, whole.own, curved)
+        return replace(whole, shared=whole.shared @ self.columns, curved=curved)
 
-    def square(self, u: Array, v: Array) -> float:
+    def value(self, u: Array, v: Array) -> float:
         residual = self.space.residual(self.placed(u, v))
-        return np.inf if residual is None else float(residual @ residual)
+        if residual is None:
+            return np.inf
+        return log_square(self.space.problem.recorded_numbers, float(residual @ residual))
 
     def bend(self, du: Array, dv: Array, share: float) -> tuple[Array, Array] | None:
         here = self.apart(self.here)

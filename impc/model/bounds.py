@@ -102,7 +102,10 @@ class BoundRows(Value):
 
     def along_limit(self, control: int) -> Array:
         """Derivative of `b` (c,) with respect to the logarithm of the limits of a control."""
-        return np.where((self.F[:, control] != 0) & ~self.on_state, self.b, 0.0)
+        own = (self.F[:, control] != 0) & ~np.any(
+            self.E, axis=1
+        )  # not of a command that is a state
+        return np.where(own, self.b, 0.0)
 
 
 def bound_rows(bounds: Bounds, plant: Plant) -> BoundRows:

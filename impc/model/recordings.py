@@ -72,6 +72,9 @@ class Recording(Value):
         for one control. NaN marks missing values. They are fitted in addition to the outputs.
     offset : array_like, optional
         Offset (p,) contained in the recorded outputs; zero by default. See `Problem.offsets`.
+    finer : array_like, optional
+        Disturbance (samples, d) whose jumps lie between samples. `impc.fit` takes it in place of
+        `disturbance` if all trials together are predicted better with it.
     label : Label, optional
         Label of the trial.
     findings : tuple of str
@@ -91,6 +94,8 @@ class Recording(Value):
         Signals with a target.
     commands : ndarray of shape (samples, m)
         Recorded commands, the last row NaN; shape (0, m) if there are none.
+    finer : ndarray of shape (samples, d)
+        The same with jumps between samples; shape (0, d) if there is no choice.
     errors : ndarray of shape (kinds, p + d)
         Errors of outputs and disturbances, one row a kind (`impc.model.signal_errors`); zero unless
         they are fitted (`Problem.signal_errors`).
@@ -119,6 +124,7 @@ class Recording(Value):
         "x0": "n",
         "target": "* q",
         "commands": "~* m",
+        "finer": "* d",
         "errors": "* *",
     }
 
@@ -128,6 +134,7 @@ class Recording(Value):
     target: Array
     signals: tuple[str, ...]
     commands: Array
+    finer: Array
     errors: Array
     label: Label
     findings: tuple[str, ...]
@@ -143,6 +150,7 @@ class Recording(Value):
         target: Mapping[str, Any] | None = None,
         commands: ArrayLike | None = None,
         offset: ArrayLike | None = None,
+        finer: ArrayLike | None = None,
         label: Label | None = None,
         findings: tuple[str, ...] = (),
     ) -> None:
@@ -168,6 +176,9 @@ class Recording(Value):
         begin, driven = with_steps(
             plant, start, finite_array("disturbance", d, (len(y), width)), values, names
         )
+        choice: Array = np.zeros((0, driven.shape[1]))
+        if finer is not None:
+            choice = finite_array("finer", finer, driven.shape)
         self._fill(
             outputs=frozen(y),
             disturbance=frozen(driven),
@@ -175,6 +186,7 @@ class Recording(Value):
             target=frozen(values),
             signals=names,
             commands=frozen(_commands(commands, len(y), plant.m)),
+            finer=frozen(choice),
             errors=frozen(_errors(offset, y.shape[1], driven.shape[1])),
             label=label or Label(),
             findings=findings,

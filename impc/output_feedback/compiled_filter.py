@@ -1,4 +1,4 @@
-"""Compiled code: filter of plant and estimate over one trial, with its derivatives.
+"""Compiled code: filter of plant and estimate over one trial with derivatives, and simulation.
 
 The equations are those of `likelihood`. With the filter gain g = P C'S^-1 and the updated
 covariance P|t,
@@ -36,7 +36,6 @@ from impc.control.compiled_values import (
     Workspace,
 )
 from impc.jit import njit
-from impc.output_feedback.joint_loop import JointLoop
 
 # The covariance counts as stationary if no entry differs by more than the first tolerance, in the
 # standard deviations of its row and column, and its derivative by no more than the second.
@@ -46,6 +45,20 @@ _STEADY, _STEADY_SLOPE = 1e-10, 1e-8
 _FORGOTTEN = 1e-9
 # Bounds beyond this many standard deviations are ignored (normal tail probability 1e-13).
 _FAR, _EXACT = 7.5, 1e-12
+
+
+class JointLoop(NamedTuple):
+    """System matrices, or their derivatives along k directions (first axis)."""
+
+    F: Buffer  # (z, z), transition
+    B: Buffer  # (z, m), commands
+    E: Buffer  # (z, d), perturbations
+    G: Buffer  # (z, m), motor noise
+    C: Buffer  # (p, z)
+    Q: Buffer  # (z, z), covariance of the process noise
+    R: Buffer  # (p, p), covariance of the recording noise
+    P0: Buffer  # (z, z), covariance of the first state
+    share: Buffer  # (m,), signal-dependent motor noise as a share of the command
 
 
 class Clip(NamedTuple):
@@ -109,6 +122,14 @@ class Likelihood(NamedTuple):
     def value(self) -> float:
         """Log-likelihood, nats."""
         return float(np.sum(self.identified))
+
+
+class Trace(NamedTuple):
+    """What a simulation writes."""
+
+    z: Buffer  # (steps + 1, z)
+    u: Buffer  # (steps, m)
+    status: Buffer  # (steps,)
 
 
 class Belief(NamedTuple):
@@ -436,3 +457,35 @@ def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
     below = math.erfc(-a / np.sqrt(2.0)) / 2
     density = np.exp(-(a**2) / 2) / np.sqrt(2 * np.pi)
     return below, density, a * density, s * a * below, (s * a) ** 2 * below
+
+
+@njit(cache=True, nogil=True)
+def run_noisy(
+    loop: LoopMatrices,
+    dloop: LoopMatrices,
+    rows: Rows,
+    drows: RowDirections,
+    unit: Buffer,
+    joint: JointLoop,
+    at: int,
+    driven: tuple[Buffer, Buffer, Buffer],
+    aim: Aim,
+    trace: Trace,
+) -> int:
+    """Simulate from z[0]; `driven`: disturbance, noise, and noise in proportion to commands."""
+    (z, u, status), (disturbance, noise, shared), n = trace, driven, loop.K.shape[1]
+    work = workspace(rows, drows, u.shape[1])
+    lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
+    for t in range(len(u)):
+        x = z[t, at : at + n].copy()
+        deviate(aim, rows, drows, work, t, x, dx)
+        status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
+        if status[t] > SOFTENED:
+            return t
+        return_to(aim, t, u[t], du)
+        z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
+        z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
+        if not np.max(np.abs(z[t + 1])) < LARGEST:
+            status[t] = DIVERGED
+            return t
+    return len(u)

@@ -24,7 +24,7 @@ import scipy.linalg
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.errors import InputError
-from impc.output_feedback.search import maximise
+from impc.output_feedback.fit import maximise
 
 if TYPE_CHECKING:
     from impc.output_feedback.fit import OutputFeedbackFit

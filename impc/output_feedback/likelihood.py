@@ -28,8 +28,8 @@ from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
 from impc.output_feedback.compiled_filter import Belief, Clip, FilterParts, Likelihood, run_filter
-from impc.output_feedback.joint_loop import joint_directions, joint_loop
 from impc.output_feedback.observer import Body, filter_changes, stationary_filter
+from impc.output_feedback.simulation import joint_directions, joint_loop
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
     from impc.model.recordings import Recording
-    from impc.output_feedback.joint_loop import JointLoop
+    from impc.output_feedback.compiled_filter import JointLoop
     from impc.output_feedback.observer import Observer
 
 # Status of samples at which the likelihood is undefined.
@@ -50,7 +50,6 @@ _FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)
 class NoiseDirections:
     """Further derivatives along q directions (last axis), in addition to `Directions`."""
 
-    C: Array  # (p, n, q), outputs of the plant
     levels: Array  # (levels + p, q), noise SDs of the subject, then of the recording
     covariances: int  # number of leading directions that change more than the first state
 
@@ -74,7 +73,7 @@ def prepare_filter(
     plant = controller.plant
     law, clip = unclipped(prepare_loop(controller, along, whole=True))
     count = along.count if np.any(person.share) or clip.used else noise.covariances
-    given = (along.A, along.B, along.E, noise.C, noise.levels)
+    given = (along.A, along.B, along.E, along.C, noise.levels)
     *first, levels = (np.moveaxis(part[..., :count], -1, 0) for part in given)
     joint = joint_loop(plant, person, recorder)
     moves = joint_directions(plant, person, recorder, Body(*first), levels)

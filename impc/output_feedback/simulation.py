@@ -1,29 +1,43 @@
-"""Simulate a trial of a subject with noisy senses: `joint_loop` with all bounds, compiled."""
+"""Plant, sensorimotor model and recording as one linear system, and its simulation.
+
+With the error e = x - xh of the estimate the state is z = (e, xh, dh), or z = x for a subject who
+observes every state exactly, and
+
+    z+ = F z + B u + E d + G w + noise of covariance Q,    u = MPC(xh),    y = C z + noise of R
+
+where only u depends on the controller. As the command does not affect the error, F has blocks:
+
+    e+  = (A - L C_s) e - E dh + E d + B w + p - L v      (with a known perturbation: without E)
+    xh+ = A xh + E dh + B u + L C_s e + L v
+    dh+ = r dh + L_d C_s e + L_d v      (r: assumed AR(1) coefficient, 1 for a random walk)
+
+At the first sample the estimate is given, and the error has its stationary covariance
+(docs/why/output_feedback.md).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.arrays import Array, Buffer, Frozen, finite_array, frozen
+from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
-from impc.control.compiled_kernel import LARGEST, deviate, law, return_to, workspace
-from impc.control.compiled_values import (
-    DIVERGED,
-    SOFTENED,
-    Aim,
-    LoopMatrices,
-    RowDirections,
-    Rows,
-)
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Status, scenario
-from impc.jit import njit
-from impc.output_feedback.joint_loop import JointLoop, joint_loop
+from impc.model.riccati import lyapunov_series
+from impc.output_feedback.compiled_filter import JointLoop, Trace, run_noisy
+from impc.output_feedback.observer import (
+    Body,
+    believed_filter,
+    believed_matrices,
+    diagonal,
+    filter_changes,
+    moving_noise,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,8 +45,89 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from impc.control.closed_loop import PreparedLoop
+    from impc.control.compiled_values import Aim
     from impc.control.controller import Controller
+    from impc.model.plant import Plant
     from impc.output_feedback.observer import Observer
+
+# Complex step: its square vanishes next to 1.
+_STEP = 1e-30j
+
+
+def joint_loop(plant: Plant, person: Observer, recorder: Array) -> JointLoop:
+    """Assemble the system of `person` and `plant`, with `recorder` noise SDs (p,)."""
+    L = believed_filter(plant, person).L if person.estimates else None
+    body = Body(plant.A, plant.B, plant.E, plant.C)
+    found = _assembled(body, person, [*person.by_kind, np.asarray(recorder)], L)
+    if person.estimates:
+        own = _apart(plant, person)
+        alone = lyapunov_series(own.T @ found.F @ own, (own.T @ found.Q @ own)[None])[0]
+        found = found._replace(P0=own @ alone @ own.T)
+    return found
+
+
+def joint_directions(
+    plant: Plant, person: Observer, recorder: Array, moves: Body, levels: Array
+) -> JointLoop:
+    """Derivatives of `joint_loop` along k directions; the subject's model follows the plant.
+
+    The equations, except two, are products: a complex step is exact (Squire and Trapp 1998).
+    `recorder` (p,); `levels` (k, levels + p).
+    """
+    each = [*person.by_kind, np.asarray(recorder)]
+    moved = np.split(levels, np.cumsum([len(level) for level in each])[:-1], axis=1)
+    given = plant.A, plant.B, plant.E, plant.C
+    body = Body(*(part + _STEP * change for part, change in zip(given, moves, strict=True)))
+    changed = [level + _STEP * change for level, change in zip(each, moved, strict=True)]
+    if not person.estimates:
+        return _slopes(_assembled(body, person, changed, None))
+    F, C, _, _ = believed_matrices(plant, person)
+    dF, _, dQ, dR = (
+        np.imag(part) / _STEP.imag for part in believed_matrices(body, person, changed[:-1])
+    )
+    believed, dC = believed_filter(plant, person), np.zeros((len(levels), *C.shape))
+    L = believed.L + _STEP * filter_changes(believed, (F, C), (dF, dC, dQ, dR)).L
+    change, here = (
+        _slopes(_assembled(body, person, changed, L)),
+        joint_loop(plant, person, recorder),
+    )
+    own = _apart(plant, person)
+    turned = own.T @ (change.F @ here.P0 @ here.F.T) @ own
+    right = turned + turned.transpose(0, 2, 1) + own.T @ change.Q @ own
+    alone = lyapunov_series(own.T @ here.F @ own, right)
+    return change._replace(P0=own @ alone @ own.T)
+
+
+def _apart(plant: Plant, person: Observer) -> Array:
+    """Unit vectors of what no command affects in z: error and perturbation estimate."""
+    n, d = plant.n, 0 if person.walk is None else plant.E.shape[1]
+    return np.delete(np.eye(2 * n + d), np.s_[n : 2 * n], axis=1)
+
+
+def _assembled(body: Body, person: Observer, levels: list[Array], L: Array | None) -> JointLoop:
+    """Assemble the system without P0; arrays may be complex, with k directions as first axis."""
+    (A, B, E, C), (motor, share, process, sensory, _, white) = body, levels
+    moved, R = moving_noise(B, motor, process), diagonal(white**2)
+    if L is None:
+        return _contiguous(A, B, E, B, C, moved, R, np.zeros_like(moved), share)
+    n, d = A.shape[-1], 0 if person.walk is None else E.shape[-1]
+    error, estimate, walk = np.split(np.eye(2 * n + d), [n, 2 * n], axis=1)
+    entry = (estimate - error) @ L[..., :n, :] + walk @ L[..., n:, :]
+    F = entry @ person.C @ error.T + error @ A @ error.T + estimate @ A @ estimate.T
+    if person.walk is not None:
+        F += (estimate - error) @ E @ walk.T + walk @ np.diag(person.persistence) @ walk.T
+    into = (estimate if person.walk is None else error) @ E
+    Q = entry @ diagonal(sensory**2) @ np.swapaxes(entry, -1, -2) + error @ moved @ error.T
+    seen = C @ (error + estimate).T
+    return _contiguous(F, estimate @ B, into, error @ B, seen, Q, R, np.zeros_like(Q), share)
+
+
+def _slopes(found: JointLoop) -> JointLoop:
+    return _contiguous(*(part.imag / _STEP.imag for part in found))
+
+
+def _contiguous(*parts: Array) -> JointLoop:
+    return JointLoop(*(np.array(part, order="C") for part in parts))
 
 
 @dataclass(frozen=True)
@@ -49,14 +144,6 @@ class PersonTrial(Frozen):
     def reached(self) -> int:
         """Number of samples with a command; later samples repeat the last."""
         return int(np.count_nonzero(self.status <= Status.SOFTENED))
-
-
-class _Trace(NamedTuple):
-    """What a simulation writes."""
-
-    z: Buffer  # (steps + 1, z)
-    u: Buffer  # (steps, m)
-    status: Buffer  # (steps,)
 
 
 @checked(steps=(1, 10_000_000))
@@ -99,15 +186,15 @@ def run_joint(
     disturbance: Array,
     aim: Aim,
     noise: tuple[Array, Array],
-) -> _Trace:
+) -> Trace:
     """Simulate states of plant and estimate, and commands, for given noise samples."""
     steps, (m, n) = len(disturbance), law.controller.K.shape
     z, u = np.zeros((steps + 1, len(start))), np.zeros((steps, m))
     z[0] = start
-    trace = _Trace(z, u, np.full(steps, Status.NOT_REACHED, dtype=np.int8))
+    trace = Trace(z, u, np.full(steps, Status.NOT_REACHED, dtype=np.int8))
     parts = law.matrices, law.matrix_directions, law.rows, law.row_directions, law.unit
     at = 0 if len(start) == n else n
-    reached = _run(*parts, joint, at, (disturbance, *noise), aim, trace)
+    reached = run_noisy(*parts, joint, at, (disturbance, *noise), aim, trace)
     z[reached + 1 :], u[reached:] = z[reached], u[max(reached - 1, 0)]
     return trace
 
@@ -116,35 +203,3 @@ def _root(covariance: Array) -> Array:
     """Symmetric A with A A' the covariance; unique, so that draws are reproducible."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
-
-
-@njit(cache=True, nogil=True)
-def _run(
-    loop: LoopMatrices,
-    dloop: LoopMatrices,
-    rows: Rows,
-    drows: RowDirections,
-    unit: Buffer,
-    joint: JointLoop,
-    at: int,
-    driven: tuple[Buffer, Buffer, Buffer],
-    aim: Aim,
-    trace: _Trace,
-) -> int:
-    """Simulate from z[0]; `driven`: disturbance, noise, and noise in proportion to commands."""
-    (z, u, status), (disturbance, noise, shared), n = trace, driven, loop.K.shape[1]
-    work = workspace(rows, drows, u.shape[1])
-    lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
-    for t in range(len(u)):
-        x = z[t, at : at + n].copy()
-        deviate(aim, rows, drows, work, t, x, dx)
-        status[t], _, _ = law(loop, dloop, rows, drows, unit, work, x, dx, lam, False, u[t], du)
-        if status[t] > SOFTENED:
-            return t
-        return_to(aim, t, u[t], du)
-        z[t + 1] = joint.F @ z[t] + joint.B @ u[t] + joint.E @ disturbance[t] + noise[t]
-        z[t + 1] += joint.G @ (joint.share * u[t] * shared[t])
-        if not np.max(np.abs(z[t + 1])) < LARGEST:
-            status[t] = DIVERGED
-            return t
-    return len(u)

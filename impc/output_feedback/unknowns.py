@@ -27,15 +27,12 @@ from impc.arrays import Array, IntArray, frozen
 from impc.control.constraint_rows import directions
 from impc.errors import ImpcError, SolverError
 from impc.inverse.laws import GainLaw, WeightLaw
-from impc.inverse.problem import controller_for
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import natural_coordinates
-from impc.inverse.starts import regulators
 from impc.inverse.unknowns import Point, Unknowns
-from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
-from impc.model.riccati import is_stable, lyapunov_series, stabilises
+from impc.model.riccati import is_stable, lyapunov_series
 from impc.output_feedback.likelihood import NoiseDirections, joint_likelihoods, prepare_filter
 
 if TYPE_CHECKING:
@@ -43,7 +40,6 @@ if TYPE_CHECKING:
 
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
-    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.output_feedback.compiled_filter import Likelihood
     from impc.output_feedback.observer import Observer
@@ -61,10 +57,6 @@ _BARRIER = 0.5
 _UNLIKE = 0.25
 # Noise-free recordings have no residual: noise SDs start at this share of the outputs.
 _LEAST = 1e-6
-# Increase of the log cost weights at the second start: a low cost weight and noisy senses both
-# delay the response, and a search from least squares, which assumes exact senses, may end at the
-# first.
-_FAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +149,7 @@ class NoisyUnknowns:
     def origin(self) -> dict[str, Any]:
         """Numbers from which `space_at` makes the same unknowns again."""
         posed, law = self.space.problem, self.space.law
-        K, S = law.pair(posed, law.start)
+        K, S = law.given if isinstance(law, GainLaw) else law.pair(posed, law.start)
         return {
             "K": K,
             "S": S,
@@ -219,11 +211,8 @@ class NoisyUnknowns:
     def _trials(self, theta: Array, columns: IntArray) -> list[Likelihood]:
         """Likelihood of each trial along some unknowns, its initial state last."""
         here, person, recorder = self.unpack(theta)
-        problem = here.problem
-        bounded = problem.terminal_set or len(bound_rows(problem.bounds, problem.plant).b) > 0
-        if bounded and not stabilises(problem.plant, here.K):
-            raise SolverError("gain", "does not stabilise the plant", "use another start")
-        controller = controller_for(problem, here.K, here.S)
+        problem, part = here.problem, theta[self.space.controller]
+        controller = self.space.law.controller(problem, part, None, None)
         along, noise = self._directions(theta, controller, here, columns)
         prepared = prepare_filter(controller, person, recorder, along, noise)
         return joint_likelihoods(prepared, problem.recordings, self.request.counted)
@@ -233,7 +222,7 @@ class NoisyUnknowns:
     ) -> tuple[Directions, NoiseDirections]:
         """Directions along some unknowns; all initial states have the same scale."""
         count, starts = len(columns), self._starts.shape[1]
-        levels, dC = np.zeros((len(self.first), len(self.moving))), np.zeros((1, 1, 0))
+        levels = np.zeros((len(self.first), len(self.moving)))
         levels[self.moving, np.arange(len(self.moving))] = self.levels(theta)[self.moving]
 
         def along(change: Array, first: int) -> Array:
@@ -249,10 +238,9 @@ class NoisyUnknowns:
             given["x0"] = along(self.space.own_unit, self.shared)
         if count and family is not None:
             slopes, units = plant_differential(family, here.problem.logarithms), self.space.units
-            given |= {name: along(units * getattr(slopes, name), self.after) for name in "ABE"}
-            dC = units * slopes.C
-        noise = along(np.broadcast_to(dC, (*controller.plant.C.shape, dC.shape[-1])), self.after)
-        lasting = NoiseDirections(noise, along(levels, self.own), max(count - starts, 0))
+            for name in ("A", "B", "E", "C", "observer"):
+                given[name] = along(units * getattr(slopes, name), self.after)
+        lasting = NoiseDirections(along(levels, self.own), max(count - starts, 0))
         return directions(controller, count, **given), lasting
 
     def at(self, theta: Array) -> Iterate:
@@ -279,13 +267,18 @@ class NoisyUnknowns:
         return freed
 
     def parabola(self, here: Iterate, unseen: Array) -> tuple[Array, Array]:
-        """Gradient (q,) and negative Hessian (q, q), positive definite, of the objective.
+        """Gradient (q,) and curvature (q, q), positive definite, of the objective.
 
-        `unseen` (q,): gradient of the REML term.
+        The gradient by a log noise SD is added to its curvature, so that no step moves it by more
+        than one: far from the maximum the information is too small by any factor. `unseen` (q,):
+        gradient of the REML term.
         """
         slope, bend = self.slopes(here.theta)
         gradient = here.identified.gradient + slope + unseen
-        return gradient, here.identified.information + bend + _FLAT * np.eye(len(gradient))
+        curvature = here.identified.information + bend
+        own = np.arange(self.own, len(gradient))
+        curvature[own, own] += np.abs(gradient[own])
+        return gradient, curvature + _FLAT * np.eye(len(gradient))
 
     def lost(self, theta: Array, identified: LikelihoodTerms) -> float:
         """REML term at theta (q,) in nats."""
@@ -298,13 +291,9 @@ class NoisyUnknowns:
     def log_prior(self, theta: Array) -> float:
         """Log-prior at theta (q,), nats; minus infinity if the gain does not stabilise."""
         away = float((theta - self.center) @ self.weights @ (theta - self.center)) / 2
-        unlike = float(np.sum(self.unlike(theta)))
-        return -away - unlike - _BARRIER * self.noise_growth(theta)[0]
-
-    def unlike(self, theta: Array) -> Array:
-        """Penalty of each noise SD at theta (q,), nats: log cosh of its deviation."""
         off = np.abs(theta[self.own :] - self.scales)
-        return np.asarray(self._unlikely * (off + np.log1p(np.exp(-2 * off)) - np.log(2)))
+        log_cosh = off + np.log1p(np.exp(-2 * off)) - np.log(2)
+        return float(-away - self._unlikely @ log_cosh - _BARRIER * self.noise_growth(theta)[0])
 
     def slopes(self, theta: Array) -> tuple[Array, Array]:
         """Gradient and negative Hessian of the log-prior at theta (q,).
@@ -365,18 +354,6 @@ def space_at(problem: Problem, request: Request, origin: dict[str, Any]) -> Nois
     point = Point(kept["K"], kept["S"], problem.at(kept["starts"], kept["logarithms"]))
     weights = None if origin["cost_weights"] is None else kept["cost_weights"]
     return NoisyUnknowns(gain_space(point, weights), request, kept["levels"])
-
-
-def starting_points(
-    found: Estimate, problem: Problem, request: Request
-) -> list[tuple[list[Point], Array | None]]:
-    """Points from which a fit starts, and their cost weights (count,), if these are estimated."""
-    first = [Point(np.array(found.gain), np.array(found.metric), problem)]
-    if found.cost_weights is None:
-        others = [Point(np.array(one.K), np.array(one.S), problem) for one in regulators(problem)]
-        return [(first, None), (others, None)]
-    larger = [(first, np.array(found.cost_weights) + _FAR)] if request.observer.estimates else []
-    return [(first, found.cost_weights), *larger]
 
 
 class Sizes(NamedTuple):

@@ -53,7 +53,7 @@ def compile_filter() -> None:
     person = Observer(plant, ["x", "v"], motor=0.3, sensory=[0.1, 0.2])
     trial = simulate_person(law, person, drive.disturbance, recorder=0.02, seed=1)
     levels = np.zeros((len(person.levels) + 1, 2))
-    noise = filtering.NoiseDirections(np.zeros((1, 2, 2)), levels, 0)
+    noise = filtering.NoiseDirections(levels, 0)
     along = directions(law, 2, x0=np.eye(2))
     prepared = filtering.prepare_filter(law, person, recorder, along, noise)
     recording = Recording(plant, trial.outputs, drive.disturbance, [0.5, 0.0])

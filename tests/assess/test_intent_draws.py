@@ -10,8 +10,7 @@ from experiments.coverage import cart
 from experiments.cursor_tracking import ConditionResult, weight_ratio
 from impc.arrays import Array
 from impc.assess.covariance import GainCovariance, gain_covariance
-from impc.assess.intent_draws import drawn_gains
-from impc.assess.weights_ranges import WeightsSummary, summarise_weights
+from impc.assess.weights_ranges import WeightsSummary, drawn_gains, summarise_weights
 from impc.studies.fit.result import FittedParameter
 from tests.assess.cart_fits import cart_fit
 

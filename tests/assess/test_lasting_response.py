@@ -6,8 +6,7 @@ import control
 import numpy as np
 
 import impc
-from impc.assess.lasting_response import follows_command, lasting_responses
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import follows_command, gain_estimate, lasting_responses
 from impc.inverse.noisy_fit import fit_controller
 from plants import seated_balance_for
 from tests.support import differences, posed, regulator

@@ -14,7 +14,7 @@ from impc.arrays import Array
 from impc.assess import printed_gain, resampling
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import white_noise
-from impc.assess.profiles import profile_likelihood
+from impc.assess.profiles import FitCurve, profile_likelihood
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import misfit_or_reason
 from tests.assess.cart_fits import cart_fit, cart_gain, cart_problem
@@ -40,8 +40,7 @@ def test_replicates_draw_what_is_known_of_the_body_again() -> None:
     at = printed_gain.gain_estimate(
         fit_controller(posed(law, trial, unknown_start=True, family=family))
     )
-    model = model_of(at)
-    repeated = [resampling.replicate(model, index, SEED) for index in range(40)]
+    repeated = [replicate(at, index) for index in range(40)]
     spread = np.std([np.log(one.K[0, 0] / at.K[0, 0]) for one in repeated])
     assert 0.07 < spread < 0.13
     found = resampling.bootstrap_intervals(at, repeated, "bootstrap", 0.95)
@@ -54,8 +53,8 @@ def first_order(root: float, samples: int, seed: int) -> Array:
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
 
 
-def model_of(at: printed_gain.GainEstimate) -> resampling.BootstrapModel:
-    return resampling.bootstrap_model(at.problem, np.array(at.K), np.array(at.S))
+def replicate(at: printed_gain.GainEstimate, index: int, seed: int = SEED) -> resampling.Replicate:
+    return resampling.replicate(at.problem, np.array(at.K), np.array(at.S), index, seed)
 
 
 def white_covariance(estimate: printed_gain.GainEstimate) -> GainCovariance:
@@ -74,14 +73,13 @@ def test_bootstrap_and_profiles_agree_with_the_sandwich(root: float) -> None:
     """30 replicates, seed 4: widths within a third of the sandwich's; nearly quadratic profiles."""
     estimate = cart_gain(SEED, root=root)
     sandwich = printed_gain.covariance_intervals(estimate, estimate.covariance, "sandwich")
-    model = model_of(estimate)
-    found = [resampling.replicate(model, index, SEED) for index in range(30)]
+    found = [replicate(estimate, index) for index in range(30)]
     ratio = width(resampling.bootstrap_intervals(estimate, found, "bootstrap", 0.95)) / width(
         sandwich
     )
     assert np.all(np.abs(np.log(ratio)) < np.log(1.5)), ratio
     for item in sandwich:
-        profile, near = profile_likelihood(estimate, item.name).interval, item.high - item.low
+        profile, near = profile_likelihood(estimate, item.name), item.high - item.low
         assert profile.low == pytest.approx(item.low, abs=0.15 * near)
         assert profile.high == pytest.approx(item.high, abs=0.15 * near)
         assert profile.low < profile.value < profile.high  # type: ignore[operator]
@@ -99,18 +97,20 @@ def test_profile_against_brute_force(root: float) -> None:
     fitted = cart_fit(SEED, root=root)
     problem = impc.replace(fitted.problem, unknown_start=False)
     known = printed_gain.gain_estimate(impc.replace(fitted, problem=problem))
-    profile = profile_likelihood(known, printed_gain.entry_names(problem.plant)[0])
-    K, S = np.array(known.K)[0], np.array(known.S)
+    name, K, S = printed_gain.entry_names(problem.plant)[0], np.array(known.K)[0], np.array(known.S)
+    curve = FitCurve(problem, np.array(known.K), S, name)
+    away = 2 * known.covariance.entries[0, 0]
+    curve.loss(0.0)
+    curve.refine(0.01 * away, away)
 
     def least(first: float) -> float:
         gains = [np.array([[first, K[1] + step]]) for step in np.linspace(-0.5, 0.5, 401)]
         return min(misfit_or_reason(problem, gain, S)[0] ** 2 for gain in gains)
 
-    best = least(profile.values[int(np.argmin(profile.distances))])
+    best = least(K[0] + curve.best)
     variance = best / sum(trial.outputs.size for trial in problem.recordings)
-    factor = max((known.covariance.entries[0, 0] / white_covariance(known).entries[0, 0]) ** 2, 1.0)
-    distance = (least(profile.values[0]) - best) / (variance * factor)
-    assert profile.distances[0] == pytest.approx(distance, rel=0.05, abs=0.05)
+    distance = (least(K[0] - away) - best) / variance
+    assert curve.rise(-away) == pytest.approx(distance, rel=0.05, abs=0.05)
 
 
 def test_what_is_not_determined_has_no_end() -> None:
@@ -126,8 +126,8 @@ def test_what_is_not_determined_has_no_end() -> None:
         fit_controller(impc.fit_problem(plant, [again], settings))
     )
     names = printed_gain.entry_names(plant)
-    assert np.isinf(profile_likelihood(estimate, names[2]).interval.high)
-    assert np.isfinite(profile_likelihood(estimate, names[0]).interval.high)
+    assert np.isinf(profile_likelihood(estimate, names[2]).high)
+    assert np.isfinite(profile_likelihood(estimate, names[0]).high)
     assert estimate.covariance.individually_identified.tolist() == [[True, True, False]]
     with pytest.raises(impc.InputError, match=r"choose from: K\.force"):
         profile_likelihood(estimate, "mass")
@@ -136,37 +136,19 @@ def test_what_is_not_determined_has_no_end() -> None:
 @both_roots
 def test_a_replicate_depends_on_seed_and_number_only(root: float) -> None:
     at = cart_gain(SEED, root=root)
-    alone = resampling.replicate(model_of(at), 3, SEED)
-    model = model_of(at)
-    after = [resampling.replicate(model, index, SEED) for index in (2, 3)][1]
+    alone, after = replicate(at, 3), [replicate(at, index) for index in (2, 3)][1]
     np.testing.assert_array_equal(alone.K, after.K)
-    assert not np.array_equal(resampling.replicate(model, 3, SEED + 1).K, alone.K)
+    assert not np.array_equal(replicate(at, 3, SEED + 1).K, alone.K)
 
 
 @both_roots
-def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(
-    root: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(root: float) -> None:
     """Against a full fit of the same draws (weights, then gain): within 0.01 standard errors."""
     at = cart_gain(SEED, root=root)
-    kept: list[list[Array]] = []
-    draw = resampling.block_residuals
-
-    def keep(residuals: list[Array], rng: np.random.Generator) -> list[Array]:
-        kept.append(draw(residuals, rng))
-        return kept[-1]
-
-    monkeypatch.setattr(resampling, "block_residuals", keep)
-    model = model_of(at)
-    found = resampling.replicate(model, 0, SEED)
-    trials = tuple(
-        impc.replace(trial, outputs=outputs + noise)
-        for trial, outputs, noise in zip(
-            at.problem.recordings, model.measured, kept[0], strict=True
-        )
-    )
+    rng = np.random.default_rng(np.random.SeedSequence(SEED, spawn_key=(0,)))
+    trials = resampling.resampled_trials(at.problem, np.array(at.K), np.array(at.S), rng)
     asked = impc.replace(cart_problem(SEED, root=root), recordings=trials)
-    whole = printed_gain.gain_estimate(fit_controller(asked))
+    found, whole = replicate(at, 0), printed_gain.gain_estimate(fit_controller(asked))
     assert np.all(np.abs(found.K - whole.K) < 0.01 * whole.covariance.entries)
     assert np.all(np.abs(found.K - at.K) > 0.01 * whole.covariance.entries)
 

@@ -18,7 +18,7 @@ from experiments.structure_study import cart_person, seat_person
 from impc.arrays import Array
 from impc.assess.structured_weights import Tangent, tangent, weight_covariance
 from impc.assess.structures import structure_test
-from impc.assess.weight_profiles import WeightProfiles
+from impc.assess.weight_profiles import LocalQuadratic, WeightProfiles
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured import search_from
 from tests.support import differences, posed
@@ -222,7 +222,7 @@ def test_near_a_fit_the_misfit_is_that_of_the_recordings() -> None:
     moved = here + 0.3 * np.array(weight_covariance(at).each) * [1, -1, 0.5, 0.5, 1]
     near, true = [], []
     for cost_weights in (here, moved):
-        near.append(at.quadratic.least(cost_weights, nothing)[0])
+        near.append(LocalQuadratic(at).least(cost_weights, nothing)[0])
         place = tangent(at.structure, at.problem, cost_weights)
         true.append(_left(np.array(place.residual), _start_columns(place)))
     assert near[1] - near[0] == pytest.approx(true[1] - true[0], rel=0.1)

@@ -259,3 +259,16 @@ def test_a_plant_in_degrees_is_refused(tmp_path: Path) -> None:
     plant = Plant(seated_balance_plant(), ["command"], units={"theta1": "deg"})
     with pytest.raises(InputError, match="make the plant in SI units"):
         read(tmp_path, plant, csv_text(seated()))
+
+
+@pytest.mark.parametrize(("rate", "offered"), [(1000.0, False), (100.0, True)])
+def test_a_push_that_jumps_between_samples_is_offered_to_the_fit(
+    tmp_path: Path, seat: Plant, rate: float, offered: bool
+) -> None:
+    """Every 125 ms: at 100 Hz every second jump lies in the middle of a sample."""
+    columns = seated(rate, push=ternary_torque(rate=rate, seed=9))
+    trial = read(tmp_path, seat, csv_text(columns))
+    assert len(trial.finer) == (trial.samples if offered else 0)
+    if offered:
+        fine = ternary_torque(rate=8000.0, seed=9).reshape(-1, 80)[: trial.samples - 15]
+        np.testing.assert_allclose(trial.finer[: len(fine), 0], fine.mean(axis=1), atol=1e-9)

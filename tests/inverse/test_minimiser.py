@@ -26,10 +26,14 @@ class Model:
 
     def rows(self, u: np.ndarray, v: np.ndarray) -> Rows | None:
         self.last = u, v
-        return Rows(self.residual(u, v), *self.slopes(u, v), self.bent)
+        parts = self.residual(u, v), *self.slopes(u, v)
+        return Rows.of_white_noise(self.count, *parts, curved=self.bent)
 
     def square(self, u: np.ndarray, v: np.ndarray) -> float:
         return float(np.sum(self.residual(u, v) ** 2))
+
+    def value(self, u: np.ndarray, v: np.ndarray) -> float:
+        return float(self.count * np.log(max(self.square(u, v), 1e-300)))
 
     def bend(self, du: np.ndarray, dv: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
         (u, v), (shared, own) = self.last, self.slopes(*self.last)
@@ -79,7 +83,7 @@ def test_the_minimum_is_that_of_another_search(seed: int, bent: bool, weight: fl
 
     def value(z: np.ndarray) -> float:
         u, v = z[:SHARED], z[SHARED:].reshape(TRIALS, OWN)
-        return float(model.count * np.log(model.square(u, v)) + prior.square(u, v))
+        return model.value(u, v) + prior.square(u, v)
 
     found = np.concatenate([end.u, end.v.ravel()])
     assert value(found) < value(np.concatenate([prior.u, prior.v.ravel()])) - 1
@@ -144,18 +148,18 @@ def test_steps_too_short_to_predict_a_decrease_end_as_stuck(
     """Long steps are infeasible, and each short one gains the same little."""
     tries, level = 0, 1.0
 
-    def square(*_: object) -> float:
+    def value(*_: object) -> float:
         nonlocal tries, level
         tries += 1
         level *= 1 if tries % 14 else 1 - 1e-6
-        return np.inf if tries % 14 else level
+        return np.inf if tries % 14 else float(np.log(level))
 
     model = Model(
         1,
         lambda *_: np.full((1, 1), np.sqrt(level)),
         lambda *_: (np.ones((1, 1, 1)), np.zeros((1, 1, 0))),
     )
-    monkeypatch.setattr(Model, "square", square)
+    monkeypatch.setattr(Model, "value", value)
     end = searched(model, Prior(np.zeros(1), np.zeros((1, 0)), np.zeros(1), 0.0), 1e-2, 0.0, 50)
     assert end.ended is Ended.STUCK
     assert end.promised == pytest.approx(1.0)

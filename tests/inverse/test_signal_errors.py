@@ -112,3 +112,21 @@ def test_errors_that_cannot_be_asked_for(errors: Errors, known: bool, said: str)
     trial = impc.Recording(plant, np.ones((9, 2)), np.ones(9))
     with pytest.raises(impc.InputError, match=said):
         impc.Problem(plant, impc.Bounds(plant), 10, [trial], signal_errors=errors)
+
+
+@pytest.mark.parametrize("finer", [False, True])
+def test_a_fit_takes_the_jumps_that_predict_better(finer: bool) -> None:
+    """A push held over each sample and one that jumps between samples look alike in a file."""
+    law, rng = controller(), np.random.default_rng(8)
+    levels = rng.choice([-2.0, 2.0], 120)
+    places = np.arange(SAMPLES * 20) / 20 / 2.5  # jumps every 2.5 samples
+    fine = levels[np.floor(places).astype(int)].reshape(SAMPLES, 20)
+    held, means = fine[:, :1], fine.mean(axis=1, keepdims=True)
+    run = law.simulate([0.05, 0.0], disturbance=means if finer else held)
+    y = run.x + 2e-3 * rng.standard_normal(run.x.shape)
+    trial = impc.Recording(law.plant, y, held, finer=np.vstack([means, means[-1:]]))
+    found = impc.fit(posed(law, trial, unknown_start=True, terminal_set=False))
+    (taken,) = found.problem.recordings
+    np.testing.assert_array_equal(taken.disturbance[:SAMPLES], means if finer else held)
+    assert taken.finer.size == 0
+    assert found.gain == pytest.approx(law.K, rel=0.1)

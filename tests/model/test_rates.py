@@ -12,11 +12,10 @@ import pytest
 import scipy.linalg
 
 import impc
-from impc.assess.input_limits import on_limit
 from impc.control.closed_loop import prepare_loop
 from impc.control.simulation import Scenario, Status
 from impc.inverse.methods import METHODS
-from impc.inverse.residuals import residual_only
+from impc.inverse.residuals import along_bounds, residual_only
 from impc.model.bounds import bound_rows
 from impc.output_feedback.likelihood import unclipped
 from tests.control.test_closed_loop import check_jacobian
@@ -178,12 +177,14 @@ def test_limits_of_changes_are_not_those_of_commands() -> None:
     law = controller_of(1, 0.9 * DU / 0.8)
     problem, at = impc.replace(posed(controller_of(1)), bounds=law.bounds), (law.K, law.S)
 
-    def residual(limit: float) -> np.ndarray:
-        bounds = impc.replace(law.bounds, u_max=np.array([limit]))
+    def residual(share: float) -> np.ndarray:
+        u_max, u_min = share * law.bounds.u_max, share * law.bounds.u_min
+        bounds = impc.replace(law.bounds, u_max=u_max, u_min=u_min)
         return residual_only(impc.replace(problem, bounds=bounds), *at)
 
-    slope = (residual(0.9 * DU + 1e-6) - residual(0.9 * DU - 1e-6)) / 2e-6
-    found = on_limit(problem, *at, 0.9 * DU)
+    slope = (residual(1 + 1e-6) - residual(1 - 1e-6)) / 2e-6
+    moves = bound_rows(problem.bounds, problem.plant).along_limit(0)
+    found = along_bounds(problem, *at, moves[:, None])[:, 0]
     np.testing.assert_allclose(found, slope, rtol=0, atol=1e-6 * np.max(np.abs(slope)))
     cut_off = METHODS["clipped_lqr"].restrict(problem).bounds
     np.testing.assert_array_equal(cut_off.x_max, law.bounds.x_max)

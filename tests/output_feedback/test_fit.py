@@ -19,16 +19,15 @@ from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.methods import fit
 from impc.inverse.search import refine_gain
 from impc.inverse.structured import fit_structured
+from impc.model.foresight import with_observer
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.structure import Structure
 from impc.output_feedback import likelihood
-from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
+from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback, reml_slope
 from impc.output_feedback.intervals import person_covariance
-from impc.output_feedback.models import decode_model, encode_model
+from impc.output_feedback.models import PersonModel, decode_model, encode_model
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.page import PersonModel
-from impc.output_feedback.search import reml_slope
 from impc.output_feedback.unknowns import NoisyUnknowns
 from tests.output_feedback.fits import cart, fitted, law, least_squares, posed
 from tests.support import extrapolated_slope
@@ -52,24 +51,26 @@ def check_slope(value: Callable[[Array], float], gradient: Array, theta: Array) 
         assert gradient @ step == pytest.approx(slope, rel=1e-6)
 
 
-def unknowns_with_a_free_parameter() -> NoisyUnknowns:
-    """The same, and friction, on which the subject's filter depends as well."""
+def unknowns_with_free_parameters() -> NoisyUnknowns:
+    """The same, and friction, the scale of the output, and the rate of an observer."""
 
     def make(values: Array) -> Plant:
+        friction, scale, rate = map(float, values)
         system = control.ss(
-            [[1, 0.05], [0, 1 - float(values[0])]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
+            [[1, 0.05], [0, 1 - friction]], [[0, 0], [0.05, 0.05]], [[scale, 0]], 0, 0.05,
             states=["x", "v"], inputs=["u", "d"], outputs=["x"],
         )  # fmt: skip
-        return Plant(system, ["u"])
+        return with_observer(Plant(system, ["u"]), [rate])
 
     first = least_squares("limited")[1]
-    family = PlantFamily(make, ["friction"], [0.02])
-    posed = replace(first.problem, family=family, logarithms=np.zeros(1))
+    family = PlantFamily(make, ["friction", "scale", "rate"], [0.02, 1.0, 0.5])
+    plant = make(family.nominal)
+    posed = replace(first.problem, plant=plant, family=family, logarithms=np.zeros(3))
     person = Observer(cart(), ["x"], motor=0.15, sensory=0.02, walk=0.2)
     return fit_output_feedback(replace(first, problem=posed), person, max_evaluations=1).space
 
 
-@pytest.mark.parametrize("make", [unknowns, unknowns_with_a_free_parameter])
+@pytest.mark.parametrize("make", [unknowns, unknowns_with_free_parameters])
 def test_the_gradient_is_that_of_likelihood_and_prior(make: Callable[[], NoisyUnknowns]) -> None:
     space = make()
     identified = space.identified(space.start)

@@ -18,7 +18,6 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.output_feedback.compiled_filter import Likelihood
-from impc.output_feedback.joint_loop import joint_loop
 from impc.output_feedback.likelihood import (
     NoiseDirections,
     PreparedFilter,
@@ -26,7 +25,7 @@ from impc.output_feedback.likelihood import (
     prepare_filter,
 )
 from impc.output_feedback.observer import Observer, believed_filter
-from impc.output_feedback.simulation import PersonTrial, simulate_person
+from impc.output_feedback.simulation import PersonTrial, joint_loop, simulate_person
 from tests.support import extrapolated_slope
 
 if TYPE_CHECKING:
@@ -118,7 +117,7 @@ def filter_of(who: Someone, *, slopes: bool = False) -> PreparedFilter:
         each, walk = [[4], [5]] if who.sensory else [[], []], [] if who.walk is None else [6]
         for column, group in enumerate([[0], [1], [2, 3], *each, walk, [-1]], 2):
             along[group, column] = levels[group]
-    noise = NoiseDirections(np.zeros((1, 2, q)), along, min(q, 9))
+    noise = NoiseDirections(along, min(q, 9))
     about = directions(law, q, K=gain, x0=start)
     return prepare_filter(law, person, np.array([who.recorder]), about, noise)
 
@@ -281,7 +280,7 @@ def test_an_expectation_without_a_command_is_an_error() -> None:
     plant = Plant(control.ss([[2.0]], [[1.0]], [[1.0]], 0, 1))
     law = Controller.from_gain(plant, [[1.5]], Bounds(plant, u_max=1, u_min=-1), 30,
                                terminal_set=False)  # fmt: skip
-    nothing = NoiseDirections(np.zeros((1, 1, 0)), np.zeros((4, 0)), 0)
+    nothing = NoiseDirections(np.zeros((4, 0)), 0)
     prepared = prepare_filter(law, Observer(plant), np.array([1.0]), directions(law, 0), nothing)
     with pytest.raises(SolverError, match="in the prediction of the filter"):
         joint_likelihoods(prepared, [Recording(plant, np.zeros((60, 1)), x0=[3.0])])

@@ -1,26 +1,85 @@
-"""Competing sensorimotor models, stored when interrupted, and predictions of the filter."""
+"""Competing sensorimotor models: stored when interrupted, report section, result.json."""
 
 from __future__ import annotations
 
+import functools
+import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from impc.arrays import frozen
+from impc.checking import replace
+from impc.control.simulation import Status
+from impc.errors import InputError
 from impc.inverse.methods import fit
+from impc.model.recordings import Recording
 from impc.model.structure import Structure
+from impc.output_feedback.fit import OutputFeedbackFit
 from impc.output_feedback.intervals import person_covariance
-from impc.output_feedback.models import person_report, prediction_errors
+from impc.output_feedback.models import (
+    PersonModel,
+    PersonReport,
+    asked_observer,
+    person_report,
+    prediction_errors,
+)
 from impc.output_feedback.observer import Observer
-from impc.output_feedback.page import PersonModel
+from impc.reporting.document import Fold, Section
+from impc.reporting.finding import Finding
+from impc.reporting.rendering import plain
 from impc.studies.fit.memory import open_memory
-from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.subject import fit_problem, fit_recordings, stages
 from tests.inverse.test_regulator_span import late_body, late_problem
+from tests.output_feedback import fits
 from tests.output_feedback.fits import cart, fitted, least_squares, posed
 from tests.output_feedback.test_fit import check_stored
 
 pytestmark = pytest.mark.full
+
+TABLE: dict[str, Any] = {
+    "horizon": 5,
+    "u_max": 0.9,
+    "methods": [],
+    "held_out": False,
+    "intent_draws": False,
+    "observer": {"sensed": ["x", "v"]},
+}
+
+
+@functools.cache
+def trials() -> list[Recording]:
+    """A subject whose sensory noise is half the size of the movement."""
+    return fits.trials(Observer(cart(), ["x", "v"], motor=0.05, sensory=[0.05, 0.1]), 0.002, 0.9)
+
+
+@functools.cache
+def reported(*, profiles: bool = False) -> tuple[PersonReport, list[str]]:
+    """The report, and the stages of the fit."""
+    settings = fit_settings(TABLE | {"observer": {"sensed": ["x", "v"], "profiles": profiles}})
+    without = fit_settings({key: item for key, item in TABLE.items() if key != "observer"})
+    problem, heard = fit_problem(cart(), trials(), settings), list[str]()
+    report = fit_recordings(problem, settings, heard.append).person
+    assert report is not None
+    assert len(heard) == stages(problem, settings)
+    assert len(heard) - stages(problem, without) == len(report.models) + 1
+    return report, heard
+
+
+def report_and_fit() -> tuple[PersonReport, OutputFeedbackFit]:
+    report, _ = reported()
+    assert report.fit is not None
+    return report, report.fit
+
+
+def findings(section: Section) -> dict[str, Finding]:
+    """Findings of a section, including folded ones."""
+    inside = [one.blocks if isinstance(one, Fold) else [one] for one in section.blocks]
+    return {one.name: one for part in inside for one in part if isinstance(one, Finding)}
 
 
 def test_errors_ahead_are_those_that_the_filter_expects() -> None:
@@ -107,3 +166,112 @@ def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> N
     np.testing.assert_array_equal(report.entries, whole.entries)
     np.testing.assert_array_equal(report.levels, whole.levels)
     assert [one.criterion for one in report.models] == [one.criterion for one in whole.models]
+
+
+def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
+    report, fit = report_and_fit()
+    criteria = {item.name: item.criterion for item in report.models}
+    asked, first = report.models[0].name, report.models[0]
+    assert asked == "estimates, perturbation known"
+    assert criteria[asked] < criteria["sees every state, noise in the loop"] - 10
+    assert criteria[asked] < criteria["sees every state, noise in the recorder alone"] - 100
+    undecided = f"The recordings do not decide between the models “{asked}” and “{asked}, no limit”"
+    assert report.sentences()[0] == f"{undecided} (AIC differs by 0.0)."
+    assert report.preferred
+    unsettled = replace(first, fit=replace(fit, converged=False))
+    for other in (unsettled, replace(first, fit=None)):
+        assert not replace(report, models=(other, *report.models[1:])).preferred
+    alone = replace(report, models=(first,)).sentences()[0]
+    assert alone == "No other model of sensing could be fitted for comparison."
+    best = replace(report.models[1], fit=replace(fit, log_likelihood=1e6))
+    beaten = replace(report, models=(first, best))
+    assert not beaten.preferred
+    assert f"“{best.name}” explains" in beaten.sentences()[0]
+
+
+def test_what_is_said_of_gains_noise_and_limits() -> None:
+    report, fit = report_and_fit()
+
+    def said(intervals: list[list[float]], *, loose: bool = False) -> str:
+        settled = replace(fit, converged=not loose)
+        return replace(report, entries=np.array(intervals), fit=settled).sentences()[1]
+
+    both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
+    assert "of 2 of 2 gains" in said(both)
+    assert "of 1 of 2 gains" in said(one)
+    # By profile an entry that is not individually identified has no interval.
+    assert "of 0 of 2 gains" in said([[np.nan, np.nan], [-1.0, np.inf]])
+    assert "did not converge" in said(both, loose=True)
+    assert not any("80 to 95 %" in line for line in report.sentences())
+    terms = fit.identified
+    limited = [one._replace(status=np.full_like(one.status, Status.ACTIVE)) for one in terms.trials]
+    met = replace(report, fit=replace(fit, identified=replace(terms, trials=limited)))
+    assert any("80 to 95 %" in line for line in met.sentences())
+    assert met.data()["at_limit"] is True
+    other = replace(report, confusion=0.95, whiteness=frozen([1e-3])).sentences()[-2:]
+    assert other[0] == "Gain and noise can hardly be separated here (correlation 0.95)."
+    assert other[1] == "Residuals of x are autocorrelated: the model is incomplete."
+
+
+def test_the_section_and_result_json_have_the_same_numbers() -> None:
+    report, fit = report_and_fit()
+    found = findings(report.section())
+    sizes = {name: len(one.rows) for name, one in found.items()}
+    assert sizes == {"person_gain": 2, "person_levels": 4, "person_models": 5}
+    kept = json.loads(json.dumps(plain(report.data())))
+    rows = found["person_models"].rows
+    assert [item["name"] for item in kept["models"]] == [row[0] for row in rows]
+    level = kept["levels"]["motor u"]
+    assert level["low"] < level["value"] < level["high"]
+    assert (kept["known"], kept["at_limit"], kept["sensed"]) == (True, False, ["x", "v"])
+    assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
+    np.testing.assert_allclose(kept["K"], fit.K)
+    table = found["person_gain"].table
+    assert table is not None
+    np.testing.assert_allclose([table["maximum_likelihood"]], kept["K"])  # no angles
+    np.testing.assert_allclose(table[["low", "high"]], kept["K_intervals"][0])
+
+
+def test_intervals_follow_the_likelihood_where_asked() -> None:
+    (report, heard), (rough, others) = reported(profiles=True), reported()
+    assert (heard, report.profiled, rough.profiled) == (others, True, False)
+    fit, covariance = rough.fit, rough.covariance
+    assert fit is not None
+    assert covariance is not None
+    about = np.asarray(fit.K)[..., None] + 1.959964 * covariance.entries[..., None] * [-1, 1]
+    np.testing.assert_allclose(rough.data()["K_intervals"], about, rtol=1e-6)
+    # The gain is well identified: ends are within half a width of the sandwich intervals.
+    width = np.ptp(about, axis=-1, keepdims=True)
+    assert np.all(np.abs((report.data()["K_intervals"] - about) / width) < 0.5)
+    assert "profile likelihood" not in findings(rough.section())["person_gain"].caption
+    assert "profile likelihood" in findings(report.section())["person_gain"].caption
+
+
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [
+        ([-np.inf, 2.5], ["not determined", "2.50"]),
+        ([np.nan, np.nan], ["-", "-"]),
+        ([2.5, 3.5], ["2.50", "3.50"]),
+    ],
+)
+def test_an_interval_without_end_says_so(ends: list[float], words: list[str]) -> None:
+    found = findings(replace(reported()[0], entries=frozen([ends, ends])).section())
+    assert [row[2:4] for row in found["person_gain"].rows] == [words, words]
+
+
+def test_settings_of_a_person() -> None:
+    table = {"observer": {"sensed": ["x"], "known": False, "share": True, "motor": False}}
+    asked = fit_settings(table).observer
+    assert asked is not None
+    given = msgspec.structs.asdict(asked)
+    del given["profiles"]
+    person, walk = asked_observer(cart(), trials(), **given)
+    assert person.walk is not None
+    # A push of one of three sizes every tenth sample: steps of .7 or 1.4, most of them none.
+    np.testing.assert_allclose(walk, person.walk)
+    assert 0.1 < walk[0] < 0.7
+    assert person.motor[0] == 0 < person.share[0]
+    with pytest.raises(InputError, match=r"\[fit.observer\] senses: is not a setting"):
+        fit_settings({"observer": {"senses": ["x"]}})
+    assert FitSettings().observer is None

@@ -21,7 +21,7 @@ from impc.assess.assessments import assessed, evaluate_method
 from impc.assess.intent import intent
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
-from impc.assess.resampling import bootstrap_model, replicate
+from impc.assess.resampling import replicate
 from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out, saturated_share
 from impc.assess.weights_test import weights_test
@@ -31,6 +31,7 @@ from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.search import with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
@@ -116,6 +117,7 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
+    problem = with_jumps(problem)
     fitted = fit_controller(problem)
     with angles_in(task.configuration.report.angles):
         content = _described(problem, fitted, settings)
@@ -127,8 +129,7 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     started = time.perf_counter()
     problem, settings = unit_problem(task)
     here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "errors")))
-    model = bootstrap_model(here, np.array(fit["K"]), np.array(fit["S"]))
-    found = replicate(model, index, settings.seed)
+    found = replicate(here, np.array(fit["K"]), np.array(fit["S"]), index, settings.seed)
     return _finished({"K": found.K, "parameters": found.parameters}, started)
 
 

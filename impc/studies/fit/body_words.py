@@ -13,16 +13,17 @@ from impc.assess.lack_of_fit import (
     LIMIT,
     MODE,
     NONLINEAR,
-    OFFSET,
     PARAMETERS,
-    PUSH,
     STIFFNESS,
 )
+from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Finding, Level, table_of
 from impc.reporting.rendering import number
+from impc.reporting.shown_units import signal_name
 
 if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
+    from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult, FittedParameter
 
 # Standard deviation after the fit over the stated one above which nothing was learned.
@@ -34,8 +35,6 @@ _KINDS = {
     DELAY: "a delay of the command",
     LIMIT: "another limit of the command",
     LEAN: "a lean, a constant push in each trial",
-    OFFSET: "an offset of the recorded outputs",
-    PUSH: "another size of the perturbation, or another inertia",
     STIFFNESS: "another stiffness or damping where the perturbation acts",
     MODE: "a further mode of the body",
     NONLINEAR: "a nonlinear body, or a reaction to noise at the limit",
@@ -99,12 +98,32 @@ def _wider(result: FitResult) -> str:
 def error_words(result: FitResult, error: ModelError) -> str:
     """A model error in words, with its size if it has one."""
     plant, size, deviation = result.given.plant, error.size, error.deviation
-    words = _KINDS[error.name]
+    words = _words(plant, error.name)
+    kind, _, name = error.name.partition(".")
+    if name and np.isfinite(size):
+        return f"{words}{_size_words(plant, kind, name, size, deviation)}"
     if not np.isfinite(size):
         return words
     if error.name == DELAY:
         return f"{words} of {1e3 * plant.dt * size:.0f} ± {1e3 * plant.dt * deviation:.0f} ms"
     return f"{words}, by {100 * size:+.1f} ± {100 * deviation:.1f} %"
+
+
+def _words(plant: Plant, name: str) -> str:
+    """A tested error in words."""
+    kind, _, signal = name.partition(".")
+    return f"{KINDS[kind][0]} of the {signal_name(plant, signal)}" if signal else _KINDS[name]
+
+
+def _size_words(plant: Plant, kind: str, name: str, size: float, deviation: float) -> str:
+    """Size of an error of a signal, with what it means for the recording."""
+    unit = 1e3 * plant.dt if kind == "shift" else 100
+    much = f"{unit * abs(size):.3g} ± {unit * deviation:.2g} {'ms' if kind == 'shift' else '%'}"
+    if kind == "shift" and name in plant.outputs:
+        return f" (it is recorded {much} too {'late' if size > 0 else 'early'})"
+    if kind == "shift":
+        return f" (it acts {much} {'later' if size > 0 else 'earlier'} than recorded)"
+    return f" (by {'+' if size > 0 else '-'}{much})"
 
 
 def added_sentence(result: FitResult) -> str:
@@ -143,7 +162,7 @@ def probability_words(error: ModelError) -> str:
     return "p < 0.0001" if error.probability < 1e-4 else f"p = {error.probability:.4f}"
 
 
-def lack_finding(found: LackOfFit) -> Finding:
+def lack_finding(plant: Plant, found: LackOfFit) -> Finding:
     """Table of all model errors that were tested."""
     table = table_of(
         found.errors,
@@ -154,11 +173,11 @@ def lack_finding(found: LackOfFit) -> Finding:
             "standard_error": lambda item: float(item.deviation),
         },
     )
-    untestable = ", ".join(_KINDS[name] for name in found.untestable)
+    untestable = ", ".join(_words(plant, name) for name in found.untestable)
     caption = (
         "Tests for errors of the model whose effect on the outputs resembles the residual. p: "
         "p-value of each test if the model is right, without correction for several tests. Sizes: "
-        "delay in samples; limit and perturbation as fractions."
+        "delay and time shift in samples; the others as fractions."
     )
     if untestable:
         caption += (

@@ -47,7 +47,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.assess.intent import dominant_sentence
-from impc.assess.lasting_response import lasting_responses
+from impc.assess.printed_gain import lasting_responses
 from impc.studies.fit.aim import aim_data
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data

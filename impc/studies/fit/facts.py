@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from impc.assess.lasting_response import follows_command
+from impc.assess.printed_gain import follows_command
 from impc.reporting.rendering import fixed, number
 from impc.reporting.shown_units import shown_unit, signal_name
 

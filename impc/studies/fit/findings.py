@@ -9,6 +9,7 @@ import pandas as pd
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names
+from impc.assess.profiles import QUANTILE
 from impc.files.disk import truth_beside
 from impc.inverse.refit import IDENTIFIED
 from impc.model.plant import UNKNOWN, gain_unit
@@ -187,7 +188,7 @@ def limit_findings(result: FitResult) -> list[Finding]:
                 "low": lambda pair: float(pair[1].low),
                 "high": lambda pair: float(pair[1].high),
                 "distance_of_no_limit": lambda pair: float(pair[1].against_none),
-                "threshold": lambda pair: float(pair[1].quantile),
+                "threshold": lambda _: QUANTILE,
             },
         )
         found.append(Finding("limits", table, "Estimated limits of the command, 95 % intervals."))

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from impc.assess.lack_of_fit import LIMIT
-from impc.assess.lasting_response import LastingResponse, lasting_responses
+from impc.assess.printed_gain import LastingResponse, lasting_responses
 from impc.control.named_solver import described
 from impc.inverse.minimiser import Ended
 from impc.reporting.document import (
@@ -387,7 +387,7 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
         Pair(curves[0], residuals) if curves else residuals,
         Fold("Every trial in numbers", [findings.agreement_finding(result)]),
         Fold("Every trial, to explore", [chart]),
-        *([] if result.lack[-1] is None else [lack_finding(result.lack[-1])]),
+        *([] if result.lack[-1] is None else [lack_finding(result.given.plant, result.lack[-1])]),
     ]
 
 

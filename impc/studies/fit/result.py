@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate, Identifiability
     from impc.inverse.problem import Problem
-    from impc.output_feedback.page import PersonReport
+    from impc.output_feedback.models import PersonReport
     from impc.studies.fit.settings import FitSettings
     from impc.studies.fit.uncertainty import Uncertainty
 

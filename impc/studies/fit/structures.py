@@ -10,8 +10,7 @@ import pandas as pd
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.structured_weights import IDENTIFIED_FACTOR
-from impc.assess.structures import criterion_of
-from impc.assess.variance_accounted_for import innovation_roots
+from impc.assess.variance_accounted_for import innovation_roots, innovations_criterion
 from impc.reporting.document import Block, Draw, Fold, Section
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.rendering import probability
@@ -207,7 +206,7 @@ def _powers(result: FitResult, found: StructureFit) -> Finding:
 def _comparison(result: FitResult) -> Finding:
     plant = result.fitted.problem.plant
     identified = int(np.count_nonzero(result.estimate.covariance.identified))
-    free = criterion_of(result.fitted, innovation_roots(result.fitted), identified)
+    free = innovations_criterion(result.fitted, innovation_roots(result.fitted), identified)
     least = min([free, *(item.aic for item in result.structures)])
     held = [item.vaf for item in result.held_out]
     left_out = np.mean(held, axis=0) if held else np.full(len(plant.outputs), np.nan)

@@ -19,16 +19,14 @@ from tqdm.auto import tqdm
 from impc.arrays import Array, frozen
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
-from impc.assess.command_table import command_regression
 from impc.assess.frequency_response import frequency_response
 from impc.assess.input_limits import LimitCurve, limit_curve
 from impc.assess.intent import intent
-from impc.assess.intent_draws import drawn_gains
-from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, with_culprit
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, named_cause
+from impc.assess.printed_gain import command_regression, gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out
-from impc.assess.weights_ranges import weights_summary_or_reason
+from impc.assess.weights_ranges import drawn_gains, weights_summary_or_reason
 from impc.assess.weights_test import identifiability, weights_test
 from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
@@ -36,6 +34,7 @@ from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.problem import Problem, aims, simulated
+from impc.inverse.search import with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.foresight import physical_states
 from impc.studies.fit.asked import (
@@ -67,7 +66,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
     from impc.model.recordings import Recording
-    from impc.output_feedback.page import PersonReport
+    from impc.output_feedback.models import PersonReport
     from impc.studies.fit.uncertainty import Attempt
 
 _THREADS = 2
@@ -224,6 +223,7 @@ def _attempt(failures: dict[str, str], stage: str, compute: Callable[[], Any], d
 def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> FitResult:
     started = time.perf_counter()
     failures: dict[str, str] = {}
+    problem = with_jumps(problem)
     attempt = functools.partial(_attempt, failures)
     problem, progress, fitted, estimate, lack = _first_fits(problem, progress, attempt)
     found = _estimates(problem, fitted, settings, progress)
@@ -300,13 +300,16 @@ def _first_fits(
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
     """Inverse MPC, repeated with one more unknown if the tests of the model point to it."""
     lack: list[LackOfFit | None] = []
+    begin: Problem | None = problem
     while True:
-        fitted = progress.estimate("inverse_mpc", functools.partial(fit, problem))
+        fitted = progress.estimate("inverse_mpc", functools.partial(fit, begin or problem))
         estimate = gain_estimate(fitted)
         test = functools.partial(lack_of_fit, estimate)
-        lack.append(attempt("test of the model", test, None))
-        further = with_culprit(problem, lack[-1])
-        if further is None or len(lack) > 1:
+        found, further = attempt("test of the model", test, None), None
+        if not lack:
+            found, further, begin = named_cause(problem, estimate, found)
+        lack.append(found)
+        if further is None:
             progress.done("inverse MPC")
             return problem, progress, fitted, estimate, tuple(lack)
         problem, progress = further, progress.anew(further)

@@ -17,12 +17,11 @@ import numpy as np
 from impc.assess.input_limits import input_limit
 from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals, gain_estimate
 from impc.assess.profiles import profile_likelihood, require_numbers
-from impc.assess.resampling import bootstrap_intervals, bootstrap_model, replicate
+from impc.assess.resampling import bootstrap_intervals, replicate
 from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
     left_out,
-    residuals_of,
 )
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -86,7 +85,7 @@ def assess(
     for name in settings.profiles:
         stage = f"profile of {name}"
         profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
-        intervals += [] if profile is None else [profile.interval]
+        intervals += [] if profile is None else [profile]
         done(stage)
     limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
@@ -94,7 +93,8 @@ def assess(
         limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
         if limit is not None:
             limits.append(limit)
-            intervals.append(_limit_interval(limit, name))
+            ends = limit.value, limit.low, limit.high
+            intervals.append(Interval(f"u_max.{name}", "profile", LEVEL, *ends))
         done(f"limit of {name}")
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
@@ -106,10 +106,6 @@ def assess(
     return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
 
-def _limit_interval(found: LimitEstimate, control: str) -> Interval:
-    return Interval(f"u_max.{control}", "profile", found.level, found.value, found.low, found.high)
-
-
 def _bootstrap(
     estimate: GainEstimate,
     settings: FitSettings,
@@ -118,11 +114,10 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
-    model = bootstrap_model(estimate.problem, np.array(estimate.K), np.array(estimate.S))
-    found = []
+    found, at = [], (estimate.problem, np.array(estimate.K), np.array(estimate.S))
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
-        compute = functools.partial(replicate, model, index, settings.seed)
+        compute = functools.partial(replicate, *at, index, settings.seed)
         found.append(remember(name, compute))
         done(name)
     return bootstrap_intervals(estimate, found, "block", LEVEL)
@@ -195,6 +190,6 @@ def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Ar
         held = [left_out(found, estimate, index, settle).vaf for index in places]
     except (WeightsError, SolverError) as error:
         return Alternative(name, problem.horizon, np.inf, np.inf, np.nan, str(error))
-    aic = innovations_criterion(residuals_of(found), roots)
+    aic = innovations_criterion(found, roots)
     mean = float(np.mean(held)) if held else float("nan")
     return Alternative(name, problem.horizon, found.misfit, aic, mean, "")

@@ -436,8 +436,8 @@ def _structure(result: FitResult) -> Kind | None:
 
 _KINDS: tuple[Callable[[FitResult], Kind | None], ...] = (
     _little,
-    _unfinished,
     _limit,
+    _unfinished,
     _observer,
     _body,
     _noise,

@@ -121,7 +121,7 @@ def test_profiles_of_two_inputs_end_where_deviations_say() -> None:
     at = estimate.problem, np.array(estimate.K), np.array(estimate.S)
     white = gain_covariance(*at, white_noise, curvature=True)
     for name, row, column in (("K.force1.x[0]", 0, 0), ("K.force2.x[1]", 1, 1)):
-        found = profile_likelihood(estimate, name).interval
+        found = profile_likelihood(estimate, name)
         half = 1.959964 * white.entries[row, column]
         value = estimate.K[row, column]
         np.testing.assert_allclose([value - found.low, found.high - value], half, rtol=0.05)
