@@ -108,13 +108,14 @@ class ModelError(Frozen):
 class LackOfFit(Frozen):
     """Tests of all kinds of model error."""
 
-    errors: tuple[ModelError, ...]  # Testable kinds, smallest p-value first
+    # Testable kinds, smallest p-value first, before them the one that a refit confirms
+    errors: tuple[ModelError, ...]
     alarm: bool  # Whether any test rejects, after Holm's correction
     untestable: tuple[str, ...]  # Kinds that other fitted quantities compensate completely
 
     @property
     def culprit(self) -> ModelError | None:
-        """Error with the smallest p-value, if there is an alarm."""
+        """First error, if there is an alarm."""
         return self.errors[0] if self.alarm else None
 
 

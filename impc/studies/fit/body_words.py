@@ -131,8 +131,10 @@ def added_sentence(result: FitResult) -> str:
     added = result.added
     if added is None:
         return ""
+    signal = "." in added.name  # its size is that of the second fit
+    words = _words(result.given.plant, added.name) if signal else error_words(result, added)
     said = (
-        f"The residuals of a first fit pointed to {error_words(result, added)} "
+        f"The residuals of a first fit pointed to {words} "
         f"({probability_words(added)}). It was added to the unknowns: all numbers come from the "
         "second fit."
     )

@@ -218,7 +218,7 @@ class FitResult:
 
     @property
     def culprit(self) -> ModelError | None:
-        """Model error with the smallest p-value in the last fit, if its tests reject."""
+        """Likeliest error in the last fit, if its tests reject."""
         return None if self.lack[-1] is None else self.lack[-1].culprit
 
     @property

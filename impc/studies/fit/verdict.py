@@ -275,18 +275,20 @@ def _body(result: FitResult) -> Kind | None:
     if error is None or _limit(result) is not None:  # a wrong limit has the same effects
         return None
     reason, of_limit = alternative_reason(result, error), error.name == LIMIT
+    of_signal = "." in error.name
     most = "the most that the person can produce, or state its uncertainty in [plant.uncertainty]"
     alert = Alert(
         Level.AMBER,
         "The residual depends on the perturbation",
-        f"Part of the residual follows the perturbation, unlike measurement noise. The tested "
-        f"model error with the smallest p-value is {error_words(result, error)} "
+        f"Part of the residual follows the perturbation, unlike measurement noise. The likeliest "
+        f"of the tested errors is {error_words(result, error)} "
         f"({probability_words(error)}).{reason}",
         "The gains compensate for part of the error. Their intervals do not include it; the true "
         "uncertainty may be several times larger.",
         (
             *(("Add [fit.observer] to the settings and fit again.",) if reason else ()),
             *((f"Set u_max to {most}, and fit again.",) if of_limit else ()),
+            *(("Check units, zeros and clocks of the recording devices.",) if of_signal else ()),
             "Check body mass, height and sex in the settings, and the dimensions of the device.",
             "State how well they are known in [plant.uncertainty], or fit a doubtful one with "
             "free = [...], and report how much the gains change.",
@@ -294,11 +296,11 @@ def _body(result: FitResult) -> Kind | None:
             "cancels.",
         ),
     )
-    headline = (
-        "The model follows the movement, but the person may react to noise."
-        if reason
-        else "The model follows the movement, but the body model seems to be inexact."
+    seems = (
+        "a recorded signal seems to be wrong" if of_signal else "the body model seems to be inexact"
     )
+    what = "the person may react to noise" if reason else seems
+    headline = f"The model follows the movement, but {what}."
     return Kind(
         headline,
         "Part of the residual follows the perturbation. The error of the gains may be larger than "
