@@ -22,13 +22,11 @@ from tqdm import tqdm
 from experiments.cursor_data import Condition, data_file, read_conditions
 from experiments.cursor_tracking import condition_problem
 from impc.assess.covariance import gain_covariance
-from impc.assess.printed_gain import gain_estimate
 from impc.assess.structured_weights import tangent
 from impc.assess.structures import StructureFit, assess_structure
 from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
-    left_out,
     vaf,
 )
 from impc.assess.weight_profiles import WeightProfiles
@@ -126,8 +124,11 @@ def _any_weights(blur: float, problem: Problem, near: Estimate) -> StructureRow:
     runs = [simulate(near.controller(), drive) for drive in scenarios(near.problem)]
     simulated = np.concatenate([run.x @ near.problem.plant.C.T for run in runs])
     recorded = np.concatenate([trial.outputs for trial in problem.recordings])
-    estimate, places = gain_estimate(near), range(len(problem.recordings))
-    held = [left_out(near, estimate, index, 1.0).vaf for index in places]
+    held = []
+    for index, trial in enumerate(problem.recordings):
+        other = fit_controller(problem.leaving_out(index), near.stage_weights)
+        pair = np.array(other.gain), np.array(other.metric)
+        held.append(predicted(other.problem, *pair, trial, 1.0).vaf)
     at = near.problem, np.array(near.gain), np.array(near.metric)
     identified = int(np.count_nonzero(gain_covariance(*at).identified))
     roots = innovation_roots(near)

@@ -210,7 +210,7 @@ def _person(limit: float) -> Controller:
 
 def _full(controller: Controller) -> NonlinearMpc:
     plant = controller.plant
-    step, weights = seated_balance_for().body, seat_weights(plant)
+    step, weights = seated_balance_for().body(), seat_weights(plant)
     return build_nonlinear_mpc(step, plant, weights, controller.bounds, HORIZON)
 
 

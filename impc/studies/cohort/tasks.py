@@ -117,7 +117,6 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
-    problem = with_jumps(problem)
     fitted = fit_controller(problem)
     with angles_in(task.configuration.report.angles):
         content = _described(problem, fitted, settings)
@@ -162,7 +161,7 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     first, *others = read
     left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
     recordings = (replace(first, findings=(*first.findings, *left)), *others)
-    return fit_problem(plant, recordings, settings, family), settings
+    return with_jumps(fit_problem(plant, recordings, settings, family)), settings
 
 
 def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.lack_of_fit import LIMIT
+from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Level
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import signal_name
@@ -310,6 +311,32 @@ def _body(result: FitResult) -> Kind | None:
     )
 
 
+def _corrected(result: FitResult) -> Kind | None:
+    """An error of a signal, other than its timing, that the second fit estimated."""
+    added = result.added
+    kind, _, signal = ("", "", "") if added is None else added.name.partition(".")
+    if not signal or kind == "shift" or result.culprit is not None:
+        return None
+    words = f"{KINDS[kind][0]} of the {signal_name(result.given.plant, signal)}"
+    alert = Alert(
+        Level.AMBER,
+        "A recorded signal seems to be wrong",
+        f"With {words} as a further unknown, the model explains the recordings.",
+        "The gains on this page are those with this error removed. If the error has another cause, "
+        "they may be wrong.",
+        (
+            "Check unit, sign and zero of the signal, correct the recordings or their settings, "
+            "and fit again.",
+        ),
+    )
+    return Kind(
+        "The model follows the movement after a correction of a recorded signal.",
+        f"The recordings point to {words}. Correct it, and fit again.",
+        alert,
+        frozenset(),
+    )
+
+
 def _noise(result: FitResult) -> Kind | None:
     """A large residual that is not white: noise in the loop may have caused it."""
     least = float(np.min(result.inverse_mpc.vaf))
@@ -440,6 +467,7 @@ _KINDS: tuple[Callable[[FitResult], Kind | None], ...] = (
     _little,
     _limit,
     _unfinished,
+    _corrected,
     _observer,
     _body,
     _noise,

@@ -11,6 +11,7 @@ import pytest
 import scipy.stats
 
 from impc.checking import replace
+from impc.errors import InputError
 from impc.files.plant_sources import plant_source
 from impc.studies.cohort.comparison import compare_cohort, measures_of
 from impc.studies.cohort.engine import Store
@@ -102,4 +103,5 @@ def test_a_structure_that_loses_its_plant_names_why(tmp_path: Path) -> None:
     study = read_study(path)
     source = plant_source("tests.studies.cohort.carts:cart_plant", {})
     tasks, _ = study_tasks(replace(study, plant=source.name), source)
-    assert "expected a name" in fit_unit(next(iter(tasks.values())))["reason"]
+    with pytest.raises(InputError, match="expected a name"):
+        fit_unit(next(iter(tasks.values())))
