@@ -27,6 +27,7 @@ from impc.assess.structures import StructureFit, assess_structure
 from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
+    predicted,
     vaf,
 )
 from impc.assess.weight_profiles import WeightProfiles
