@@ -104,6 +104,12 @@ class ModelError(Frozen):
     deviation: float
 
 
+def signal_of(name: str) -> tuple[str, str] | None:
+    """Kind and signal of an error of a recorded signal; None for another error."""
+    kind, _, signal = name.partition(".")
+    return (kind, signal) if signal else None
+
+
 @dataclass(frozen=True)
 class LackOfFit(Frozen):
     """Tests of all kinds of model error."""
@@ -165,7 +171,7 @@ def named_cause(
     """
     if found is None or not found.alarm:
         return found, None, None
-    likely = [one for one in found.errors if "." in one.name][:_REFITTED]
+    likely = [one for one in found.errors if signal_of(one.name)][:_REFITTED]
     likely += [one for one in found.errors if one.name in _CURES]
     ends = [(one, end) for one in likely for end in _refitted(estimate, one.name)]
     named, begin = found.errors[0], None
@@ -207,8 +213,8 @@ def _freed(problem: Problem, name: str) -> Problem | None:
     """Problem with an error as a further unknown; None if that is not possible."""
     if name in _CURES:
         return _CURES[name](problem)
-    kind, _, signal = name.partition(".")
-    return with_errors_unknown(problem, [(kind, signal)]) if signal else None
+    pair = signal_of(name)
+    return with_errors_unknown(problem, [pair]) if pair else None
 
 
 def _with_offsets(problem: Problem) -> Problem:

@@ -31,7 +31,6 @@ from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.search import with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
@@ -161,7 +160,7 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     first, *others = read
     left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
     recordings = (replace(first, findings=(*first.findings, *left)), *others)
-    return with_jumps(fit_problem(plant, recordings, settings, family)), settings
+    return fit_problem(plant, recordings, settings, family), settings
 
 
 def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:

@@ -17,7 +17,6 @@ from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.methods import METHODS, fit
-from impc.inverse.search import with_jumps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -51,7 +50,6 @@ def compare_recordings(
     held_out: bool = True,
 ) -> tuple[MethodFit, ...]:
     """Fit every method to all trials, then to all trials except each one."""
-    problem = with_jumps(problem)
     count, names = len(problem.recordings), compared_methods()
     whole = cross_checked(problem, _all(problem, names, "all", remember))
     parts = []

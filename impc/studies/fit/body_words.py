@@ -15,6 +15,7 @@ from impc.assess.lack_of_fit import (
     NONLINEAR,
     PARAMETERS,
     STIFFNESS,
+    signal_of,
 )
 from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Finding, Level, table_of
@@ -98,10 +99,9 @@ def _wider(result: FitResult) -> str:
 def error_words(result: FitResult, error: ModelError) -> str:
     """A model error in words, with its size if it has one."""
     plant, size, deviation = result.given.plant, error.size, error.deviation
-    words = _words(plant, error.name)
-    kind, _, name = error.name.partition(".")
-    if name and np.isfinite(size):
-        return f"{words}{_size_words(plant, kind, name, size, deviation)}"
+    words, signal = name_words(plant, error.name), signal_of(error.name)
+    if signal is not None:
+        return f"{words}{_size_words(plant, *signal, size, deviation)}"
     if not np.isfinite(size):
         return words
     if error.name == DELAY:
@@ -109,14 +109,18 @@ def error_words(result: FitResult, error: ModelError) -> str:
     return f"{words}, by {100 * size:+.1f} ± {100 * deviation:.1f} %"
 
 
-def _words(plant: Plant, name: str) -> str:
-    """A tested error in words."""
-    kind, _, signal = name.partition(".")
-    return f"{KINDS[kind][0]} of the {signal_name(plant, signal)}" if signal else _KINDS[name]
+def name_words(plant: Plant, name: str) -> str:
+    """A tested error in words, without its size."""
+    signal = signal_of(name)
+    if signal is None:
+        return _KINDS[name]
+    return f"{KINDS[signal[0]][0]} of the {signal_name(plant, signal[1])}"
 
 
 def _size_words(plant: Plant, kind: str, name: str, size: float, deviation: float) -> str:
-    """Size of an error of a signal, with what it means for the recording."""
+    """What an error of a signal means for the recording, if it is the same in all trials."""
+    if kind in ("offset", "drift") or not np.isfinite(size):
+        return ""
     unit = 1e3 * plant.dt if kind == "shift" else 100
     much = f"{unit * abs(size):.3g} ± {unit * deviation:.2g} {'ms' if kind == 'shift' else '%'}"
     if kind == "shift" and name in plant.outputs:
@@ -131,8 +135,9 @@ def added_sentence(result: FitResult) -> str:
     added = result.added
     if added is None:
         return ""
-    signal = "." in added.name  # its size is that of the second fit
-    words = _words(result.given.plant, added.name) if signal else error_words(result, added)
+    words = error_words(result, added)
+    if signal_of(added.name):  # its size is that of the second fit
+        words = name_words(result.given.plant, added.name)
     said = (
         f"The residuals of a first fit pointed to {words} "
         f"({probability_words(added)}). It was added to the unknowns: all numbers come from the "
@@ -175,7 +180,7 @@ def lack_finding(plant: Plant, found: LackOfFit) -> Finding:
             "standard_error": lambda item: float(item.deviation),
         },
     )
-    untestable = ", ".join(_words(plant, name) for name in found.untestable)
+    untestable = ", ".join(name_words(plant, name) for name in found.untestable)
     caption = (
         "Tests for errors of the model whose effect on the outputs resembles the residual. p: "
         "p-value of each test if the model is right, without correction for several tests. Sizes: "

@@ -170,7 +170,7 @@ def fit_problem(
         )
     require_dressed(plant, settings)
     plant, family = moving_body(plant, family, settings)
-    return Problem(
+    posed = Problem(
         plant,
         fit_bounds(plant, settings, recordings),
         settings.horizon,
@@ -185,6 +185,7 @@ def fit_problem(
         feedback_states=settings.feedback_states,
         solver=settings.solver,
     )
+    return with_jumps(posed)
 
 
 def fit_recordings(
@@ -223,7 +224,6 @@ def _attempt(failures: dict[str, str], stage: str, compute: Callable[[], Any], d
 def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> FitResult:
     started = time.perf_counter()
     failures: dict[str, str] = {}
-    problem = with_jumps(problem)
     attempt = functools.partial(_attempt, failures)
     problem, progress, fitted, estimate, lack = _first_fits(problem, progress, attempt)
     found = _estimates(problem, fitted, settings, progress)

@@ -12,13 +12,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.lack_of_fit import LIMIT
-from impc.model.signal_errors import KINDS
+from impc.assess.lack_of_fit import LIMIT, signal_of
 from impc.reporting.finding import Level
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import signal_name
 from impc.reporting.verdict import Alert, Claim, Verdict
-from impc.studies.fit.body_words import alternative_reason, error_words, probability_words
+from impc.studies.fit.body_words import (
+    alternative_reason,
+    error_words,
+    name_words,
+    probability_words,
+)
 from impc.studies.fit.facts import (
     amount,
     decided,
@@ -276,7 +280,7 @@ def _body(result: FitResult) -> Kind | None:
     if error is None or _limit(result) is not None:  # a wrong limit has the same effects
         return None
     reason, of_limit = alternative_reason(result, error), error.name == LIMIT
-    of_signal = "." in error.name
+    of_signal = signal_of(error.name) is not None
     most = "the most that the person can produce, or state its uncertainty in [plant.uncertainty]"
     alert = Alert(
         Level.AMBER,
@@ -314,10 +318,10 @@ def _body(result: FitResult) -> Kind | None:
 def _corrected(result: FitResult) -> Kind | None:
     """An error of a signal, other than its timing, that the second fit estimated."""
     added = result.added
-    kind, _, signal = ("", "", "") if added is None else added.name.partition(".")
-    if not signal or kind == "shift" or result.culprit is not None:
+    signal = None if added is None else signal_of(added.name)
+    if added is None or signal is None or signal[0] == "shift" or result.culprit is not None:
         return None
-    words = f"{KINDS[kind][0]} of the {signal_name(result.given.plant, signal)}"
+    words = name_words(result.given.plant, added.name)
     alert = Alert(
         Level.AMBER,
         "A recorded signal seems to be wrong",
