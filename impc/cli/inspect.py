@@ -32,20 +32,22 @@ if TYPE_CHECKING:
 )
 def command(file: Path, plant_name: str | None, out: Path | None, config: Path | None) -> None:
     """Show what a recording holds and write a commented configuration for it."""
-    from impc.files.formats import read_table  # noqa: PLC0415  # not needed for --help
+    from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
+    from impc.files.formats import read_table, write_file  # noqa: PLC0415
     from impc.files.inspection import open_places, summary  # noqa: PLC0415
 
     if config is not None:
         _check(file, config, plant_name)
         return
-    _require_new(out)
+    if out is not None and out.exists():
+        raise OutputError(str(out), "already exists", "choose another name, or remove it")
     table = read_table(file)
     text = _draft(table, plant_name)
     click.echo(summary(table))
     if out is None:
         click.echo("\n" + text, nl=False)
     else:
-        _write(out, text)
+        write_file(out, text.encode())
         guesses, places = open_places(text)
         click.echo(
             f'\nWritten to {out}: {places} places with "?" to fill in, {guesses} guesses to check; '
@@ -54,23 +56,13 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
 
 
 def _draft(table: Table, plant_name: str | None) -> str:
-    from impc.files.inspection import Wanted, draft_configuration  # noqa: PLC0415
+    from impc.files.inspection import draft_configuration  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
 
     if plant_name is None:
         return draft_configuration(table)
     source = find_plant(plant_name, {})
-    plant = make_plant(source, ())
-    # Without a configuration the first input is taken for the command.
-    wanted = Wanted(
-        plant.outputs,
-        plant.controls[1:],
-        plant.controls[:1],
-        dict(plant.units),
-        source.defaults(),
-        plant.dt,
-    )
-    return draft_configuration(table, wanted)
+    return draft_configuration(table, make_plant(source, ()), source.defaults())
 
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:
@@ -88,24 +80,3 @@ def _check(file: Path, config: Path, plant_name: str | None) -> None:
     click.echo(f"{trial.label}: {trial.samples} samples at {1 / plant.dt:g} per second")
     for finding in trial.findings or ("The checks found no problems.",):
         click.echo(finding)
-
-
-def _require_new(out: Path | None) -> None:
-    from impc.errors import OutputError  # noqa: PLC0415
-
-    if out is not None and out.exists():
-        raise OutputError(str(out), "already exists", "choose another name, or remove it")
-
-
-def _write(out: Path, text: str) -> None:
-    from impc.files.disk import unwritable  # noqa: PLC0415
-
-    made = False
-    try:
-        with out.open("x", encoding="utf-8", newline="\n") as file:
-            made = True
-            file.write(text)
-    except OSError as error:
-        if made:  # incomplete
-            out.unlink(missing_ok=True)
-        raise unwritable(str(out), error, "choose another path") from None

@@ -10,10 +10,11 @@ import scipy.interpolate
 
 from impc.checking import replace
 from impc.errors import DataError, InputError
+from impc.files.alignment import named_clock, rising
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
-    from impc.arrays import Array, BoolArray, IntArray
+    from impc.arrays import Array, IntArray
     from impc.files.configuration import RecordingTable
     from impc.files.table import Table
 
@@ -21,6 +22,11 @@ if TYPE_CHECKING:
 _GAP = 1.5
 # Deviation from a uniform clock, in periods, that is reported and makes values be interpolated.
 _JITTER = 0.01
+# Largest relative difference of two clocks that is that of two devices and not of two units.
+_APART = 0.02
+_UNITS = np.array([1, 60, 3600, 86400])  # of a clock, in s, times any power of ten
+# Deviation of a step from a whole multiple of the usual one, in periods, in a clock or counter.
+_UNEVEN = 0.05
 # Relative difference above which two statements of the rate contradict each other.
 _RATE = 1e-3
 # Plausible: clocks below 30 000 years (1.7e9 s counts from 1970), periods in this range in s, and
@@ -37,8 +43,9 @@ class Clock:
     steps: IntArray  # (samples,): index of the uniform instant of each sample; 0 for the first
     start: float  # s; the uniform instants are start + k period
     period: float  # s
+    fill_gaps: float  # s, the longest gap that is interpolated
     findings: tuple[str, ...] = ()  # accepted gaps and jitter, for the report
-    note: str = ""  # how the numbers were read if the file does not say it
+    notes: tuple[str, ...] = ()  # how the clock was read, and columns that contradict it
 
     @property
     def even(self) -> bool:
@@ -46,15 +53,17 @@ class Clock:
         return not self.findings
 
 
-def read_clock(table: Table, recording: RecordingTable) -> Clock:
-    """Read the clock, cut the recording, and require uniform sampling."""
+def read_clock(table: Table, recording: RecordingTable, dt: float = 0.0) -> Clock:
+    """Read the clock, cut, require uniform sampling; by default gaps up to `dt` s are filled."""
+    fill_gaps = dt if recording.fill_gaps is None else recording.fill_gaps
     if recording.time is None:
         rate = _stated_rate(table, recording)
         _require_period(table.source, 1 / rate)
         time = np.arange(table.samples) / rate
         rows = _cut(table.source, time, recording)
         steps = np.arange(rows.stop - rows.start)
-        return Clock(time[rows], rows, steps, float(time[rows.start]), 1 / rate)
+        clock = Clock(time[rows], rows, steps, float(time[rows.start]), 1 / rate, fill_gaps)
+        return replace(clock, notes=_rows_lost(table, clock, None))
     name, values = column_of(table, recording.time, "recording.time")
     subject = f"{table.source}: clock {name!r}"
     days = not recording.time_unit and name not in table.units and counts_days(values)
@@ -72,8 +81,13 @@ def read_clock(table: Table, recording: RecordingTable) -> Clock:
         remedy = "correct the clock, or recording.time_unit"
         raise DataError(subject, f"reaches {furthest:.3g} s", remedy)
     rows = _cut(table.source, time, recording)
-    note = f"{subject}: read as day numbers of a spreadsheet" if days else ""
-    return replace(_measured(subject, time[rows], rows, recording.fill_gaps), note=note)
+    notes = (f"{subject}: read as day numbers of a spreadsheet",) if days else ()
+    longest = "a model sample" if recording.fill_gaps is None else f"{fill_gaps:g} s"
+    clock = _measured(subject, time[rows], rows, fill_gaps, longest)
+    if table.rate is not None and abs(table.rate * clock.period - 1) > _RATE:
+        stated = f"the file states {table.rate:g} samples per second"
+        notes = (*notes, f"{subject} has {1 / clock.period:.4g} and {stated}")
+    return replace(clock, notes=(*notes, *_rows_lost(table, clock, name)))
 
 
 def counts_days(values: Array) -> bool:
@@ -129,22 +143,53 @@ def on_even_instants(clock: Clock, values: Array) -> Array:
 
 
 def _stated_rate(table: Table, recording: RecordingTable) -> float:
-    given, stated = recording.rate, table.rate
-    if given is None and stated is None:
+    rate = table.rate if recording.rate is None else recording.rate
+    if rate is None:
         raise DataError(
             table.source,
             "has neither a time column nor a sampling rate",
             "set recording.time or recording.rate",
         )
-    if given is not None and stated is not None and abs(given - stated) > _RATE * stated:
+    if table.rate is not None and abs(rate - table.rate) > _RATE * table.rate:
         raise DataError(
             table.source,
-            f"states {stated:g} samples per second, but recording.rate is {given:g}",
+            f"states {table.rate:g} samples per second, but recording.rate is {rate:g}",
             "correct recording.rate or leave it out",
         )
-    rate = given if given is not None else stated
-    assert rate is not None
     return rate
+
+
+def _rows_lost(table: Table, clock: Clock, chosen: str | None) -> tuple[str, ...]:
+    """Columns that contradict the clock used (`chosen`, or a rate): rows lost, another rate."""
+    found = []
+    for name, values in table.columns.items():
+        time = rising(values[clock.rows])
+        if name == chosen or len(time) < len(clock.time):
+            continue
+        intervals = np.diff(time)
+        usual = float(np.median(intervals))
+        if named_clock(name) and usual != 1:  # 1: a counter
+            ratio = np.outer([usual, np.mean(intervals)], _UNITS) / clock.period
+            ratio /= 10.0 ** np.rint(np.log10(ratio[0]))
+            off = np.asarray((np.abs(ratio - 1) > _RATE).all(axis=1))
+            if off.all() and chosen is None:
+                rate = 1 / clock.period
+                raise DataError(
+                    f"{table.source}: clock {name!r}",
+                    f"has {rate / ratio[0, 0]:.4g} samples per second, but the rate is {rate:g}",
+                    f"set recording.time = {name!r}, or correct the rate",
+                )
+            if off.all() and (apart := abs(ratio[1, 0] - 1)) < _APART:
+                found.append(f"clocks {chosen!r} and {name!r} run {apart:.2%} apart")
+            if off[0]:
+                continue  # another device, or rounded times
+        counts = np.rint(intervals / usual)
+        lost = int(counts.sum()) - len(counts) - (int(clock.steps[-1]) + 1 - len(clock.time))
+        if lost > 0 and np.abs(intervals - usual * counts).max() < _UNEVEN * usual:
+            after = int(np.argmax(counts > 1)) + 1
+            wrong = "times are wrong from there; use it as recording.time if it is a clock"
+            found.append(f"column {name!r} skips {lost} rows, first after sample {after}: {wrong}")
+    return tuple(f"{table.source}: {one}" for one in found)
 
 
 def _require_rising(subject: str, values: Array) -> None:
@@ -197,7 +242,7 @@ def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
     return slice(int(kept[0]), int(kept[-1]) + 1)
 
 
-def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock:
+def _measured(subject: str, time: Array, rows: slice, fill_gaps: float, longest: str) -> Clock:
     """Period by least squares over the samples; gaps count as whole periods."""
     intervals = np.diff(time)
     usual = intervals[intervals < _GAP * np.median(intervals)]
@@ -215,9 +260,21 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock
             f"{rough:.4g} s are usual",
             "export with a constant sampling rate",
         )
-    gaps = intervals > _GAP * rough
-    findings = _gaps(subject, time, intervals, gaps, fill_gaps)
     steps = np.concatenate([[0], np.cumsum(counts)])
+    findings, lost = list[str](), intervals > _GAP * rough
+    if lost.any():
+        worst = int(np.argmax(intervals))
+        if intervals[worst] > fill_gaps * (1 + 1e-9):
+            raise DataError(
+                subject,
+                f"has {lost.sum()} gaps, the first at {time[np.argmax(lost)]:.6g} s, the longest "
+                f"of {intervals[worst]:.4g} s at {time[worst]:.6g} s",
+                "cut with recording.start and stop, or raise recording.fill_gaps "
+                f"(now {fill_gaps:g} s)",
+            )
+        rows_lost = steps[-1] + 1 - len(time)
+        said = f"{rows_lost} rows missing, none for longer than {longest}: interpolated"
+        findings.append(f"{subject}: {said}")
     period, start = (float(value) for value in np.polyfit(steps, time - time[0], 1))
     late = np.abs(time - time[0] - start - period * steps)
     if late.max() > _JITTER * period:
@@ -227,27 +284,7 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float) -> Clock
             f"from a uniform clock by more than 1 % of its period, at most by "
             f"{late.max() / period:.0%} (at {time[worst]:.6g} s); values were interpolated"
         )
-    return Clock(time, rows, steps, float(time[0]) + start, period, tuple(findings))
-
-
-def _gaps(
-    subject: str, time: Array, intervals: Array, gaps: BoolArray, fill_gaps: float
-) -> list[str]:
-    if not gaps.any():
-        return []
-    longest = int(np.argmax(intervals))
-    found = (
-        f"{gaps.sum()} gaps, the first at {time[np.argmax(gaps)]:.6g} s, the longest of "
-        f"{intervals[longest]:.4g} s at {time[longest]:.6g} s"
-    )
-    if intervals[longest] > fill_gaps * (1 + 1e-9):
-        raise DataError(
-            subject,
-            f"has {found}",
-            f"cut with recording.start and stop, or raise recording.fill_gaps "
-            f"(now {fill_gaps:g} s)",
-        )
-    return [f"{subject}: {found}; filled by interpolation"]
+    return Clock(time, rows, steps, float(time[0]) + start, period, fill_gaps, tuple(findings))
 
 
 def _require_period(subject: str, period: float) -> None:

@@ -66,7 +66,7 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Regular expression that must match the whole file name without its ending. Its named
         groups `subject`, `visit`, `condition` and `trial` give the label.
     fill_gaps : float, optional
-        Longest gap in s that is filled by interpolation; 0 fills none.
+        Longest gap in s that is filled by interpolation; by default a sample of the model.
     keep_gaps : bool, optional
         Whether longer gaps of outputs and commands count as not measured instead of an error.
     start : float, optional
@@ -85,7 +85,7 @@ class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     condition: str = ""
     trial: str = ""
     pattern: str | None = None
-    fill_gaps: Annotated[float, msgspec.Meta(ge=0, le=_MOST)] = 0.0
+    fill_gaps: Annotated[float, msgspec.Meta(ge=0, le=_MOST)] | None = None
     keep_gaps: bool = False
     start: Finite | None = None
     stop: Finite | None = None

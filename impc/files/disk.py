@@ -95,8 +95,12 @@ def write_whole(path: Path, content: bytes, *, flush: bool = True) -> None:
         except BaseException:  # also when interrupted from the keyboard
             staging.unlink(missing_ok=True)
             raise
-        if flush:
-            flush_folder(path.parent)
+        if flush and os.name == "posix":  # the folder's entries too
+            number = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(number)
+            finally:
+                os.close(number)
     except (OSError, ValueError) as error:
         raise unwritable(f"file {path}", error, IN_ITS_PLACE) from None
 
@@ -106,17 +110,6 @@ def remove_empty(folder: Path) -> None:
     for path in (*sorted(folder.rglob("*"), reverse=True), folder):
         if path.is_dir() and not path.is_symlink() and not os.listdir(path):
             path.rmdir()
-
-
-def flush_folder(folder: Path) -> None:
-    """Flush the directory entries of a `folder` to disk (POSIX only)."""
-    if os.name != "posix":
-        return
-    number = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)
 
 
 def truth_beside(folder: Path) -> Any:

@@ -135,7 +135,7 @@ def write_table(path: Path | str, table: Table) -> None:
     """
     path = Path(path)
     suffix = _suffix(path, OutputError)
-    _write(path, FORMATS[suffix].encode(table))
+    write_file(path, FORMATS[suffix].encode(table))
 
 
 def encode_table(ending: str, table: Table) -> bytes:
@@ -210,7 +210,8 @@ def _no_ods(table: Table) -> bytes:
     )
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes) -> None:
+    """Write `content` atomically to `path` in an existing folder."""
     try:
         with tempfile.TemporaryDirectory(prefix=".impc-", dir=path.parent) as staging:
             new = Path(staging, path.name)

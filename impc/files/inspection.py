@@ -5,15 +5,15 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.errors import InputError
-from impc.files.clock import counts_days
-from impc.files.configuration import FILL_IN
+from impc.files.alignment import named_clock, rising
+from impc.files.clock import counts_days, read_clock
+from impc.files.configuration import FILL_IN, RecordingTable
 from impc.files.plant_sources import OWN
 from impc.files.table import in_columns
 from impc.files.units import si_unit
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.files.table import Table
+    from impc.model.plant import Plant
 
-_CLOCKS = ("time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec")
 # Units tried for a clock without unit, with steps per second: the first in which steps are shorter
 # than `_SLOWEST` s, the longest of any movement recording.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
@@ -43,6 +43,7 @@ def summary(table: Table) -> str:
     lines = [in_columns([heads, *(_row(table, name) for name in table.columns)], left=2)]
     if table.rate is not None:
         lines.append(f"The file states a rate of {table.rate:g} samples per second.")
+    lines += _clock_findings(table)
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
     lines += [f"Note: {note}" for note in table.notes]
     return "\n".join(lines)
@@ -52,28 +53,17 @@ def summary(table: Table) -> str:
 def clock_column(table: Table) -> str | None:
     """Column with the clock: rising, recognised by its name or by even steps."""
     rising = [name for name, values in table.columns.items() if _rate(values) is not None]
-    named = [name for name in rising if _base(name) in _CLOCKS]
-    return next(iter(named or rising), None)
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """Signals and arguments of a plant that a configuration must cover."""
-
-    outputs: Sequence[str]
-    disturbances: Sequence[str]
-    controls: Sequence[str]
-    units: Mapping[str, str]  # by signal, where the plant states them
-    # of the plant's function, with their defaults; `FILL_IN` if there is none
-    arguments: Mapping[str, object]
-    dt: float  # sample time, s
+    return next(iter([*filter(named_clock, rising), *rising]), None)
 
 
 @np.errstate(all="ignore")
-def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
+def draft_configuration(
+    table: Table, plant: Plant | None = None, arguments: Mapping[str, object] | None = None
+) -> str:
     """Draft a commented TOML configuration (docs/howto/recordings.md).
 
-    Without `wanted` (the plant), every column becomes a signal named after itself.
+    Without a plant, every column becomes a signal named after itself. The first input of the plant
+    is the command. `arguments` of its function with their defaults, `FILL_IN` if there is none.
     """
     lines = [
         f"# Meaning of the columns of {Path(table.source).name!r}. Check every line; replace each",
@@ -86,31 +76,31 @@ def draft_configuration(table: Table, wanted: Wanted | None = None) -> str:
     ]
     clock = clock_column(table)
     rest = [name for name in table.columns if name != clock] or list(table.columns)
-    if wanted is None:
+    if plant is None:
         lines += ["", "# Rename each table [signals.NAME] to an output or disturbance of the"]
         lines += ["# plant; remove columns that are neither."]
         for column in rest:
             lines += ["", *_signal_lines(table, column, column, _span(table, column), "")]
         lines += ["", "[plant]", "# arguments of the plant's function", ""]
         return "\n".join([*lines, "[fit]", "# settings of the fit"]) + "\n"
-    signals = (*wanted.outputs, *wanted.disturbances)
-    chosen = _guessed(table, signals, rest, wanted)
+    signals = (*plant.outputs, *plant.controls[1:])
+    chosen = _guessed(table, signals, rest, plant)
     for signal in signals:
         column, why = chosen.get(signal, (FILL_IN, "no remaining column fits: enter its name"))
-        acts = signal in wanted.disturbances
+        acts = signal in plant.controls
         kind = _INPUT if acts else _span(table, column)
         lines += ["", *_signal_lines(table, signal, column, kind, why)]
     unused = [name for name in rest if name not in [column for column, _ in chosen.values()]]
     if unused:
         named = ", ".join(_stated(table, name) for name in unused)
         lines += ["", f"# Columns that are not used: {named}"]
-    return "\n".join([*lines, "", *_plant_lines(wanted), "", *_fit_lines(wanted)]) + "\n"
+    return "\n".join([*lines, "", *_plant_lines(arguments or {}), "", *_fit_lines(plant)]) + "\n"
 
 
-def _plant_lines(wanted: Wanted) -> list[str]:
+def _plant_lines(arguments: Mapping[str, object]) -> list[str]:
     lines = ["[plant]", "# Arguments of the plant's function. They describe the subject: correct"]
-    lines += ["# those that you know and remove the #."] if wanted.arguments else []
-    for name, value in wanted.arguments.items():
+    lines += ["# those that you know and remove the #."] if arguments else []
+    for name, value in arguments.items():
         if isinstance(value, bool | int | float | str):
             text = json.dumps(value, ensure_ascii=False)
             own = f"the subject's own; without this line the plant's {text} is used"
@@ -121,9 +111,10 @@ def _plant_lines(wanted: Wanted) -> list[str]:
     return lines
 
 
-def _fit_lines(wanted: Wanted) -> list[str]:
-    seconds = f", {_HORIZON * wanted.dt:.3g} s" if wanted.dt else ""
-    units = ", ".join(f"{name} in {wanted.units.get(name, 'SI')}" for name in wanted.controls)
+def _fit_lines(plant: Plant) -> list[str]:
+    seconds = f", {_HORIZON * plant.dt:.3g} s" if plant.dt else ""
+    command = plant.controls[0]
+    units = f"{command} in {plant.unit(command)}"
     return [
         "[fit]",
         _line(f"horizon = {_HORIZON}", f"prediction horizon of the controller in samples{seconds}"),
@@ -143,12 +134,12 @@ def _span(table: Table, column: str) -> str:
     return f"recorded from {values.min():.4g} to {values.max():.4g}" if len(values) else "missing"
 
 
-def _fits(table: Table, column: str, signal: str, wanted: Wanted) -> int:
+def _fits(table: Table, column: str, signal: str, plant: Plant) -> int:
     """Fit of a column's unit to a signal: 0 contradicts, 1 unknown, 2 same kind."""
     try:
         stated = si_unit(_column_unit(table, column)[0])
-        needed = si_unit(wanted.units[signal])
-    except (KeyError, InputError):  # one of the two units is missing or unknown
+        needed = si_unit(plant.unit(signal))
+    except InputError:  # one of the two units is missing or unknown
         return 1
     return 2 if stated.base == needed.base else int(stated.base == "dimensionless")
 
@@ -189,16 +180,8 @@ def _row(table: Table, name: str) -> tuple[str, ...]:
 
 def _rate(values: Array) -> float | None:
     """Samples per unit of a column that rises evenly; None for the others."""
-    steps = np.diff(values)
-    if not np.isfinite(values).all() or (steps <= 0).any():
-        return None
-    median = float(np.median(steps))
-    even = np.abs(steps - median) < 0.5 * median
-    return 1 / median if even.mean() > 0.9 else None
-
-
-def _base(name: str) -> str:
-    return name.rpartition(".")[2].rpartition("/")[2].strip().lower()
+    whole = len(rising(values)) == len(values)
+    return 1 / float(np.median(np.diff(values))) if whole else None
 
 
 def open_places(text: str) -> tuple[int, int]:
@@ -215,7 +198,7 @@ _OPTIONS = (
     '# condition = "eyes open"',
     _line('# trial = "1"', "by default the name of the file"),
     "# pattern = '(?P<subject>[^_]+)_(?P<trial>[0-9]+)'  # or the label from the file's name",
-    _line("# fill_gaps = 0.0", "s, the longest gap that may be filled by interpolation"),
+    _line("# fill_gaps = 0.05", "s, longest gap to interpolate; default: a model sample"),
     _line("# start = 0.0", "s, cut on the file's clock"),
     "# stop = 30.0",
     _line('# sheet = "Data"', "of a workbook; by default the first with rows of numbers"),
@@ -223,7 +206,7 @@ _OPTIONS = (
 
 
 def _clock_lines(table: Table) -> list[str]:
-    clock = clock_column(table)
+    clock = _clock(table)
     if clock is None and table.rate is not None:
         return [_line(f"# rate = {table.rate!r}", "samples per second, stated in the file")]
     if clock is None:
@@ -231,28 +214,49 @@ def _clock_lines(table: Table) -> list[str]:
             _line('# time = "..."', "no column rises evenly: name the clock column,"),
             _line("# rate = 1000.0", "or give the samples per second"),
         ]
-    values = table.columns[clock]
+    name, unit, why = clock
+    values = table.columns[name]
     step = float(np.median(np.diff(values)))
-    unit, why = _time_unit(*_column_unit(table, clock), step)
-    if unit != "day" and counts_days(values) and not table.units.get(clock):
-        unit, why = "day", "a guess: day numbers of a spreadsheet"
     span = f"from {values[0]:.6g} to {values[-1]:.6g}, in steps of {step:.6g}"
-    return [_line(f"time = {_quoted(clock)}", span), _line(f"time_unit = {_quoted(unit)}", why)]
+    return [_line(f"time = {_quoted(name)}", span), _line(f"time_unit = {_quoted(unit)}", why)]
 
 
-def _time_unit(written: str, how: str, step: float) -> tuple[str, str]:
+def _clock(table: Table) -> tuple[str, str, str] | None:
+    """Column with the clock, its unit, and the origin of the unit."""
+    name = clock_column(table)
+    if name is None:
+        return None
+    values, (written, how) = table.columns[name], _column_unit(table, name)
+    if written != "day" and counts_days(values) and not table.units.get(name):
+        return name, "day", "a guess: day numbers of a spreadsheet"
     if written != FILL_IN and si_unit(written).base == "second":
-        return written, how
+        return name, written, how
+    step = float(np.median(np.diff(values)))
     unit, second = next(pair for pair in _GUESSES if step < pair[1] * _SLOWEST or pair[1] == 1e9)
-    return unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
+    return name, unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
+
+
+def _clock_findings(table: Table) -> list[str]:
+    """Findings of the clock that the draft names, or of the rate of the file."""
+    recording = RecordingTable()
+    if (clock := _clock(table)) is not None:
+        longest = float(np.diff(table.columns[clock[0]]).max()) * si_unit(clock[1]).factor
+        recording = RecordingTable(time=clock[0], time_unit=clock[1], fill_gaps=longest)
+    elif table.rate is None:
+        return []
+    try:
+        used = read_clock(table, recording)
+    except InputError as error:
+        return [str(error)]
+    return [*used.findings, *used.notes]
 
 
 def _guessed(
-    table: Table, signals: Sequence[str], columns: Sequence[str], wanted: Wanted
+    table: Table, signals: Sequence[str], columns: Sequence[str], plant: Plant
 ) -> dict[str, tuple[str, str]]:
     """Column for each signal, and why: most similar names first, then by unit and order."""
     fits = {
-        (signal, column): _fits(table, column, signal, wanted)
+        (signal, column): _fits(table, column, signal, plant)
         for signal in signals
         for column in columns
     }

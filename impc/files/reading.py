@@ -126,12 +126,12 @@ def read_unit(
     if not read:
         return (), tuple(fallen)
     longest = max(trial.samples for _, trial in read)
-    trials = (
-        trial
-        if trial.samples == longest
-        else replace(trial, findings=(*trial.findings, _shorter(path, trial.samples, longest)))
-        for path, trial in read
-    )
+    trials = [trial for _, trial in read]
+    for place, (path, trial) in enumerate(read):
+        if trial.samples < longest:
+            said = f"unequal length: {trial.samples} samples, the longest has {longest}"
+            found = (*trial.findings, f"{path}: trials of {said}")
+            trials[place] = replace(trial, findings=found)
     return tuple(trials), tuple(fallen)
 
 
@@ -140,22 +140,32 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     _require_names(configuration, plant)
     entry = configuration.recording
     label = label_of(table.source, entry)
-    clock = read_clock(table, entry)
+    clock = read_clock(table, entry, plant.dt)
     checks.comparable_rates(table.source, clock.period, plant.dt)
     samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
     checks.too_few(table.source, samples, _SAMPLES_A_STATE * physical_states(plant))
     findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
-    findings += [clock.note] if clock.note else []
-    series, lost, targets, finer, found = _clocked(table, clock, configuration, plant)
+    findings += clock.notes
+    inputs = (*plant.disturbances, *(plant.commands or plant.controls))
+    names = (*plant.outputs, *(name for name in inputs if name in configuration.signals))
+    series, lost, targets, finer, found = _clocked(table, clock, configuration, plant, names)
     findings += found
     samples = len(series[plant.outputs[0]])
-    findings += _slower(table.source, clock, plant)
+    if clock.period > plant.dt and not same_rate(len(clock.time), clock.period, plant.dt):
+        findings.append(
+            f"{table.source}: recorded at {1 / clock.period:.4g} samples per second and analysed "
+            f"at {1 / plant.dt:.4g}: it contains nothing above {0.5 / clock.period:.4g} Hz"
+        )
     findings += _departing(table.source, series, targets, configuration, plant)
     disturbance = np.zeros((samples, physical_disturbances(plant)))
     for index, name in enumerate(plant.disturbances):
         if name in series:
             disturbance[:, index] = series[name]
-            findings += _order(table.source, series, name, plant)
+            findings += [
+                f"{table.source}: {output} {reason} ({name})"
+                for output in plant.outputs
+                if (reason := misaligned(series[name], series[output], plant.dt))
+            ]
     outputs = np.column_stack([series[name] for name in plant.outputs])
     if clock.even and same_rate(len(clock.time), clock.period, plant.dt):
         findings += _later(table.source, outputs, series, plant)
@@ -166,7 +176,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
     if plant.commands:  # the controls are changes of the commands
         commands = np.diff(commands, axis=0, prepend=np.nan)
     other = None
-    if finer and not plant.ahead:
+    if finer:
         other = disturbance.copy()
         for name, values in finer.items():
             other[:, plant.disturbances.index(name)] = values
@@ -184,19 +194,18 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
 
 
 def _clocked(
-    table: Table, clock: Clock, configuration: Configuration, plant: Plant
+    table: Table, clock: Clock, configuration: Configuration, plant: Plant, names: Sequence[str]
 ) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], dict[str, Array], list[str]]:
     """Signals, their missing share, targets and finer pushes, at the plant's rate; findings."""
     recorded, signals, findings = configuration.recording, configuration.signals, list[str]()
-    acting = [name for name in plant.disturbances if name in signals]
-    commands = [name for name in plant.commands or plant.controls if name in signals]
+    acting = [name for name in plant.disturbances if name in names]
     even: dict[tuple[str, str], Array] = {}  # by signal and kind: "", "lost" or "target"
-    for name in (*plant.outputs, *acting, *commands):
+    for name in names:
         channel = channel_of(table, clock, name, signals[name])
         response, keep = name in plant.outputs, None if name in acting else recorded.keep_gaps
-        findings += _checked(table, channel, signals[name], recorded, response, keep)
+        findings += _checked(table, channel, signals[name], clock, response, keep)
         values = on_even_instants(clock, channel.values * channel.unit.factor)
-        if keep and (gaps := checks.gaps(channel, recorded.fill_gaps)).any():
+        if keep and (gaps := checks.gaps(channel, clock.fill_gaps)).any():
             known = np.isfinite(values)
             values = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
             even[name, "lost"] = np.zeros(len(values))
@@ -216,11 +225,14 @@ def _clocked(
         resample = held_values if kind == "target" else resample
         clocked[kind][name] = resample(values, clock.period, plant.dt)
         steps = jumps.get(name)
-        if steps is not None and steps.jitter * clock.period > _JITTER * plant.dt:
-            steps = steps.delayed(shifts[name] - first)
-            finer[name] = held_means(values, clock.period, plant.dt, steps)
+        if plant.ahead or steps is None or steps.jitter * clock.period <= _JITTER * plant.dt:
+            continue
+        steps = steps.delayed(shifts[name] - first)
+        finer[name] = held_means(values, clock.period, plant.dt, steps)
+        switches = f"{name} switches every {steps.dwell * clock.period:.4g} s"
+        findings.append(f"{table.source}: {switches}; its edges are placed between samples")
     targets = clocked["target"]
-    samples = len(clocked[""][plant.outputs[0]])
+    samples = len(clocked[""][names[0]])
     for name in configuration.aimed:
         at = signals[name].target
         if isinstance(at, float | int):
@@ -238,7 +250,7 @@ def _target(
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
-        checks.missing(channel, configuration.recording.fill_gaps),
+        checks.missing(channel, clock.fill_gaps),
     ]
     finite = np.isfinite(channel.values)
     instant = np.arange(clock.steps[-1] + 1)
@@ -256,21 +268,14 @@ def require_whole(recordings: Sequence[Recording], command: str) -> None:
 
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
     """Perturbations of a table at the plant's rate (samples, d), in SI base units."""
-    entry, columns = configuration.recording, []
-    clock = read_clock(table, entry)
-    checks.comparable_rates(table.source, clock.period, plant.dt)
     for name in plant.disturbances:
         if name not in configuration.signals:
             raise InputError(f"signals.{name}", "is missing", "name the column of the file")
-        signal = configuration.signals[name]
-        require_kind(name, signal.unit, plant.unit(name))
-        channel = channel_of(table, clock, name, signal)
-        _checked(table, channel, signal, entry, response=False, keep=None)
-        even = on_even_instants(clock, channel.values * channel.unit.factor)
-        shift = _shifts(table.source, clock, configuration, [name])
-        columns.append(held_means(shifted({name: even}, shift)[name], clock.period, plant.dt))
-    shortest = min(map(len, columns))
-    return np.column_stack([values[:shortest] for values in columns])
+        require_kind(name, configuration.signals[name].unit, plant.unit(name))
+    clock = read_clock(table, configuration.recording, plant.dt)
+    checks.comparable_rates(table.source, clock.period, plant.dt)
+    series, *_ = _clocked(table, clock, configuration, plant, plant.disturbances)
+    return np.column_stack([series[name] for name in plant.disturbances])
 
 
 def _shifts(
@@ -445,7 +450,7 @@ def _checked(
     table: Table,
     channel: checks.Channel,
     entry: SignalTable,
-    recorded: RecordingTable,
+    clock: Clock,
     response: bool,
     keep: bool | None,
 ) -> list[str]:
@@ -453,7 +458,7 @@ def _checked(
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
-        checks.missing(channel, recorded.fill_gaps, keep),
+        checks.missing(channel, clock.fill_gaps, keep),
         checks.constant(channel),
         checks.degrees_for_radians(channel) if response else "",
         "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
@@ -470,27 +475,3 @@ def stated_unit(table: Table, column: str) -> Unit | None:
         return si_unit(table.units[column])
     except (KeyError, InputError):
         return None
-
-
-def _slower(source: str, clock: Clock, plant: Plant) -> list[str]:
-    samples = len(clock.time)
-    if clock.period < plant.dt or same_rate(samples, clock.period, plant.dt):
-        return []
-    return [
-        f"{source}: recorded at {1 / clock.period:.4g} samples per second and analysed at "
-        f"{1 / plant.dt:.4g}: it contains nothing above {0.5 / clock.period:.4g} Hz"
-    ]
-
-
-def _order(source: str, series: dict[str, Array], name: str, plant: Plant) -> list[str]:
-    """Report outputs that precede, or are unrelated to, a disturbance."""
-    found = [misaligned(series[name], series[output], plant.dt) for output in plant.outputs]
-    return [
-        f"{source}: {output} {reason} ({name})"
-        for output, reason in zip(plant.outputs, found, strict=True)
-        if reason
-    ]
-
-
-def _shorter(path: Path, samples: int, longest: int) -> str:
-    return f"{path}: trials of unequal length: {samples} samples, the longest has {longest}"

@@ -16,6 +16,7 @@ import numpy as np
 
 from impc.errors import DataError, OutputError
 from impc.extras import optional
+from impc.files.alignment import aligned, own_clocks
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
@@ -30,13 +31,15 @@ _SCALES = (
     *("Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"),
     *("RTD", "Strain", "Thermistor", "Thermocouple"),
 )
+# Longest plausible increment of a waveform, s.
+_SLOWEST = 1e6
 
 
 def read_tdms(path: Path, largest: int) -> Table:
     """Read the channels of all groups; `group/channel` if two groups use the same name.
 
-    Time stamps become seconds after the first; the rate is 1 / wf_increment. The arrays may take
-    `largest` bytes.
+    Time stamps become seconds after the first; the rate is 1 / wf_increment of the fastest channel.
+    The arrays may take `largest` bytes.
     """
     source = str(path)
     nptdms = optional("nptdms", source)
@@ -105,7 +108,9 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
     columns: dict[str, Array] = {}
     units: dict[str, str] = {}
     skipped: dict[str, str] = {}
+    paths: dict[str, str] = {}
     timed: dict[str, Any] = {}
+    stamps = [channel[0] for channel in channels if channel.dtype.kind == "M" and len(channel)]
     for channel in channels:
         twice = names[channel.name] > 1
         name = f"{channel.group_name}/{channel.name}" if twice else channel.name
@@ -118,38 +123,38 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
         data = channel[:]
         unit = str(channel.properties.get("unit_string", ""))
         if data.dtype.kind == "M" and len(data):
-            data = (data - data[0]) / np.timedelta64(1, "s")
+            data = (data - min(stamps)) / np.timedelta64(1, "s")
             unit = "s"
         columns[name] = np.asarray(data, dtype=np.float64)
-        units[name] = unit
-        if float(channel.properties.get("wf_increment", 0) or 0) > 0:
+        units[name], paths[name] = unit, f"{channel.group_name}/{channel.name}"
+        if 0 < float(channel.properties.get("wf_increment", 0) or 0) < _SLOWEST:
             timed[name] = channel.properties
-    _require_together(source, timed)
-    table = make_table(source, columns, units, None, skipped)
-    stated = {1 / float(timed[name]["wf_increment"]) for name in table.columns if name in timed}
-    if len(stated) > 1:
-        raise DataError(
-            source,
-            f"has channels of {min(stated):g} and {max(stated):g} samples per second",
-            "export those of one rate into a separate file",
-        )
-    return make_table(source, table.columns, table.units, next(iter(stated), None), table.skipped)
+    clocks = _waveform_clocks(columns, timed) if timed else own_clocks(columns, paths)
+    columns, notes = aligned(source, columns, clocks)
+    rates = [1 / float(item["wf_increment"]) for name, item in timed.items()]
+    return make_table(source, columns, units, max(rates, default=None), skipped, notes)
 
 
-def _require_together(source: str, timed: dict[str, Any]) -> None:
-    """Reject channels whose clocks begin at different times."""
+def _waveform_clocks(
+    columns: dict[str, Array], timed: dict[str, Any]
+) -> dict[str, tuple[str, Array]]:
+    """Name and times in s of the clock of each channel with a waveform's start and increment."""
     moments = {name: item.get("wf_start_time") for name, item in timed.items()}
     earliest = min((moment for moment in moments.values() if moment is not None), default=None)
-    begins = {name: float(item.get("wf_start_offset", 0) or 0) for name, item in timed.items()}
-    for name, moment in moments.items():
-        if moment is not None:
-            begins[name] += float((moment - earliest) / np.timedelta64(1, "s"))
-    first = next(iter(begins), "")
-    for name, begin in begins.items():
-        if begin != begins[first]:
-            problem = f"channel {first} begins at {begins[first]:g} s and {name} at {begin:g} s"
-            remedy = "export channels that were recorded together into a separate file"
-            raise DataError(source, problem, remedy)
+    clocks: dict[tuple[float, float, int], tuple[str, Array]] = {}
+    found = {}
+    for name, item in timed.items():
+        if len(columns[name]) < 2:
+            continue
+        begin, step = float(item.get("wf_start_offset", 0) or 0), float(item["wf_increment"])
+        if moments[name] is not None:
+            begin += float((moments[name] - earliest) / np.timedelta64(1, "s"))
+        key = begin, step, len(columns[name])
+        clocks.setdefault(
+            key, (f"clock of {name}", np.asarray(begin + step * np.arange(float(key[2]))))
+        )
+        found[name] = clocks[key]
+    return found
 
 
 @contextlib.contextmanager

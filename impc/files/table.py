@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from impc.arrays import Frozen, frozen
 from impc.checking import checked
 from impc.errors import DataError
+from impc.files.alignment import aligned, own_clocks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -49,6 +50,8 @@ def make_table(
 ) -> Table:
     """Make a table from columns of equal length; those of another length are skipped.
 
+    Columns with clocks of their own are first interpolated to the fastest clock.
+
     Parameters
     ----------
     source : str
@@ -86,6 +89,7 @@ def make_table(
         raise DataError(source, "has two columns of one name", "give each its own name")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
     left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
+    vectors, said = aligned(source, vectors, own_clocks(vectors))
     lengths = Counter(len(values) for values in vectors.values() if len(values) > 1)
     if not lengths:
         left_out |= {name: f"has {len(values)} values" for name, values in vectors.items()}
@@ -102,7 +106,7 @@ def make_table(
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     stated = {name: unit for name, unit in units.items() if name in kept and unit}
-    return Table(source, kept, stated, rate, left_out, tuple(map(_line, notes)))
+    return Table(source, kept, stated, rate, left_out, tuple(map(_line, (*notes, *said))))
 
 
 def _line(text: str) -> str:

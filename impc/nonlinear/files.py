@@ -240,7 +240,7 @@ def _series(
                 "count as not measured"
             )
     else:
-        found.append(checks.missing(channel, configuration.recording.fill_gaps))
+        found.append(checks.missing(channel, clock.fill_gaps))
         resample = held_means if held else instants
         values = resample(on_even_instants(clock, values), clock.period, dt)
     return values, [finding for finding in found if finding]
@@ -262,7 +262,7 @@ def fit_files(
     entry, recordings, labels, findings, dt = configuration.recording, [], [], [], problem.dt
     for path in files:
         table = read_table(path, sheet=entry.sheet)
-        label, clock = label_of(table.source, entry), read_clock(table, entry)
+        label, clock = label_of(table.source, entry), read_clock(table, entry, problem.dt or 0)
         recording, found = read_recording(table, clock, configuration, fitted, settings)
         recordings.append(recording)
         labels.append(str(label))

@@ -158,7 +158,7 @@ CELLS[:] = [np.arange(5.0), "seat"]
 SHIFTED = {name: values + 0.123456 for name, values in SEAT.items()}
 OVERLOAD = {k: LINES[k].replace(LINES[k].split(",")[1], "overload", 1) for k in (11, 40)}
 SIDES = "\n".join([LINES[0] + ",side", *(line + ",left" for line in LINES[1:-1])])
-RATES = [("seat", 100.0), ("trunk", 200.0)]
+RATES = [("seat", 100.0), ("trunk", 5000.0)]
 DEGREES = 'column = "seat"\nunit = "deg"\nlimit = 12.0'
 UNEVEN = np.cumsum(np.where(np.arange(600) % 2, 0.0196, 0.0004))
 THETA2 = '[signals.theta2]\ncolumn = "trunk"\nunit = "deg"\n'
@@ -240,8 +240,8 @@ DAMAGED: dict[str, tuple[str, Make]] = {
     "data in another file": ("seat lies in another file", linked(outside)),
     # TDMS and C3D
     "truncated tdms": ("ends in the middle of its data", cut(own("trial.tdms"))),
-    "tdms of two rates": (
-        "has channels of 100 and 200 samples per second",
+    "tdms of clocks far apart": (
+        "has clocks without a common span: clock of seat (0 to 5.99 by 0.01), clock of trunk (",
         tdms(*((name, SEAT[name], {"wf_increment": 1 / rate}) for name, rate in RATES)),
     ),
     "tdms of text": ("has no column of numbers", tdms(("notes", ["a", "b"]))),

@@ -289,8 +289,30 @@ def test_tdms_channels_that_begin_at_different_times(tmp_path: Path, late: dict[
     begins = {"wf_start_time": np.datetime64("2026-01-01"), "wf_increment": 0.02}
     signal = np.sin(0.1 * np.arange(100.0))
     path = tdms(tmp_path / "a.tdms", ("push", signal, begins), ("seat", signal, begins | late))
-    with pytest.raises(DataError, match="push begins at 0 s and seat at"):
-        read_table(path)
+    table = read_table(path)
+    assert_columns(table, {"push": signal[20:], "seat": signal[:80]}, 1e-9)
+    assert table.rate == 50.0
+    assert "clock of push (0 to 1.98 by 0.02), clock of seat (0.4 to 2.38 by" in table.notes[0]
+
+
+def test_tdms_channels_of_two_rates_and_groups_with_time_stamps(tmp_path: Path) -> None:
+    time = 0.01 * np.arange(600)
+    slow = ("seat", np.sin(time[::2]), {"wf_increment": 0.02})
+    table = read_table(
+        tdms(tmp_path / "a.tdms", ("push", np.sin(time), {"wf_increment": 0.01}), slow)
+    )
+    assert table.rate == 100.0
+    np.testing.assert_allclose(table.columns["seat"], np.sin(time[:599]), atol=1e-4)
+    stamps = np.datetime64("2026-01-01T10:00:00") + (1e6 * time).astype("timedelta64[us]")
+    with TdmsWriter(str(tmp_path / "b.tdms")) as writer:
+        for group, name, late in (("a", "push", 0), ("b", "seat", 400)):
+            channel = ChannelObject(group, name, np.sin(time))
+            shifted = stamps + np.timedelta64(late, "ms")
+            writer.write_segment([ChannelObject(group, "Time", shifted), channel])
+    found = read_table(tmp_path / "b.tdms").columns
+    expected = {"a/Time": time[40:], "push": np.sin(time[40:]), "seat": np.sin(time[:560])}
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["AdvancedAPI", "Bridge"])

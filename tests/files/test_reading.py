@@ -119,13 +119,53 @@ def test_gaps_are_filled_only_where_allowed_and_reported(tmp_path: Path, seat: P
     allowed = ('time = "time"', 'time = "time"\nfill_gaps = 0.06')
     trial = read(tmp_path, seat, csv_text(lost), allowed)
     assert trial.samples == 3000
-    assert [word in " ".join(trial.findings) for word in ("1 gaps", "3 of 2995")] == [True, True]
+    assert [
+        word in " ".join(trial.findings)
+        for word in ("5 rows missing, none for longer than 0.06 s: inter", "3 of 2995")
+    ] == [True, True]
     whole = np.deg2rad(np.column_stack([columns["seat"], columns["trunk"]]))
     assert np.abs(trial.outputs - whole).max() < np.deg2rad(0.1)
     kept = np.r_[0:690, 720:1490, 1520:3000]
     np.testing.assert_allclose(trial.outputs[kept], whole[kept], atol=1e-9)
     with pytest.raises(InputError, match="1 gaps"):
         read(tmp_path, seat, csv_text(lost), (allowed[0], allowed[1].replace("6", "5")))
+
+
+def test_gaps_below_a_sample_of_the_model_are_filled_by_default(
+    tmp_path: Path, seat: Plant
+) -> None:
+    columns = seated(1000.0, 10.0)
+    rng = np.random.default_rng(5)  # seed 5
+    kept = np.flatnonzero((rng.random(10_000) > 0.05) | (np.arange(10_000) % 9_999 == 0))
+    lost = {name: values[kept] for name, values in columns.items()}
+    lost["trunk"][1500:1503] = np.nan
+    trial, whole = (read(tmp_path, seat, csv_text(one)) for one in (lost, columns))
+    said = f"{10_000 - len(kept)} rows missing, none for longer than a model sample: interpolated"
+    assert any(finding.endswith(said) for finding in trial.findings)
+    assert np.abs(trial.outputs - whole.outputs).max() < np.deg2rad(0.02)
+    with pytest.raises(InputError, match="gaps, the first at"):
+        read(tmp_path, seat, csv_text(lost), ('"time"', '"time"\nfill_gaps = 0.0'))
+    beyond = {name: np.delete(values, slice(700, 711)) for name, values in columns.items()}
+    with pytest.raises(InputError, match="1 gaps"):
+        read(tmp_path, seat, csv_text(beyond))
+
+
+def test_clocks_and_counters_beside_a_rate(tmp_path: Path, seat: Plant) -> None:
+    columns = seated()
+    counted = {"count": np.arange(3000.0), **columns}
+    at_rate = ('time = "time"', "rate = 100.0")
+    assert read(tmp_path, seat, csv_text(counted), at_rate).findings == ()
+    rounded = seated(300.0, 10.0)
+    rounded["time"] = np.round(rounded["time"], 3)
+    assert read(tmp_path, seat, csv_text(rounded), (at_rate[0], "rate = 300")).findings == ()
+    lost = {name: np.delete(values, slice(700, 705)) for name, values in counted.items()}
+    for name in ("count", "time"):
+        one = {**lost, "count": counted["count"][:2995], name: lost[name]}
+        one = one if name == "time" else {**one, "time": columns["time"][:2995]}
+        (found,) = read(tmp_path, seat, csv_text(one), at_rate).findings
+        assert f"column '{name}' skips 5 rows, first after sample 700" in found
+    with pytest.raises(DataError, match="has 100 samples per second, but the rate is 200"):
+        read(tmp_path, seat, csv_text(counted), (at_rate[0], "rate = 200"))
 
 
 def test_jitter_is_a_finding_and_values_come_to_even_instants(tmp_path: Path, seat: Plant) -> None:
@@ -269,6 +309,8 @@ def test_a_push_that_jumps_between_samples_is_offered_to_the_fit(
     columns = seated(rate, push=ternary_torque(rate=rate, seed=9))
     trial = read(tmp_path, seat, csv_text(columns))
     assert len(trial.finer) == (trial.samples if offered else 0)
+    said = "perturbation switches every 0.125 s; its edges are placed between samples"
+    assert any(said in finding for finding in trial.findings) == offered
     if offered:
         fine = ternary_torque(rate=8000.0, seed=9).reshape(-1, 80)[: trial.samples - 15]
         np.testing.assert_allclose(trial.finer[: len(fine), 0], fine.mean(axis=1), atol=1e-9)

@@ -1,0 +1,122 @@
+"""Columns with clocks of their own, interpolated to the fastest clock over the common span.
+
+The clock of a column is a rising column named as one: in the same struct or group ("tilt.Time" of
+"tilt.Data"), with the column's name ("push_time"), or the nearest to the left.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.interpolate
+
+from impc.errors import DataError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from impc.arrays import Array
+
+_WORDS = {"time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec"}
+# Clocks are equal if they differ by less than this part of a step; a value is taken without
+# interpolation below the second; an interval of more than the third many steps is a gap.
+_SAME, _EXACT, _GAP = 1e-2, 1e-3, 1.5
+# Longest clock in any unit; least part of its steps that are within half of the usual one.
+_LONGEST, _EVEN = 1e30, 0.9
+_COMMON = 0.1  # least common part of the longest clock
+
+
+def named_clock(name: str) -> bool:
+    """Whether a word of the last part of a column's name is that of a clock."""
+    last = re.split(r"[./]", name)[-1]
+    words = re.findall(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+", last)
+    return last.startswith("X_Value") or not _WORDS.isdisjoint(map(str.lower, words))
+
+
+def rising(values: Array) -> Array:
+    """`values` (samples,) to the last finite one, if they rise evenly to it; otherwise empty."""
+    time = values[: int(np.isfinite(values).sum())]
+    with np.errstate(all="ignore"):  # steps of numbers beyond any clock
+        steps = np.diff(time)
+        if len(time) < 2 or not (steps > 0).all() or not 1 / _LONGEST < np.ptp(time) < _LONGEST:
+            return time[:0]
+        even = np.abs(steps - np.median(steps)) < 0.5 * np.median(steps)
+    return time if even.mean() > _EVEN else time[:0]
+
+
+def own_clocks(
+    columns: Mapping[str, Array], paths: Mapping[str, str] | None = None
+) -> dict[str, tuple[str, Array]]:
+    """Name and times of the clock of each column; `paths` are full names where they differ."""
+    times = {name: rising(values) for name, values in columns.items() if named_clock(name)}
+    clocks = [name for name, time in times.items() if len(time)]
+    full = {name: (paths or {}).get(name, name) for name in columns}
+    parents = {name: re.sub(r"[^./]*$", "", full[name]) for name in clocks}
+    places = {name: place for place, name in enumerate(columns)}
+    owners: dict[str, str] = {}
+    for name in columns if len(clocks) > 1 else ():
+        near = [one for one in clocks if full[name].startswith(parents[one])]
+        near = [one for one in near if len(columns[one]) == len(columns[name])]
+        depth = max((len(parents[one]) for one in near), default=0)
+        near = [one for one in near if len(parents[one]) == depth]
+        alike = [one for one in near if len(name) > 2 and name.lower() in one.lower()]
+        left = [one for one in near if places[one] <= places[name]]
+        found = [name] if name in near else [*alike[:1], *left[-1:], *near]
+        owners |= {name: found[0]} if found else {}
+    used = {clock for name, clock in owners.items() if not len(rising(columns[name]))}
+    return {name: (clock, times[clock]) for name, clock in owners.items() if clock in used}
+
+
+@np.errstate(all="ignore")  # starts and values beyond anything measured, refused here or later
+def aligned(
+    source: str, columns: Mapping[str, Array], clocks: Mapping[str, tuple[str, Array]]
+) -> tuple[dict[str, Array], tuple[str, ...]]:
+    """Columns at the instants of the fastest of their `clocks` (name, times), and a note."""
+    times = dict(clocks.values())
+    if all(_same(time, next(iter(times.values()))) for time in times.values()):
+        return dict(columns), ()
+    fastest = min(times, key=lambda name: _step(times[name]))
+    first = max(float(time[0]) for time in times.values())
+    last = min(float(time[-1]) for time in times.values())
+    spans = ", ".join(
+        f"{name} ({time[0]:g} to {time[-1]:g} by {_step(time):.4g})" for name, time in times.items()
+    )
+    if not last - first >= _COMMON * max(float(np.ptp(time)) for time in times.values()):
+        raise DataError(
+            source,
+            f"has clocks without a common span: {spans}",
+            "save the columns of each in a file of their own, or remove a clock that is not used",
+        )
+    slack = _EXACT * _step(times[fastest])
+    instants = times[fastest]
+    instants = instants[(instants >= first - slack) & (instants <= last + slack)]
+    made = dict(columns)
+    for name, (_, time) in clocks.items():
+        made[name] = instants if name in times else _at(columns[name][: len(time)], time, instants)
+    note = f"interpolated to {fastest} from {first:g} to {last:g}; clocks: {spans}"
+    return made, (note,)
+
+
+def _at(values: Array, time: Array, instants: Array) -> Array:
+    """`values` (samples,) of `time` at `instants` (Akima); NaN in gaps and at missing samples."""
+    finite = np.isfinite(values)
+    if finite.sum() < 2:
+        return np.full(len(instants), np.nan)
+    after = np.clip(np.searchsorted(time, instants), 1, len(time) - 1)
+    before, step = after - 1, _step(time)
+    near = np.where(instants - time[before] < time[after] - instants, before, after)
+    known = finite[before] & finite[after] & (time[after] - time[before] <= _GAP * step)
+    spline = scipy.interpolate.Akima1DInterpolator(time[finite], values[finite], method="makima")
+    between = np.where(known, spline(instants), np.nan)
+    exact = np.abs(time[near] - instants) <= _EXACT * step
+    return np.asarray(np.where(exact, values[near], between), dtype=np.float64)
+
+
+def _step(time: Array) -> float:
+    return float(np.median(np.diff(time)))
+
+
+def _same(time: Array, other: Array) -> bool:
+    return len(time) == len(other) and bool(np.abs(time - other).max() <= _SAME * _step(other))
