@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from impc.cli.plant import KNOWN, find_plant
-
-if TYPE_CHECKING:
-    from impc.files.table import Table
 
 
 @click.command("inspect")
@@ -34,7 +30,12 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
     """Show what a recording holds and write a commented configuration for it."""
     from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
     from impc.files.formats import read_table, write_file  # noqa: PLC0415
-    from impc.files.inspection import open_places, summary  # noqa: PLC0415
+    from impc.files.inspection import (  # noqa: PLC0415
+        draft_configuration,
+        open_places,
+        summary,
+    )
+    from impc.files.plant_sources import make_plant  # noqa: PLC0415
 
     if config is not None:
         _check(file, config, plant_name)
@@ -42,8 +43,12 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
     if out is not None and out.exists():
         raise OutputError(str(out), "already exists", "choose another name, or remove it")
     table = read_table(file)
-    text = _draft(table, plant_name)
-    click.echo(summary(table))
+    plant, arguments = None, {}
+    if plant_name is not None:
+        source = find_plant(plant_name, {})
+        plant, arguments = make_plant(source, ()), source.defaults()
+    text = draft_configuration(table, plant, arguments)
+    click.echo(summary(table, plant.dt if plant else None))
     if out is None:
         click.echo("\n" + text, nl=False)
     else:
@@ -53,16 +58,6 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
             f'\nWritten to {out}: {places} places with "?" to fill in, {guesses} guesses to check; '
             "then run impc fit with it."
         )
-
-
-def _draft(table: Table, plant_name: str | None) -> str:
-    from impc.files.inspection import draft_configuration  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant  # noqa: PLC0415
-
-    if plant_name is None:
-        return draft_configuration(table)
-    source = find_plant(plant_name, {})
-    return draft_configuration(table, make_plant(source, ()), source.defaults())
 
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:

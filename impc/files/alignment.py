@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
 
 _WORDS = {"time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec"}
+_SECONDS = ("s", "sec", "ms", "us")
 # Clocks are equal if they differ by less than this part of a step; a value is taken without
 # interpolation below the second; an interval of more than the third many steps is a gap.
 _SAME, _EXACT, _GAP = 1e-2, 1e-3, 1.5
@@ -28,11 +29,15 @@ _LONGEST, _EVEN = 1e30, 0.9
 _COMMON = 0.1  # least common part of the longest clock
 
 
-def named_clock(name: str) -> bool:
-    """Whether a word of the last part of a column's name is that of a clock."""
+def named_clock(name: str, unit: str = "") -> bool:
+    """Whether a column's unit is a time, or a word of the last part of its name a clock."""
     last = re.split(r"[./]", name)[-1]
     words = re.findall(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+", last)
-    return last.startswith("X_Value") or not _WORDS.isdisjoint(map(str.lower, words))
+    return (
+        unit in _SECONDS
+        or last.startswith("X_Value")
+        or not _WORDS.isdisjoint(map(str.lower, words))
+    )
 
 
 def rising(values: Array) -> Array:
@@ -47,17 +52,17 @@ def rising(values: Array) -> Array:
 
 
 def own_clocks(
-    columns: Mapping[str, Array], paths: Mapping[str, str] | None = None
+    columns: Mapping[str, Array], units: Mapping[str, str], paths: Mapping[str, str] | None = None
 ) -> dict[str, tuple[str, Array]]:
     """Name and times of the clock of each column; `paths` are full names where they differ."""
-    times = {name: rising(values) for name, values in columns.items() if named_clock(name)}
-    clocks = [name for name, time in times.items() if len(time)]
+    named = [name for name in columns if named_clock(name, units.get(name, ""))]
+    times = {name: time for name in named if len(time := rising(columns[name]))}
     full = {name: (paths or {}).get(name, name) for name in columns}
-    parents = {name: re.sub(r"[^./]*$", "", full[name]) for name in clocks}
+    parents = {name: re.sub(r"[^./]*$", "", full[name]) for name in times}
     places = {name: place for place, name in enumerate(columns)}
     owners: dict[str, str] = {}
-    for name in columns if len(clocks) > 1 else ():
-        near = [one for one in clocks if full[name].startswith(parents[one])]
+    for name in columns if len(times) > 1 else ():
+        near = [one for one in times if full[name].startswith(parents[one])]
         near = [one for one in near if len(columns[one]) == len(columns[name])]
         depth = max((len(parents[one]) for one in near), default=0)
         near = [one for one in near if len(parents[one]) == depth]

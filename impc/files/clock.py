@@ -168,7 +168,7 @@ def _rows_lost(table: Table, clock: Clock, chosen: str | None) -> tuple[str, ...
             continue
         intervals = np.diff(time)
         usual = float(np.median(intervals))
-        if named_clock(name) and usual != 1:  # 1: a counter
+        if named_clock(name, table.units.get(name, "")) and usual != 1:  # 1: a counter
             ratio = np.outer([usual, np.mean(intervals)], _UNITS) / clock.period
             ratio /= 10.0 ** np.rint(np.log10(ratio[0]))
             off = np.asarray((np.abs(ratio - 1) > _RATE).all(axis=1))

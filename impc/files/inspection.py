@@ -37,23 +37,16 @@ _ALIKE = 0.6  # theta1 and theta_2 are alike; push and perturbation are not
 
 
 @np.errstate(all="ignore")  # the mean of values of 1e308 overflows
-def summary(table: Table) -> str:
-    """Table of the columns: unit, samples, range, mean, missing, and rate of a rising column."""
+def summary(table: Table, dt: float | None = None) -> str:
+    """Table of the columns with the findings of their clock; `dt` of the plant in s, if known."""
     heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
     lines = [in_columns([heads, *(_row(table, name) for name in table.columns)], left=2)]
     if table.rate is not None:
         lines.append(f"The file states a rate of {table.rate:g} samples per second.")
-    lines += _clock_findings(table)
+    lines += _clock_findings(table, dt)
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
     lines += [f"Note: {note}" for note in table.notes]
     return "\n".join(lines)
-
-
-@np.errstate(all="ignore")
-def clock_column(table: Table) -> str | None:
-    """Column with the clock: rising, recognised by its name or by even steps."""
-    rising = [name for name, values in table.columns.items() if _rate(values) is not None]
-    return next(iter([*filter(named_clock, rising), *rising]), None)
 
 
 @np.errstate(all="ignore")
@@ -74,8 +67,8 @@ def draft_configuration(
         _line('subject = ""', "code of the subject"),
         *_OPTIONS,
     ]
-    clock = clock_column(table)
-    rest = [name for name in table.columns if name != clock] or list(table.columns)
+    clock = _clock(table)
+    rest = [name for name in table.columns if not clock or name != clock[0]] or list(table.columns)
     if plant is None:
         lines += ["", "# Rename each table [signals.NAME] to an output or disturbance of the"]
         lines += ["# plant; remove columns that are neither."]
@@ -222,8 +215,10 @@ def _clock_lines(table: Table) -> list[str]:
 
 
 def _clock(table: Table) -> tuple[str, str, str] | None:
-    """Column with the clock, its unit, and the origin of the unit."""
-    name = clock_column(table)
+    """Column with the clock (named as one, or the first that rises), its unit and its origin."""
+    even = [name for name, values in table.columns.items() if _rate(values) is not None]
+    named = [name for name in even if named_clock(name, table.units.get(name, ""))]
+    name = next(iter([*named, *even]), None)
     if name is None:
         return None
     values, (written, how) = table.columns[name], _column_unit(table, name)
@@ -236,19 +231,21 @@ def _clock(table: Table) -> tuple[str, str, str] | None:
     return name, unit, f"a guess: {second / step:.4g} samples per second; a counter needs rate"
 
 
-def _clock_findings(table: Table) -> list[str]:
+def _clock_findings(table: Table, dt: float | None) -> list[str]:
     """Findings of the clock that the draft names, or of the rate of the file."""
     recording = RecordingTable()
     if (clock := _clock(table)) is not None:
         longest = float(np.diff(table.columns[clock[0]]).max()) * si_unit(clock[1]).factor
-        recording = RecordingTable(time=clock[0], time_unit=clock[1], fill_gaps=longest)
+        fill_gaps = longest if dt is None else None
+        recording = RecordingTable(time=clock[0], time_unit=clock[1], fill_gaps=fill_gaps)
     elif table.rate is None:
         return []
     try:
-        used = read_clock(table, recording)
+        used = read_clock(table, recording, dt or 0.0)
     except InputError as error:
         return [str(error)]
-    return [*used.findings, *used.notes]
+    found = [*used.findings, *used.notes]
+    return found if dt else [one.removesuffix(": interpolated") for one in found]
 
 
 def _guessed(

@@ -129,7 +129,7 @@ def _table(source: str, channels: list[Any], unknown: dict[str, str]) -> Table:
         units[name], paths[name] = unit, f"{channel.group_name}/{channel.name}"
         if 0 < float(channel.properties.get("wf_increment", 0) or 0) < _SLOWEST:
             timed[name] = channel.properties
-    clocks = _waveform_clocks(columns, timed) if timed else own_clocks(columns, paths)
+    clocks = _waveform_clocks(columns, timed) if timed else own_clocks(columns, units, paths)
     columns, notes = aligned(source, columns, clocks)
     rates = [1 / float(item["wf_increment"]) for name, item in timed.items()]
     return make_table(source, columns, units, max(rates, default=None), skipped, notes)

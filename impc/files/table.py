@@ -89,7 +89,7 @@ def make_table(
         raise DataError(source, "has two columns of one name", "give each its own name")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
     left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
-    vectors, said = aligned(source, vectors, own_clocks(vectors))
+    vectors, said = aligned(source, vectors, own_clocks(vectors, units))
     lengths = Counter(len(values) for values in vectors.values() if len(values) > 1)
     if not lengths:
         left_out |= {name: f"has {len(values)} values" for name, values in vectors.items()}

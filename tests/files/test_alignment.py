@@ -20,6 +20,7 @@ NAMES = {
     "structs": ("a.Time", "a.Data", "b.Time", "b.Data"),
     "columns": ("time", "tilt", "time_2", "push"),
     "alphabet": ("push_t", "push", "tilt_t", "tilt"),
+    "units": ("X", "tilt", "X_2", "push"),
     "groups": ("one/t", "one/x", "two/t", "two/x"),
 }
 CLOCKS: dict[str, tuple[Array, Array]] = {
@@ -40,7 +41,7 @@ def both(names: tuple[str, ...], first: Array, other: Array) -> dict[str, Array]
     series = [first, wave(first), other, wave(other)]
     most = max(map(len, series))
     full = [np.pad(one, (0, most - len(one)), constant_values=np.nan) for one in series]
-    return dict(zip(names, full if names[0] == "time" else series, strict=True))
+    return dict(zip(names, full if names[1] == "tilt" else series, strict=True))
 
 
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
@@ -48,7 +49,7 @@ def both(names: tuple[str, ...], first: Array, other: Array) -> dict[str, Array]
 def test_series_come_to_the_fastest_clock(
     names: tuple[str, ...], clocks: tuple[Array, Array]
 ) -> None:
-    table = make_table("trial", both(names, *clocks))
+    table = make_table("trial", both(names, *clocks), {"X": "s", "X_2": "s"})
     time, other = table.columns[names[0]], table.columns[names[2]]
     np.testing.assert_array_equal(time, other)
     fastest = min(clocks, key=lambda clock: float(clock[1]))
@@ -124,5 +125,8 @@ def test_clocks_of_the_same_rows_that_run_apart(drift: float) -> None:
 
 def test_rows_missing_are_counted_without_a_configuration() -> None:
     lost = np.delete(EVEN, [3, 50, 51])
-    said = summary(make_table("trial", {"time": lost, "tilt": wave(lost)}))
-    assert said.endswith("clock 'time': 3 rows missing, none for longer than 0.06 s: interpolated")
+    table = make_table("trial", {"time": lost, "tilt": wave(lost)})
+    said = "clock 'time': 3 rows missing, none for longer than"
+    assert summary(table).endswith(f"{said} 0.06 s")
+    assert summary(table, 0.1).endswith(f"{said} a model sample: interpolated")
+    assert "has 2 gaps" in summary(table, 0.05)
