@@ -30,11 +30,7 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
     """Show what a recording holds and write a commented configuration for it."""
     from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
     from impc.files.formats import read_table, write_file  # noqa: PLC0415
-    from impc.files.inspection import (  # noqa: PLC0415
-        draft_configuration,
-        open_places,
-        summary,
-    )
+    from impc.files.inspection import draft_configuration, open_places, summary  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
 
     if config is not None:

@@ -26,7 +26,7 @@ _SECONDS = ("s", "sec", "ms", "us")
 _SAME, _EXACT, _GAP = 1e-2, 1e-3, 1.5
 # Longest clock in any unit; least part of its steps that are within half of the usual one.
 _LONGEST, _EVEN = 1e30, 0.9
-_COMMON = 0.1  # least common part of the longest clock
+_COMMON, _COVERED = 0.1, 0.5  # least part of the longest clock: common, and of a clock that counts
 
 
 def named_clock(name: str, unit: str = "") -> bool:
@@ -78,9 +78,19 @@ def own_clocks(
 def aligned(
     source: str, columns: Mapping[str, Array], clocks: Mapping[str, tuple[str, Array]]
 ) -> tuple[dict[str, Array], tuple[str, ...]]:
-    """Columns at the instants of the fastest of their `clocks` (name, times), and a note."""
+    """Columns at the instants of the fastest of their `clocks` (name, times), and a note.
+
+    A series of another length that covers less than half of the longest one is left as it is.
+    """
     times = dict(clocks.values())
-    if all(_same(time, next(iter(times.values()))) for time in times.values()):
+    most = max(times.values(), key=np.ptp, default=np.arange(2.0))
+    times = {
+        name: time
+        for name, time in times.items()
+        if len(time) == len(most) or np.ptp(time) > _COVERED * np.ptp(most)
+    }
+    close = _SAME * _step(most)
+    if all(len(t) == len(most) and np.abs(t - most).max() <= close for t in times.values()):
         return dict(columns), ()
     fastest = min(times, key=lambda name: _step(times[name]))
     first = max(float(time[0]) for time in times.values())
@@ -88,18 +98,20 @@ def aligned(
     spans = ", ".join(
         f"{name} ({time[0]:g} to {time[-1]:g} by {_step(time):.4g})" for name, time in times.items()
     )
-    if not last - first >= _COMMON * max(float(np.ptp(time)) for time in times.values()):
+    if not last - first >= _COMMON * np.ptp(most):
         raise DataError(
             source,
             f"has clocks without a common span: {spans}",
             "save the columns of each in a file of their own, or remove a clock that is not used",
         )
-    slack = _EXACT * _step(times[fastest])
-    instants = times[fastest]
+    instants, slack = times[fastest], _EXACT * _step(times[fastest])
     instants = instants[(instants >= first - slack) & (instants <= last + slack)]
     made = dict(columns)
-    for name, (_, time) in clocks.items():
-        made[name] = instants if name in times else _at(columns[name][: len(time)], time, instants)
+    for name, (clock, time) in clocks.items():
+        if name in times:
+            made[name] = instants
+        elif clock in times:
+            made[name] = _at(columns[name][: len(time)], time, instants)
     note = f"interpolated to {fastest} from {first:g} to {last:g}; clocks: {spans}"
     return made, (note,)
 
@@ -121,7 +133,3 @@ def _at(values: Array, time: Array, instants: Array) -> Array:
 
 def _step(time: Array) -> float:
     return float(np.median(np.diff(time)))
-
-
-def _same(time: Array, other: Array) -> bool:
-    return len(time) == len(other) and bool(np.abs(time - other).max() <= _SAME * _step(other))

@@ -108,6 +108,13 @@ def test_clocks_without_a_common_span_are_named() -> None:
             make_table("trial", both(NAMES["structs"], EVEN, other))
 
 
+def test_events_do_not_cut_the_signals() -> None:
+    events = {"c.Time": np.array([3.0, 4.0, 5.0]), "c.Data": np.array([1.0, 2.0, 1.0])}
+    table = make_table("trial", both(NAMES["structs"], EVEN, EVEN + 0.1) | events)
+    assert table.samples == 595
+    assert list(table.skipped) == ["c.Time", "c.Data"]
+
+
 def test_what_a_series_lacks_stays_missing() -> None:
     made = both(NAMES["structs"], EVEN, np.delete(EVEN + 0.1, slice(200, 260)))
     made["a.Data"][100] = np.nan
