@@ -164,9 +164,9 @@ def main() -> None:
             no = forbidden(one.result)
             if GAIN not in no and one.gain is not None:
                 for truth, (_, row) in zip(one.gain.ravel(), named_gains(one.result), strict=False):
-                    gains += row.identified
+                    gains += row.interval.identified
                     inside += bool(
-                        row.identified and row.interval.low <= truth <= row.interval.high
+                        row.interval.identified and row.interval.low <= truth <= row.interval.high
                     )
             if WEIGHTS not in no and name != "body":
                 found = _true_statements(one.result)

@@ -35,6 +35,7 @@ from impc.inverse.problem import noise_of_residual
 from impc.inverse.refit import IDENTIFIED
 from impc.inverse.residuals import residual_only, residual_or_reason
 from impc.inverse.unknowns import linear_at
+from impc.model.signal_errors import SHIFT
 
 if TYPE_CHECKING:
     from impc.inverse.columns import TrialSpan
@@ -52,6 +53,8 @@ TWO_SIDED = 1.959964
 _SHARE = 1e-6
 _SEEN = 1e-10
 _STEPS = (1.0, 0.5, 0.25, 0.125)
+# Largest number of trials whose time shifts have standard errors: each adds a column.
+_MOST_TRIALS = 12
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,10 @@ class GainCovariance(Frozen):
     shares: Array
     noise: ResidualNoise  # Autocorrelation model of the residuals
     spread: Array  # Covariance of steps along directions with a finite value (k, k)
+    # Standard error of each fitted time shift, in samples (shifts, trials); empty for many trials
+    shifts: Array
+    # Long-run over white variance of the residuals along identified directions (median)
+    colour: float
 
     def along(self, step: Array) -> Array:
         """Coordinates of a gain step (m, n) along the directions (m * n,)."""
@@ -123,7 +130,7 @@ class Slopes(Frozen):
     def colour(self, model: NoiseModel, fitted: TrialSpan) -> ResidualNoise:
         """Autocorrelation model of the residuals after a fit of the span."""
         residuals = by_trial(self.problem, np.array(self.residual))
-        return model(residuals, fitted.upper(len(residuals), sum(self.problem.trial_sizes)))
+        return model(residuals, fitted.recorded(self.problem))
 
     def spread(self, noise: ResidualNoise, columns: Array) -> Array:
         """Covariance (k, k) of columns' residual for this noise."""
@@ -188,6 +195,8 @@ def gain_covariance(
     # of H.
     rest = at.span(on_metric, on_parameters)
     found = at.sandwich(rest.without(on_gain), rest, noise)
+    ratios = np.diag(found.spread) * (found.values[found.usable] / at.noise) ** 2
+    well = found.deviations[found.usable] < IDENTIFIED
     if curvature:
         found = _curved(at, gain, metric, in_units, found)
     directions, deviations = found.directions, found.deviations
@@ -206,10 +215,12 @@ def gain_covariance(
         frozen(deviations),
         frozen(entries.reshape(m, n)),
         frozen(foreign.reshape(m, n)),
-        frozen(_parameter_deviations(at, others, found.noise)),
+        frozen(_standard_errors(at, on_parameters, others, found.noise)),
         frozen(shares.reshape(m, n, shares.shape[1])),
         found.noise,
         frozen(found.spread),
+        frozen(_shift_deviations(at, [on_gain, on_metric, on_parameters], found.noise)),
+        float(np.median(ratios[well])) if np.any(well) else 1.0,
     )
 
 
@@ -227,7 +238,7 @@ def _curved(at: Slopes, gain: Array, metric: Array, in_units: Array, found: Sand
 
 def spread_of_rows(problem: Problem, noise: ResidualNoise, columns: Array, scale: float) -> Array:
     """Covariance of columns' e (k, k): coloured noise, white of SD `scale` in prior rows."""
-    below = columns[sum(problem.trial_sizes) :]
+    below = columns[~problem.recorded_rows]
     return spread_of_sum(noise, by_trial(problem, columns)) + scale**2 * below.T @ below
 
 
@@ -281,6 +292,8 @@ def _entries(back: Array, deviations: Array, spread: Array) -> tuple[Array, Arra
 def by_trial(problem: Problem, rows: Array) -> list[Array]:
     """Split `rows` (r, ...) into one (samples, q, ...) array per trial, prior rows dropped."""
     q, ends = len(problem.measured), np.cumsum(problem.trial_sizes)
+    if len(rows) > ends[-1]:
+        rows = rows[problem.recorded_rows]
     parts = np.split(rows, ends)[:-1]
     return [part.reshape(len(part) // q, q, *rows.shape[1:]) for part in parts]
 
@@ -292,9 +305,24 @@ def _identified_metric(alone: Array) -> Array:
     return np.asarray(metric[:, sizes > _SEEN * np.max(sizes, initial=0.0)])
 
 
-def _parameter_deviations(at: Slopes, others: TrialSpan, noise: ResidualNoise) -> Array:
-    """Standard errors of the log-parameters, all else fitted too."""
-    own = np.array(at.on_parameters)
+def _shift_deviations(at: Slopes, shared: list[Array], noise: ResidualNoise) -> Array:
+    """Standard errors of the time shifts (shifts, trials), all else fitted too."""
+    problem, first = at.problem, at.problem.searched_states
+    places = [k for k, (kind, _) in enumerate(problem.error_places, first) if kind == SHIFT]
+    trials = len(problem.recordings)
+    if not places or trials > _MOST_TRIALS:
+        return np.zeros((len(places), 0))
+    ends = np.cumsum(problem.row_sizes)[:trials]
+    columns = np.zeros((len(at.own), len(places), trials))
+    for trial, rows in enumerate(map(slice, [0, *ends[:-1]], ends)):
+        columns[rows, :, trial] = at.own[rows, places]
+    others = trial_span(np.delete(at.own, places, axis=1), problem.row_sizes, np.hstack(shared))
+    found = _standard_errors(at, columns.reshape(len(columns), -1), others, noise)
+    return found.reshape(len(places), trials)
+
+
+def _standard_errors(at: Slopes, own: Array, others: TrialSpan, noise: ResidualNoise) -> Array:
+    """Standard errors of the unknowns with derivatives `own` (r, k), all else fitted too."""
     count = own.shape[1]
     if count == 0:
         return np.zeros(0)

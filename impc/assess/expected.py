@@ -180,7 +180,7 @@ def _deviations(at: Tangent, colour: ResidualNoise, *known: int, noise: float = 
     """Standard errors of the unknowns with parameters `known`, or with less `noise`."""
     slopes = np.delete(np.array(at.on_parameters), known, axis=1)
     # Prior rows are in units of the noise.
-    slopes[sum(at.problem.trial_sizes) :] *= noise
+    slopes[~at.problem.recorded_rows] *= noise
     less = replace(at, on_parameters=frozen(slopes))
     found = weight_covariance(less, lambda *_: colour, lambda *_: colour)
     return noise * np.asarray(found.each)
@@ -211,7 +211,7 @@ def _limits(at: Tangent, colour: ResidualNoise) -> Array:
             continue
         column = np.zeros(len(at.residual))
         moves = rows.along_limit(control)[:, None]
-        column[: sum(problem.trial_sizes)] = along_bounds(problem, K, S, moves)[:, 0]
+        column[problem.recorded_rows] = along_bounds(problem, K, S, moves)[:, 0]
         family = problem.family
         own = [k for k, of in family.limits(problem.plant) if of == control] if family else []
         rest = frozen(np.delete(np.array(at.on_parameters), own, axis=1))

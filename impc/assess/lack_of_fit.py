@@ -26,7 +26,6 @@ samples replaces it. Holm's correction keeps the level over all groups.
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -42,16 +41,10 @@ from impc.checking import replace
 from impc.control.body_steps import slopes_along
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
-from impc.errors import ImpcError
 from impc.inverse.columns import trial_span
-from impc.inverse.further_unknowns import (
-    with_delay_unknown,
-    with_errors_unknown,
-    with_limit_unknown,
-)
+from impc.inverse.further_unknowns import with_errors_unknown
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import controller_for, drive_of, noise_of_residual
-from impc.inverse.refit import refit
 from impc.inverse.residuals import along_bounds
 from impc.inverse.unknowns import Unknowns
 from impc.model import plant_family
@@ -81,12 +74,6 @@ _LATER = (0.005, 0.01, 0.02, 0.04)
 _LEFT = 1e-3
 # Largest number of trials tested.
 _MOST = 12
-# Errors of signals that are refitted after an alarm, decrease of the objective at which they end,
-# and the logarithm of the second limit at which one begins.
-_REFITTED, _PROMISE, _LOWER = 4, 1.0, -0.5
-# Decrease of -2 log L over -log(p) of the likeliest error that needs no further test: residuals are
-# coloured, so the former is several times the statistic of a test.
-_FAR = 20.0
 # Residuals below this share of the outputs are rounding; least number of samples.
 _EXACT, _FEWEST = 1e-7, 100
 
@@ -129,7 +116,9 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     """Test the model on trials without gaps; None for an exact fit or too few samples."""
     if all(trial.has_gaps for trial in estimate.problem.recordings):
         return None
-    problem, K, S = _some_trials(estimate.problem), np.array(estimate.K), np.array(estimate.S)
+    # A stated time of a signal is tested like one that is not fitted: its prior may hold it back.
+    problem = _some_trials(estimate.problem).with_signals_placed()
+    K, S = np.array(estimate.K), np.array(estimate.S)
     signals = untested_errors(problem)
     space = Unknowns(with_errors_unknown(problem, signals), GainLaw(problem, K, S))
     found = space.evaluated(space.start)[0]
@@ -159,72 +148,6 @@ def lack_of_fit(estimate: GainEstimate | Fitted) -> LackOfFit | None:
     )
 
 
-def named_cause(
-    problem: Problem, estimate: GainEstimate, found: LackOfFit | None
-) -> tuple[LackOfFit | None, Problem | None, Problem | None]:
-    """Put the error first that a refit confirms; also the problem with it as a further unknown.
-
-    A test is linear about a fit that has compensated for part of the error, so the likely ones are
-    refitted from there. The one of least -2 log L is named if no test rejects its fit or if it
-    explains far more than the error of smallest p-value; otherwise the latter. The last problem has
-    the values at which that refit ended.
-    """
-    if found is None or not found.alarm:
-        return found, None, None
-    likely = [one for one in found.errors if signal_of(one.name)][:_REFITTED]
-    likely += [one for one in found.errors if one.name in _CURES]
-    ends = [(one, end) for one in likely for end in _refitted(estimate, one.name)]
-    named, begin = found.errors[0], None
-    if ends:
-        best, end = min(ends, key=lambda pair: pair[1].objective)
-        again, here = lack_of_fit(end), GainLaw(estimate.problem, estimate.K, estimate.S)
-        space = Unknowns(estimate.problem, here)
-        fallen = space.ended(space.start).objective - end.objective
-        if again is None or not again.alarm or fallen > _FAR * named.evidence:
-            named, begin = best, end.problem
-    others = tuple(one for one in found.errors if one is not named)
-    further = _freed(problem, named.name)
-    if further is not None and begin is not None:
-        values = begin.starts, begin.logarithms, begin.errors
-        begin = further.at(*map(np.array, values))
-    return replace(found, errors=(named, *others)), further, begin or further
-
-
-def _refitted(estimate: GainEstimate, name: str) -> list[Fitted]:
-    """Refits with one more unknown from a fit; a limit begins at two values."""
-    there = _freed(estimate.problem, name)
-    if there is None:
-        return []
-    K, more = np.array(estimate.K), there.plant.n - estimate.problem.plant.n
-    K = np.hstack([K, np.zeros((len(K), more))])
-    begins = [there]
-    if name == LIMIT:
-        lower = np.array(there.logarithms)
-        lower[len(estimate.problem.logarithms) :] = _LOWER
-        begins.append(there.at(np.array(there.starts), lower, np.array(there.errors)))
-    ends = []
-    for begin in begins:
-        with contextlib.suppress(ImpcError):  # it cannot be simulated: no candidate
-            ends.append(refit(begin, K, np.array(estimate.S), _PROMISE))
-    return ends
-
-
-def _freed(problem: Problem, name: str) -> Problem | None:
-    """Problem with an error as a further unknown; None if that is not possible."""
-    if name in _CURES:
-        return _CURES[name](problem)
-    pair = signal_of(name)
-    return with_errors_unknown(problem, [pair]) if pair else None
-
-
-def _with_offsets(problem: Problem) -> Problem:
-    """A lean looks like an offset of every output."""
-    return with_errors_unknown(problem, [("offset", name) for name in problem.plant.outputs])
-
-
-_CURES = {DELAY: with_delay_unknown, LIMIT: with_limit_unknown, LEAN: _with_offsets}
-
-
 def untested_errors(problem: Problem) -> list[tuple[str, str]]:
     """Errors of recorded signals that are not fitted: pairs of a kind and a signal."""
     plant, moved = problem.plant, np.zeros(0, bool)
@@ -247,12 +170,12 @@ class _Tested:
     """Whitened columns after projection on the fitted quantities, and their noise."""
 
     def __init__(self, problem: Problem, found: Linear, columns: Array) -> None:
-        self.problem, trials = problem, len(problem.recordings)
+        self.problem = problem
         shared, own = found.shared, found.shared + problem.own_unknowns
         rows = np.column_stack([np.concatenate(found.tables)[:, :own], columns, found.residual])
         self.root = np.array(residual_noise(by_trial(problem, found.residual)).root)
         rows = _white_rows(problem, rows, self.root)
-        self.scale, count = noise_of_residual(problem, rows[:, -1]), len(rows)
+        self.scale = noise_of_residual(problem, rows[:, -1])
         # One row for each parameter with a stated uncertainty.
         slopes = self.scale * np.diag(1 / problem.parameter_units)[problem.stated]
         below = np.zeros((len(slopes), rows.shape[1]))
@@ -265,7 +188,7 @@ class _Tested:
         self.seen, self.residual = left[:, :-1], left[:, -1]
         basis = self._basis(np.arange(columns.shape[1]))
         left = self.residual - basis @ (basis.T @ self.residual)
-        everything = fitted.plus(basis).upper(trials, count)
+        everything = fitted.plus(basis).recorded(problem)
         self.noise = residual_noise(by_trial(problem, left), everything)
 
     def _basis(self, part: IntArray) -> Array:

@@ -8,7 +8,7 @@ value * exp(+- z SE). See docs/why/intervals.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -21,13 +21,14 @@ from impc.checking import checked, replace
 from impc.inverse.command_regression import regress_commands
 from impc.inverse.minimiser import Ended
 from impc.inverse.refit import refit
+from impc.inverse.residuals import misfit_or_reason
 from impc.model.continuous_gain import continuous_gain
 from impc.model.plant import UNKNOWN, gain_unit
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from impc.inverse.estimates import Estimate
+    from impc.inverse.estimates import Estimate, Rival
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
 
@@ -45,6 +46,8 @@ class GainEstimate:
     exact: GainCovariance | None = None
     ended: Ended = Ended.CONVERGED  # How the search ended, and the decrease that it still promises
     promised: float = 0.0
+    # Other ends of the search that are within noise of this one
+    rivals: tuple[GainEstimate, ...] = ()
 
     @property
     def parameters(self) -> Array:
@@ -53,11 +56,15 @@ class GainEstimate:
 
 
 def gain_estimate(fitted: Estimate) -> GainEstimate:
-    """Estimate the identified gain of a fit, and its covariance."""
+    """Estimate the identified gain of a fit, and its covariance.
+
+    Other ends of the search whose -2 log posterior is within a 95 % quantile of the lowest, times
+    the ratio of long-run to white variance, are as good: intervals are the union of theirs.
+    """
     end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
     problem, at = end.problem, (end.K, end.S)
     fixed = problem.with_body_fixed()
-    return GainEstimate(
+    found = GainEstimate(
         problem,
         *at,
         end.misfit,
@@ -66,8 +73,28 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
         end.ended,
         end.promised,
     )
+    lowest = min([end.objective, *(one.objective for one in fitted.rivals)])
+    near = lowest + max(found.covariance.colour, 1.0) * TWO_SIDED**2
+    return replace(
+        found,
+        rivals=tuple(
+            _rival(one.problem(fitted.problem), one)
+            for one in fitted.rivals
+            if one.objective <= near
+        ),
+    )
 
 
+def _rival(problem: Problem, end: Rival) -> GainEstimate:
+    """Another end of the search with its covariance."""
+    K, S = np.array(end.K), np.array(end.S)
+    misfit = misfit_or_reason(problem, K, S)[0]
+    return GainEstimate(
+        problem, end.K, end.S, misfit, gain_covariance(problem, K, S, curvature=True)
+    )
+
+
+Item = TypeVar("Item", "Interval", "LastingResponse")
 #: Default confidence level.
 LEVEL = 0.95
 #: Largest standard error of the log of an identified parameter.
@@ -96,6 +123,11 @@ class Interval:
         """Whether both ends are on one side of zero."""
         return self.low > 0 or self.high < 0
 
+    @property
+    def determined(self) -> bool:
+        """Whether it is identified, and half of the interval is at most half of the value."""
+        return self.identified and self.high - self.low <= abs(self.value or 0.0)
+
 
 def entry_names(plant: Plant) -> tuple[str, ...]:
     """Names of the entries of a gain, row by row."""
@@ -105,7 +137,23 @@ def entry_names(plant: Plant) -> tuple[str, ...]:
 def covariance_intervals(
     estimate: GainEstimate, covariance: GainCovariance, method: str
 ) -> tuple[Interval, ...]:
-    """Normal intervals of the entries of K and of free parameters."""
+    """Intervals of the entries of K and of free parameters: normal, the union over `rivals`."""
+    own = _normal_intervals(estimate, covariance, method)
+    return _union(own, *(_normal_intervals(one, one.covariance, method) for one in estimate.rivals))
+
+
+def _union(own: tuple[Item, ...], *others: tuple[Item, ...]) -> tuple[Item, ...]:
+    """The `own` intervals, widened to the ends of those of the same numbers in `others`."""
+    found = []
+    for one, *same in zip(own, *others, strict=True):
+        low, high = min(item.low for item in (one, *same)), max(item.high for item in (one, *same))
+        found.append(replace(one, low=low, high=high))
+    return tuple(found)
+
+
+def _normal_intervals(
+    estimate: GainEstimate, covariance: GainCovariance, method: str
+) -> tuple[Interval, ...]:
     z = float(scipy.special.ndtri(0.5 + LEVEL / 2))
     names = entry_names(estimate.problem.plant)
     found = [
@@ -147,8 +195,9 @@ def interval_table(fitted: Estimate) -> pd.DataFrame:
     -------
     pandas.DataFrame
         Index: name, such as "K.u.x1" for the entry from state x1 to input u. Columns: `unit`,
-        `value`, `low`, `high`, and `identified`, whether the recordings identify this number
-        individually. Values are least-squares estimates along the identified directions and can
+        `value`, `low`, `high`; `identified`, whether the recordings identify this number
+        individually; and `determined`, whether also half of the interval is at most half of the
+        value. Values are least-squares estimates along the identified directions and can
         differ from K, which belongs to weights (docs/why/intervals.md).
     """
     return _table(gain_estimate(fitted))
@@ -162,10 +211,15 @@ def continuous_interval_table(fitted: Estimate) -> pd.DataFrame:
     conversion.
     """
     found = gain_estimate(fitted)
+    return _table(replace(_continuous(found), rivals=tuple(map(_continuous, found.rivals))))
+
+
+def _continuous(found: GainEstimate) -> GainEstimate:
+    """The same with the continuous-time gain and its standard errors."""
     K, slopes = continuous_gain(found.problem.plant, found.K)
     entries, foreign = found.covariance.combinations(slopes)
     shape = {"entries": entries.reshape(K.shape), "foreign": foreign.reshape(K.shape)}
-    return _table(replace(found, K=K, covariance=replace(found.covariance, **shape)))
+    return replace(found, K=K, covariance=replace(found.covariance, **shape))
 
 
 def _table(found: GainEstimate) -> pd.DataFrame:
@@ -176,10 +230,10 @@ def _table(found: GainEstimate) -> pd.DataFrame:
     items = covariance_intervals(found, found.covariance, "sandwich")
     units += [UNKNOWN] * (len(items) - len(units))  # of parameters
     rows = [
-        (item.name, unit, item.value, item.low, item.high, item.identified)
+        (item.name, unit, item.value, item.low, item.high, item.identified, item.determined)
         for item, unit in zip(items, units, strict=True)
     ]
-    heads = ["name", "unit", "value", "low", "high", "identified"]
+    heads = ["name", "unit", "value", "low", "high", "identified", "determined"]
     return pd.DataFrame(rows, columns=heads).set_index("name")
 
 
@@ -270,6 +324,11 @@ def follows_command(plant: Plant) -> BoolArray:
 
 
 def lasting_responses(estimate: GainEstimate) -> tuple[LastingResponse, ...]:
+    """For each output that is a state: of the estimate, with the union of intervals."""
+    return _union(*(_lasting(one) for one in (estimate, *estimate.rivals)))
+
+
+def _lasting(estimate: GainEstimate) -> tuple[LastingResponse, ...]:
     """For each output that is a state; empty if no state is driven by the command alone.
 
     States that only the command drives (delay, muscle) settle under a constant u at x_a = D u,

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.assess.bounded_weights import WeightsSet
     from impc.assess.covariance import GainCovariance
+    from impc.assess.printed_gain import GainEstimate
     from impc.model.plant import Plant
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
@@ -258,6 +259,20 @@ _ENOUGH = 1e-9
 _DOUBLINGS = 60
 # Least standard error in whitened units: exact data are limited by rounding and search.
 _SHARPEST = 1e-6
+
+
+def estimate_draws(
+    plant: Plant, weights: Weights, estimate: GainEstimate
+) -> tuple[LqrSolution, ...]:
+    """Regulators with gains within the uncertainty of an estimate, in equal parts of its ends."""
+    ends = (estimate, *estimate.rivals)[:DRAWS]
+    plants = (plant, *(end.problem.plant for end in ends[1:]))
+    count = -(-DRAWS // len(ends))
+    drawn = [
+        drawn_gains(plant, weights, end.K, end.covariance, count)
+        for plant, end in zip(plants, ends, strict=True)
+    ]
+    return tuple(one for each in zip(*drawn, strict=True) for one in each)[:DRAWS]
 
 
 def drawn_gains(

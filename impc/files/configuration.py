@@ -36,6 +36,9 @@ _LABELS = ("subject", "visit", "condition", "trial")
 _TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
 _STUDY = ("study", "model", "select")
 
+# A delay with its standard deviation, such as "0 ± 2 ms" or "-0.02 +- 0.001 s".
+_SHIFT = r"^\s*([+-]?\d+(?:\.\d*)?)\s*(?:±|\+/?-)\s*(\d+(?:\.\d*)?)\s*(ms|s)\s*$"
+_SECONDS = {"ms": 1e-3, "s": 1.0}
 _MOST = sys.float_info.max
 Finite = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=_MOST)]
@@ -109,8 +112,10 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         -1 reverses the direction of the signal.
     overrule_unit : bool, optional
         Whether `unit` counts although the file states another one.
-    shift : int or float, optional
+    shift : int, float or str, optional
         Delay that is added to the signal: a whole number of samples, or s if written with a point.
+        Text such as "0 ± 2 ms" also states its standard deviation; a fit then estimates the rest.
+        Without one it is half a recorded sample for a perturbation, 0 for other signals.
     command : bool, optional
         Whether the signal is a recorded command of the subject and not a disturbance.
     target : str or float, optional
@@ -124,9 +129,19 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: Finite = 0.0
     sign: Literal[1, -1] = 1
     overrule_unit: bool = False
-    shift: int | Finite = 0
+    shift: int | Finite | Annotated[str, msgspec.Meta(pattern=_SHIFT)] = 0
     command: bool = False
     target: str | Finite | None = None
+
+    def delay(self, period: float) -> tuple[float, float | None]:
+        """Delay in samples of `period` s, and its stated standard deviation in s, if any."""
+        if isinstance(self.shift, str):
+            found = re.match(_SHIFT, self.shift)
+            assert found is not None  # the pattern of the field
+            mean, deviation = float(found[1]), float(found[2])
+            unit = _SECONDS[found[3]]
+            return unit * mean / period, unit * deviation
+        return (self.shift if isinstance(self.shift, int) else self.shift / period), None
 
 
 class ReportTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

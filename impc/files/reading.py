@@ -188,6 +188,7 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
         target=targets,
         commands=commands if any(name in series for name in controls) else None,
         finer=other,
+        timing=_timing(clock, configuration, plant),
         label=label,
         findings=tuple(findings),
     )
@@ -282,16 +283,25 @@ def _shifts(
     source: str, clock: Clock, configuration: Configuration, names: Iterable[str]
 ) -> dict[str, float]:
     """Shift of each signal in samples of the recording; integers count samples, floats s."""
-    given = {name: configuration.signals[name].shift for name in names}
-    rows = {
-        name: float(shift) if isinstance(shift, int) else shift / clock.period
-        for name, shift in given.items()
-    }
+    rows = {name: configuration.signals[name].delay(clock.period)[0] for name in names}
     for name, shift in rows.items():
         if abs(shift) > (len(clock.time) - 1) / 2:
             problem = f"moves the signal by {shift:.4g} of {len(clock.time)} samples"
             raise DataError(f"{source}: signals.{name}.shift", problem, "use a smaller shift")
     return rows
+
+
+def _timing(clock: Clock, configuration: Configuration, plant: Plant) -> dict[str, float]:
+    """Standard deviation of the time of signals in s: stated, or half a sample for pushes."""
+    given = {
+        name: entry.delay(clock.period)[1]
+        for name, entry in configuration.signals.items()
+        if not entry.command
+    }
+    assumed = dict.fromkeys(plant.disturbances, clock.period / 2)
+    known = {name: value if value is not None else assumed.get(name, 0.0)
+             for name, value in given.items()}  # fmt: skip
+    return {name: value for name, value in known.items() if value}
 
 
 def _departing(

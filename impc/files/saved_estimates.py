@@ -20,7 +20,7 @@ from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, InputError
 from impc.files.disk import unwritable, write_whole
 from impc.files.results import SCHEMA, ResultFile, read_content, read_result
-from impc.inverse.estimates import Estimate, Goodness, Status
+from impc.inverse.estimates import Estimate, Goodness, Rival, Status
 from impc.inverse.methods import METHODS
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
@@ -147,6 +147,7 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
         "evaluations": int(kept["evaluations"]),
         "cost_weights": None if kept["cost_weights"] is None else frozen(kept["cost_weights"]),
         "problem": posed.at(*own),
+        "rivals": tuple(_rival(one, sizes) for one in kept["rivals"]),
         "weights": None if weights is None else Weights(weights["Q"], weights["R"]),
         "metrics": frozen(np.reshape(kept["metrics"], (-1, m, m))),
         "status": Status(kept["status"]),
@@ -159,6 +160,12 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
         },
     }
     return Estimate(**{item.name: values[item.name] for item in fields(Estimate)})
+
+
+def _rival(kept: Mapping[str, Any], sizes: Mapping[str, tuple[int, int]]) -> Rival:
+    K, S = (frozen(finite_array(name, kept[name], size)) for name, size in sizes.items())
+    starts, logarithms, errors = (frozen(kept[name]) for name in ("starts", "logarithms", "errors"))
+    return Rival(K, S, starts, logarithms, errors, float(kept["objective"]))
 
 
 def _encode(value: Any) -> Any:

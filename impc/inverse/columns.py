@@ -17,6 +17,8 @@ from impc.arrays import Array
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from impc.inverse.problem import Problem
+
 # Rows of one block: a few thousand fit into the cache of the processor.
 _BLOCK = 4096
 
@@ -53,9 +55,11 @@ class TrialSpan:
         left = _without(self.own, columns)
         return np.asarray(left - self.shared @ (self.shared.T @ left))
 
-    def upper(self, trials: int, rows: int) -> TrialSpan:
-        """Restriction to the first `trials` trials, `rows` rows."""
-        return TrialSpan(self.own[:trials], self.shared[:rows])
+    def recorded(self, problem: Problem) -> TrialSpan:
+        """Restriction to the rows of recorded values."""
+        pairs = zip(self.own, problem.trial_sizes, strict=False)
+        own = tuple(basis[:size] for basis, size in pairs)
+        return TrialSpan(own, self.shared[problem.recorded_rows])
 
     def plus(self, columns: Array) -> TrialSpan:
         """Basis extended by orthonormal `columns` (r, k) orthogonal to it."""

@@ -87,7 +87,7 @@ def _driven(problem: Problem, trial: Recording) -> Array:
         raise DataError(
             "commands", "have gaps although not all states are recorded", "fill the gaps"
         )
-    pushes = commands @ plant.B.T + trial.disturbance[:-1] @ plant.E.T
+    pushes = commands @ plant.B.T + drive_of(trial, trial.x0).disturbance @ plant.E.T
     free = np.empty((trial.samples, plant.n, plant.n))
     x = np.empty((trial.samples, plant.n))
     free[0], x[0] = np.eye(plant.n), trial.x0

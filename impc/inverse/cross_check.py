@@ -75,7 +75,8 @@ def _pair(estimate: Estimate) -> tuple[Array, Array]:
 
 def _begun_again(own: Estimate, winner: Estimate) -> Estimate:
     try:
-        return fit_controller(own.problem, winner.stage_weights)
+        found = fit_controller(own.problem, winner.stage_weights)
+        return replace(found, rivals=own.rivals)
     except ImpcError:  # keep the own solution
         return own
 

@@ -105,6 +105,22 @@ class OtherWeights:
 
 
 @dataclass(frozen=True)
+class Rival(Frozen):
+    """Another end of the search, from another start."""
+
+    K: Array  # Gain (m, n) and metric (m, m)
+    S: Array
+    starts: Array  # As `Problem.at`
+    logarithms: Array
+    errors: Array
+    objective: float  # -2 log posterior
+
+    def problem(self, posed: Problem) -> Problem:
+        """A problem at the values of this end."""
+        return posed.at(np.array(self.starts), np.array(self.logarithms), np.array(self.errors))
+
+
+@dataclass(frozen=True)
 class Identifiability(Frozen):
     """Result of `identifiability`."""
 
@@ -157,6 +173,8 @@ class Estimate(Frozen):
     cost_weights : ndarray of shape (count,), or None
         Unknowns of the cost structure (logarithms of cost weights), if the method estimates them;
         minus infinity stands for a cost weight of zero.
+    rivals : tuple of Rival
+        Other ends of the search for the gain; intervals include those within noise of the best.
 
     Examples
     --------
@@ -172,9 +190,9 @@ class Estimate(Frozen):
     >>> found.status.sentence
     'The weights reproduce the recordings to a relative error of 1e-9.'
     >>> found.intervals().round(3)
-                unit  value    low   high  identified
+                unit  value    low   high  identified  determined
     name
-    K.u[0].x[0]   SI  0.538  0.538  0.538        True
+    K.u[0].x[0]   SI  0.538  0.538  0.538        True        True
     >>> found.vaf, found.outputs[0].shape
     (array([100.]), (21, 1))
     """
@@ -193,6 +211,7 @@ class Estimate(Frozen):
     seconds: float
     fit: Goodness
     cost_weights: Array | None = None
+    rivals: tuple[Rival, ...] = ()
 
     if TYPE_CHECKING:  # attached by `impc.attached_methods`
 

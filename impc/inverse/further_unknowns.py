@@ -69,8 +69,19 @@ def with_delay_unknown(problem: Problem) -> Problem | None:
 
 
 def with_errors_unknown(problem: Problem, errors: Sequence[tuple[str, str]]) -> Problem:
-    """Free errors of signals, pairs of a kind and a signal, in every trial; new ones last."""
-    return replace(problem, signal_errors=tuple(dict.fromkeys([*problem.signal_errors, *errors])))
+    """Free errors of signals, pairs of a kind and a signal, in every trial; new ones last.
+
+    The stated timing of these signals does not count.
+    """
+    known = (*problem.plant.outputs, *problem.plant.disturbances)
+    places = [known.index(name) for kind, name in errors if kind == "shift"]
+    trials = []
+    for trial in problem.recordings:
+        timing = np.array(trial.timing)
+        timing[places] = 0.0
+        trials.append(replace(trial, timing=frozen(timing)))
+    pairs = tuple(dict.fromkeys([*problem.signal_errors, *errors]))
+    return replace(problem, recordings=tuple(trials), signal_errors=pairs)
 
 
 def _family(problem: Problem) -> PlantFamily:

@@ -94,7 +94,7 @@ class Prior:
     u: Array  # Mean of u (a,) and of v (trials, n)
     v: Array
     shared: Array  # 1 / SD of u (a,)
-    own: Array | float  # 1 / SD of v (n,)
+    own: Array | float  # 1 / SD of v (trials, n)
 
     def square(self, u: Array, v: Array) -> float:
         """-2 log density at `u` (a,), `v` (trials, n), up to a constant."""

@@ -19,9 +19,10 @@ import scipy.special
 
 from impc.arrays import Array
 from impc.checking import replace
-from impc.errors import ImpcError, InputError, SolverError, WeightsError
+from impc.errors import InputError, SolverError, WeightsError
+from impc.inverse.ends import several_ends
 from impc.inverse.equivalent_weights import least_condition_weights
-from impc.inverse.estimates import Estimate, simulated_estimate
+from impc.inverse.estimates import Estimate, Rival, simulated_estimate
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.laws import GainLaw
@@ -46,15 +47,15 @@ from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
 from impc.inverse.search import (
     FEW,
     best_of,
-    fit_gain,
     free_gain,
+    gain_ends,
     noise_of,
     with_fitted_starts,
     with_jumps,
 )
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starts import regulators
-from impc.inverse.unknowns import Unknowns
+from impc.inverse.unknowns import Fitted, Unknowns
 from impc.model.plant import change_coordinates
 from impc.model.riccati import solve_lqr
 from impc.model.weights import condition_number, normalised
@@ -64,11 +65,12 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
     from impc.inverse.proximal_search import ConditionedFit
-    from impc.inverse.unknowns import Fitted
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
 
+# Promise at which a first search ends.
+_ROUGH = 0.1
 # Continue the search if the free gain fits better at this significance level (likelihood ratio).
 _RARE = 0.01
 # Largest relative misfit at which weights of an exact gain are accepted. If few samples identify S,
@@ -76,18 +78,36 @@ _RARE = 0.01
 _NEARLY = 1e-6
 # Relative difference below which two misfits count as equal.
 _SAME = 1e-3
-# Multiples of the best gain at which further attempts begin.
-_SCALES = (1.0, 0.7, 1.4)
 # Largest number of regulators used as starts.
 _BEGINNINGS = 3
 
 
-def fit_controller(problem: Problem, start: Weights | None = None) -> Estimate:
-    """Fit the weights of the constrained controller to the recordings."""
+def first_end(problem: Problem) -> Fitted | None:
+    """End of a first search, from which `fit_controller` can go on; None for exact recordings."""
+    found = gain_ends(problem)[0]
+    if found.explained:
+        return None
+    return refit(found.problem, np.array(found.K), np.array(found.S), _ROUGH)
+
+
+def fit_controller(problem: Problem, start: Weights | tuple[Fitted, ...] | None = None) -> Estimate:
+    """Fit the weights of the constrained controller to the recordings.
+
+    With weights as a start the search is one from there; ends of first searches save these.
+    """
     problem = with_jumps(problem)
 
+    before: list[Estimate] = []  # Without the set, where both are tried
+
     def fit(posed: Problem) -> Estimate:
-        found = _fitted(posed, start)
+        if before and posed.recorded_numbers > FEW:  # a set costs ten times as much
+            there = before[0].problem
+            values = there.starts, there.logarithms, there.errors
+            begin = posed.at(*map(np.array, values))
+            found = replace(_fitted(begin, before[0].weights), rivals=before[0].rivals)
+        else:
+            found = _fitted(posed, start)
+        before.append(found)
         tried = posed.terminal_set and problem.terminal_set is None
         if tried and not keeps_hard(found.problem, found.stage_weights):
             raise SolverError(
@@ -120,9 +140,15 @@ def _set_may_matter(found: Estimate) -> bool:
     return abs(misfit(posed, runs) - found.misfit) > EXPLAINED * recorded_size(posed)
 
 
-def _fitted(problem: Problem, start: Weights | None) -> Estimate:
+def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Estimate:
     """Fit for a decided terminal set."""
-    free = fit_gain(problem) if start is None else free_gain(problem, start)
+    if isinstance(start, tuple):
+        chosen = {"terminal_set": problem.terminal_set}
+        ends = [replace(end, problem=replace(end.problem, **chosen)) for end in start]
+        start = None
+    else:
+        ends = gain_ends(problem) if start is None else [free_gain(problem, start)]
+    free = ends[0]
     if free.explained:  # otherwise no weights have exactly this gain: use the direct form
         behind = weights_behind(free)
         nearly = behind.misfit <= _NEARLY * recorded_size(problem)
@@ -131,18 +157,29 @@ def _fitted(problem: Problem, start: Weights | None) -> Estimate:
             return _finish(free, free.problem, weights, evaluations=0, converged=True)
     found, spent = _weights(free, start)
     if problem.recorded_numbers > FEW and not free.explained:
-        free, more = _confirmed(problem, free.problem, found, alone=start is not None)
+        first = refit(free.problem, np.array(found.solution.K), np.array(found.solution.S))
+        ends = several_ends(problem, [first, *ends[1:]]) if start is None else [first]
+        free = replace(ends[0], unconfirmed=start is None and best_of(ends)[1] == 1)
         found, again = _weights(free, found.weights)
-        spent += more + again
+        spent += again + sum(end.evaluations for end in ends)
     elif found.misfit < free.misfit:  # the free gain is in a local minimum
         free = free_gain(free.problem, found.weights)
+        ends = [free, *ends]
         found, more = _weights(free, found.weights)
         spent += more
     settled = free.problem
     if problem.own_unknowns:
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     one = _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
+    if not one.explained:
+        one = replace(one, rivals=tuple(_rival(end) for end in ends[1:]))
     return one if start is None else _not_worse(problem, free, one, start)
+
+
+def _rival(end: Fitted) -> Rival:
+    """The values of an end."""
+    at = end.problem
+    return Rival(end.K, end.S, at.starts, at.logarithms, at.errors, end.objective)
 
 
 def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) -> Estimate:
@@ -154,32 +191,6 @@ def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) ->
     if reason or left >= one.misfit:
         return one
     return _finish(free, there, start, evaluations=one.evaluations, converged=one.converged)
-
-
-def _confirmed(
-    problem: Problem, there: Problem, found: ConditionedFit, *, alone: bool
-) -> tuple[Fitted, int]:
-    """Gain refitted from that of weights, and from other starts until two ends agree.
-
-    The others begin at multiples of the best gain with the body as it is posed: gain and uncertain
-    body, searched together, can end in a local minimum with a good fit and wrong gains.
-    """
-    ends = [refit(there, np.array(found.solution.K), np.array(found.solution.S))]
-    for scale in () if alone else _SCALES:
-        best, agreed = best_of(ends)
-        if agreed > 1:
-            break
-        pair = scale * np.array(best.K), np.array(best.S)
-        with contextlib.suppress(ImpcError):  # it cannot be simulated: skip it
-            begin = with_fitted_starts(problem.with_body_fixed(), *pair)
-            if np.any(problem.stated):
-                fixed = refit(begin, *pair)
-                begin, pair = fixed.problem, (np.array(fixed.K), np.array(fixed.S))
-            starts, errors = np.array(begin.starts), np.array(begin.errors)
-            ends.append(refit(problem.at(starts, np.array(problem.logarithms), errors), *pair))
-    best, agreed = best_of(ends)
-    spent = sum(end.evaluations for end in ends)
-    return replace(best, unconfirmed=agreed == 1 and not alone), spent
 
 
 def _weights(free: Fitted, start: Weights | None) -> tuple[ConditionedFit, int]:

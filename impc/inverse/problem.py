@@ -9,6 +9,7 @@ values have zero residuals.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
@@ -25,7 +26,7 @@ from impc.model.bounds import Bounds
 from impc.model.foresight import physical_states
 from impc.model.plant_family import plant_at
 from impc.model.riccati import terminal_matrix
-from impc.model.signal_errors import KINDS, distorted
+from impc.model.signal_errors import KINDS, SHIFT, distorted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -212,7 +213,7 @@ class Problem(Value):
             softening=softening,
             output_scale=frozen(_scale("output_scale", output_scale, outputs, len(plant.outputs))),
             command_scale=frozen(_scale("command_scale", command_scale, commands, plant.m)),
-            signal_errors=_error_pairs(plant, offsets, signal_errors or {}),
+            signal_errors=_error_pairs(plant, offsets, signal_errors or {}, recordings),
             unknown_start=unknown_start,
             family=family,
             logarithms=frozen(np.zeros(0 if family is None else len(family.names))),
@@ -242,6 +243,27 @@ class Problem(Value):
         free = ~self.stated
         family = self.family.part(free, self.logarithms) if np.any(free) else None
         return replace(self, family=family, logarithms=frozen(self.logarithms[free]))
+
+    def with_signals_placed(self) -> Problem:
+        """Copy whose disturbances act when the fit says, without a stated uncertainty of it."""
+        if not np.any(self.own_weights):
+            return self
+        trials, p = [], len(self.plant.outputs)
+        for trial, drive in zip(self.recordings, scenarios(self), strict=True):
+            errors, pushes = np.array(trial.errors), np.array(trial.disturbance)
+            errors[:, p:], pushes[:-1] = 0.0, drive.disturbance
+            trials.append(
+                replace(
+                    trial,
+                    disturbance=frozen(pushes),
+                    errors=frozen(errors),
+                    timing=frozen(0 * trial.timing),
+                )
+            )
+        pairs = zip(self.signal_errors, np.any(self.own_weights, axis=0)[self.searched_states :],
+                    strict=True)  # fmt: skip
+        kept = tuple(pair for pair, stated in pairs if not stated)
+        return replace(self, recordings=tuple(trials), signal_errors=kept)
 
     def leaving_out(self, trial: int) -> Problem:
         """Copy without one trial, counted from 0."""
@@ -330,6 +352,29 @@ class Problem(Value):
         return self.searched_states + len(self.signal_errors)
 
     @property
+    def own_values(self) -> Array:
+        """Searched initial states and errors of signals (trials, own)."""
+        errors, places = self.errors, self.error_places
+        starts = self.starts[:, : self.searched_states]
+        return np.column_stack([starts, *(errors[:, kind, column] for kind, column in places)])
+
+    @property
+    def own_weights(self) -> Array:
+        """1 / SD of the unknowns of each trial (trials, own), in samples; 0 if none is stated."""
+        found = np.zeros((len(self.recordings), self.own_unknowns))
+        for place, (kind, column) in enumerate(self.error_places, self.searched_states):
+            for row, trial in enumerate(self.recordings):
+                if kind == SHIFT and trial.timing[column] > 0:
+                    found[row, place] = self.plant.dt / trial.timing[column]
+        return found
+
+    @property
+    def unlikely(self) -> float:
+        """-2 log prior density of stated parameters and times, up to a constant."""
+        body = (self.logarithms / self.parameter_units)[self.stated]
+        return float(body @ body + np.sum((self.own_weights * self.own_values) ** 2))
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the k fitted physical parameters."""
         return () if self.family is None else self.family.names
@@ -356,9 +401,18 @@ class Problem(Value):
 
     @property
     def row_sizes(self) -> list[int]:
-        """`trial_sizes`, then the number of rows for stated uncertainties."""
+        """Rows of each trial with its stated unknowns, then of stated parameters, if any."""
         stated = int(np.count_nonzero(self.stated))
-        return self.trial_sizes + ([stated] if stated else [])
+        own = int(np.count_nonzero(np.any(self.own_weights, axis=0)))
+        return [size + own for size in self.trial_sizes] + ([stated] if stated else [])
+
+    @property
+    def recorded_rows(self) -> BoolArray:
+        """Mask of the rows that are recorded values, not stated uncertainties."""
+        sizes, rows = self.row_sizes, []
+        for size, seen in itertools.zip_longest(sizes, self.trial_sizes, fillvalue=0):
+            rows.append(np.arange(size) < seen)
+        return np.concatenate(rows)
 
     @property
     def scaled_outputs(self) -> Array:
@@ -372,9 +426,15 @@ class Problem(Value):
 
 
 def _error_pairs(
-    plant: Plant, offsets: Sequence[str], errors: Mapping[str, Sequence[str]]
+    plant: Plant,
+    offsets: Sequence[str],
+    errors: Mapping[str, Sequence[str]],
+    recordings: Sequence[Recording],
 ) -> tuple[tuple[str, str], ...]:
-    """Pairs (kind, signal); requires known ones, and a plant whose disturbances can be moved."""
+    """Pairs (kind, signal), given or of uncertain timing.
+
+    Requires known ones, and a plant whose disturbances can be moved.
+    """
     for name in sorted(set(offsets) - set(plant.outputs)):
         said = f"choose from: {', '.join(plant.outputs)}"
         raise InputError("offsets", f"no output is named {name!r}", said)
@@ -390,6 +450,13 @@ def _error_pairs(
         if name in plant.disturbances and (plant.ahead or np.any(plant.observer)):
             problem = f"{name} is known to the controller"
             raise InputError("signal_errors", problem, "estimate errors of outputs only")
+    fixed = plant.disturbances if plant.ahead or np.any(plant.observer) else ()
+    uncertain = np.any([trial.timing > 0 for trial in recordings], axis=0)
+    pairs += [
+        ("shift", name)
+        for name, one in zip(known, uncertain, strict=False)
+        if one and name not in fixed
+    ]
     return tuple(dict.fromkeys(pairs))
 
 

@@ -74,17 +74,28 @@ class Linear:
         return table[:, :first], table[:, first : self.shared], table[:, self.shared :]
 
     def with_prior(self, problem: Problem, noise: float) -> Linear:
-        """With one row per parameter with a stated uncertainty, scaled by the noise SD `noise`.
+        """With a row per stated uncertainty (`Problem.row_sizes`), scaled by the noise SD `noise`.
 
-        A parameter q away from its nominal value counts as a residual of q / SD noise SDs.
+        A value q away from its nominal one counts as a residual of q / SD noise SDs.
         """
+        residuals, tables = list(self.residuals), list(self.tables)
+        weights = noise * problem.own_weights
+        stated = np.any(weights, axis=0)
+        width = tables[0].shape[1]
+        if np.any(stated):
+            away = weights * problem.own_values
+            for index, own in enumerate(weights):
+                below = np.zeros((np.count_nonzero(stated), width))
+                below[:, self.shared :] = np.diag(own)[stated]
+                tables[index] = np.vstack([tables[index], below])
+                residuals[index] = np.concatenate([residuals[index], away[index, stated]])
         slopes = noise * np.diag(1 / problem.parameter_units)[problem.stated]
-        if len(slopes) == 0:
-            return self
-        below = np.zeros((len(slopes), self.tables[0].shape[1]))
-        below[:, self.shared - len(problem.logarithms) : self.shared] = slopes
-        residuals = (*self.residuals, slopes @ problem.logarithms)
-        return replace(self, residuals=residuals, tables=(*self.tables, below))
+        if len(slopes):
+            below = np.zeros((len(slopes), width))
+            below[:, self.shared - len(problem.logarithms) : self.shared] = slopes
+            residuals.append(slopes @ problem.logarithms)
+            tables.append(below)
+        return replace(self, residuals=tuple(residuals), tables=tuple(tables))
 
 
 def linearise(

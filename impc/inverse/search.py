@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from impc.inverse.problem import Problem
     from impc.inverse.unknowns import Fitted
+    from impc.model.recordings import Recording
     from impc.model.riccati import LqrSolution
     from impc.model.weights import Weights
 
@@ -52,6 +53,8 @@ _AGREE, _HANDFUL, _SURE = 3, 200, 5
 _SAME, _NEAR = 0.25, 2.0
 # Factor above the best prediction at which a start is dropped.
 _HOPELESS = 30.0
+# Largest autocorrelation of residuals that counts.
+_LONGEST = 0.98
 # Command errors assumed by the filter, in units of the command size: 10 and 1 both find all 67
 # sticks; a fast filter keeps the gains of delays bounded.
 _RATIOS = (10.0, 1.0)
@@ -73,16 +76,21 @@ _MORE, _ROUNDS, _DRAWN, _QUICK, _KEPT = 2, 2, 100, 4, 12
 
 
 def fit_gain(problem: Problem) -> Fitted:
-    """Fit K, S (several inputs), and unknown initial states, errors and parameters.
+    """Fit K, S (several inputs), and unknown initial states, errors and parameters."""
+    return gain_ends(problem)[0]
 
-    The end of long recordings is that of one search, a start for others (`noisy_fit`).
+
+def gain_ends(problem: Problem) -> list[Fitted]:
+    """Ends of searches for the gain, the lowest first.
+
+    The end of long recordings is that of one search, a start for others (`ends`).
     """
     require_riccati(problem)
     exact = pair_of_inactive_samples(problem)
     if exact is not None and not misfit_or_reason(problem, *exact)[1]:
         first = refine_gain(problem, *exact)
         if first.explained:
-            return first
+            return [first]
     count = problem.recorded_numbers
     few = count <= FEW
     wanted = (_SURE if count <= _HANDFUL else _AGREE) if few else 1
@@ -111,7 +119,8 @@ def fit_gain(problem: Problem) -> Fitted:
     # With so few values and unobserved initial states wrong searches agree as well.
     unsure = agreed == 1 or (count <= _HANDFUL and _hides_states(problem))
     alone = few and unsure and not best.explained
-    return replace(best, evaluations=spent, unconfirmed=alone)
+    others = sorted((end for end in ends if end is not best), key=lambda end: end.objective)
+    return [replace(best, evaluations=spent, unconfirmed=alone), *others]
 
 
 def refine_gain(
@@ -150,8 +159,12 @@ def with_jumps(problem: Problem) -> Problem:
             for trial, push in zip(problem.recordings, pushes, strict=True)
         ]
         posed.append(replace(problem, recordings=tuple(trials)))
-    begin = regulators(posed[0])[0]
-    return min(posed, key=lambda one: _predicted(one, begin, _RATIOS[0])[1])
+    return min(posed, key=prediction_misfit)
+
+
+def prediction_misfit(problem: Problem) -> float:
+    """Least misfit of one-step predictions from a first start."""
+    return _predicted(problem, regulators(problem)[0], _RATIOS[0])[1]
 
 
 def free_gain(problem: Problem, begin: Weights) -> Fitted:
@@ -170,15 +183,19 @@ def with_fitted_starts(
     """
     fitted = []
     for trial in problem.recordings:
-        seen = trial.samples if samples is None else min(samples, trial.samples)
-        parts = {name: getattr(trial, name)[:seen] for name in ("outputs", "disturbance", "target")}
-        short = replace(trial, commands=trial.commands[:seen], **parts)
+        short = cut(trial, 0, trial.samples if samples is None else samples)
         one = replace(problem, recordings=(short,), unknown_start=True).with_parameters_fixed()
         space = Unknowns(one, FixedLaw(gain, metric))
         end = space.search(space.start, stop_at(one, 1e-3 * PROMISE, _STATES), own=1.0)
         (found,) = end.problem.recordings
         fitted.append(replace(trial, x0=found.x0, errors=found.errors))
     return replace(problem, recordings=tuple(fitted))
+
+
+def cut(trial: Recording, first: int, last: int) -> Recording:
+    """Samples of a trial from `first` to `last` - 1."""
+    names = ("outputs", "disturbance", "target", "commands")
+    return replace(trial, **{name: getattr(trial, name)[first:last] for name in names})
 
 
 def stop_at(problem: Problem, promise: float, evaluations: int) -> Stop:
@@ -191,8 +208,11 @@ def best_of(ends: list[Fitted]) -> tuple[Fitted, int]:
     best = min(ends, key=lambda end: end.objective)
     if best.explained:
         return best, sum(end.explained for end in ends)
-    near = [end for end in ends if end.objective - best.objective <= _NEAR]
-    if len(near) < 2 or not best.stabilises:
+    if not best.stabilises:
+        return best, 1
+    longer = colour(best)
+    near = [end for end in ends if end.objective - best.objective <= _NEAR * longer]
+    if len(near) < 2:
         return best, len(near)
     law = GainLaw(best.problem, np.array(best.K), np.array(best.S))
     space = Unknowns(best.problem, law)
@@ -201,7 +221,21 @@ def best_of(ends: list[Fitted]) -> tuple[Fitted, int]:
     steps = np.array([law.natural(np.array(end.K) - best.K).ravel() for end in near])
     left, _, _ = np.linalg.svd(seen, full_matrices=False)
     moved = np.max(np.abs(left.T @ seen @ steps.T), axis=0) / noise
-    return best, int(np.count_nonzero(moved <= _SAME))
+    return best, int(np.count_nonzero(moved <= _SAME * np.sqrt(longer)))
+
+
+def colour(end: Fitted) -> float:
+    """Long-run over white variance of the residuals by their first autocorrelation, at least 1.
+
+    Differences of -2 log L for white noise are too large by this factor.
+    """
+    space = Unknowns(end.problem, GainLaw(end.problem, np.array(end.K), np.array(end.S)))
+    width, above, below = len(end.problem.measured), 0.0, 1e-300
+    for part in space.evaluated(space.start)[0].residuals:
+        rows = part.reshape(-1, width)
+        above, below = above + np.sum(rows[1:] * rows[:-1]), below + np.sum(rows**2)
+    root = float(np.clip(above / below, 0.0, _LONGEST))
+    return (1 + root) / (1 - root)
 
 
 def _hides_states(problem: Problem) -> bool:

@@ -153,10 +153,9 @@ class Fitted(Frozen):
 
     @property
     def objective(self) -> float:
-        """-2 log posterior: N log of the squared misfit, and the prior of stated parameters."""
-        problem = self.problem
-        away = (problem.logarithms / problem.parameter_units)[problem.stated]
-        return float(2 * problem.recorded_numbers * np.log(max(self.misfit, 1e-300)) + away @ away)
+        """-2 log posterior: N log of the squared misfit, and the prior of what is stated."""
+        count = self.problem.recorded_numbers
+        return float(2 * count * np.log(max(self.misfit, 1e-300))) + self.problem.unlikely
 
     @property
     def stabilises(self) -> bool:
@@ -177,6 +176,9 @@ class Unknowns:
         self.trials, self.own = len(problem.recordings), problem.own_unknowns
         self.own_unit = own_unit(problem, law.reference(problem))
         self.units, self.stated = problem.parameter_units, problem.stated
+        # 1 / SD of the unknowns of each trial in units of z; only errors have one, whose unit is
+        # diagonal.
+        self.own_weights = problem.own_weights * np.diag(self.own_unit)
         first = len(law.start)
         last = first + self.trials * self.own
         #: Places of the three parts in z.
@@ -190,6 +192,9 @@ class Unknowns:
     def centre(self) -> Array:
         """Prior mean of z (q,): the start; nominal values of stated uncertainties."""
         found = self.start.copy()
+        if np.any(self.own_weights):
+            none = -self.problem.own_values / np.diag(self.own_unit)
+            found[self.trial] = np.where(self.own_weights > 0, none, 0.0).ravel()
         nominal = -self.problem.logarithms / self.units
         found[self.parameters] = np.where(self.stated, nominal, 0.0)
         return found
@@ -221,7 +226,7 @@ class Unknowns:
         """z (q,) of the starting controller at the trials' unknowns and parameters of `there`."""
         z = self.start.copy()
         if self.own:
-            away = own_values(there) - own_values(self.problem)
+            away = there.own_values - self.problem.own_values
             z[self.trial] = np.linalg.solve(self.own_unit, away.T).T.ravel()
         z[self.parameters] = (there.logarithms - self.problem.logarithms) / self.units
         return z
@@ -296,14 +301,18 @@ class Unknowns:
 
     def without_nuisance(self, z: Array) -> Array:
         """Derivative at z (q,) by the controller, after projection on the other unknowns."""
-        rows = self.at(z).rows
-        left, values, _ = np.linalg.svd(rows.own, full_matrices=False)
+        rows, noise = self.at(z).rows, noise_of_residual(self.problem, self.at(z).residual)
+        own, shared = rows.own, rows.shared
+        if np.any(self.own_weights):  # rows of stated errors
+            below = noise * self.own_weights[:, None, :] * np.eye(self.own)
+            own = np.concatenate([own, below], axis=1)
+            shared = np.concatenate([shared, np.zeros((*below.shape[:2], shared.shape[2]))], axis=1)
+        left, values, _ = np.linalg.svd(own, full_matrices=False)
         largest = np.max(values, initial=0.0)
         basis = left * (values > _EXPLAINED * largest)[:, None, :]
-        shared = rows.shared - basis @ (np.swapaxes(basis, 1, 2) @ rows.shared)
+        shared = shared - basis @ (np.swapaxes(basis, 1, 2) @ shared)
         first = self.controller.stop
         kept, nuisance = np.split(shared.reshape(-1, shared.shape[2]), [first], axis=1)
-        noise = noise_of_residual(self.problem, self.at(z).residual)
         held = noise * np.eye(len(self.stated))[self.stated]
         kept = np.vstack([kept, np.zeros((len(held), kept.shape[1]))])
         nuisance = np.vstack([nuisance, held])
@@ -333,7 +342,8 @@ class Unknowns:
         weights = np.array(np.broadcast_to(shared, model.columns.shape[1]), dtype=np.float64)
         parameters = model.columns[len(model.columns) - len(self.stated) :]
         weights[np.any(parameters[self.stated] != 0, axis=0)] = 1.0
-        prior = Prior(*model.apart(self.centre if centre is None else centre), weights, own)
+        stated = np.where(self.own_weights > 0, self.own_weights, own) if self.own else own
+        prior = Prior(*model.apart(self.centre if centre is None else centre), weights, stated)
         end = minimise(model, prior, model.begin, stop)
         z = model.placed(end.u, end.v)
         return self.ended(z, end.evaluations, end.ended, end.promised)
@@ -427,13 +437,6 @@ def with_own(problem: Problem, moved: Array, logarithms: Array | None = None) ->
     for place, (kind, column) in enumerate(problem.error_places):
         errors[:, kind, column] += moved[:, size + place]
     return problem.at(starts, problem.logarithms if logarithms is None else logarithms, errors)
-
-
-def own_values(problem: Problem) -> Array:
-    """Searched initial states and errors of signals (trials, own)."""
-    starts, errors = problem.starts[:, : problem.searched_states], problem.errors
-    places = problem.error_places
-    return np.column_stack([starts, *(errors[:, kind, column] for kind, column in places)])
 
 
 def own_unit(problem: Problem, gain: Array) -> Array:

@@ -75,6 +75,9 @@ class Recording(Value):
     finer : array_like, optional
         Disturbance (samples, d) whose jumps lie between samples. `impc.fit` takes it in place of
         `disturbance` if all trials together are predicted better with it.
+    timing : mapping of str to float, optional
+        Standard deviation in s of the time at which a disturbance acts, or an output is recorded,
+        by name; others are on one clock. A shift of it is fitted with this prior.
     label : Label, optional
         Label of the trial.
     findings : tuple of str
@@ -99,6 +102,8 @@ class Recording(Value):
     errors : ndarray of shape (kinds, p + d)
         Errors of outputs and disturbances, one row a kind (`impc.model.signal_errors`); zero unless
         they are fitted (`Problem.signal_errors`).
+    timing : ndarray of shape (p + d,)
+        Standard deviation of the time shift of outputs and disturbances, in s; zero if not stated.
     label : Label
         Label of the trial.
     findings : tuple of str
@@ -126,6 +131,7 @@ class Recording(Value):
         "commands": "~* m",
         "finer": "* d",
         "errors": "* *",
+        "timing": "*",
     }
 
     outputs: Array
@@ -136,6 +142,7 @@ class Recording(Value):
     commands: Array
     finer: Array
     errors: Array
+    timing: Array
     label: Label
     findings: tuple[str, ...]
 
@@ -151,6 +158,7 @@ class Recording(Value):
         commands: ArrayLike | None = None,
         offset: ArrayLike | None = None,
         finer: ArrayLike | None = None,
+        timing: Mapping[str, float] | None = None,
         label: Label | None = None,
         findings: tuple[str, ...] = (),
     ) -> None:
@@ -188,6 +196,7 @@ class Recording(Value):
             commands=frozen(_commands(commands, len(y), plant.m)),
             finer=frozen(choice),
             errors=frozen(_errors(offset, y.shape[1], driven.shape[1])),
+            timing=frozen(_timing(timing or {}, plant, y.shape[1] + driven.shape[1])),
             label=label or Label(),
             findings=findings,
         )
@@ -233,6 +242,18 @@ def _errors(offset: ArrayLike | None, outputs: int, disturbances: int) -> Array:
     if offset is not None:
         errors[OFFSET, :outputs] = finite_array("offset", offset, (outputs,))
     return errors
+
+
+def _timing(given: Mapping[str, float], plant: Plant, count: int) -> Array:
+    """Standard deviations of the time shifts (count,) of outputs and disturbances."""
+    found, known = np.zeros(count), (*plant.outputs, *plant.disturbances)
+    for name, deviation in given.items():
+        if name not in known:
+            raise DataError("timing", f"no signal is named {name!r}", f"use {', '.join(known)}")
+        if not 0 <= deviation < np.inf:
+            raise DataError(f"timing of {name}", f"got {deviation}", "give seconds, 0 or more")
+        found[known.index(name)] = deviation
+    return found
 
 
 def _with_gaps(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> Array:

@@ -177,7 +177,8 @@ def fit_output_feedback(
     """
     if unknown := [kind for kind in held if kind not in LEVELS]:
         raise InputError("held", f"got {unknown[0]!r}", f"give some of {', '.join(LEVELS)}")
-    problem = found.problem.with_body_fixed()  # uncertain parameters keep their fitted values
+    # Uncertain parameters and times keep their fitted values.
+    problem = found.problem.with_body_fixed().with_signals_placed()
     _require_plain(problem)
     require_riccati(problem)
     shortest = min(trial.samples for trial in problem.recordings)

@@ -11,8 +11,9 @@ import impc
 from experiments.residual_study import diagnosed
 from experiments.uncertain_body import cart, cart_person
 from impc.arrays import Array, frozen
+from impc.assess import diagnosis
 from impc.assess import lack_of_fit as module
-from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, LackOfFit, lack_of_fit, named_cause
+from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, LackOfFit, lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.checking import replace
 from impc.inverse.further_unknowns import (
@@ -125,12 +126,13 @@ def test_a_wrong_recording_is_named_and_mended(name: str, size: float) -> None:
         trials.append(replace(trial, outputs=frozen(y), disturbance=frozen(d)))
     wrong = replace(problem, recordings=tuple(trials))
     fitted = gain_estimate(impc.fit(wrong))
-    found, _, again = named_cause(wrong, fitted, lack_of_fit(fitted))
-    assert found is not None
-    assert found.culprit is not None
-    assert found.culprit.name == name
+    cause = diagnosis.diagnosed(wrong, fitted)
+    assert cause is not None
+    assert cause.found.culprit is not None
+    assert cause.found.culprit.name == name
     if kind != "drift":  # a group of one column for each trial has no size
-        assert found.culprit.size == pytest.approx(size, rel=0.2)
+        assert cause.found.culprit.size == pytest.approx(size, rel=0.2)
+    again = cause.problem
     assert again is not None
     estimate = gain_estimate(impc.fit(again))
     last = lack_of_fit(estimate)

@@ -208,3 +208,29 @@ def test_a_recorded_command_is_no_disturbance(tmp_path: Path) -> None:
     assert np.isfinite(trial.commands[:-1]).all()
     with pytest.raises(InputError, match=r"signals.angle: is no command of the plant"):
         read(tmp_path, angle, push, ("# limit = 20.0", "command = true"))
+
+
+@pytest.mark.parametrize(
+    ("written", "deviation"),
+    [
+        ("# shift = 0", 0.01),
+        ('shift = "0 ± 2 ms"', 0.002),
+        ('shift = "-0 +- 0.001 s"', 0.001),
+        ('shift = "0 ± 0 ms"', 0.0),
+    ],
+)
+def test_the_time_of_a_push_is_known_to_half_a_sample_or_as_stated(
+    tmp_path: Path, written: str, deviation: float
+) -> None:
+    angle, push = balanced(1)
+    trial, _ = read(tmp_path, angle, push, ("# shift = 0", written))
+    np.testing.assert_allclose(trial.timing, [0.0, deviation])
+
+
+def test_a_stated_time_also_moves_a_signal(tmp_path: Path) -> None:
+    angle, push = balanced(1)
+    moved, _ = read(tmp_path, angle, np.roll(push, 1), ("# shift = 0", 'shift = "-20 ± 1 ms"'))
+    plain, _ = read(tmp_path, angle, np.roll(push, 1), ("# shift = 0", "shift = -0.02"))
+    np.testing.assert_array_equal(moved.disturbance, plain.disturbance)
+    with pytest.raises(InputError, match=r"signals.push.shift"):
+        read(tmp_path, angle, push, ("# shift = 0", 'shift = "about 2 ms"'))

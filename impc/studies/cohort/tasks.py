@@ -18,9 +18,10 @@ import psutil
 
 from impc.arrays import frozen
 from impc.assess.assessments import assessed, evaluate_method
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.intent import intent
 from impc.assess.lack_of_fit import lack_of_fit
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import covariance_intervals, gain_estimate
 from impc.assess.resampling import replicate
 from impc.assess.structures import assess_structure
 from impc.assess.variance_accounted_for import left_out, saturated_share
@@ -195,17 +196,19 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
     except (ImpcError, np.linalg.LinAlgError):
         lack = None
     test = weights_test(fitted, estimate, contradicted=lack is not None and lack.alarm)
-    identified = bool(np.any(estimate.covariance.individually_identified))
+    found = covariance_intervals(estimate, estimate.covariance, "sandwich")[: K.size]
+    determined = any(one.determined for one in found)
+    halves = np.array([(one.high - one.low) / 2 for one in found])
     limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     saturated = saturated_share(fit.commands, *limits)
     return {
         **_named(plant),
-        "verdict": unit_verdict(fit, lack, test, saturated, identified).data(),
+        "verdict": unit_verdict(fit, lack, test, saturated, determined).data(),
         "trials": len(problem.recordings),
         "samples": sum(trial.samples for trial in problem.recordings),
         "K": estimate.K,
         "S": estimate.S,
-        "K_deviation": estimate.covariance.entries,
+        "K_deviation": (halves / TWO_SIDED).reshape(K.shape),
         "K_identified": estimate.covariance.individually_identified,
         "K_of_weights": K,
         "Q": weights.Q,

@@ -57,6 +57,8 @@ def aim_sentences(result: FitResult) -> list[str]:
             how = f"learns it at a rate of {number(rate, 3)} 1/s{between}"
         said.append(f"it assumes that the {signal_name(plant, name)} persists and {how}")
     for kind, name, values in result.fitted.problem.fitted_errors:
+        if kind == "shift":  # `shift_words`, with its interval
+            continue
         factor, unit = error_unit(plant, kind, name)
         ends = f"{number(factor * min(values), 3)} to {number(factor * max(values), 3)} {unit}"
         said.append(f"the {signal_name(plant, name)} has {KINDS[kind][0]} in each trial, {ends}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
+from impc.assess.diagnosis import DIFFERENCE, EXCHANGED, SIGN, SUM
 from impc.assess.lack_of_fit import (
     DELAY,
     LEAN,
@@ -20,7 +21,7 @@ from impc.assess.lack_of_fit import (
 from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Finding, Level, table_of
 from impc.reporting.rendering import number
-from impc.reporting.shown_units import signal_name
+from impc.reporting.shown_units import error_unit, signal_name
 
 if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
@@ -39,6 +40,13 @@ _KINDS = {
     STIFFNESS: "another stiffness or damping where the perturbation acts",
     MODE: "a further mode of the body",
     NONLINEAR: "a nonlinear body, or a reaction to noise at the limit",
+}
+# Words of mistakes in the meaning of a signal, and what to do.
+_MISTAKES = {
+    SIGN: ("a reversed sign of the {}", "Change sign in [signals.{}]: to -1, or remove it."),
+    EXCHANGED: ("an exchange of the {} with another signal", "Exchange the columns."),
+    SUM: ("a {} recorded as its sum with another signal", "Subtract that signal."),
+    DIFFERENCE: ("a {} recorded as its difference to another signal", "Add that signal."),
 }
 
 
@@ -114,12 +122,28 @@ def name_words(plant: Plant, name: str) -> str:
     signal = signal_of(name)
     if signal is None:
         return _KINDS[name]
-    return f"{KINDS[signal[0]][0]} of the {signal_name(plant, signal[1])}"
+    kind, words = signal[0], signal_name(plant, signal[1])
+    if kind in _MISTAKES:
+        return _MISTAKES[kind][0].format(words)
+    return f"{KINDS[kind][0]} of the {words}"
+
+
+def remedy_words(result: FitResult, error: ModelError) -> str:
+    """What to do about an error that the fit has corrected."""
+    kind, name = signal_of(error.name) or (error.name, "")
+    if kind in _MISTAKES:
+        return _MISTAKES[kind][1].format(name)
+    values = {pair[:2]: pair[2] for pair in result.estimate.problem.fitted_errors}
+    factor, unit = error_unit(result.given.plant, kind, name)
+    size = number(factor * float(np.mean(values[kind, name])), 3)
+    if kind == "offset":
+        return f"If the zero of the sensor is off, add {size} {unit} to offset in [signals.{name}]."
+    return f"Correct the signal by its {kind} of {size} {unit}, in the file or at the device."
 
 
 def _size_words(plant: Plant, kind: str, name: str, size: float, deviation: float) -> str:
     """What an error of a signal means for the recording, if it is the same in all trials."""
-    if kind in ("offset", "drift") or not np.isfinite(size):
+    if kind not in ("scale", "shift", "clock") or not np.isfinite(size):
         return ""
     unit = 1e3 * plant.dt if kind == "shift" else 100
     much = f"{unit * abs(size):.3g} ± {unit * deviation:.2g} {'ms' if kind == 'shift' else '%'}"
@@ -136,12 +160,13 @@ def added_sentence(result: FitResult) -> str:
     if added is None:
         return ""
     words = error_words(result, added)
-    if signal_of(added.name):  # its size is that of the second fit
+    signal = signal_of(added.name)
+    if signal:  # its size is that of the second fit
         words = name_words(result.given.plant, added.name)
+    done = "corrected" if signal and signal[0] in _MISTAKES else "added to the unknowns"
     said = (
         f"The residuals of a first fit pointed to {words} "
-        f"({probability_words(added)}). It was added to the unknowns: all numbers come from the "
-        "second fit."
+        f"({probability_words(added)}). It was {done}: all numbers come from the second fit."
     )
     unknown = [
         item for item in result.parameters if _is_added(result, item) and not item.determined

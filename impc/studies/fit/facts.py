@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from impc.assess.printed_gain import follows_command
+from impc.assess.covariance import TWO_SIDED
+from impc.assess.printed_gain import entry_names, follows_command
 from impc.reporting.rendering import fixed, number
 from impc.reporting.shown_units import shown_unit, signal_name
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult, LimitFound
 
 _BEST = "inverse_lqr_output"
+# Longest recordings that are proposed, s.
+_LONGEST = 600.0
 
 
 class GainRow(NamedTuple):
@@ -39,14 +42,9 @@ class GainRow(NamedTuple):
         return between(self.low, self.high)
 
     @property
-    def identified(self) -> bool:
-        """Whether it is individually identified."""
-        return self.interval.identified
-
-    @property
-    def certain(self) -> bool:
-        """Whether it may be reported: identified, and its interval excludes zero."""
-        return self.identified and self.interval.excludes_zero
+    def determined(self) -> bool:
+        """Whether it may be reported (`Interval.determined`)."""
+        return self.interval.determined
 
 
 def between(low: float, high: float) -> str:
@@ -101,9 +99,33 @@ def named_gains(result: FitResult) -> list[tuple[str, GainRow]]:
     return [(f"{row.state} by {row.control}" if several else row.state, row) for row in rows]
 
 
+def ends_words(result: FitResult) -> str:
+    """How far apart searches from different starts end, for the first gain; empty for one end."""
+    (_, row), *_ = named_gains(result)
+    if not result.estimate.rivals or not row.interval.value:
+        return ""
+    place = entry_names(result.given.plant).index(row.interval.name)
+    values = [float(np.ravel(one.K)[place]) for one in (result.estimate, *result.estimate.rivals)]
+    low, high = sorted(row.value / row.interval.value * np.array([min(values), max(values)]))
+    return (
+        f" Searches from {len(values)} starts explain the recordings equally well, with "
+        f"{number(low)} to {number(high)} {row.unit} for {row.per}."
+    )
+
+
+def enough_words(result: FitResult) -> str:
+    """Time for which a gain would be determined, if errors fall with its root; else empty."""
+    wide = [(row.high - row.low) / abs(row.value) for _, row in named_gains(result) if row.value]
+    seconds = sum(one.samples for one in result.given.recordings) * result.given.plant.dt
+    needed = seconds * min(wide, default=np.inf) ** 2
+    if not needed < _LONGEST:
+        return ""
+    return f" (about {max(2, int(np.ceil(needed / 30)))} trials of 30 s would determine a gain)"
+
+
 def first_gain(result: FitResult) -> GainRow | None:
     """The first entry that may be reported; None if there is none."""
-    rows = [row for _, row in named_gains(result) if row.certain]
+    rows = [row for _, row in named_gains(result) if row.determined]
     return rows[0] if rows else None
 
 
@@ -147,6 +169,31 @@ def amount(result: FitResult, values: Array) -> str:
     plant = result.given.plant
     factor, unit = shown_unit(plant, plant.controls[0])
     return f"{number(float(factor * values[0]))} {unit}"
+
+
+def shift_halves(result: FitResult) -> dict[str, Array]:
+    """Half widths of the 95 % intervals of the time shifts (trials,) in s, by signal."""
+    problem = result.estimate.problem
+    names = [name for kind, name in problem.signal_errors if kind == "shift"]
+    found = TWO_SIDED * problem.plant.dt * np.array(result.estimate.covariance.shifts)
+    return dict(zip(names, found, strict=True)) if found.size else {}
+
+
+def shift_words(result: FitResult) -> list[str]:
+    """Sentences on signals whose time shift differs from zero in a trial."""
+    plant, halves, said = result.given.plant, shift_halves(result), []
+    for kind, name, values in result.estimate.problem.fitted_errors:
+        if kind != "shift" or name not in halves or not np.any(np.abs(values) > halves[name]):
+            continue
+        value, half = 1e3 * float(np.mean(values)), 1e3 * float(np.mean(halves[name]))
+        ends = f"{abs(value):.2g} ms ({max(abs(value) - half, 0):.2g} to {abs(value) + half:.2g})"
+        push = name in plant.disturbances
+        late = ("later" if push else "late") if value > 0 else ("earlier" if push else "early")
+        how = f"acts {ends} {late} than recorded" if push else f"is recorded {ends} {late}"
+        differ = float(np.ptp(values)) > 2 * float(np.max(halves[name]))
+        each = " on average; trials differ (see the table of errors)" if differ else ""
+        said.append(f"The {signal_name(plant, name)} {how}{each}.")
+    return said
 
 
 def saturation(result: FitResult) -> float:

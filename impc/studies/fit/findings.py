@@ -16,7 +16,7 @@ from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
-from impc.studies.fit.facts import gain_rows, named_gains, statement_text
+from impc.studies.fit.facts import gain_rows, named_gains, shift_halves, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.uncertainty import verdict
 from impc.studies.methods_table import trajectory_table, weight_entries
@@ -49,11 +49,11 @@ def per_unit_finding(result: FitResult) -> Finding:
             "low": lambda row: float(row.low),
             "high": lambda row: float(row.high),
             "unit": lambda row: row.unit,
-            "identified": lambda row: row.identified,
+            "determined": lambda row: row.determined,
         },
     )
     inner = [row for row in gain_rows(result) if row.inner]
-    known = sum(row.identified for row in inner)
+    known = sum(row.interval.identified for row in inner)
     of_inner = (
         f" Single gains on the {len(inner)} states of nerves and muscles ({known} identified) have "
         "no meaning; they are listed under details."
@@ -61,7 +61,14 @@ def per_unit_finding(result: FitResult) -> Finding:
         else ""
     )
     labels = {"for_every": "For every ...", "low": "95 % CI, low", "high": "95 % CI, high"}
-    caption = f"Identified: the recordings determine this single number.{of_inner}"
+    count = len(result.estimate.rivals)
+    ends = (
+        f" Intervals include {'another end' if count == 1 else f'{count} other ends'} of the "
+        "search, which explain the recordings as well."
+        if count
+        else ""
+    )
+    caption = f"Determined: known to within half of its value.{ends}{of_inner}"
     return Finding("gain_per_unit", table, caption, labels=labels, digits=3)
 
 
@@ -328,13 +335,16 @@ def agreement_finding(result: FitResult) -> Finding:
 
 def error_findings(result: FitResult) -> list[Finding]:
     """Table of the fitted errors of signals, if requested."""
-    problem, rows = result.fitted.problem, []
+    problem, rows, found = result.estimate.problem, [], shift_halves(result)
     for kind, name, values in problem.fitted_errors:
         factor, unit = error_unit(problem.plant, kind, name)
-        signal = signal_name(problem.plant, name)
-        for index, value in enumerate(values):
-            rows.append((trial_name(result, index), signal, kind, unit, factor * value))
-    table = pd.DataFrame(rows, columns=["trial", "signal", "error", "unit", "value"])
+        signal, none = signal_name(problem.plant, name), np.full(len(values), np.nan)
+        halves = found.get(name, none) if kind == "shift" else none
+        for index, (value, half) in enumerate(zip(values, halves, strict=True)):
+            ends = factor * (value - half), factor * (value + half)
+            rows.append((trial_name(result, index), signal, kind, unit, factor * value, *ends))
+    heads = ["trial", "signal", "error", "unit", "value", "low", "high"]
+    table = pd.DataFrame(rows, columns=heads).dropna(axis="columns", how="all")
     caption = "Errors of the recorded signals, estimated with the gain in each trial."
     return [Finding("signal_errors", table, caption, folded="Errors of signals")] if rows else []
 

@@ -38,7 +38,10 @@ class FitMemory(Steps):
 
     def about(self, problem: Problem) -> FitMemory:
         """Store for another problem of the same recordings, with one more unknown."""
-        known = digest(self.digest, problem.parameter_names, problem.signal_errors)
+        numbers = problem.own_weights, problem.parameter_units, problem.recordings[0].outputs
+        names = problem.parameter_names, problem.signal_errors
+        pushes = problem.recordings[0].disturbance
+        known = digest(self.digest, *names, *map(np.asarray, (*numbers, pushes)))
         return replace(self, digest=known, problem=problem)
 
     def estimate(self, name: str, compute: Callable[[], Estimate]) -> Estimate:

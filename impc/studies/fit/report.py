@@ -54,6 +54,7 @@ from impc.studies.fit.facts import (
     one_of,
     saturation,
     shares,
+    shift_words,
     statement_text,
     unlimited_ratio,
     with_unit,
@@ -168,7 +169,7 @@ def _keys(result: FitResult) -> list[Key]:
         )  # fmt: skip
     row, gains = first_gain(result), named_gains(result)
     if row is None or GAIN in forbidden(result):
-        known = 0 if GAIN in forbidden(result) else sum(row.certain for _, row in gains)
+        known = 0 if GAIN in forbidden(result) else sum(row.determined for _, row in gains)
         keys.append(Key(str(known), f"of {len(gains)}", "gains to report", "see the warning"))
     else:
         unit = row.unit if row.unit == "-" else f"{row.unit} per {row.per[1:].partition(' of ')[0]}"
@@ -241,6 +242,7 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
         f"reached.{lasting} {body_sentence_of(result)}",
         *aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
+        *shift_words(result),
         findings.per_unit_finding(result),
         Fold(
             "All gains in SI units, combinations and parameters",
@@ -510,7 +512,7 @@ def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy |
     gains = [
         f"{number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})"
         for _, row in named_gains(result)
-        if row.certain
+        if row.determined
     ]
     results.append(f"Gains were {'; '.join(gains)}.")
     made = [statement_text(plant, one) for one in decided(result)]

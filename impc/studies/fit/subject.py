@@ -19,22 +19,24 @@ from tqdm.auto import tqdm
 from impc.arrays import Array, frozen
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
+from impc.assess.diagnosis import Diagnosis, diagnosed
 from impc.assess.frequency_response import frequency_response
 from impc.assess.input_limits import LimitCurve, limit_curve
 from impc.assess.intent import intent
-from impc.assess.lack_of_fit import LackOfFit, lack_of_fit, named_cause
+from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
 from impc.assess.printed_gain import command_regression, gain_estimate
 from impc.assess.structures import assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out
-from impc.assess.weights_ranges import drawn_gains, weights_summary_or_reason
+from impc.assess.weights_ranges import estimate_draws, weights_summary_or_reason
 from impc.assess.weights_test import identifiability, weights_test
 from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
+from impc.inverse.noisy_fit import first_end, fit_controller
 from impc.inverse.problem import Problem, aims, simulated
-from impc.inverse.search import with_jumps
+from impc.inverse.search import FEW, with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.foresight import physical_states
 from impc.studies.fit.asked import (
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
     from impc.assess.weights_ranges import WeightsSummary
     from impc.control.simulation import Simulation
+    from impc.inverse.unknowns import Fitted
     from impc.model.bounds import Bounds
     from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
@@ -70,6 +73,8 @@ if TYPE_CHECKING:
     from impc.studies.fit.uncertainty import Attempt
 
 _THREADS = 2
+# Evidence (-log p) of an alarm in a first search that cannot come from its early end.
+_PLAIN = 50.0
 _UNUSABLE = "the controller explains less than half of a recorded signal (VAF below 50 %)."
 
 
@@ -242,7 +247,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         """Summary of all weights with the fitted gain, or None and the reason."""
         if not usable or test.rejected:
             return None, test.sentence if usable else _UNUSABLE
-        drawn = functools.partial(drawn_gains, plant, weights, estimate.K, estimate.covariance)
+        drawn = functools.partial(estimate_draws, plant, weights, estimate)
         draws = attempt("drawn gains", drawn, ()) if settings.intent_draws else ()
         return weights_summary_or_reason(plant, K, metrics, sizes, draws, pool.map)
 
@@ -298,21 +303,36 @@ def _regressed(fitted: Estimate) -> pd.DataFrame | None:
 def _first_fits(
     problem: Problem, progress: FitProgress, attempt: Attempt
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
-    """Inverse MPC, repeated with one more unknown if the tests of the model point to it."""
-    lack: list[LackOfFit | None] = []
-    begin: Problem | None = problem
+    """Inverse MPC, with one more unknown if tests of a first search or of the fit point to it."""
+    search = functools.partial(first_end, problem)
+    first = attempt("first search", search, None) if problem.recorded_numbers > FEW else None
+    begins: tuple[Fitted, ...] = () if first is None else (first,)
+    cause: Diagnosis | None = None
+    if first is not None:
+        cause = attempt("diagnosis", functools.partial(diagnosed, problem, first, _PLAIN), None)
     while True:
-        fitted = progress.estimate("inverse_mpc", functools.partial(fit, begin or problem))
+        if cause is not None and cause.problem is not None:
+            problem, begins = cause.problem, cause.ends
+            progress = progress.anew(problem)
+        fitted = progress.estimate("inverse_mpc", functools.partial(_whole_fit, problem, begins))
         estimate = gain_estimate(fitted)
-        test = functools.partial(lack_of_fit, estimate)
-        found, further = attempt("test of the model", test, None), None
-        if not lack:
-            found, further, begin = named_cause(problem, estimate, found)
-        lack.append(found)
-        if further is None:
-            progress.done("inverse MPC")
-            return problem, progress, fitted, estimate, tuple(lack)
-        problem, progress = further, progress.anew(further)
+        if cause is None:
+            cause = attempt("diagnosis", functools.partial(diagnosed, problem, estimate), None)
+            if cause is not None and cause.problem is not None:
+                continue
+        last = attempt("test of the model", functools.partial(lack_of_fit, estimate), None)
+        progress.done("inverse MPC")
+        freed = cause is not None and cause.problem is not None
+        before = (cause.found,) if cause is not None and freed else ()
+        return problem, progress, fitted, estimate, (*before, last)
+
+
+def _whole_fit(problem: Problem, begins: tuple[Fitted, ...]) -> Estimate:
+    """Fit from the ends of first searches, if there are any."""
+    if not begins:
+        return fit(problem)
+    started = time.perf_counter()
+    return replace(fit_controller(problem, begins), seconds=time.perf_counter() - started)
 
 
 def _estimates(

@@ -22,10 +22,13 @@ from impc.studies.fit.body_words import (
     error_words,
     name_words,
     probability_words,
+    remedy_words,
 )
 from impc.studies.fit.facts import (
     amount,
     decided,
+    ends_words,
+    enough_words,
     given_limit,
     held_out,
     lasting_or_first,
@@ -281,12 +284,14 @@ def _body(result: FitResult) -> Kind | None:
         return None
     reason, of_limit = alternative_reason(result, error), error.name == LIMIT
     of_signal = signal_of(error.name) is not None
+    added = result.added
+    tried = f", also with {name_words(result.given.plant, added.name)}" if added else ""
     most = "the most that the person can produce, or state its uncertainty in [plant.uncertainty]"
     alert = Alert(
         Level.AMBER,
         "The residual depends on the perturbation",
-        f"Part of the residual follows the perturbation, unlike measurement noise. The likeliest "
-        f"of the tested errors is {error_words(result, error)} "
+        f"Part of the residual follows the perturbation, unlike measurement noise{tried}. The "
+        f"likeliest of the tested errors is {error_words(result, error)} "
         f"({probability_words(error)}).{reason}",
         "The gains compensate for part of the error. Their intervals do not include it; the true "
         "uncertainty may be several times larger.",
@@ -316,7 +321,7 @@ def _body(result: FitResult) -> Kind | None:
 
 
 def _corrected(result: FitResult) -> Kind | None:
-    """An error of a signal, other than its timing, that the second fit estimated."""
+    """An error of a signal, other than its timing, that the second fit removed."""
     added = result.added
     signal = None if added is None else signal_of(added.name)
     if added is None or signal is None or signal[0] == "shift" or result.culprit is not None:
@@ -325,12 +330,12 @@ def _corrected(result: FitResult) -> Kind | None:
     alert = Alert(
         Level.AMBER,
         "A recorded signal seems to be wrong",
-        f"With {words} as a further unknown, the model explains the recordings.",
+        f"With {words}, the model explains the recordings.",
         "The gains on this page are those with this error removed. If the error has another cause, "
         "they may be wrong.",
         (
-            "Check unit, sign and zero of the signal, correct the recordings or their settings, "
-            "and fit again.",
+            remedy_words(result, added),
+            "Then fit again.",
         ),
     )
     return Kind(
@@ -425,17 +430,18 @@ def _fell(result: FitResult) -> Kind | None:
 
 def _weak(result: FitResult) -> Kind | None:
     gains = named_gains(result)
-    if any(row.certain and row.high - row.low < abs(row.value) for _, row in gains):
+    if any(row.determined for _, row in gains):
         return None
     alert = Alert(
         Level.AMBER,
         "The recordings are too short, or the perturbation is too weak",
-        f"None of the {len(gains)} gains is known to within half of its value. Combinations of "
-        "gains may be identified; they are listed under details.",
+        f"None of the {len(gains)} gains is known to within half of its value."
+        f"{ends_words(result)} Combinations of gains may be identified; they are listed under "
+        "details.",
         "The model is not contradicted, but many controllers would have moved in this way.",
         (
-            "Record more trials, or use a stronger or faster perturbation: impc plan shows how "
-            "many intervals would become narrow enough.",
+            f"Record more{enough_words(result)}, or use a stronger or faster perturbation: impc "
+            "plan shows how many intervals would become narrow enough.",
             "Compare groups by the combinations that are identified, or by measures of movement.",
         ),
     )
@@ -508,7 +514,7 @@ def _may(result: FitResult) -> list[Claim]:
                   "Estimated from the movement, not only assumed.")
         )  # fmt: skip
     if GAIN not in no:
-        known = [name for name, row in named_gains(result) if row.certain]
+        known = [name for name, row in named_gains(result) if row.determined]
         claims.append(
             Claim(f"The gain on {', '.join(dict.fromkeys(known))}, with intervals.",
                   lasting_or_first(result))
@@ -530,11 +536,11 @@ def _may_not(result: FitResult) -> list[Claim]:
     if GAIN in no:
         claims.append(Claim("Any gain.", "See the warning above."))
     else:
-        unknown = [name for name, row in named_gains(result) if not row.certain]
+        unknown = [name for name, row in named_gains(result) if not row.determined]
         if unknown:
             claims.append(
                 Claim(f"The gain on {', '.join(dict.fromkeys(unknown))}, by itself.",
-                      "Its interval includes zero, or only combinations are identified.")
+                      "It is not known to within half of its value.")
             )  # fmt: skip
     if WEIGHTS in no:
         claims.append(Claim("Any cost weight, or comparison of costs.", "See the warning above."))

@@ -76,7 +76,7 @@ def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.Mon
         raise SolverError("stage", "did not end", "try another")
 
     whole = fitted()
-    for name in ("drawn_gains", "lack_of_fit", "_terminal_set_difference"):
+    for name in ("estimate_draws", "lack_of_fit", "_terminal_set_difference"):
         monkeypatch.setattr(subject, name, fails)
     result = fitted()
     assert set(result.failures) == {"drawn gains", "test of the model", "terminal set"}

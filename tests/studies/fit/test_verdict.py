@@ -79,7 +79,7 @@ def test_a_fit_that_nothing_speaks_against() -> None:
     report = fit_report(result, Provenance())
     assert isinstance(report.copy, Copy)
     assert share in report.copy.results
-    for row in (row for _, row in named_gains(result) if row.certain):
+    for row in (row for _, row in named_gains(result) if row.determined):
         assert row.ends in report.copy.results
     assert max(map(len, verdict.text().splitlines())) <= 100
 

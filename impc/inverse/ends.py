@@ -1,0 +1,125 @@
+"""Refits from several starts, which tell how far apart equally good answers are.
+
+In short recordings F = -2 log posterior has a flat, bent valley (gain against delay) with creases
+where the set of saturated samples changes: searches end anywhere in it, and the curvature at an end
+says little about its extent. The ends of searches from different starts do:
+
+    the answer  ->  its multiples with the body as posed, and answers of parts of the recordings
+                ->  initial states  ->  everything
+
+More starts are tried until enough ends agree: two where the gain is known well, more the less it
+is. All ends within noise of the lowest are kept (`Estimate.rivals`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from impc.checking import replace
+from impc.errors import ImpcError
+from impc.inverse.laws import GainLaw
+from impc.inverse.refit import refit
+from impc.inverse.search import best_of, cut, with_fitted_starts
+from impc.inverse.unknowns import Unknowns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from impc.arrays import Array
+    from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
+
+# Multiples of the gain that starts with the body as posed: first ones, and after the parts.
+_FIRST, _FAR = (1.0, 0.7, 1.4), (0.5, 2.0)
+# Shares of all trials that are fitted alone, and how many single trials.
+_PARTS, _SINGLE = ((0.5, 1.0), (0.0, 0.5)), 3
+# Promise at which a fit of a part ends.
+_ROUGH = 0.1
+# Relative standard error of the gain up to which two ends and three have to agree.
+_KNOWN, _DOUBTFUL = 0.06, 0.1
+# The same from which some ends suffice, because the gain is not determined anyway.
+_UNKNOWN, _ANYWAY = 0.3, 3
+
+
+def several_ends(problem: Problem, ends: list[Fitted]) -> list[Fitted]:
+    """The `ends` and those of refits from other starts, the lowest first; `problem` is as posed."""
+    ends = list(ends)
+    for start in _starts(problem):
+        best, agreed = best_of(ends)
+        if best.explained or agreed >= _enough(best, len(ends)):
+            break
+        with contextlib.suppress(ImpcError):  # it cannot be simulated: skip it
+            begin, K, S = start(best)
+            ends.append(refit(begin, K, S))
+    return sorted(ends, key=lambda end: end.objective)
+
+
+def _enough(end: Fitted, count: int) -> float:
+    """Number of ends that must agree, of the `count` so far."""
+    uncertain = relative_error(end)
+    if uncertain > _UNKNOWN and count >= _ANYWAY:
+        return 0
+    return 2 if uncertain < _KNOWN else 3 if uncertain < _DOUBTFUL else np.inf
+
+
+def relative_error(end: Fitted) -> float:
+    """Standard error of the entry of the gain that moves the command most, over its value.
+
+    Other directions have a prior of SD 1 in whitened units.
+    """
+    K = np.array(end.K)
+    law = GainLaw(end.problem, K, np.array(end.S))
+    space = Unknowns(end.problem, law)
+    seen = space.without_nuisance(space.start)[:, : K.size]
+    noise = end.misfit / np.sqrt(end.problem.recorded_numbers)
+    moved = np.abs(law.natural(np.diag(np.ones(K.size)).reshape(-1, *K.shape) * K))
+    largest = int(np.argmax(np.sum(moved**2, axis=(1, 2))))
+    along = law.gains.reshape(K.size, -1)[:, largest]
+    variance = along @ np.linalg.solve(seen.T @ seen / noise**2 + np.eye(K.size), along)
+    return float(np.sqrt(variance) / abs(np.ravel(K)[largest]))
+
+
+def _starts(problem: Problem) -> Iterator[Callable[[Fitted], tuple[Problem, Array, Array]]]:
+    """Starts of further refits from the best end: problem at its values, gain and metric."""
+    yield from (functools.partial(_scaled, problem, scale) for scale in _FIRST)
+    if problem.unknown_start:
+        trials = range(len(problem.recordings))
+        yield from (functools.partial(_of_part, problem, trials, *pair) for pair in _PARTS)
+        if len(trials) > 1:
+            for trial in trials[:_SINGLE]:
+                yield functools.partial(_of_part, problem, trials[trial : trial + 1], 0.0, 1.0)
+    yield from (functools.partial(_scaled, problem, scale) for scale in _FAR)
+
+
+def _scaled(problem: Problem, scale: float, best: Fitted) -> tuple[Problem, Array, Array]:
+    """Start at a multiple of the gain with the body as posed; a stated body is fixed at first.
+
+    Gain and uncertain body, searched together, can end in a local minimum with a good fit and
+    wrong gains.
+    """
+    K, S = scale * np.array(best.K), np.array(best.S)
+    begin = with_fitted_starts(problem.with_body_fixed(), K, S)
+    if np.any(problem.stated):
+        fixed = refit(begin, K, S)
+        begin, K, S = fixed.problem, np.array(fixed.K), np.array(fixed.S)
+    starts, errors = np.array(begin.starts), np.array(begin.errors)
+    return problem.at(starts, np.array(problem.logarithms), errors), K, S
+
+
+def _of_part(
+    problem: Problem, trials: range, low: float, high: float, best: Fitted
+) -> tuple[Problem, Array, Array]:
+    """Start at the gain and body of some trials from share `low` to `high`, from the best end."""
+    there, K, S = best.problem, np.array(best.K), np.array(best.S)
+    whole = [there.recordings[trial] for trial in trials]
+    parts = tuple(cut(one, int(low * one.samples), int(high * one.samples)) for one in whole)
+    alone = with_fitted_starts(replace(there, recordings=parts), K, S)
+    found = refit(alone, K, S, _ROUGH)
+    K, S = np.array(found.K), np.array(found.S)
+    body = np.array(found.problem.logarithms)
+    begin = problem.at(np.array(there.starts), body, np.array(there.errors))
+    return with_fitted_starts(begin, K, S), K, S
