@@ -20,7 +20,8 @@ import numpy as np
 from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.covariance import TWO_SIDED
+from impc.assess.printed_gain import covariance_intervals, gain_estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
@@ -41,7 +42,7 @@ class Subject:
     below_ceiling : float
         VAF of the true controller minus that of the fit, percentage points, scaled outputs.
     entries : Array
-        Error of each entry of K over its estimated standard error, shape (n,).
+        Distance of each entry of K from the centre of its interval, which spans 3.92, shape (n,).
     directions : Array
         The same along the directions of `GainCovariance`, shape (n,).
     """
@@ -79,9 +80,11 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     samples = sum(trial.outputs.size for trial in trials)
     error = estimate.K - truth
     along = covariance.along(error)
+    intervals = covariance_intervals(estimate, covariance, "sandwich")[: error.size]
+    ends = np.array([[one.low, one.high] for one in intervals])
     return Subject(
         100 * (fitted.misfit**2 - noise) / samples,
-        np.ravel(error / covariance.entries),
+        (ends.mean(axis=1) - np.ravel(truth)) / (np.ptp(ends, axis=1) / (2 * TWO_SIDED)),
         along / covariance.deviations,
     )
 

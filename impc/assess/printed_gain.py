@@ -137,8 +137,13 @@ def entry_names(plant: Plant) -> tuple[str, ...]:
 def covariance_intervals(
     estimate: GainEstimate, covariance: GainCovariance, method: str
 ) -> tuple[Interval, ...]:
-    """Intervals of the entries of K and of free parameters: normal, the union over `rivals`."""
+    """Intervals of the entries of K and of free parameters: normal.
+
+    Those of the estimate's own covariance are the union over its `rivals`.
+    """
     own = _normal_intervals(estimate, covariance, method)
+    if covariance is not estimate.covariance:
+        return own
     return _union(own, *(_normal_intervals(one, one.covariance, method) for one in estimate.rivals))
 
 
