@@ -35,20 +35,18 @@ from impc.inverse.further_unknowns import (
     with_errors_unknown,
     with_limit_unknown,
 )
-from impc.inverse.laws import GainLaw
 from impc.inverse.noisy_fit import first_end
 from impc.inverse.refit import refit
-from impc.inverse.search import colour, prediction_misfit
-from impc.inverse.unknowns import Unknowns
+from impc.inverse.search import prediction_misfit, seen_at
 from impc.model.signal_errors import OFFSET
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from impc.arrays import Array
-    from impc.assess.printed_gain import GainEstimate
     from impc.inverse.problem import Problem
     from impc.inverse.unknowns import Fitted
+    from impc.model.plant import Plant
 
 #: Mistakes in the meaning of a signal.
 SIGN, EXCHANGED, SUM, DIFFERENCE = "sign", "exchanged", "sum", "difference"
@@ -71,25 +69,23 @@ class Diagnosis(NamedTuple):
     ends: tuple[Fitted, ...]  # Fits with it, the lowest first
 
 
-def diagnosed(problem: Problem, at: GainEstimate | Fitted, least: float = 0.0) -> Diagnosis | None:
-    """Cause of an alarm in a fit `at` of the problem as posed; None without an alarm.
+def diagnosed(
+    problem: Problem, at: Fitted, found: LackOfFit | None, least: float = 0.0
+) -> Diagnosis | None:
+    """Cause of an alarm in the tests `found` of a fit `at` of the problem as posed.
 
-    Nor with one of less evidence than `least`, for the end of a first search.
+    None without an alarm, or with one of less evidence than `least`: of the end of a first search.
     """
-    found = lack_of_fit(at)
     if found is None or not found.alarm or found.errors[0].evidence < least:
         return None
-    first, mistakes = found.errors[0], dict(_mistakes(problem))
+    first, mistakes = found.errors[0], _mistake(problem)
     ends = _tried({_like(first, name): other for name, other in mistakes.items()})
     ends = ends or _refits(problem, at, found)
     named: ModelError = first
     if ends:
         best, last = min(ends, key=lambda pair: pair[1].objective)
-        test, here = lack_of_fit(last), GainLaw(at.problem, np.array(at.K), np.array(at.S))
-        space = Unknowns(at.problem, here)
-        start = space.ended(space.start)
-        promised = 2 * colour(start) * first.evidence
-        if test is None or not test.alarm or start.objective - last.objective > promised:
+        test, promised = lack_of_fit(last), 2 * seen_at(at).colour * first.evidence
+        if test is None or not test.alarm or at.objective - last.objective > promised:
             named = best
     others = tuple(one for one in found.errors if one is not named)
     further = mistakes.get(named.name) or _freed(problem, named.name)
@@ -98,9 +94,7 @@ def diagnosed(problem: Problem, at: GainEstimate | Fitted, least: float = 0.0) -
     return Diagnosis(replace(found, errors=(named, *others)), further, tuple(same))
 
 
-def _refits(
-    problem: Problem, at: GainEstimate | Fitted, found: LackOfFit
-) -> list[tuple[ModelError, Fitted]]:
+def _refits(problem: Problem, at: Fitted, found: LackOfFit) -> list[tuple[ModelError, Fitted]]:
     """Fits with one more unknown: of likely errors from `at`, of the best from the posed body."""
     first = found.errors[0]
     likely = [one for one in found.errors if signal_of(one.name)][:_REFITTED]
@@ -137,7 +131,7 @@ def _like(first: ModelError, name: str) -> ModelError:
     return ModelError(name, first.probability, first.evidence, np.nan, np.nan)
 
 
-def _refitted(at: GainEstimate | Fitted, name: str) -> list[Fitted]:
+def _refitted(at: Fitted, name: str) -> list[Fitted]:
     """Refits with one more unknown from a fit; a limit begins at two values."""
     there = _freed(at.problem, name)
     if there is None:
@@ -168,26 +162,11 @@ def _displaced(problem: Problem) -> Iterator[tuple[str, Problem]]:
             yield f"offset.{name}", freed.at(np.array(freed.starts), freed.logarithms, errors)
 
 
-def _mistakes(problem: Problem) -> Iterator[tuple[str, Problem]]:
+def _mistake(problem: Problem) -> dict[str, Problem]:
     """The mistake in the meaning of a signal with which predictions are clearly best, if any."""
-    plant = problem.plant
-    p, best = len(plant.outputs), _CLEARLY * prediction_misfit(problem)
-    unit, found = np.eye(p), None
-    changes: list[tuple[str, Array, int]] = []
-    for i, name in enumerate(plant.outputs):
-        changes.append((f"{SIGN}.{name}", unit - 2 * np.outer(unit[i], unit[i]), 1))
-    if p > 1 and len(plant.disturbances) == 1:  # with one output it is the sign of that
-        changes.append((f"{SIGN}.{plant.disturbances[0]}", unit, -1))
-    for i, j in itertools.permutations(range(p), 2):
-        if plant.unit(plant.outputs[i]) != plant.unit(plant.outputs[j]):
-            continue
-        if i < j:
-            swapped = unit[[j if k == i else i if k == j else k for k in range(p)]]
-            changes.append((f"{EXCHANGED}.{plant.outputs[i]}", swapped, 1))
-        for kind, sign in ((SUM, -1.0), (DIFFERENCE, 1.0)):
-            moved = unit + sign * np.outer(unit[i], unit[j])
-            changes.append((f"{kind}.{plant.outputs[i]}", moved, 1))
-    for name, outputs, push in changes:
+    best = _CLEARLY * prediction_misfit(problem)
+    found: dict[str, Problem] = {}
+    for name, outputs, push in _meanings(problem.plant):
         trials = tuple(
             replace(
                 trial,
@@ -202,9 +181,28 @@ def _mistakes(problem: Problem) -> Iterator[tuple[str, Problem]]:
         with contextlib.suppress(ImpcError):  # no prediction: no candidate
             misfit = prediction_misfit(other)
             if misfit < best:
-                best, found = misfit, (name, other)
-    if found is not None:
-        yield found
+                best, found = misfit, {name: other}
+    return found
+
+
+def _meanings(plant: Plant) -> list[tuple[str, Array, int]]:
+    """Mistakes by name: matrix (p, p) that corrects the outputs, and sign of the perturbation."""
+    unit, p = np.eye(len(plant.outputs)), len(plant.outputs)
+    changes: list[tuple[str, Array, int]] = []
+    for i, name in enumerate(plant.outputs):
+        changes.append((f"{SIGN}.{name}", unit - 2 * np.outer(unit[i], unit[i]), 1))
+    if p > 1 and len(plant.disturbances) == 1:  # with one output it is the sign of that
+        changes.append((f"{SIGN}.{plant.disturbances[0]}", unit, -1))
+    for i, j in itertools.permutations(range(p), 2):
+        if plant.unit(plant.outputs[i]) != plant.unit(plant.outputs[j]):
+            continue
+        if i < j:
+            swapped = unit[[j if k == i else i if k == j else k for k in range(p)]]
+            changes.append((f"{EXCHANGED}.{plant.outputs[i]}", swapped, 1))
+        for kind, sign in ((SUM, -1.0), (DIFFERENCE, 1.0)):
+            moved = unit + sign * np.outer(unit[i], unit[j])
+            changes.append((f"{kind}.{plant.outputs[i]}", moved, 1))
+    return changes
 
 
 def _freed(problem: Problem, name: str) -> Problem | None:

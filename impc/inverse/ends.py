@@ -21,10 +21,8 @@ import numpy as np
 
 from impc.checking import replace
 from impc.errors import ImpcError
-from impc.inverse.laws import GainLaw
 from impc.inverse.refit import refit
-from impc.inverse.search import best_of, cut, with_fitted_starts
-from impc.inverse.unknowns import Unknowns
+from impc.inverse.search import best_of, cut, seen_at, with_fitted_starts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -72,14 +70,11 @@ def relative_error(end: Fitted) -> float:
     Other directions have a prior of SD 1 in whitened units.
     """
     K = np.array(end.K)
-    law = GainLaw(end.problem, K, np.array(end.S))
-    space = Unknowns(end.problem, law)
-    seen = space.without_nuisance(space.start)[:, : K.size]
-    noise = end.misfit / np.sqrt(end.problem.recorded_numbers)
-    moved = np.abs(law.natural(np.diag(np.ones(K.size)).reshape(-1, *K.shape) * K))
+    law, slopes, noise, _ = seen_at(end)
+    moved = np.abs(law.natural(np.eye(K.size).reshape(-1, *K.shape) * K))
     largest = int(np.argmax(np.sum(moved**2, axis=(1, 2))))
     along = law.gains.reshape(K.size, -1)[:, largest]
-    variance = along @ np.linalg.solve(seen.T @ seen / noise**2 + np.eye(K.size), along)
+    variance = along @ np.linalg.solve(slopes.T @ slopes / noise**2 + np.eye(K.size), along)
     return float(np.sqrt(variance) / abs(np.ravel(K)[largest]))
 
 

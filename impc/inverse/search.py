@@ -14,8 +14,9 @@ recordings determine K and, with several inputs and active bounds, S (docs/why/t
 
 from __future__ import annotations
 
+import functools
 import itertools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -208,34 +209,41 @@ def best_of(ends: list[Fitted]) -> tuple[Fitted, int]:
     best = min(ends, key=lambda end: end.objective)
     if best.explained:
         return best, sum(end.explained for end in ends)
-    if not best.stabilises:
-        return best, 1
-    longer = colour(best)
+    longer = seen_at(best).colour if best.stabilises else 1.0
     near = [end for end in ends if end.objective - best.objective <= _NEAR * longer]
-    if len(near) < 2:
+    if len(near) < 2 or not best.stabilises:
         return best, len(near)
-    law = GainLaw(best.problem, np.array(best.K), np.array(best.S))
-    space = Unknowns(best.problem, law)
-    seen = space.without_nuisance(space.start)[:, : best.K.size]
-    noise = best.misfit / np.sqrt(best.problem.recorded_numbers)
+    law, slopes, noise, _ = seen_at(best)
     steps = np.array([law.natural(np.array(end.K) - best.K).ravel() for end in near])
-    left, _, _ = np.linalg.svd(seen, full_matrices=False)
-    moved = np.max(np.abs(left.T @ seen @ steps.T), axis=0) / noise
+    left, _, _ = np.linalg.svd(slopes, full_matrices=False)
+    moved = np.max(np.abs(left.T @ slopes @ steps.T), axis=0) / noise
     return best, int(np.count_nonzero(moved <= _SAME * np.sqrt(longer)))
 
 
-def colour(end: Fitted) -> float:
-    """Long-run over white variance of the residuals by their first autocorrelation, at least 1.
+class Seen(NamedTuple):
+    """What the recordings say about the gain at an end."""
 
-    Differences of -2 log L for white noise are too large by this factor.
-    """
-    space = Unknowns(end.problem, GainLaw(end.problem, np.array(end.K), np.array(end.S)))
+    law: GainLaw  # Its whitened coordinates
+    slopes: Array  # Derivative of the residual by them, after projection on all else (r, m n)
+    noise: float  # RMS residual
+    # Long-run over white variance of the residuals by their first autocorrelation, at least 1:
+    # differences of -2 log L for white noise are too large by this factor
+    colour: float
+
+
+@functools.lru_cache(maxsize=16)
+def seen_at(end: Fitted) -> Seen:
+    """What the recordings say about the gain at an end; it must stabilise."""
+    law = GainLaw(end.problem, np.array(end.K), np.array(end.S))
+    space = Unknowns(end.problem, law)
     width, above, below = len(end.problem.measured), 0.0, 1e-300
     for part in space.evaluated(space.start)[0].residuals:
         rows = part.reshape(-1, width)
         above, below = above + np.sum(rows[1:] * rows[:-1]), below + np.sum(rows**2)
     root = float(np.clip(above / below, 0.0, _LONGEST))
-    return (1 + root) / (1 - root)
+    slopes = space.without_nuisance(space.start)[:, : end.K.size]
+    noise = end.misfit / np.sqrt(end.problem.recorded_numbers)
+    return Seen(law, slopes, noise, (1 + root) / (1 - root))
 
 
 def _hides_states(problem: Problem) -> bool:

@@ -126,7 +126,7 @@ class Compressed:
         return np.hstack([flat[:, : self.split], middle, flat[:, self.split :]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # identity comparison, so that derived results can be cached
 class Fitted(Frozen):
     """End of a search."""
 

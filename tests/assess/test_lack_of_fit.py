@@ -23,6 +23,7 @@ from impc.inverse.further_unknowns import (
 )
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import Problem
+from impc.inverse.refit import refit
 from impc.inverse.residuals import residual_only
 from impc.inverse.unknowns import Unknowns
 from impc.studies.fit.settings import FitSettings
@@ -126,7 +127,8 @@ def test_a_wrong_recording_is_named_and_mended(name: str, size: float) -> None:
         trials.append(replace(trial, outputs=frozen(y), disturbance=frozen(d)))
     wrong = replace(problem, recordings=tuple(trials))
     fitted = gain_estimate(impc.fit(wrong))
-    cause = diagnosis.diagnosed(wrong, fitted)
+    at = refit(fitted.problem, np.array(fitted.K), np.array(fitted.S))
+    cause = diagnosis.diagnosed(wrong, at, lack_of_fit(fitted))
     assert cause is not None
     assert cause.found.culprit is not None
     assert cause.found.culprit.name == name

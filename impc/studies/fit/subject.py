@@ -36,6 +36,7 @@ from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.noisy_fit import first_end, fit_controller
 from impc.inverse.problem import Problem, aims, simulated
+from impc.inverse.refit import refit
 from impc.inverse.search import FEW, with_jumps
 from impc.inverse.structured import fit_structured
 from impc.model.foresight import physical_states
@@ -304,23 +305,33 @@ def _first_fits(
     problem: Problem, progress: FitProgress, attempt: Attempt
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
     """Inverse MPC, with one more unknown if tests of a first search or of the fit point to it."""
+
+    def tested(at: GainEstimate | Fitted) -> LackOfFit | None:
+        found: LackOfFit | None
+        found = attempt("test of the model", functools.partial(lack_of_fit, at), None)
+        return found
+
+    def cause_of(at: Fitted, found: LackOfFit | None, least: float = 0.0) -> Diagnosis | None:
+        compute = functools.partial(diagnosed, problem, at, found, least)
+        cause: Diagnosis | None = attempt("diagnosis", compute, None)
+        return cause
+
     search = functools.partial(first_end, problem)
     first = attempt("first search", search, None) if problem.recorded_numbers > FEW else None
     begins: tuple[Fitted, ...] = () if first is None else (first,)
-    cause: Diagnosis | None = None
-    if first is not None:
-        cause = attempt("diagnosis", functools.partial(diagnosed, problem, first, _PLAIN), None)
+    cause = None if first is None else cause_of(first, tested(first), _PLAIN)
     while True:
         if cause is not None and cause.problem is not None:
             problem, begins = cause.problem, cause.ends
             progress = progress.anew(problem)
         fitted = progress.estimate("inverse_mpc", functools.partial(_whole_fit, problem, begins))
         estimate = gain_estimate(fitted)
-        if cause is None:
-            cause = attempt("diagnosis", functools.partial(diagnosed, problem, estimate), None)
+        last = tested(estimate)
+        if cause is None:  # the first search raised no clear alarm
+            end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
+            cause = cause_of(end, last)
             if cause is not None and cause.problem is not None:
                 continue
-        last = attempt("test of the model", functools.partial(lack_of_fit, estimate), None)
         progress.done("inverse MPC")
         freed = cause is not None and cause.problem is not None
         before = (cause.found,) if cause is not None and freed else ()
