@@ -264,14 +264,13 @@ _SHARPEST = 1e-6
 def estimate_draws(
     plant: Plant, weights: Weights, estimate: GainEstimate
 ) -> tuple[LqrSolution, ...]:
-    """Regulators with gains within the uncertainty of an estimate, in equal parts of its ends."""
+    """Regulators with gains within the uncertainty of an estimate, in equal parts of its ends.
+
+    All are regulators of the fitted `plant`: the sets of their weights are those of that plant.
+    """
     ends = (estimate, *estimate.rivals)[:DRAWS]
-    plants = (plant, *(end.problem.plant for end in ends[1:]))
     count = -(-DRAWS // len(ends))
-    drawn = [
-        drawn_gains(plant, weights, end.K, end.covariance, count)
-        for plant, end in zip(plants, ends, strict=True)
-    ]
+    drawn = [drawn_gains(plant, weights, end.K, end.covariance, count) for end in ends]
     return tuple(one for each in zip(*drawn, strict=True) for one in each)[:DRAWS]
 
 

@@ -62,12 +62,8 @@ def per_unit_finding(result: FitResult) -> Finding:
     )
     labels = {"for_every": "For every ...", "low": "95 % CI, low", "high": "95 % CI, high"}
     count = len(result.estimate.rivals)
-    ends = (
-        f" Intervals include {'another end' if count == 1 else f'{count} other ends'} of the "
-        "search, which explain the recordings as well."
-        if count
-        else ""
-    )
+    other = "another end" if count == 1 else f"{count} other ends"
+    ends = f" Intervals include {other} of the search with an equally good fit." if count else ""
     caption = f"Determined: known to within half of its value.{ends}{of_inner}"
     return Finding("gain_per_unit", table, caption, labels=labels, digits=3)
 
