@@ -2,8 +2,8 @@
 
 The linear seat of W2, three trials of 30 s, white noise on the angles with which the true
 controller has a VAF of 90 %. For each torque limit the script prints how far the fit is below the
-VAF of the true controller, and how often each entry of the true gain lies within three estimated
-standard errors. Results: experiments/coverage.md.
+VAF of the true controller, and how often each true gain that the report shows (not those of single
+nerves and muscles) lies within three estimated standard errors. Results: experiments/coverage.md.
 
     python -m experiments.simulated_subjects --subjects 100 --limits 70 6 4.5
 """
@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.printed_gain import covariance_intervals, gain_estimate
+from impc.assess.printed_gain import covariance_intervals, follows_command, gain_estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
 from impc.studies.fit.settings import FitSettings
@@ -29,6 +29,7 @@ from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array
+    from impc.model.plant import Plant
 
 __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
 
@@ -42,7 +43,7 @@ class Subject:
     below_ceiling : float
         VAF of the true controller minus that of the fit, percentage points, scaled outputs.
     entries : Array
-        Distance of each entry of K from the centre of its interval, which spans 3.92, shape (n,).
+        Distance of each shown entry of K from the centre of its interval, which spans 3.92.
     directions : Array
         The same along the directions of `GainCovariance`, shape (n,).
     """
@@ -80,13 +81,19 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     samples = sum(trial.outputs.size for trial in trials)
     error = estimate.K - truth
     along = covariance.along(error)
-    intervals = covariance_intervals(estimate, covariance, "sandwich")[: error.size]
-    ends = np.array([[one.low, one.high] for one in intervals])
+    intervals = covariance_intervals(estimate, covariance, "sandwich")
+    shown = _shown(plant)
+    ends = np.array([[intervals[index].low, intervals[index].high] for index in shown])
     return Subject(
         100 * (fitted.misfit**2 - noise) / samples,
-        (ends.mean(axis=1) - np.ravel(truth)) / (np.ptp(ends, axis=1) / (2 * TWO_SIDED)),
+        (ends.mean(axis=1) - np.ravel(truth)[shown]) / (np.ptp(ends, axis=1) / (2 * TWO_SIDED)),
         along / covariance.deviations,
     )
+
+
+def _shown(plant: Plant) -> Array:
+    """Places of the states whose gains the report shows, for a plant with one control."""
+    return np.flatnonzero(~follows_command(plant))
 
 
 def _study(limit: float, count: int) -> list[Subject]:
@@ -117,7 +124,8 @@ def main() -> None:
     parser.add_argument("--subjects", type=int, default=100)
     parser.add_argument("--limits", type=float, nargs="+", default=[70.0, 6.0, 4.5])
     given = parser.parse_args()
-    names = seat(1, 1.0).problem.plant.states
+    plant = seat(1, 1.0).problem.plant
+    names = tuple(plant.states[index] for index in _shown(plant))
     for limit in given.limits:
         _print(limit, _study(limit, given.subjects), names)
 

@@ -95,7 +95,7 @@ def test_inverse_mpc_against_inverse_lqr(limit: float) -> None:
     ],
 )
 def test_noisy_subjects_reach_the_ceiling(limit: float, count: int, each: bool) -> None:
-    """Within 0.5 points; 97 % of all entries, or each entry in 97 %, within 3 standard errors."""
+    """Within 0.5 points; 97 % of shown gains, or each gain in 97 %, within 3 standard errors."""
     subjects = [simulated_subject(seed, limit) for seed in range(count)]
     assert max(item.below_ceiling for item in subjects) < 0.5
     inside = np.array([np.abs(item.entries) <= 3 for item in subjects])
