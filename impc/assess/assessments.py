@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.variance_accounted_for import vaf
+from impc.assess.variance_accounted_for import explained_share
 from impc.control.simulation import Simulation
 from impc.model.plant import Plant
 from impc.model.weights import condition_number
@@ -95,9 +95,10 @@ def simulated_vaf(plant: Plant, trials: Sequence[Recording], runs: Sequence[Simu
     """VAF (3.24) over trials (p,), NaN if a simulation stops early."""
     if not all(run.complete for run in runs):
         return np.full(len(plant.outputs), np.nan)
-    return vaf(
-        np.concatenate([trial.corrected for trial in trials]),
-        np.concatenate([run.x @ plant.C.T for run in runs]),
+    return explained_share(
+        [trial.outputs for trial in trials],
+        [trial.corrected for trial in trials],
+        [run.x @ plant.C.T for run in runs],
     )
 
 

@@ -29,6 +29,8 @@ from impc.inverse.residuals import residual_only
 from impc.inverse.search import with_fitted_starts
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from impc.assess.printed_gain import GainEstimate
     from impc.control.simulation import Simulation
     from impc.inverse.estimates import Estimate
@@ -89,6 +91,27 @@ def centred_vaf(recorded: Array, simulated: Array) -> Array:
     return _explained(np.nanvar(recorded - simulated, axis=0), np.nanvar(recorded, axis=0))
 
 
+def explained_share(
+    outputs: Sequence[Array], corrected: Sequence[Array], simulated: Sequence[Array]
+) -> Array:
+    """VAF (3.24) of corrected outputs over trials (p,).
+
+    A fitted offset or scale enlarges the sum of squares of an output. Where there is one, each
+    trial has the smaller of VAF and centred VAF, and counts by its recorded variance.
+    """
+    found = vaf(np.concatenate(corrected), np.concatenate(simulated))
+    pairs = list(zip(corrected, simulated, strict=True))
+    each = [np.fmin(vaf(*pair), centred_vaf(*pair)) for pair in pairs]
+    sizes = [len(one) * np.nanvar(one, axis=0) for one in outputs]
+    total = np.sum(sizes, axis=0)
+    pooled = np.divide(
+        np.nansum(np.multiply(each, sizes), axis=0), total, out=found.copy(), where=total > 0
+    )
+    recorded = np.concatenate(outputs)
+    fitted = np.any((np.concatenate(corrected) != recorded) & np.isfinite(recorded), axis=0)
+    return np.where(fitted, pooled, found)
+
+
 def _explained(left: Array, total: Array) -> Array:
     share = np.divide(left, total, out=np.full_like(left, np.nan), where=total > 0)
     return np.asarray(100 * (1 - share))
@@ -129,7 +152,7 @@ def agreement(
     residual = np.nan_to_num(trial.corrected - simulated)
     lags = min(max(round(1 / plant.dt), _LEAST_LAGS), trial.samples // 5)
     return TrialAgreement(
-        frozen(vaf(trial.corrected, simulated)),
+        frozen(explained_share([trial.outputs], [trial.corrected], [simulated])),
         frozen(centred_vaf(trial.corrected, simulated)),
         frozen(whiteness(residual, max(lags, 1))),
         frozen(np.sqrt(np.mean(residual**2, axis=0))),
@@ -153,16 +176,19 @@ class HeldOut(Frozen):
     centred_vaf: Array  # With means removed, % (p,)
 
 
-def left_out(fitted: Estimate, estimate: GainEstimate, index: int, settle: float) -> HeldOut:
+def left_out(
+    fitted: Estimate, estimate: GainEstimate, index: int, settle: float, *, free: bool = False
+) -> HeldOut:
     """Predict a trial with the gain that the other trials have.
 
-    The gain of the weights moves by what a refit of the identified gain without the trial changes.
+    The gain of the weights, or the `free` one, moves by what a refit without the trial changes.
     """
     others = estimate.problem.with_body_fixed().leaving_out(index)
     K, S = np.array(estimate.K), np.array(estimate.S)
     change = refit(others, K, S, _PROMISE).K - K
     trial = fitted.problem.recordings[index]
-    return predicted(fitted.problem, fitted.gain + change, np.array(fitted.metric), trial, settle)
+    base = (K, S) if free else (np.array(fitted.gain), np.array(fitted.metric))
+    return predicted(fitted.problem, base[0] + change, base[1], trial, settle)
 
 
 def predicted(
@@ -177,12 +203,15 @@ def predicted(
     if problem.unknown_start:
         started = with_fitted_starts(alone, gain, metric, max(first, alone.plant.n))
     run = simulate(controller_for(started, gain, metric), scenarios(started)[0])
-    recorded = started.recordings[0].corrected[first:]
-    simulated = (run.x @ started.plant.C.T)[first:]
     if not run.complete:
-        nothing = frozen(np.full(recorded.shape[1], np.nan))
+        nothing = frozen(np.full(len(problem.plant.outputs), np.nan))
         return HeldOut(nothing, nothing)
-    return HeldOut(frozen(vaf(recorded, simulated)), frozen(centred_vaf(recorded, simulated)))
+    (begun,), simulated = started.recordings, (run.x @ started.plant.C.T)[first:]
+    outputs, recorded = begun.outputs[first:], begun.corrected[first:]
+    return HeldOut(
+        frozen(explained_share([outputs], [recorded], [simulated])),
+        frozen(centred_vaf(recorded, simulated)),
+    )
 
 
 def residuals_of(found: Estimate) -> list[Array]:

@@ -1,14 +1,13 @@
 """Test whether any cost weights explain the gain, and count identified directions.
 
-    D = sum over identified directions i of  ((K - K(Q, R)) along i / s_i)^2
+    D = d' V^-1 d,    d = K - K(Q, R) along the identified directions
 
-K is the best unrestricted gain, K(Q, R) the gain of the fitted weights, s_i the HAC standard
-errors. If the true gain belongs to some weights, D is approximately chi-squared with as many
-degrees of freedom as directions: errors along them may be correlated, and the fitted weights, whose
-condition number is penalised, need not minimise D. A much larger D rejects all weights, and then no
-statement about the intent holds. If the residuals contradict the model itself, noise is not the
-only source of gain errors: weights are then rejected only if their misfit is also more than 5 %
-larger.
+K is the best unrestricted gain, K(Q, R) the gain of the fitted weights, V the HAC covariance of K
+along these directions. If the true gain belongs to some weights, D is at most chi-squared with as
+many degrees of freedom as directions: it is zero where K itself has weights. A larger D rejects all
+weights, and then no statement about the intent holds. If the residuals contradict the model itself,
+noise is not the only source of gain errors: weights are then rejected only if their misfit is also
+more than 5 % larger.
 
 Whether weights have K itself is a linear matrix inequality. With one input and an invertible A, the
 return difference of an optimal regulator explains the result (docs/why/theory.md):
@@ -112,11 +111,13 @@ def weights_test(
 ) -> WeightsTest:
     """Compare the gain of the fitted weights with the identified gain."""
     covariance, plant = estimate.covariance, estimate.problem.plant
-    identified = covariance.identified
-    steps = covariance.along(estimate.K - fitted.gain)[identified]
-    exact = fitted.explained
-    statistic = 0.0 if exact else float(np.sum((steps / covariance.deviations[identified]) ** 2))
-    freedom = int(np.count_nonzero(identified))
+    identified, exact = covariance.identified, fitted.explained
+    # Divided by its standard errors, V is well scaled.
+    sizes, usable = covariance.deviations[identified], np.isfinite(covariance.deviations)
+    V = covariance.spread[np.ix_(identified[usable], identified[usable])] / np.outer(sizes, sizes)
+    d = covariance.along(estimate.K - fitted.gain)[identified] / sizes
+    statistic = 0.0 if exact else float(d @ np.linalg.solve(V, d))
+    freedom = len(d)
     p_value = float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
     try:
         exist = weights_margin(gain_fibre(plant, estimate.K)).exist

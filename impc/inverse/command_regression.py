@@ -44,7 +44,9 @@ def regress_commands(problem: Problem, gain: Array, metric: Array) -> CommandReg
     """Regress the recorded commands; a `gain` (m, n) and `metric` (m, m) define active bounds."""
     if not all(len(trial.commands) for trial in problem.recordings):
         raise DataError(
-            "commands", "expected recorded commands, got none", "pass Recording(..., commands=...)"
+            "commands",
+            "needs recorded commands; these recordings have none",
+            "pass Recording(..., commands=...)",
         )
     controller = controller_for(problem, gain, metric)
     x, u, used = [], [], 0

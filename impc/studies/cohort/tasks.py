@@ -16,44 +16,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import psutil
 
-from impc.arrays import frozen
-from impc.assess.assessments import assessed, evaluate_method
+from impc.assess.assessments import assessed
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.intent import intent
-from impc.assess.lack_of_fit import lack_of_fit
-from impc.assess.printed_gain import covariance_intervals, gain_estimate
 from impc.assess.resampling import replicate
-from impc.assess.structures import assess_structure
-from impc.assess.variance_accounted_for import left_out, saturated_share
-from impc.assess.weights_test import weights_test
 from impc.checking import replace
-from impc.errors import DataError, ImpcError, SolverError, WeightsError
+from impc.errors import DataError, ImpcError
+from impc.files.checks import FELL
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import plant_source
 from impc.files.reading import read_unit
-from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.structured import fit_structured
 from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_name
-from impc.studies.cohort.unit_verdict import unit_verdict
 from impc.studies.effort import Effort, fit_effort
-from impc.studies.fit.asked import asked_plant, fit_structures
+from impc.studies.fit.asked import asked_plant
 from impc.studies.fit.settings import fit_settings
-from impc.studies.fit.subject import fit_problem, state_sizes
+from impc.studies.fit.subject import fit_alone, fit_problem
+from impc.studies.fit.verdict import fit_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from impc.arrays import Array
     from impc.assess.assessments import MethodFit
-    from impc.assess.printed_gain import GainEstimate
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
-    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.model.plant import Plant
     from impc.studies.cohort.study import Study
+    from impc.studies.fit.result import FitResult
     from impc.studies.fit.settings import FitSettings
 
 
@@ -117,9 +107,8 @@ def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
-    fitted = fit_controller(problem)
     with angles_in(task.configuration.report.angles):
-        content = _described(problem, fitted, settings)
+        content = _described(fit_alone(problem, settings))
     return _finished(content, started)
 
 
@@ -127,6 +116,10 @@ def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, 
     """Bootstrap replicate `index` of a unit with the stored `fit`."""
     started = time.perf_counter()
     problem, settings = unit_problem(task)
+    if fit["added"]:
+        raise DataError(
+            "bootstrap", f"the fit has one more unknown ({fit['added']})", "correct the recordings"
+        )
     here = problem.at(*(np.array(fit[name]) for name in ("starts", "logarithms", "errors")))
     found = replicate(here, np.array(fit["K"]), np.array(fit["S"]), index, settings.seed)
     return _finished({"K": found.K, "parameters": found.parameters}, started)
@@ -182,30 +175,21 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
     return Effort(0.0, 0.0), 0.0
 
 
-def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any]:
-    plant, K, weights = fitted.problem.plant, np.array(fitted.gain), fitted.stage_weights
-    fit = evaluate_method(fitted, problem.bounds)
-    estimate = gain_estimate(fitted)
-    fit = replace(fit, held_out=_held_out(fitted, estimate, settings))
-    sizes = state_sizes(fit.runs)
-    readings = intent(plant, K, np.array(fitted.metrics), sizes, weights)
+def _described(result: FitResult) -> dict[str, Any]:
+    plant, K, weights = result.fitted.problem.plant, result.fitted.gain, result.fitted.stage_weights
+    fit, estimate, (first, *_) = result.inverse_mpc, result.estimate, result.given.recordings
+    # Named by `unit_problem`.
+    result = replace(result, falls=tuple(line for line in first.findings if FELL in line))
     family = estimate.problem.family
     known = () if family is None else family.names
-    try:
-        lack = lack_of_fit(estimate)
-    except (ImpcError, np.linalg.LinAlgError):
-        lack = None
-    test = weights_test(fitted, estimate, contradicted=lack is not None and lack.alarm)
-    found = covariance_intervals(estimate, estimate.covariance, "sandwich")[: K.size]
-    determined = any(one.determined for one in found)
-    halves = np.array([(one.high - one.low) / 2 for one in found])
-    limits = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
-    saturated = saturated_share(fit.commands, *limits)
+    halves = np.array([(one.high - one.low) / 2 for one in result.gain_intervals])
+    bounds = result.given.bounds
     return {
         **_named(plant),
-        "verdict": unit_verdict(fit, lack, test, saturated, determined).data(),
-        "trials": len(problem.recordings),
-        "samples": sum(trial.samples for trial in problem.recordings),
+        "verdict": fit_verdict(result).data(),
+        "added": None if result.added is None else result.added.name,
+        "trials": len(result.trials),
+        "samples": sum(trial.samples for trial in result.given.recordings),
         "K": estimate.K,
         "S": estimate.S,
         "K_deviation": (halves / TWO_SIDED).reshape(K.shape),
@@ -213,25 +197,25 @@ def _described(problem: Problem, fitted: Estimate, settings: FitSettings) -> dic
         "K_of_weights": K,
         "Q": weights.Q,
         "R": weights.R,
-        "misfit": fitted.misfit,
-        "exact": fitted.explained,
-        "converged": fitted.converged,
+        "misfit": result.fitted.misfit,
+        "exact": result.fitted.explained,
+        "converged": result.fitted.converged,
         **assessed(fit),
-        "saturated": saturated,
+        "saturated": result.saturated,
         "fell": fit.fell,
-        "limit": np.max(np.abs(limits), axis=0),
-        "state_sizes": sizes,
+        "limit": np.max(np.abs([bounds.u_min, bounds.u_max]), axis=0),
+        "state_sizes": result.intent.sizes,
         "readings": {
             item.rule: {"Q": item.weights.Q, "dominant": item.dominant, "angle": item.angle}
-            for item in readings.readings
+            for item in result.intent.readings
         },
         "parameters": dict(zip(known, estimate.parameters, strict=True)),
         "starts": [trial.x0 for trial in estimate.problem.recordings],
         "logarithms": estimate.problem.logarithms,
         "errors": estimate.problem.errors,
-        "findings": [trial.findings for trial in problem.recordings],
+        "findings": [trial.findings for trial in result.given.recordings],
         "trajectory": _trajectory(fit),
-        "structure": _structure(problem, fitted, settings),
+        "structure": _structure(result),
     }
 
 
@@ -265,34 +249,19 @@ def _trajectory(fit: MethodFit) -> dict[str, Any]:
     }
 
 
-def _held_out(fitted: Estimate, estimate: GainEstimate, settings: FitSettings) -> Array:
-    """VAF (trials, p) of each left-out trial, %; no rows if not requested or for one trial."""
-    count = len(fitted.problem.recordings)
-    found = [
-        left_out(fitted, estimate, index, settings.settle).vaf
-        for index in range(count if settings.held_out and count > 1 else 0)
-    ]
-    return frozen(np.reshape(found, (-1, len(fitted.problem.plant.outputs))))
-
-
-def _structure(problem: Problem, fitted: Estimate, settings: FitSettings) -> dict[str, Any] | None:
+def _structure(result: FitResult) -> dict[str, Any] | None:
     """Logarithms of cost weights with 95 % intervals; None if no structure is requested."""
-    if settings.structure is None:
+    if not result.structures:
         return None
-    structure = fit_structures(problem.plant, settings)[0]
-    record: dict[str, Any] = {"name": structure.name, "unknowns": structure.unknowns}
-    try:
-        found = fit_structured(problem, structure, fitted)
-        fit = assess_structure(problem, structure, found, fitted, settings.settle, held_out=False)
-    except (SolverError, WeightsError) as error:
-        nothing = [np.nan] * structure.count
-        ends = dict.fromkeys(("log_cost_weight", "low", "high"), nothing)
-        return record | ends | {"refused": True, "p": np.nan, "reason": str(error)}
-    return record | {
-        "log_cost_weight": [item.value for item in fit.intervals],
-        "low": [item.low for item in fit.intervals],
-        "high": [item.high for item in fit.intervals],
+    fit = result.structures[0]
+    nothing = [np.nan] * fit.structure.count
+    return {
+        "name": fit.structure.name,
+        "unknowns": fit.structure.unknowns,
+        "log_cost_weight": [item.value for item in fit.intervals] or nothing,
+        "low": [item.low for item in fit.intervals] or nothing,
+        "high": [item.high for item in fit.intervals] or nothing,
         "refused": fit.refused,
         "p": np.nan if fit.test is None else fit.test.probability,
-        "reason": "",
+        "reason": fit.reason,
     }

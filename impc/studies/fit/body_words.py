@@ -58,10 +58,10 @@ def body_sentence_of(result: FitResult) -> str:
             "The body model was taken as exact: intervals include noise, but not the uncertainty "
             "of masses, lengths, delay and limit; state it in [plant.uncertainty]."
         )
-    count = "one parameter was" if len(stated) == 1 else f"{len(stated)} parameters were"
+    count = "One parameter" if len(stated) == 1 else f"{len(stated)} parameters"
     return (
-        f"The body is not known exactly: {count} fitted within the stated uncertainty, and the "
-        f"intervals include it{_wider(result)}."
+        f"{count} of the body, such as its mass and delays, {'is' if len(stated) == 1 else 'are'} "
+        f"uncertain. {_wider(result)}"
     )
 
 
@@ -99,9 +99,9 @@ def _wider(result: FitResult) -> str:
     found, exact = result.estimate.covariance, result.estimate.exact
     identified = np.array(found.individually_identified)
     if exact is None or not np.any(identified):
-        return ""
+        return "The intervals allow for it."
     ratio = (np.array(found.entries) / np.array(exact.entries))[identified]
-    return f", {number(float(np.median(ratio)), 2)} times as wide as for an exact body"
+    return f"This makes the intervals {number(float(np.median(ratio)), 2)} times as wide."
 
 
 def error_words(result: FitResult, error: ModelError) -> str:

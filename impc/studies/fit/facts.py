@@ -10,6 +10,7 @@ from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names, follows_command
 from impc.reporting.rendering import fixed, number
 from impc.reporting.shown_units import shown_unit, signal_name
+from impc.studies.fit.result import LITTLE
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.result import FitResult, LimitFound
 
-_BEST = "inverse_lqr_output"
+#: Ratio of unexplained variances from which a limit is said to matter.
+MATTERS = 2.0
 # Longest recordings that are proposed, s.
 _LONGEST = 600.0
 
@@ -129,12 +131,31 @@ def first_gain(result: FitResult) -> GainRow | None:
     return rows[0] if rows else None
 
 
-def lasting_or_first(result: FitResult) -> str:
+def example_gain(result: FitResult) -> str:
     """Sentence with one gain and its interval as an example."""
     row = first_gain(result)
     if row is None:
         return ""
     return f"For example {number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})."
+
+
+def outside_offset(result: FitResult) -> str:
+    """Sentence on a fitted offset that lies outside its recorded signal; empty if none does."""
+    plant, trials = result.given.plant, result.given.recordings
+    for kind, name, values in result.estimate.problem.fitted_errors:
+        if kind != "offset" or name not in plant.outputs:
+            continue
+        factor, unit = shown_unit(plant, name)
+        column = plant.outputs.index(name)
+        for trial, value in zip(trials, values, strict=True):
+            low, high = np.nanmin(trial.outputs[:, column]), np.nanmax(trial.outputs[:, column])
+            if not low <= value <= high:
+                ends = f"{number(factor * low)} to {number(factor * high)}"
+                return (
+                    f"The offset of the {signal_name(plant, name)} was fitted as "
+                    f"{with_unit(number(factor * value), unit)}; the recording has {ends}."
+                )
+    return ""
 
 
 def limits(plant: Plant, low: Array, high: Array) -> list[str]:
@@ -231,19 +252,56 @@ def shares_text(result: FitResult) -> str:
     return f"{shares(result, result.inverse_mpc.vaf, 0)} of the variance"
 
 
-def unlimited_ratio(result: FitResult) -> str:
-    """Sentence on the unexplained variance without a limit; empty if below twice as much."""
-    methods = {item.name: item for item in result.methods}
-    other, own = methods.get(_BEST), result.inverse_mpc
-    if other is None or np.any(np.isnan(other.vaf)):
-        return ""
-    ratios = (100 - other.vaf) / np.maximum(100 - own.vaf, 1e-9)
+def reported_shares(result: FitResult) -> tuple[Array, str]:
+    """VAF (p,) by which the model is judged, and where: of the gain if no weights have it.
+
+    Left-out trials count if there are any and the fitted ones are explained.
+    """
+    own, held = result.inverse_mpc.vaf, held_out(result)
+    if result.weights_test.rejected:
+        own = result.gain_shares
+    if held is None or np.any(own < LITTLE) or np.any(np.isnan(own)):
+        return own, "the recordings"
+    return held, "left-out trials"
+
+
+def explained_words(result: FitResult) -> str:
+    """The shares of `reported_shares`, output by output."""
+    plant, (found, _) = result.given.plant, reported_shares(result)
+    said = []
+    for name, value in zip(plant.outputs, found, strict=True):
+        words = signal_name(plant, name)
+        if np.isnan(value):
+            said.append(f"an unknown part of the {words} (the simulation stops early)")
+        elif value < 0:
+            said.append(f"nothing of the {words} (it is further off than no movement at all)")
+        else:
+            said.append(f"{value:.0f} % of the {words}")
+    return " and ".join(said)
+
+
+def unlimited_ratio(result: FitResult) -> tuple[float, str]:
+    """Unexplained variance of the best method without a limit over that of the model, in words.
+
+    Of the output for which the ratio is largest; NaN without such a method.
+    """
+    others = [
+        item.vaf
+        for item in result.methods[:-1]
+        if not np.any(np.isfinite(item.estimate.problem.bounds.u_max))
+    ]
+    left = [100 - vaf for vaf in others if not np.any(np.isnan(vaf))]
+    if not left:
+        return float("nan"), ""
+    own = np.maximum(100 - result.inverse_mpc.vaf, 1e-9)
+    ratios = min((np.asarray(one) / own for one in left), key=lambda one: float(np.max(one)))
     place = int(np.argmax(ratios))
-    if ratios[place] < 2:
-        return ""
+    if ratios[place] < MATTERS:
+        return float(ratios[place]), " A controller without a limit explains nearly as much."
     name = signal_name(result.given.plant, result.given.plant.outputs[place])
     much = number(float(ratios[place]), 2)
-    return f" Without a limit, {much} times as much variance of the {name} is left unexplained."
+    said = f" Without a limit, {much} times as much variance of the {name} is left unexplained."
+    return float(ratios[place]), said
 
 
 def no_limit(result: FitResult) -> str:
@@ -269,4 +327,4 @@ def statement_text(plant: Plant, item: Statement) -> str:
     if item.kind == "order":
         return f"A typical {one} costs {more} than a typical {other}."
     pair = f"{one[:1].upper()}{one[1:]} and {other}"
-    return f"{pair} of the same sign cost {more} than of opposite signs."
+    return f"{pair} to the same side cost {more} than to opposite sides."

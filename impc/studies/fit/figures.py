@@ -229,7 +229,7 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
     labels = []
     for row, item in enumerate(shown):
         one, other = signal_name(plant, item.first), signal_name(plant, item.second)
-        same = "" if item.kind == "order" else ": same vs opposite sign"
+        same = "" if item.kind == "order" else ": same vs opposite side"
         label = f"{one} {'+' if same else 'vs'} {other}{same}"
         labels.append(label[:1].upper() + label[1:])
         low, high = np.clip(ends[row], -reach, reach)
@@ -252,8 +252,8 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
     ax.spines["left"].set_visible(False)
     words = "less  \u2190   \u2192  more" if narrow else "first costs less  \u2190   \u2192  more"
     ax.text(0, 1.01, words, transform=ax.get_xaxis_transform(), ha="center", color=MUTED)
-    ax.set_xlabel("Difference in cost (relative)" if narrow else
-                  "Difference in cost (relative to the first, symmetric log scale)")  # fmt: skip
+    ax.set_xlabel("Difference (in costs of the first)" if narrow else
+                  "How much more the first costs (in multiples of its own cost)")  # fmt: skip
     return figure
 
 

@@ -16,7 +16,7 @@ from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
-from impc.studies.fit.facts import gain_rows, named_gains, shift_halves, statement_text
+from impc.studies.fit.facts import named_gains, shift_halves, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.uncertainty import verdict
 from impc.studies.methods_table import trajectory_table, weight_entries
@@ -52,19 +52,11 @@ def per_unit_finding(result: FitResult) -> Finding:
             "determined": lambda row: row.determined,
         },
     )
-    inner = [row for row in gain_rows(result) if row.inner]
-    known = sum(row.interval.identified for row in inner)
-    of_inner = (
-        f" Single gains on the {len(inner)} states of nerves and muscles ({known} identified) have "
-        "no meaning; they are listed under details."
-        if inner
-        else ""
-    )
     labels = {"for_every": "For every ...", "low": "95 % CI, low", "high": "95 % CI, high"}
     count = len(result.estimate.rivals)
     other = "another end" if count == 1 else f"{count} other ends"
     ends = f" Intervals include {other} of the search with an equally good fit." if count else ""
-    caption = f"Determined: known to within half of its value.{ends}{of_inner}"
+    caption = f"Determined: known to within half of its value.{ends}"
     return Finding("gain_per_unit", table, caption, labels=labels, digits=3)
 
 

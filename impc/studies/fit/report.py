@@ -16,7 +16,6 @@ from impc.reporting.document import (
     Block,
     Check,
     Checks,
-    Copy,
     Draw,
     Fold,
     Lines,
@@ -30,7 +29,7 @@ from impc.reporting.finding import Chart, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import fixed, number, probability
 from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
-from impc.reporting.verdict import Key, Verdict
+from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
 from impc.studies.fit import figures, findings
 from impc.studies.fit.aim import aim_sentences
@@ -42,6 +41,7 @@ from impc.studies.fit.body_words import (
 )
 from impc.studies.fit.data import fit_data
 from impc.studies.fit.facts import (
+    MATTERS,
     amount,
     between,
     decided,
@@ -59,12 +59,12 @@ from impc.studies.fit.facts import (
     unlimited_ratio,
     with_unit,
 )
+from impc.studies.fit.paper import paper_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import (
     structure_draw,
     structure_section,
-    structure_sentences,
 )
 from impc.studies.fit.verdict import (
     GAIN,
@@ -104,7 +104,7 @@ def fit_report(
         _hero(result, window),
         _keys(result),
         _draws(result, window),
-        _copy(result, verdict, provenance),
+        paper_text(result, verdict, provenance),
         beside=[findings.trajectory_finding(result), *findings.response_findings(result)],
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
@@ -231,15 +231,11 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
             Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
             *findings.error_findings(result),
         ]
-    settled = [_lasting(result, one) for one in lasting_responses(result.estimate)]
-    lasting = (
-        f" In steady state the contributions of all states add up: {'; '.join(settled)}."
-        if settled
-        else ""
-    )
+    lasting = [_lasting(result, one) for one in lasting_responses(result.estimate)]
     return [
         "A gain is the opposing command per unit of a deviation, as long as the limit is not "
-        f"reached.{lasting} {body_sentence_of(result)}",
+        f"reached. {body_sentence_of(result)}",
+        *filter(None, lasting),
         *aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
         *shift_words(result),
@@ -254,32 +250,36 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
 
 
 def _lasting(result: FitResult, found: LastingResponse) -> str:
-    """Steady-state command for a constant output, in words."""
+    """What is answered to a quick and to a lasting deviation, in words; empty if unknown."""
     plant = result.given.plant
     (factor, unit), (scale, of) = (shown_unit(plant, one) for one in (found.state, found.control))
     value, low, high = (scale / factor * one for one in (found.value, found.low, found.high))
-    known = f"95 % CI {between(low, high)}" if found.identified else "not identified"
+    words, quick = (
+        signal_name(plant, found.state),
+        result.preferred.get(f"K.{found.control}.{found.state}"),
+    )
+    if not found.identified or quick is None or quick.value is None:
+        return ""
+    at_once = scale / factor * quick.value
+    change = "part of it is taken back, and" if abs(value) < abs(at_once) else "more is added, and"
     return (
-        f"a constant {signal_name(plant, found.state)} of {one_of(unit)} leads to a command of "
-        f"{fixed(value)} {of} ({known})"
+        f"A quick {words} of {one_of(unit)} is answered with {fixed(at_once)} {of}. If it lasts, "
+        f"{change} {fixed(value)} {of} remain (95 % CI {between(low, high)})."
     )
 
 
 def _limit(result: FitResult, doubtful: bool) -> list[Block]:
-    limit, ratio = given_limit(result), unlimited_ratio(result)
+    limit, (ratio, without) = given_limit(result), unlimited_ratio(result)
     if limit is None:
         said = "No limit was given, so the model has none."
     elif not result.met:
         said = "These recordings cannot answer this question: the limit is never reached."
     elif doubtful:
         said = f"A limit may matter, but {limit} is in doubt (see the warning above)."
-    elif ratio:
-        said = (
-            "Yes. The same recordings were fitted with and without a limit; the best model without "
-            "a limit leaves more of the movement unexplained."
-        )
+    elif ratio >= MATTERS:
+        said = f"Yes. The same recordings were fitted with and without a limit.{without}"
     else:
-        said = "Not measurably: the best model without a limit explains the recordings as well."
+        said = f"Not measurably.{without}"
     methods: Block = Picture(
         "methods",
         "Variance not explained, and largest command, of every method",
@@ -318,8 +318,8 @@ def _intent(result: FitResult, hidden: bool) -> list[Block]:
     if summary is None:
         return [Quiet(f"Not available: {result.uncertainty.weights_reason}"), *tables]
     drawn = (
-        f" Of {summary.drawn} other gains that the recordings allow, at most one disagrees with "
-        "each of them."
+        f" We tried {summary.drawn} other gains that fit these recordings as well. Each statement "
+        f"held for at least {summary.drawn - 1}."
         if summary.drawn and made
         else ""
     )
@@ -417,7 +417,7 @@ def _limit_check(result: FitResult) -> list[Check]:
         if result.culprit is not None and result.culprit.name == LIMIT:
             return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
         if result.curves and all(curve.best == curve.own for curve in result.curves):
-            said = f"Given as {limit}; it fits best of all limits of the limit curve."
+            said = _best_of_curve(result)
             return [Check(Level.GREEN, "Limit", said)]
         return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not estimated.")]
     said = (
@@ -425,6 +425,19 @@ def _limit_check(result: FitResult) -> list[Check]:
         f"({limit_ends(found)})."
     )
     return [Check(Level.AMBER if found.disagrees else Level.GREEN, "Limit", said)]
+
+
+def _best_of_curve(result: FitResult) -> str:
+    """That the given limit is the best of those tried, which are counted."""
+    curve, (factor, unit) = (
+        result.curves[0],
+        shown_unit(result.given.plant, result.curves[0].control),
+    )
+    tried = factor * np.array(curve.limits)
+    return (
+        f"Of {len(tried)} limits tried ({number(tried.min())} to {number(tried.max())} {unit}) "
+        f"{number(factor * curve.given)} {unit} fits best."
+    )
 
 
 def _model(result: FitResult) -> Check:
@@ -446,8 +459,8 @@ def _model(result: FitResult) -> Check:
 def _weights(result: FitResult) -> Check:
     test = result.weights_test
     if test.rejected:
-        return Check(Level.AMBER, "Cost weights", "The recordings reject all cost weights.")
-    return Check(Level.GREEN, "Cost weights", "The recordings do not reject all cost weights.")
+        return Check(Level.AMBER, "Cost weights", "No cost explains this gain.")
+    return Check(Level.GREEN, "Cost weights", "At least one cost explains this gain.")
 
 
 def _others(result: FitResult) -> list[Check]:
@@ -475,57 +488,6 @@ def _others(result: FitResult) -> list[Check]:
     for stage, reason in result.failures.items():
         found.append(Check(Level.NOTE, f"Not available: {stage}", reason))
     return found
-
-
-def _copy(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy | str:
-    if verdict.level in (Level.AMBER, Level.RED):
-        return "Text to copy is available only if no warning restricts the report."
-    plant, problem, limit = result.given.plant, result.fitted.problem, given_limit(result)
-    trials, dt = result.given.recordings, plant.dt
-    seconds = sum(trial.samples for trial in trials) * dt
-    bounded = f"with the command limited to ±{limit}" if limit else "without a limit"
-    version, names = provenance.versions["impc"], [signal_name(plant, one) for one in plant.outputs]
-    methods = (
-        f"{' and '.join(names).capitalize()} from {len(trials)} trials ({seconds:.3g} s in all) "
-        f"were analysed by inverse model predictive control (impc {version}). The body model was "
-        f"{_model_name(provenance)}{provenance.arguments}. The controller predicted "
-        f"{problem.horizon * dt:.3g} s ahead at {1 / dt:.3g} samples per second, {bounded}. "
-        f"{' '.join(aim_sentences(result))}{' ' if aim_sentences(result) else ''}"
-        "The feedback gain was estimated by minimising the difference between recorded and "
-        "modelled outputs in all trials together; 95 % confidence intervals allow for "
-        "autocorrelated residuals."
-    )
-    if any(one.stated is not None for one in result.parameters):
-        methods += " They include the stated uncertainty of the body model."
-    if held_out(result) is not None:
-        methods += " Predictive accuracy was assessed by leaving out one trial at a time."
-    results = [f"The model accounted for {shares(result, result.inverse_mpc.vaf)} of the variance"]
-    held = held_out(result)
-    results[0] += (
-        f", and for {shares(result, held)} in left-out trials." if held is not None else "."
-    )
-    if limit and result.met:
-        results.append(
-            f"The command was at its limit for {saturation(result):.1f} % of the time."
-            f"{unlimited_ratio(result)}"
-        )
-    gains = [
-        f"{number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})"
-        for _, row in named_gains(result)
-        if row.determined
-    ]
-    results.append(f"Gains were {'; '.join(gains)}.")
-    made = [statement_text(plant, one) for one in decided(result)]
-    if made:
-        results.append(f"For all cost weights compatible with the recordings: {' '.join(made)}")
-    results += structure_sentences(result)[:1]
-    return Copy(methods, " ".join(results))
-
-
-def _model_name(provenance: Provenance) -> str:
-    """Name of the plant's function or file in words."""
-    name = provenance.plant_name.rpartition(":")[2].removesuffix("_for").replace("_", " ")
-    return f"“{name}”" if name else "given by a program"
 
 
 def _made(provenance: Provenance, result: FitResult | None = None, missing: str = "") -> Section:

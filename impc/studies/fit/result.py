@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from impc.assess.assessments import simulated_vaf
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import PARAMETER, entry_names
 from impc.control.simulation import Status
-from impc.inverse.problem import recorded_size
+from impc.inverse.problem import simulated
 from impc.model.plant_family import LIMIT
 from impc.model.riccati import solve_lqr
 from impc.reporting.shown_units import shown_unit
@@ -164,11 +166,12 @@ class FitResult:
         """Whether the VAF of every recorded signal is at least 50 %."""
         return bool(np.all(self.inverse_mpc.vaf >= LITTLE))
 
-    @property
-    def gain_vaf(self) -> float:
-        """Variance that the estimated gain explains, over all scaled outputs, %."""
-        size = recorded_size(self.given)
-        return 100 * (1 - (self.estimate.misfit / size) ** 2) if size else float("nan")
+    @functools.cached_property
+    def gain_shares(self) -> Array:
+        """VAF (p,) of the estimated gain, %; NaN if a simulation stops early."""
+        problem = self.estimate.problem
+        runs = simulated(problem, np.array(self.estimate.K), np.array(self.estimate.S))
+        return simulated_vaf(problem.plant, problem.recordings, runs)
 
     @property
     def met(self) -> bool:

@@ -218,6 +218,51 @@ def fit_recordings(
     return _fitted(problem, settings, progress)
 
 
+def fit_alone(problem: Problem, settings: FitSettings) -> FitResult:
+    """Fit a subject as `fit_recordings` does, without what only its own page shows.
+
+    Left out are the other methods, the set of weights, limit curves and analyses on request.
+    """
+    settings = replace(settings, structures=[], methods=[], profiles=[], horizons=[])
+    settings = replace(settings, unknown_limit=False, replicates=0, observer=None)
+    started, failures = time.perf_counter(), dict[str, str]()
+    attempt, progress = functools.partial(_attempt, failures), FitProgress()
+    problem, progress, fitted, estimate, lack = _first_fits(problem, progress, attempt)
+    own = evaluate_method(fitted, problem.bounds)
+    doubted = lack[-1] is not None and lack[-1].alarm
+    test = weights_test(fitted, estimate, contradicted=doubted)
+    trials = len(problem.recordings)
+    held = [
+        left_out(fitted, estimate, index, settings.settle, free=test.rejected)
+        for index in range(trials if _leaves_out(trials, settings) else 0)
+    ]
+    if held:
+        own = replace(own, held_out=frozen([item.vaf for item in held]))
+    known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
+    K, metrics, sizes = np.array(fitted.gain), np.array(fitted.metrics), state_sizes(own.runs)
+    skipped = (None, "Not computed in a cohort.")
+    after = progress.done, progress.replicate, attempt
+    return FitResult(
+        settings,
+        problem,
+        fitted,
+        estimate,
+        _parameters(estimate),
+        intent(known.plant, K, metrics, sizes, weights),
+        identifiability(known, weights),
+        assess(problem, fitted, estimate, skipped, settings, *after),
+        _agreements(known, own.runs, problem.bounds),
+        tuple(held),
+        (own,),
+        lack,
+        float("nan"),
+        time.perf_counter() - started,
+        test,
+        failures,
+        _structures(problem, replace(settings, held_out=False), fitted, progress),
+    )
+
+
 def _attempt(failures: dict[str, str], stage: str, compute: Callable[[], Any], default: Any) -> Any:
     """Result of a stage; if it fails, the default, with the reason in `failures`."""
     try:
@@ -253,7 +298,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         return weights_summary_or_reason(plant, K, metrics, sizes, draws, pool.map)
 
     methods, held_out, weights_found, curves = _beside_it(
-        estimate, own, others, settings, progress, attempt, whole_set
+        estimate, own, others, settings, progress, attempt, whole_set, rejected=test.rejected
     )
     structures = _structures(problem, settings, fitted, progress)
     after = progress.done, progress.replicate, attempt
@@ -369,6 +414,8 @@ def _beside_it(
     progress: FitProgress,
     attempt: Attempt,
     whole_set: Callable[[ThreadPoolExecutor], tuple[WeightsSummary | None, str]],
+    *,
+    rejected: bool,
 ) -> tuple[
     tuple[MethodFit, ...],
     tuple[HeldOut, ...],
@@ -379,7 +426,9 @@ def _beside_it(
     held_out: list[HeldOut | None] = []
     fitted, trials = own.estimate, len(own.estimate.problem.recordings)
     with threads(_THREADS) as pool:
-        without = functools.partial(left_out, fitted, estimate, settle=settings.settle)
+        without = functools.partial(
+            left_out, fitted, estimate, settle=settings.settle, free=rejected
+        )
         pending = [
             pool.submit(attempt, _without(index), functools.partial(without, index), None)
             for index in range(trials if _leaves_out(trials, settings) else 0)

@@ -61,6 +61,7 @@ def fit_of(seed: int) -> dict[str, Any]:
         "states": ["position", "position_rate"], "controls": ["force"], "outputs": ["position"],
         "shown_units": [[1.0, "m"]], "words": {"position": "hand position"},
         "verdict": {"level": "green", "headline": "It fits.", "sentence": "Well."},
+        "added": None,
         "units": {"K.force.position": "N/m", "K.force.position_rate": "N s/m"},
         "trials": 2, "samples": 100, "K": gain, "K_deviation": [[0.1, None]],
         "K_identified": [[True, False]], "K_of_weights": gain, "S": [[1.0]],

@@ -93,7 +93,8 @@ def test_an_error_of_the_model_forbids_gains() -> None:
     assert forbidden(result) == {GAIN, WEIGHTS}
     assert not any("gain on" in claim.text for claim in verdict.may)
     report = fit_report(result, Provenance())
-    assert isinstance(report.copy, str)
+    assert isinstance(report.copy, Copy)
+    assert "Gains are not reported: the residual depends" in report.copy.results
     page = report.page()
     # The numbers are only in a folded part that says so.
     assert "(do not report)" in page.partition('id="feedback-gain"')[2][:900]
