@@ -253,7 +253,7 @@ def shares_text(result: FitResult) -> str:
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:
-    """VAF (p,) by which the model is judged, and where: of the gain if no weights have it.
+    """VAF (p,) that counts, and where it was taken; of the gain if no weights have it.
 
     Left-out trials count if there are any and the fitted ones are explained.
     """
