@@ -1,4 +1,4 @@
-"""Fisher information of normalised parameters, its null directions, and feasible subsets.
+"""Fisher information of normalised parameters, and feasible subsets.
 
     F = (1 / sigma^2) sum_k (dy_k/dt)' (dy_k/dt)                 (A.2), (A.6)
 
@@ -47,15 +47,6 @@ class Information(Frozen):
     rank: int  # Number of singular values above 1e-6 of the largest
 
 
-@dataclass(frozen=True)
-class NullDirection:
-    """Combination of parameters without effect on the outputs."""
-
-    # Parameter -> component of the direction of relative changes, largest first
-    shares: dict[str, float]
-    sentence: str  # Description in words
-
-
 def fisher_information(
     model: ParametricModel, theta: Array, trials: Sequence[Trial], variance: float | None = None
 ) -> Information:
@@ -91,24 +82,6 @@ def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[s
         for kind, names in kinds.items()
         if kind and len(names) > 1 and common_scaling(model, found, names) <= 1
     )
-
-
-def null_directions(model: ParametricModel, found: Information) -> tuple[NullDirection, ...]:
-    """Null directions in relative changes of the parameters, smallest singular value first."""
-    values, vectors = found.relative[:, 0], found.relative[:, 1:]
-    nulls = []
-    for index in range(model.size - 1, found.rank - 1, -1):
-        v = vectors[index] * np.sign(vectors[index][np.argmax(np.abs(vectors[index]))])
-        order = np.argsort(-np.abs(v), kind="stable")
-        shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= 0.1}
-        parts = ", ".join(f"{name} {share:+.2f}" for name, share in shares.items())
-        seen = float(values[index] / values[0])
-        sentence = (
-            f"changing {parts} (relative changes) together changes the outputs by {seen:.0e} times "
-            "the change along the best identified direction"
-        )
-        nulls.append(NullDirection(shares, sentence))
-    return tuple(nulls)
 
 
 _EPS = float(np.finfo(np.float64).eps)

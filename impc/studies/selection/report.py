@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,8 @@ from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PHONE, RECORDED, RULE, new_figure
-from impc.reporting.verdict import Alert, Claim, Key, Verdict
+from impc.reporting.verdict import Key
+from impc.studies.selection.verdict import SELECT_RULES, SelectFacts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,20 +29,19 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.digests import Inputs
     from impc.studies.selection.analysis import StudySelection
-    from impc.studies.selection.estimation import PriorFit
     from impc.studies.selection.model import ParametricModel
 
-_OPEN = "not determined"
-_POOR, _AT_LIMIT = 50.0, 0.1  # VAF of a poor model, %; distance to a limit in the figure, %
+_POOR, _AT_LIMIT = 50.0, 0.1  # VAF of a poor model, %; distance that counts as at a limit, %
+_STUCK = "; estimate at a limit"
 _BIAS, _WIDTH = "bias_percent_of_the_range", "width_percent_of_the_range"
 _LABELS = {
     "low": "95 % CI low", "high": "95 % CI high", "sd": "SD between people", "value": "Estimate",
     _WIDTH: "95 % CI width (% of range)", _BIAS: "Bias from fixing (% of range)",
 }  # fmt: skip
 _CAPTION = (
-    "Blue: identifiable, with 95 % intervals that allow for the SD between people in the other "
-    "parameters. Grey dots: fit of all parameters, not identifiable; grey bars: assumed value and "
-    "SD between people. One mark per subject; arrows: at a limit of the search."
+    "Blue: fitted, with 95 % intervals that allow for the SD between people in the other "
+    "parameters. Grey dots: fit of all parameters; grey bars: assumed value and SD between people. "
+    "One mark per person and visit; arrows: at a limit of the search."
 )
 _BY_SUBJECT = (
     "Estimates with 95 % intervals that allow for the SD between people in the fixed parameters. "
@@ -48,42 +49,35 @@ _BY_SUBJECT = (
     "to first order, root sum of squares over the fixed parameters, each wrong by one SD."
 )
 _METHODS = (
-    "A model with {size} parameters was fitted to recordings of {people} subjects by least squares "
-    "within search limits. The largest subset whose variances, by the Fisher information, are at "
-    "most {bound:g} in each subject (unit: half the search range, squared) was selected. The "
-    "others were fixed at assumed values; 95 % intervals allow for their SD between people."
+    "A model with {size} parameters was fitted to recordings of {whom} by least squares within "
+    "search limits. The largest subset whose variances, by the Fisher information, are at most "
+    "{bound:g} in each of them (unit: half the search range, squared) was selected. The others "
+    "were fixed at assumed values; 95 % intervals allow for their SD between people."
 )
 
 
-class _Facts(NamedTuple):
-    """Phrases and numbers shared by verdict, checks and the text for a paper."""
-
-    names: str  # Names of the identifiable parameters
-    free: str  # Their number in words
-    fixed: int  # Number of fixed parameters
-    worst: str  # Parameter with the largest bias by fixing the others
-    bias: str  # That bias, % of its search range
-    shift: str  # Both in words
-    kept: bool  # Whether all variances with the prior stay within the bound
-    stuck: str  # Estimates at a limit of the search; empty if there are none
-    vaf: str  # VAF in words
-    poor: bool  # Whether the model explains less than half
-
-
-def _facts(model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> _Facts:
+def _facts(model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> SelectFacts:
     chosen, fixed = found.chosen.values(), model.size - len(found.free)
+    reaching = table[table["note"] != ""]
+    opened = [index for index in found.free if model.names[index] in set(reaching["symbol"])]
+    of_open = table["symbol"].isin(model.named(opened)).sum()
+    ends = Counter(reaching.loc[reaching["note"].str.endswith(_STUCK), "parameter"])
     worst = table.sort_values(_BIAS).to_dict("records")[-1]
-    bias = number(worst[_BIAS])
-    narrow = all(np.all(one.known.variance <= found.bound) for one in chosen)
-    ends = Counter(table.loc[table["note"].str.contains("estimate at"), "parameter"])
+    wrong = f"be wrong by up to {number(worst[_BIAS])} % of its search range"
+    if worst[_BIAS] >= 100:
+        wrong = "be wrong by more than its whole search range, and is not usable"
     every = float(np.mean([np.mean(one.fit.vaf) for one in found.nominal.values()]))
     least = float(np.mean([np.mean(one.refit.vaf) for one in chosen]))
-    return _Facts(
-        names_of(model, found.free), f"{len(found.free)} of {model.size} parameters", fixed,
-        worst["parameter"], bias, f"{bias} % of the search range ({worst['parameter']})",
-        not fixed or narrow, ", ".join(f"{name} in {one} of {len(chosen)}"
-                                       for name, one in ends.items()),
-        f"{number(every)} % with all parameters, {number(least)} % with the identifiable ones",
+    return SelectFacts(
+        model.size, len(found.free) - len(opened),
+        names_of(model, [index for index in found.free if index not in opened]),
+        names_of(model, opened),
+        f"{len(reaching)} of {of_open} intervals of {names_of(model, opened)}",
+        fixed,
+        f"{worst['parameter']} may {wrong}",
+        not fixed or all(np.all(one.known.variance <= found.bound) for one in chosen),
+        ", ".join(f"{name} in {one} of {len(chosen)} fits" for name, one in ends.items()),
+        f"{number(every)} % with all parameters, {number(least)} % with the chosen ones",
         every < _POOR,
     )  # fmt: skip
 
@@ -92,40 +86,49 @@ def selection_report(
     model: ParametricModel,
     found: StudySelection,
     command: str,
-    inputs: Inputs,
+    inputs: Inputs | None,
     truths: Mapping[str, Array],
+    whom: tuple[int, int] = (1, 1),
 ) -> Report:
-    """Report of `impc select`; `truths` are the true parameters (k,) of simulated subjects."""
+    """Report of `impc select`; `truths` are the true parameters (k,) of simulated subjects.
+
+    `whom` are the numbers of people and visits.
+    """
     table = _intervals(model, found, truths)
-    facts, truth = _facts(model, found, table), _truth(table)
-    fixed, people, size = facts.fixed, len(found.chosen), model.size
-    provenance = Provenance(command=command, inputs=inputs)
-    copied: Copy | str = "There is no text to copy: the model does not explain the movement."
-    if not facts.poor:
-        results = f"{facts.free} were identifiable together ({facts.names}). VAF: {facts.vaf}."
-        if fixed:
-            results += f" Fixing the others may bias an estimate by up to {facts.shift}."
-        copied = Copy(_METHODS.format(size=size, people=people, bound=found.bound), results)
+    facts, truth, size = _facts(model, found, table), _truth(table), model.size
+    verdict, provenance = SELECT_RULES.verdict(facts), Provenance(command=command, inputs=inputs)
+    said = [f"{whom[0]} {'person' if whom[0] == 1 else 'people'}"]
+    said += [f"{whom[1]} visits"] * (whom[1] > 1)
+    copied: Copy | str = "There is no text to copy: no parameter may be reported."
+    if verdict.level is not Level.RED:
+        results = (
+            f"{facts.estimated} of {size} parameters could be estimated together ({facts.names})."
+        )
+        results += f" {facts.reached} ended at the search range." * bool(facts.open_names)
+        results += f" Because the others were fixed, {facts.shift}." * bool(facts.fixed)
+        methods = _METHODS.format(size=size, whom=" with ".join(said), bound=found.bound)
+        copied = Copy(methods, f"{results} VAF: {facts.vaf}.")
+    worst = table.sort_values(_BIAS).to_dict("records")[-1]
     return Report(
-        "impc: parameters that can be estimated", "parameter report", _verdict(facts),
+        "impc: parameters that can be estimated", "parameter report", verdict,
         [
             Section("Parameters", [
                 Finding("parameters", _by_parameter(model, found, table),
-                        "Medians over subjects, and largest bias.", labels=_LABELS,
+                        "Medians over people and visits, and largest bias.", labels=_LABELS,
                         hidden=() if any(model.meanings) else ["symbol"], digits=3),
-                Finding("intervals", table, _BY_SUBJECT, folded="All subjects in numbers",
+                Finding("intervals", table, _BY_SUBJECT, folded="All people in numbers",
                         labels=_LABELS, hidden=["symbol"]),
             ]),
             Section("Checks", [Checks([*_checks(model, found, facts), *truth])]),
             Section("Provenance", [Terms(provenance.terms)]),
         ],
-        meta=["Selection of parameters", f"{people} subjects", provenance.made[:10]],
+        meta=["Selection of parameters", *said, provenance.made[:10]],
         hero=Picture("parameters", "Estimates of all parameters in their search ranges", _CAPTION),
         keys=[
-            Key(str(len(found.free)), f"of {size}", "parameters identifiable", facts.names),
-            Key(str(fixed), f"of {size}", "parameters fixed", "at assumed values"),
-            Key(facts.bias if fixed else "0", "% of the search range", "largest bias from fixing",
-                facts.worst if fixed else ""),
+            Key(str(facts.estimated), f"of {size}", "parameters estimated", facts.names),
+            Key(str(facts.fixed), f"of {size}", "parameters fixed", "at assumed values"),
+            Key(number(worst[_BIAS]) if facts.fixed else "0", "% of the search range",
+                "largest bias from fixing", worst["parameter"] if facts.fixed else ""),
         ],
         figures={"parameters": partial(_forest, model, found)},
         copy=copied,
@@ -134,60 +137,32 @@ def selection_report(
     )  # fmt: skip
 
 
-def _verdict(facts: _Facts) -> Verdict:
-    if facts.poor:
-        headline = "The model explains less than half of this movement."
-        return Verdict(Level.RED, headline, "Do not interpret its parameters.")
-    fixed, kept, stuck = facts.fixed, facts.kept, facts.stuck
-    condition = f", if the other {fixed} {'is' if fixed == 1 else 'are'} as assumed" * bool(fixed)
-    shifted = " If a fixed parameter is wrong, these are biased." * (not kept)
-    alert = Alert(
-        Level.AMBER, "The estimates depend on parameters that were fixed",
-        f"Fixing the other {fixed} may bias an estimate by up to {facts.shift}.",
-        "If a subject differs from the assumed values, the estimates are biased. The intervals on "
-        "this page include this error; intervals for exactly known values do not.",
-        ["Report the assumed values, and the intervals on this page.",
-         "Measure fixed parameters in another experiment, or use a richer movement of the target."],
-    )  # fmt: skip
-    may = [Claim(f"{facts.free} are identifiable together.", f"{facts.names}."),
-           Claim("Their estimates, with the assumed values of the others.",
-                 "With the intervals on this page.")]  # fmt: skip
-    may_not = [
-        (fixed, "The fixed parameters.", "Their values are assumed, not estimated."),
-        (
-            not kept,
-            "Differences between subjects.",
-            f"Fixing the others may bias estimates by up to {facts.shift}.",
-        ),
-        (stuck, "Estimates at a limit of the search.", f"{stuck} subjects."),
-        (True, "That other parameters have no effect.", "The recordings cannot separate them."),
-    ]
-    return Verdict(
-        Level.GREEN if kept and not stuck else Level.AMBER,
-        f"{facts.free} can be estimated{condition}.",
-        f"The recordings identify {facts.names} together.{shifted}",
-        [] if kept else [alert], may, [Claim(text, why) for there, text, why in may_not if there],
-    )  # fmt: skip
-
-
-def _checks(model: ParametricModel, found: StudySelection, facts: _Facts) -> list[Check]:
+def _checks(model: ParametricModel, found: StudySelection, facts: SelectFacts) -> list[Check]:
     scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
     together = " ".join(
-        f"Scaling {names_of(model, [model.names.index(name) for name in names])} together (by a "
-        "factor of e) changes the outputs by less than their noise."
+        f"These {len(names)} can all be {math.e:.1f} times larger without a change that exceeds "
+        f"the noise: {names_of(model, [model.names.index(name) for name in names])}."
         for names in scalings
     )
-    good, doubt = Level.GREEN, Level.AMBER
-    return [
-        Check(good if facts.kept else doubt, "Bias from fixing",
-              f"Up to {facts.shift}, if each fixed parameter is wrong by one SD between people. "
-              "The intervals allow for it." if facts.fixed else "No parameter is fixed."),
-        Check(doubt if facts.stuck else good, "Search limits",
-              f"Estimates at a limit of the search: {facts.stuck or 'none'}."),
-        Check(Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
-        *([Check(Level.NOTE, "Combinations", together)] if together else []),
-        Check(Level.NOTE, "Another method", f"LASSO selects {names_of(model, found.lasso)}."),
+    good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
+    ends = (
+        f"{facts.reached} end at the search range."
+        if facts.open_names
+        else ("All 95 % intervals are inside the search range.")
+    )
+    rows = [
+        (good if facts.kept else doubt, "Bias from fixing",
+         f"If each fixed parameter is wrong by one SD between people, {facts.shift}. The intervals "
+         "allow for it." if facts.fixed else "No parameter is fixed."),
+        (doubt if facts.open_names else good, "Search range",
+         f"{ends} Estimates at a limit: {facts.stuck or 'none'}."),
+        (Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
+        *([(note, "Combinations", together)] if together else []),
+        (note, "Another method", f"LASSO selects {names_of(model, found.lasso)}."),
+        (note, "Another question", "impc key-parameters asks which parameters are repeatable "
+         "between visits and allows wider intervals, so it may name others."),
     ]  # fmt: skip
+    return [Check(*row) for row in rows]
 
 
 def _by_parameter(
@@ -207,12 +182,14 @@ def _intervals(
     rows: list[dict[str, Any]] = []
     for subject, item in found.chosen.items():
         bias = _bias(model, found, subject)
+        places = [_place(model, found.free, np.asarray(values))
+                  for values in (item.known.value, item.known.low, item.known.high)]  # fmt: skip
         for place, index in enumerate(found.free):
             low, high = float(item.known.low[place]), float(item.known.high[place])
             row: dict[str, Any] = {
                 "subject": subject, "parameter": said(model, index), "symbol": model.names[index],
                 "unit": model.units[index], "value": float(item.known.value[place]), "low": low,
-                "high": high, "note": _note(model, index, item.known, low, high),
+                "high": high, "note": note_of(*(float(one[place]) for one in places)),
                 _WIDTH: 50 * (high - low) / model.gain[index], _BIAS: bias[place],
             }  # fmt: skip
             for name in ("value", "low", "high"):
@@ -232,13 +209,19 @@ def _bias(model: ParametricModel, found: StudySelection, subject: str) -> Array:
     return np.asarray(50 * np.linalg.norm(moved * (model.deviation / model.gain)[rest], axis=1))
 
 
-def _note(model: ParametricModel, index: int, item: PriorFit, low: float, high: float) -> str:
-    """Note on an interval that reaches a search limit; else empty."""
-    ends = {"lower": low <= model.low[index], "upper": high >= model.high[index]}
-    if all(ends.values()):
-        return _OPEN
-    at = "estimate at its" if index in item.fit.at_bound else "ends at the"
-    return "".join(f"one-sided: {at} {name} limit" for name, here in ends.items() if here)
+def _place(model: ParametricModel, subset: Sequence[int], values: Array) -> Array:
+    """Positions of `values` of a subset in their search ranges, %."""
+    chosen = list(subset)
+    return np.asarray(50 * (values - model.low[chosen]) / model.gain[chosen])
+
+
+def note_of(value: float, low: float, high: float) -> str:
+    """Note on an interval that reaches an end of the search range (positions in %); else empty."""
+    ends = ["lower"] * (low < _AT_LIMIT) + ["upper"] * (high > 100 - _AT_LIMIT)
+    if not ends:
+        return ""
+    said = "not determined" if len(ends) > 1 else f"one-sided: ends at the {ends[0]} limit"
+    return said + _STUCK * (not _AT_LIMIT <= value <= 100 - _AT_LIMIT)
 
 
 def read_truths(folder: Path, model: ParametricModel) -> dict[str, Array]:
@@ -285,7 +268,7 @@ def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figu
             if free:
                 place, known = found.free.index(index), item.known
                 values = [one[place] for one in (known.value, known.low, known.high)]
-            x, *ends = scale * (np.array(values) - model.low[index])
+            x, *ends = _place(model, [index] * len(values), np.array(values))
             ax.plot(ends, [height] * len(ends), color=BLUE)
             mark = "<" if x < _AT_LIMIT else ">" if x > 100 - _AT_LIMIT else "o"
             ax.plot(x, height, mark, color=colour, clip_on=False)
