@@ -88,7 +88,7 @@ def compare_report(
 def _keys(facts: Facts) -> list[Key]:
     if not facts.ranked:
         return []
-    best, other = facts.best, facts.other
+    best, other = facts.best, next(iter(facts.others), None)
     first = Key(share(best)[:-2], "%", "of the variance explained",
                 f"{name_of(best)}, {facts.where}")  # fmt: skip
     value, _, unit = needed(facts.unbounded).partition(" ")
@@ -113,8 +113,8 @@ def _checks(facts: Facts, problem: Problem) -> list[Check]:
     fallen = " ".join(f"{name}: stops at {time:.1f} s." for name, time in falls if time is not None)
     stopped = [name_of(f) for f in facts.fits if f.estimate.status is Status.STOPPED]
     left_out, level = "No trial was left out.", Level.NOTE
-    if facts.held and facts.other is not None:
-        ahead = facts.best.held_out.mean(axis=1) > facts.other.held_out.mean(axis=1)
+    if facts.held and facts.others:
+        ahead = facts.best.held_out.mean(axis=1) > facts.others[0].held_out.mean(axis=1)
         level = Level.GREEN if np.all(ahead) else Level.NOTE
         left_out = f"The best model leads in {np.count_nonzero(ahead)} of {len(ahead)} trials."
     good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
@@ -140,7 +140,8 @@ def _checks(facts: Facts, problem: Problem) -> list[Check]:
 
 
 def _copy(facts: Facts, count: int) -> Copy:
-    best, other, trials = facts.best, facts.other, f"{count} trial{'s' * (count > 1)}"
+    best, other = facts.best, next(iter(facts.others), None)
+    trials = f"{count} trial{'s' * (count > 1)}"
     others = ", and to all trials except one, which they then predicted" if facts.held else ""
     results = f"{name_of(best)} explained {share(best)} of the variance in {facts.where}"
     if other is not None:

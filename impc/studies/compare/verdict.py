@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,97 +28,49 @@ _MUCH = 1000
 
 
 class Facts:
-    """Ranking and labels that sentences and numbers share."""
+    """Ranking, numbers and phrases that verdict, page and text share."""
 
     def __init__(self, fits: Sequence[MethodFit]) -> None:
         plant, bounds = fits[0].estimate.problem.plant, fits[0].bounds
         word = signal_name(plant, plant.controls[0]).removeprefix("commanded ")
-        self.fits = fits
-        self.fitted = sum(one.estimate.K is not None for one in fits)
+        self.fits, self.fitted = fits, sum(one.estimate.K is not None for one in fits)
         # Methods that reach the end of every trial, best first
         self.ranked = [one for one in by_score(fits) if not np.any(np.isnan(explained(one)))]
         # For example "6 N m" (empty without limits) and "torque limit"
         self.limit = " and ".join(limits(plant, np.array(bounds.u_min), np.array(bounds.u_max)))
         self.word = f"{word} limit" if plant.m == 1 else "limit"
-        self.free = [one for one in self.ranked if not _knows(one)]
-        self.kept = [one for one in self.ranked if one.keeps_bounds]
         self.held = bool(self.ranked) and all(len(one.held_out) for one in self.ranked)
         self.where = "left-out trials" if self.held else "the fitted trials"
-
-    @property
-    def best(self) -> MethodFit:
-        """Best method that reaches the end of every trial."""
-        return self.ranked[0]
-
-    @cached_property
-    def other(self) -> MethodFit | None:
-        """Best method of the other kind, with or without limit; without limits the second best."""
-        others = self.ranked[1:]
+        self.others: list[MethodFit] = []  # Of the other kind, with or without limit
+        self.free: list[MethodFit] = []  # Methods that ignore the limit
+        self.poor = self.beyond = self.matters = False
+        if not self.ranked:
+            return
+        self.best, self.others = self.ranked[0], self.ranked[1:]
+        self.poor, aware = float(np.min(explained(self.best))) < _HALF, _knows(self.best)
+        self.against = "next model"
         if self.limit:
-            others = [one for one in others if _knows(one) != _knows(self.best)]
-        return next(iter(others), None)
-
-    @property
-    def against(self) -> str:
-        """What `other` is."""
-        if not self.limit:
-            return "next model"
-        return f"best model {'without a' if _knows(self.best) else 'with the'} limit"
-
-    @property
-    def unbounded(self) -> MethodFit:
-        """Best method that ignores the limit, or the best of all."""
-        return self.free[0] if self.limit and self.free else self.other or self.best
-
-    @property
-    def alone(self) -> bool:
-        """Whether it is the only method: a page made from Python."""
-        return len(self.fits) == 1
-
-    @property
-    def times(self) -> float:
-        """Unexplained variance of the other method over that of the best."""
-        return 1.0 if self.other is None else unexplained(self.other) / unexplained(self.best)
-
-    @property
-    def factor(self) -> str:
-        """`times` in words."""
-        return number(self.times, 2) if self.times < _MUCH else f"over {_MUCH:g}"
-
-    @property
-    def poor(self) -> bool:
-        """Whether the best method explains less than half of a signal."""
-        return float(np.min(explained(self.best))) < _HALF
-
-    @property
-    def beyond(self) -> bool:
-        """Whether no method within the limit comes close to the best, which needs more."""
-        if not self.limit or self.other is None or self.best.keeps_bounds:
-            return False
-        return not self.kept or unexplained(self.kept[0]) > _WORSE * unexplained(self.best)
-
-    @property
-    def matters(self) -> bool:
-        """Whether every method that ignores the limit needs more."""
-        one_limit = self.limit and self.other is not None
-        return bool(one_limit) and not any(one.keeps_bounds for one in self.free)
-
-    @property
-    def each(self) -> str:
-        """Variance that the best method explains of each signal."""
-        plant = self.best.estimate.problem.plant
-        parts = zip(plant.outputs, explained(self.best), strict=True)
-        return ", ".join(f"{value:.2f} % ({signal_name(plant, name)})" for name, value in parts)
-
-    @property
-    def sentence(self) -> str:
-        """What the best and the other method explain and need."""
-        said = f"“{name_of(self.best)}” explains {share(self.best)} of the variance in {self.where}"
-        if self.other is not None:
-            needs = needed(self.other if _knows(self.best) else self.best)
-            whose = f" with up to {needs}" if _knows(self.best) else f"; the first needs {needs}"
-            said += f", the {self.against} {share(self.other)}{whose if self.limit else ''}"
-        return f"{said}."
+            self.against = f"best model {'without a' if aware else 'with the'} limit"
+            self.free = [one for one in self.ranked if not _knows(one)]
+            self.others = [one for one in self.others if _knows(one) != aware]
+        # Best method that ignores the limit, or the second, or the best
+        self.unbounded = (*self.free, *self.others, self.best)[0]
+        # Unexplained variance of the best of the others over that of the best
+        self.times = unexplained((*self.others, self.best)[0]) / unexplained(self.best)
+        self.factor = number(self.times, 2) if self.times < _MUCH else f"over {_MUCH:g}"
+        kept = [one for one in self.ranked if one.keeps_bounds]
+        if self.limit and self.others:
+            self.matters = not any(one.keeps_bounds for one in self.free)
+            self.beyond = not self.best.keeps_bounds and (
+                not kept or unexplained(kept[0]) > _WORSE * unexplained(self.best)
+            )
+        self.sentence = f"“{name_of(self.best)}” explains {share(self.best)} of the variance in "
+        self.sentence += self.where
+        if self.others:
+            self.sentence += f", the {self.against} {share(self.others[0])}"
+        if self.limit and self.others:
+            needs = f"; the first needs up to {needed(self.best)}"
+            self.sentence += f" with up to {needed(self.others[0])}" if aware else needs
 
 
 def name_of(fit: MethodFit) -> str:
@@ -144,22 +96,22 @@ def _knows(fit: MethodFit) -> bool:
 
 
 _EXPLAINS = Kind[Facts](
-    Level.GREEN, always, "“{best}” explains {share} of the variance.", "{sentence}"
+    Level.GREEN, always, "“{best}” explains {share} of the variance.", "{sentence}."
 )
 RULES = Rules[Facts](
-    {
+    {name: attrgetter(name) for name in ("limit", "word", "where", "sentence", "factor")}
+    | {
         "best": lambda it: name_of(it.best),
         "share": lambda it: share(it.best),
         "needs": lambda it: needed(it.unbounded),
-        "times": lambda it: it.factor,
-        "limit": lambda it: it.limit,
-        "word": lambda it: it.word,
-        "where": lambda it: it.where,
-        "each": lambda it: it.each,
+        "each": lambda it: ", ".join(
+            f"{value:.2f} % ({signal_name(it.best.estimate.problem.plant, name)})"
+            for name, value in zip(it.best.estimate.problem.plant.outputs, explained(it.best),
+                                   strict=True)
+        ),
         "status": lambda it: it.best.estimate.status.sentence,
         "next": lambda it: "Call impc.report with settings, or use impc fit."
         if it.best.name == "inverse_mpc" else "Use impc compare.",
-        "sentence": lambda it: it.sentence,
     },
     kinds=(
         Kind(
@@ -167,10 +119,10 @@ RULES = Rules[Facts](
             "No model follows these recordings to their end.",
             "The simulations of every model stop before the end of a trial.",
         ),
-        replace(_EXPLAINS, level=Level.RED, when=lambda it: it.ranked and it.poor,
+        replace(_EXPLAINS, level=Level.RED, when=lambda it: it.poor,
                 headline="No model explains half of every recorded signal."),
         replace(
-            _EXPLAINS, level=Level.AMBER, when=lambda it: it.ranked and it.beyond,
+            _EXPLAINS, level=Level.AMBER, when=lambda it: it.beyond,
             headline="The model that explains most needs more than {limit}.",
             title="The {word} does not agree with the recordings",
             found="“{best}” explains most and needs up to {needs}; the limit was given as {limit}.",
@@ -180,43 +132,43 @@ RULES = Rules[Facts](
                   "again.", "Check body mass, height and the units of the recordings."),
         ),
         replace(
-            _EXPLAINS, level=Level.AMBER, when=lambda it: it.ranked and it.alone,
+            _EXPLAINS, level=Level.AMBER, when=lambda it: it.ranked and len(it.fits) == 1,
             sentence="{status}", title="Intervals and left-out trials are missing",
             found="This page shows the result of one method on the trials that it was fitted to.",
             means="How far the gain and the cost weights may be from the truth is unknown.",
             todo=("{next}",),
         ),
         replace(
-            _EXPLAINS, when=lambda it: it.ranked and it.matters and it.times > _WORSE,
-            headline="Without the {word} of {limit}, {times} times as much variance is left "
+            _EXPLAINS, when=lambda it: it.matters and it.times > _WORSE,
+            headline="Without the {word} of {limit}, {factor} times as much variance is left "
             "unexplained, and {needs} would be needed.",
         ),
         replace(
-            _EXPLAINS, when=lambda it: it.ranked and it.matters,
+            _EXPLAINS, when=lambda it: it.matters,
             headline="Models without the {word} explain as much, but would need {needs} instead of "
             "{limit}.",
         ),
         replace(
-            _EXPLAINS, when=lambda it: it.limit and it.free and it.other is not None
+            _EXPLAINS, when=lambda it: it.limit and it.free and it.others
             and all(one.keeps_bounds for one in it.free),
             headline="No model needs more than {limit}: the {word} does not matter here.",
         ),
         _EXPLAINS,
     ),
     may=(
-        Line(lambda it: it.ranked and not it.poor and it.other is None,
+        Line(lambda it: it.ranked and not it.poor and not it.others,
              "How much of the movement is explained.", "{each} of {where}."),
-        Line(lambda it: it.ranked and not it.poor and it.other is not None,
+        Line(lambda it: it.ranked and not it.poor and it.others,
              "“{best}” explains most.", "{each} of {where}."),
-        Line(lambda it: it.ranked and not it.poor and not it.beyond and it.matters
+        Line(lambda it: it.matters and not it.poor and not it.beyond
              and it.times > _WORSE,
-             "The {word} matters.", "Without it {times} times as much variance is left "
+             "The {word} matters.", "Without it {factor} times as much variance is left "
              "unexplained, and up to {needs} are needed."),
     ),
     may_not=(
-        Line(lambda it: it.ranked and it.poor, "Which model is best.",
+        Line(lambda it: it.poor, "Which model is best.",
              "All explain less than half of a recorded signal."),
-        Line(lambda it: it.ranked and it.beyond, "That the person keeps to the {word}.",
+        Line(lambda it: it.beyond, "That the person keeps to the {word}.",
              "The model that explains most needs more."),
         Line(lambda it: it.ranked and not it.poor, "Gains and cost weights.",
              "They have no intervals here; impc fit computes them."),

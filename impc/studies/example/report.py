@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -112,18 +113,11 @@ class _Facts:
             (one.max_abs_u for name, own in each.items() for one in own
              if name not in self.within and one.max_abs_u is not None), default=0.0,
         )  # fmt: skip
-
-    @property
-    def finds(self) -> str:
-        """Methods that find the true weights, with the verb."""
         names = " and ".join(f"“{method_label(name)}”" for name in self.found) or "No method"
-        return f"{names} find{'s' * (len(self.found) < 2)}"
-
-    @property
-    def others(self) -> str:
-        """Command of the other methods; empty if there are none."""
-        said = f" The others need a command of up to {self.largest:.3g}; the limit is {BOUND:g}."
-        return said if self.largest else ""
+        self.finds, self.others = f"{names} find{'s' * (len(self.found) < 2)}", ""
+        if self.largest:
+            self.others = f" The others need a command of up to {self.largest:.3g}; the limit is "
+            self.others += f"{BOUND:g}."
 
 
 _SHOWN = Kind[_Facts](
@@ -136,9 +130,8 @@ RULES = Rules[_Facts](
         "all": lambda _: _COUNTS[len(EXAMPLE)],
         "few": lambda it: _COUNTS[len(it.within)].lower(),
         "need": lambda it: "needs" if len(it.within) == 1 else "need",
-        "finds": lambda it: it.finds,
-        "others": lambda it: it.others,
-    },
+    }
+    | {name: attrgetter(name) for name in ("finds", "others")},
     kinds=(
         replace(
             _SHOWN, level=Level.AMBER, when=lambda it: not it.found, badge="Not as expected",

@@ -119,45 +119,36 @@ class _Facts:
     """Numbers and phrases of the verdict."""
 
     def __init__(self, plan: Plan) -> None:
-        self.plan, found = plan, expected(plan)
+        found, needed, tried = expected(plan), trials_needed(plan), len(plan.outcomes)
         sides, aim = [half(item) for item in found.intervals], target(plan)
-        self.body, self.worst, self.count = found.body is not None, max(sides), len(sides)
-        self.good = sum(side <= aim for side in sides)
+        self.count, self.good = len(sides), sum(side <= aim for side in sides)
         self.missed = "; ".join(
             f"{name}: {stated_as(item)}"
             for name, item, side in zip(weight_names(plan), found.intervals, sides, strict=True)
             if side > aim
         )
-        self.needed = trials_needed(plan)
-
-    @property
-    def verb(self) -> str:
-        """The experiment as the subject of a sentence, with its verb."""
-        one = self.plan.settings.trials == 1
-        return f"{sentence_case(_experiment(self.plan))} identif{'ies' if one else 'y'}"
-
-    @property
-    def chosen(self) -> str:
-        """Which experiment it is."""
-        tried = len(self.plan.outcomes)
+        self.weights = "cost weight" if self.count == 1 else "cost weights"
+        self.every = {1: "the", 2: "both"}.get(self.count, f"all {self.count}")
+        self.aim, worst = f"{plan.settings.difference:g} %", max(sides)
+        self.close = f"a factor of {number(math.exp(worst), 2)}"
+        if worst < _FACTOR:
+            self.close = f"{number(100 * math.expm1(worst), 2)} %"
+        ends = "ies" if plan.settings.trials == 1 else "y"
+        self.verb = f"{sentence_case(_experiment(plan))} identif{ends}"
         which = f"best of {tried} experiments" if tried > 1 else "only simulated experiment"
-        return f"This is the {which}: {design_name(self.plan, self.plan.best.design)}."
-
-    @property
-    def close(self) -> str:
-        """Longest side of an interval."""
-        if self.worst < _FACTOR:
-            return f"{number(100 * math.expm1(self.worst), 2)} %"
-        return f"a factor of {number(math.exp(self.worst), 2)}"
-
-    @property
-    def more(self) -> str:
-        """Whether more trials would be enough."""
-        if math.isfinite(self.needed):
-            return f"{self.needed:.0f} trials would be enough for all."
-        return f"{max(widths(self.plan)[0]):g} trials would not be enough."
+        self.chosen = f"This is the {which}: {design_name(plan, plan.best.design)}."
+        self.more, self.record = f"{max(widths(plan)[0]):g} trials would not be enough.", ""
+        if math.isfinite(needed):
+            self.more = f"{needed:.0f} trials would be enough for all."
+            self.record = f"Record {needed:.0f} trials."
+        self.measure = ""
+        if found.body is not None:
+            self.measure = "Measure the body more exactly; the table of the body lists the "
+            self.measure += "parameters."
 
 
+_WORDS = ("count", "good", "missed", "weights", "every", "aim", "close", "verb", "chosen", "more",
+          "record", "measure")  # fmt: skip
 _WIDE = Kind[_Facts](
     Level.AMBER, lambda it: it.good < it.count,
     "{verb} {good} of {count} {weights} to within {aim}.", "{more} {chosen}",
@@ -169,16 +160,7 @@ _WIDE = Kind[_Facts](
     badge="Depends",
 )  # fmt: skip
 RULES = Rules[_Facts](
-    {name: attrgetter(name) for name in ("verb", "chosen", "close", "more", "good", "count",
-                                         "missed")}
-    | {
-        "aim": lambda it: f"{it.plan.settings.difference:g} %",
-        "weights": lambda it: "cost weight" if it.count == 1 else "cost weights",
-        "every": lambda it: {1: "the", 2: "both"}.get(it.count, f"all {it.count}"),
-        "record": lambda it: f"Record {it.needed:.0f} trials." * math.isfinite(it.needed),
-        "measure": lambda it: "Measure the body more exactly; the table of the body lists the "
-        "parameters." * it.body,
-    },
+    {name: attrgetter(name) for name in _WORDS},
     kinds=(
         replace(
             _WIDE, level=Level.RED, when=lambda it: not it.good, title="All intervals are too wide",

@@ -7,6 +7,7 @@ after Cicchetti (1994), whatever the estimate (docs/howto/reliability_selection.
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,27 +80,24 @@ class _Facts:
     """Cases with an ICC, by whether their intervals reach the band good."""
 
     def __init__(self, result: Reliability, words: Mapping[str, str]) -> None:
-        self.result, self.words, self.cases = result, words, known(result)
-        self.sways = [item for item in self.cases if item.measure == "rms"]
-        self.good = [item for item in self.cases if _begins_good(item)]
-        self.bad = [item for item in self.cases if not _begins_good(item)]
-        self.reliable = [item for item in self.sways if _begins_good(item)]
+        cases = known(result)
+        self.words, self.people, self.visits = words, len(result.subjects), len(result.visits)
+        self.sways = [item for item in cases if item.measure == "rms"]
+        self.good = [item for item in cases if _reaches(item)]
+        self.poor = [item for item in cases if not _reaches(item)]
+        self.cases, self.bad = len(cases), len(self.poor)
+        self.reliable = sum(map(_reaches, self.sways))
         # Whether an interval reaches the band good, so that more people may show it
-        self.hopeful = any(map(_ends_good, self.sways))
-
-    @property
-    def lowest(self) -> str:
-        """The ICC whose interval begins lowest, in words."""
-        least = lowest(self.sways)
-        return f"{icc_text(least)}, {measure_name(least, self.words)}, {least.condition}"
+        self.hopeful = any(_reaches(item, low=False) for item in self.sways)
+        self.lowest = ""
+        if self.sways:
+            least = lowest(self.sways)
+            self.lowest = f"{icc_text(least)}, {measure_name(least, words)}, {least.condition}"
 
 
-def _begins_good(item: MeasureResult) -> bool:
-    return item.icc is not None and item.icc.low >= GOOD
-
-
-def _ends_good(item: MeasureResult) -> bool:
-    return item.icc is not None and item.icc.high >= GOOD
+def _reaches(item: MeasureResult, *, low: bool = True) -> bool:
+    """Whether the lower or the upper end of its interval is good or better."""
+    return item.icc is not None and (item.icc.low if low else item.icc.high) >= GOOD
 
 
 _EACH = Kind[_Facts](
@@ -109,7 +107,7 @@ _EACH = Kind[_Facts](
     badge="Reliable",
 )  # fmt: skip
 _PART = replace(
-    _EACH, level=Level.AMBER, when=lambda it: 0 < len(it.reliable) < len(it.sways),
+    _EACH, level=Level.AMBER, when=lambda it: 0 < it.reliable < len(it.sways),
     badge="Reliable in part", title="Not all measures are shown to be reliable",
     found="In {bad} of {cases} cases the interval of the ICC begins below 0.60.",
     means="In these cases the order of the people may differ at the next visit. A wide interval "
@@ -118,14 +116,8 @@ _PART = replace(
           "Average over more trials or visits before you compare people."),
 )  # fmt: skip
 RULES = Rules[_Facts](
-    {
-        "lowest": lambda it: it.lowest,
-        "bad": lambda it: len(it.bad),
-        "cases": lambda it: len(it.cases),
-        "people": lambda it: len(it.result.subjects),
-        "visits": lambda it: len(it.result.visits),
-        "each": lambda it: _headline(it.sways, it.words),
-    },
+    {name: attrgetter(name) for name in ("lowest", "bad", "cases", "people", "visits")}
+    | {"each": lambda it: _headline(it.sways, it.words)},
     kinds=(
         Kind(
             Level.AMBER, lambda it: not it.sways,
@@ -148,7 +140,7 @@ RULES = Rules[_Facts](
     ),
     may=(lambda it: _claims(it.good, it.words),),
     may_not=(
-        lambda it: _claims(it.bad, it.words),
+        lambda it: _claims(it.poor, it.words),
         Line(lambda it: it.sways,
              "That the test is reliable for other people, tasks or times between visits.",
              "An ICC is lower in people who differ less from each other."),
@@ -179,11 +171,15 @@ def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
     """Headline: reliable signals and conditions first."""
     parts: dict[str, list[str]] = {}
     for name, own in _by_name(sways, words).items():
-        good = [item.condition for item in own if _begins_good(item)]
+        good = [item.condition for item in own if _reaches(item)]
         where = f" in {' and '.join(good)}"
         if len(good) == len(own):
             where = f" in {_COUNTS.get(len(own), 'all')} conditions" if len(own) > 1 else ""
-        no = "not shown to be reliable" if any(map(_ends_good, own)) else "not reliable"
+        no = (
+            "not shown to be reliable"
+            if any(_reaches(item, low=False) for item in own)
+            else "not reliable"
+        )
         parts.setdefault(f"reliable{where}" if good else no, []).append(name)
     said = "; ".join(
         f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} {what}"

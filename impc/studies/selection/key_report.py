@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PAPER, PHONE, new_figure
 from impc.reporting.verdict import Key
-from impc.studies.reliability.icc import GOOD
 from impc.studies.selection.key_parameters import between_visits
-from impc.studies.selection.report import names_of, said
 from impc.studies.selection.verdict import KEY_RULES, KeyFacts
 
 if TYPE_CHECKING:
@@ -39,7 +35,7 @@ def key_report(
     model: ParametricModel, found: KeyParameters, command: str, inputs: Inputs | None
 ) -> Report:
     """Report of `impc key-parameters`."""
-    facts, subsets = _facts(model, found), found.selection
+    facts, subsets = KeyFacts(model, found), found.selection
     copied: Copy | str = "There is no text to copy: no subset passes all filters."
     if facts.keys:
         copied = Copy(
@@ -84,31 +80,9 @@ def key_report(
     )  # fmt: skip
 
 
-def _facts(model: ParametricModel, found: KeyParameters) -> KeyFacts:
-    subsets, tried, count = found.selection, found.candidates, len(found.chosen)
-    explained = [item for item in tried if item.explained]
-    best = max(explained or tried, key=lambda one: (one.kept, one.certain), default=None)
-    width = 100 * TWO_SIDED * math.sqrt(subsets.bound)
-    known = f"known to within {number(width, 2)} % of the search range"
-    if width >= 100:
-        known = "known, but perhaps no better than the search range"
-    kind = {2: "pairs", 3: "triples"}.get(subsets.size, f"sets of {subsets.size} parameters")
-    least = "-" if best is None else number(best.reliability, 3)
-    begins = "" if best is None else f"95 % intervals begin at {number(best.certain, 3)} or above"
-    people, visits = found.nominal.shape[1:]
-    return KeyFacts(
-        model.size, count, names_of(model, found.chosen), model.size - count, people, visits,
-        f"Parameters {known}, in every person and visit: {len(subsets.subsets)} {kind}. Fitted: "
-        f"{len(tried)}; these explain the movement: {len(explained)}; these are also repeatable "
-        f"between visits: {sum(item.kept for item in tried)}.",
-        f"ICC of at least {least}, {begins}", least, begins, len(tried), len(explained),
-        any(item.reliability >= GOOD for item in explained),
-    )  # fmt: skip
-
-
 def _candidates(model: ParametricModel, found: KeyParameters) -> Finding:
     rows = [
-        (names_of(model, item.subset), item.variance, item.vaf, item.reliability, item.certain,
+        (model.words(item.subset), item.variance, item.vaf, item.reliability, item.certain,
          item.diversity, item.kept)
         for item in found.candidates
     ]  # fmt: skip
@@ -128,7 +102,7 @@ def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
         if index in found.chosen:
             fits.append(("chosen", found.estimates[found.chosen.index(index)]))
         for free, values in fits:
-            row: dict[str, Any] = {"parameter": said(model, index), "unit": model.units[index]}
+            row: dict[str, Any] = {"parameter": model.word(index), "unit": model.units[index]}
             row |= {"free": free, **_mean_sd(values, "")}
             if free == "chosen":
                 for visit, own in enumerate(values.T, start=1):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PHONE, RECORDED, RULE, new_figure
 from impc.reporting.verdict import Key
-from impc.studies.selection.verdict import SELECT_RULES, SelectFacts
+from impc.studies.selection.verdict import BIAS, SELECT_RULES, STUCK, SelectFacts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,12 +30,11 @@ if TYPE_CHECKING:
     from impc.studies.selection.analysis import StudySelection
     from impc.studies.selection.model import ParametricModel
 
-_POOR, _AT_LIMIT = 50.0, 0.1  # VAF of a poor model, %; distance that counts as at a limit, %
-_STUCK = "; estimate at a limit"
-_BIAS, _WIDTH = "bias_percent_of_the_range", "width_percent_of_the_range"
+_AT_LIMIT = 0.1  # Distance in % of the search range that counts as at a limit
+_WIDTH = "width_percent_of_the_range"
 _LABELS = {
     "low": "95 % CI low", "high": "95 % CI high", "sd": "SD between people", "value": "Estimate",
-    _WIDTH: "95 % CI width (% of range)", _BIAS: "Bias from fixing (% of range)",
+    _WIDTH: "95 % CI width (% of range)", BIAS: "Bias from fixing (% of range)",
 }  # fmt: skip
 _CAPTION = (
     "Blue: fitted, with 95 % intervals that allow for the SD between people in the other "
@@ -56,32 +54,6 @@ _METHODS = (
 )
 
 
-def _facts(model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> SelectFacts:
-    chosen, fixed = found.chosen.values(), model.size - len(found.free)
-    reaching = table[table["note"] != ""]
-    opened = [index for index in found.free if model.names[index] in set(reaching["symbol"])]
-    of_open = table["symbol"].isin(model.named(opened)).sum()
-    ends = Counter(reaching.loc[reaching["note"].str.endswith(_STUCK), "parameter"])
-    worst = table.sort_values(_BIAS).to_dict("records")[-1]
-    wrong = f"be wrong by up to {number(worst[_BIAS])} % of its search range"
-    if worst[_BIAS] >= 100:
-        wrong = "be wrong by more than its whole search range, and is not usable"
-    every = float(np.mean([np.mean(one.fit.vaf) for one in found.nominal.values()]))
-    least = float(np.mean([np.mean(one.refit.vaf) for one in chosen]))
-    return SelectFacts(
-        model.size, len(found.free) - len(opened),
-        names_of(model, [index for index in found.free if index not in opened]),
-        names_of(model, opened),
-        f"{len(reaching)} of {of_open} intervals of {names_of(model, opened)}",
-        fixed,
-        f"{worst['parameter']} may {wrong}",
-        not fixed or all(np.all(one.known.variance <= found.bound) for one in chosen),
-        ", ".join(f"{name} in {one} of {len(chosen)} fits" for name, one in ends.items()),
-        f"{number(every)} % with all parameters, {number(least)} % with the chosen ones",
-        every < _POOR,
-    )  # fmt: skip
-
-
 def selection_report(
     model: ParametricModel,
     found: StudySelection,
@@ -95,7 +67,7 @@ def selection_report(
     `whom` are the numbers of people and visits.
     """
     table = _intervals(model, found, truths)
-    facts, truth, size = _facts(model, found, table), _truth(table), model.size
+    facts, truth, size = SelectFacts(model, found, table), _truth(table), model.size
     verdict, provenance = SELECT_RULES.verdict(facts), Provenance(command=command, inputs=inputs)
     said = [f"{whom[0]} {'person' if whom[0] == 1 else 'people'}"]
     said += [f"{whom[1]} visits"] * (whom[1] > 1)
@@ -108,7 +80,6 @@ def selection_report(
         results += f" Because the others were fixed, {facts.shift}." * bool(facts.fixed)
         methods = _METHODS.format(size=size, whom=" with ".join(said), bound=found.bound)
         copied = Copy(methods, f"{results} VAF: {facts.vaf}.")
-    worst = table.sort_values(_BIAS).to_dict("records")[-1]
     return Report(
         "impc: parameters that can be estimated", "parameter report", verdict,
         [
@@ -127,8 +98,8 @@ def selection_report(
         keys=[
             Key(str(facts.estimated), f"of {size}", "parameters estimated", facts.names),
             Key(str(facts.fixed), f"of {size}", "parameters fixed", "at assumed values"),
-            Key(number(worst[_BIAS]) if facts.fixed else "0", "% of the search range",
-                "largest bias from fixing", worst["parameter"] if facts.fixed else ""),
+            Key(number(facts.worst[BIAS]) if facts.fixed else "0", "% of the search range",
+                "largest bias from fixing", facts.worst["parameter"] if facts.fixed else ""),
         ],
         figures={"parameters": partial(_forest, model, found)},
         copy=copied,
@@ -141,7 +112,7 @@ def _checks(model: ParametricModel, found: StudySelection, facts: SelectFacts) -
     scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
     together = " ".join(
         f"These {len(names)} can all be {math.e:.1f} times larger without a change that exceeds "
-        f"the noise: {names_of(model, [model.names.index(name) for name in names])}."
+        f"the noise: {model.words([model.names.index(name) for name in names])}."
         for names in scalings
     )
     good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
@@ -158,7 +129,7 @@ def _checks(model: ParametricModel, found: StudySelection, facts: SelectFacts) -
          f"{ends} Estimates at a limit: {facts.stuck or 'none'}."),
         (Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
         *([(note, "Combinations", together)] if together else []),
-        (note, "Another method", f"LASSO selects {names_of(model, found.lasso)}."),
+        (note, "Another method", f"LASSO selects {model.words(found.lasso)}."),
         (note, "Another question", "impc key-parameters asks which parameters are repeatable "
          "between visits and allows wider intervals, so it may name others."),
     ]  # fmt: skip
@@ -169,10 +140,10 @@ def _by_parameter(
     model: ParametricModel, found: StudySelection, intervals: pd.DataFrame
 ) -> pd.DataFrame:
     table = pd.DataFrame({
-        "parameter": [said(model, index) for index in range(model.size)], "symbol": model.names,
+        "parameter": [model.word(index) for index in range(model.size)], "symbol": model.names,
         "unit": model.units, "assumed": model.typical, "sd": model.deviation,
     }).iloc[_ordered(model, found)]  # fmt: skip
-    kinds = {"value": "median", _WIDTH: "median", _BIAS: "max"}
+    kinds = {"value": "median", _WIDTH: "median", BIAS: "max"}
     return table.join(intervals.groupby("symbol").agg(kinds), on="symbol")
 
 
@@ -187,10 +158,10 @@ def _intervals(
         for place, index in enumerate(found.free):
             low, high = float(item.known.low[place]), float(item.known.high[place])
             row: dict[str, Any] = {
-                "subject": subject, "parameter": said(model, index), "symbol": model.names[index],
+                "subject": subject, "parameter": model.word(index), "symbol": model.names[index],
                 "unit": model.units[index], "value": float(item.known.value[place]), "low": low,
                 "high": high, "note": note_of(*(float(one[place]) for one in places)),
-                _WIDTH: 50 * (high - low) / model.gain[index], _BIAS: bias[place],
+                _WIDTH: 50 * (high - low) / model.gain[index], BIAS: bias[place],
             }  # fmt: skip
             for name in ("value", "low", "high"):
                 row[f"others_exact_{name}"] = float(getattr(item.exact, name)[place])
@@ -221,7 +192,7 @@ def note_of(value: float, low: float, high: float) -> str:
     if not ends:
         return ""
     said = "not determined" if len(ends) > 1 else f"one-sided: ends at the {ends[0]} limit"
-    return said + _STUCK * (not _AT_LIMIT <= value <= 100 - _AT_LIMIT)
+    return said + STUCK * (not _AT_LIMIT <= value <= 100 - _AT_LIMIT)
 
 
 def read_truths(folder: Path, model: ParametricModel) -> dict[str, Array]:
@@ -273,7 +244,7 @@ def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figu
             mark = "<" if x < _AT_LIMIT else ">" if x > 100 - _AT_LIMIT else "o"
             ax.plot(x, height, mark, color=colour, clip_on=False)
         x, y, side = (0, row - 0.4, "left") if narrow else (-5, row, "right")
-        ax.text(x, y, said(model, index), color=colour, va="center", ha=side)
+        ax.text(x, y, model.word(index), color=colour, va="center", ha=side)
     ax.vlines([0, 100], -0.5, len(order) - 0.5, color=RULE, linewidth=0.8, zorder=0)
     ax.set(xlim=(-4, 104), ylim=(len(order) - 0.5, -0.7), yticks=[])
     ax.set_xlabel("Position in the search range (%)")
@@ -309,14 +280,3 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
             for item in found.worst_case
         ],
     }
-
-
-def said(model: ParametricModel, index: int) -> str:
-    """Meaning of a parameter in words, or its name."""
-    meaning = model.meanings[index] if model.meanings else ""
-    return meaning or model.names[index].replace("_", " ")
-
-
-def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
-    """Parameters of a subset in words, separated by commas."""
-    return ", ".join(said(model, index) for index in subset)

@@ -7,34 +7,61 @@ reliability`.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from dataclasses import replace
 from operator import attrgetter
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from impc.assess.covariance import TWO_SIDED
 from impc.reporting.finding import Level
+from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
+from impc.studies.reliability.icc import GOOD
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from impc.studies.selection.analysis import StudySelection
+    from impc.studies.selection.key_parameters import KeyParameters
+    from impc.studies.selection.model import ParametricModel
+
+_POOR = 50.0  # VAF of a poor model, %
+#: Column of the bias by fixing parameters, and end of a note on an estimate.
+BIAS, STUCK = "bias_percent_of_the_range", "; estimate at a limit"
 
 
-class SelectFacts(NamedTuple):
+class SelectFacts:
     """Phrases and numbers shared by verdict, checks and the text for a paper."""
 
-    size: int  # Number of parameters of the model
-    estimated: int  # Number of estimated parameters
-    names: str  # Their names
-    open_names: str  # Other parameters of the subset; empty if there are none
-    reached: str  # How many of their intervals end at the search range
-    fixed: int  # Number of fixed parameters
-    shift: str  # Largest bias by fixing them
-    kept: bool  # Whether all variances with the prior stay within the bound
-    stuck: str  # Estimates at a limit of the search; empty if there are none
-    vaf: str  # VAF in words
-    poor: bool  # Whether the model explains less than half
-
-    @property
-    def condition(self) -> str:
-        """Condition of the headline; empty if no parameter is fixed."""
+    def __init__(self, model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> None:
+        chosen, reaching = found.chosen.values(), table[table["note"] != ""]
+        opened = [index for index in found.free if model.names[index] in set(reaching["symbol"])]
+        rest = [index for index in found.free if index not in opened]
+        of_open = table["symbol"].isin(model.named(opened)).sum()
+        stuck = Counter(reaching.loc[reaching["note"].str.endswith(STUCK), "parameter"])
+        self.size, self.estimated, self.fixed = model.size, len(rest), model.size - len(found.free)
+        self.names, self.open_names = model.words(rest), model.words(opened)
+        self.reached = f"{len(reaching)} of {of_open} intervals of {self.open_names}"
+        self.stuck = ", ".join(f"{name} in {n} of {len(chosen)} fits" for name, n in stuck.items())
         which = "the fixed one is" if self.fixed == 1 else f"the {self.fixed} fixed ones are"
-        return f", if {which} as assumed" if self.fixed else ""
+        self.condition = f", if {which} as assumed" if self.fixed else ""
+        self.worst = table.sort_values(BIAS).to_dict("records")[-1]
+        self.shift = f"{self.worst['parameter']} may be wrong by "
+        self.shift += f"up to {number(self.worst[BIAS])} % of its search range"
+        if self.worst[BIAS] >= 100:
+            self.shift = f"{self.worst['parameter']} may be wrong by more than its whole search "
+            self.shift += "range, and is not usable"
+        # Whether all variances with the prior stay within the bound
+        self.kept = not self.fixed or all(
+            np.all(one.known.variance <= found.bound) for one in chosen
+        )
+        every = float(np.mean([np.mean(one.fit.vaf) for one in found.nominal.values()]))
+        least = float(np.mean([np.mean(one.refit.vaf) for one in chosen]))
+        self.vaf = f"{number(every)} % with all parameters, {number(least)} % with the chosen ones"
+        self.poor = every < _POOR
 
 
 _ESTIMATED = Kind[SelectFacts](
@@ -49,7 +76,8 @@ _REACHED = replace(
           "Use a richer movement of the target, more trials, or a wider search range."),
 )  # fmt: skip
 SELECT_RULES = Rules[SelectFacts](
-    {name: attrgetter(name) for name in (*SelectFacts._fields, "condition")},
+    {name: attrgetter(name) for name in ("size", "estimated", "names", "open_names", "reached",
+                                         "condition", "shift")},
     kinds=(
         Kind(
             Level.RED, lambda it: it.poor, "The model explains less than half of this movement.",
@@ -90,45 +118,51 @@ SELECT_RULES = Rules[SelectFacts](
 )  # fmt: skip
 
 
-class KeyFacts(NamedTuple):
+class KeyFacts:
     """Phrases and numbers shared by verdict, text and key numbers."""
 
-    size: int  # Number of parameters of the model
-    keys: int  # Number of key parameters
-    names: str  # Their names
-    fixed: int  # Number of the other parameters
-    people: int
-    visits: int
-    filters: str  # How many subsets pass each filter
-    icc: str  # Lowest ICC of the best subset, and where the intervals begin
-    least: str  # The ICC alone
-    begins: str  # Where the intervals begin
-    tried: int  # Number of refitted subsets
-    explained: int  # Number of these that explain the movement
-    hopeful: bool  # Whether the ICC of one of these is high enough, but not its interval
+    def __init__(self, model: ParametricModel, found: KeyParameters) -> None:
+        subsets, tried = found.selection, found.candidates
+        explained = [item for item in tried if item.explained]
+        best = max(explained or tried, key=lambda one: (one.kept, one.certain), default=None)
+        self.size, self.keys, self.names = model.size, len(found.chosen), model.words(found.chosen)
+        self.fixed, (self.people, self.visits) = self.size - self.keys, found.nominal.shape[1:]
+        self.explained = len(explained)
+        # Whether the ICC of a subset is high enough, but perhaps not its interval
+        self.hopeful = any(item.reliability >= GOOD for item in explained)
+        self.least = "-" if best is None else number(best.reliability, 3)
+        self.begins = ""
+        if best is not None:
+            self.begins = f"95 % intervals begin at {number(best.certain, 3)} or above"
+        self.icc = f"ICC of at least {self.least}, {self.begins}"
+        width = 100 * TWO_SIDED * math.sqrt(subsets.bound)
+        known = f"known to within {number(width, 2)} % of the search range"
+        if width >= 100:
+            known = "known, but perhaps no better than the search range"
+        kind = {2: "pairs", 3: "triples"}.get(subsets.size, f"sets of {subsets.size} parameters")
+        self.filters = (
+            f"Parameters {known}, in every person and visit: {len(subsets.subsets)} {kind}. "
+            f"Fitted: {len(tried)}; these explain the movement: {len(explained)}; these are also "
+            f"repeatable between visits: {sum(item.kept for item in tried)}."
+        )
 
 
 _NONE = Kind[KeyFacts](
-    Level.AMBER, lambda it: not it.tried,
-    "No parameters can be estimated together in every person and visit.",
+    Level.AMBER, lambda it: not it.explained,
+    "No parameters can be estimated together and explain these movements.",
     "Report no parameter of this model as repeatable.",
-    title="No subset is precise enough", found="{filters}",
-    means="The recordings do not determine the parameters.",
-    todo=("Use a richer movement of the target, or more trials.",
-          "Raise --bound if wider intervals are enough."),
+    title="No subset passes the first filters", found="{filters}",
+    means="The recordings do not determine the parameters, or these people differ too much from "
+    "the fixed ones.",
+    todo=("Check the model, its fixed values and the units of the recordings.",
+          "Use a richer movement of the target, or more trials."),
 )  # fmt: skip
 _MORE_PEOPLE = "Measure more people, or the same people at more visits."
 KEY_RULES = Rules[KeyFacts](
-    {name: attrgetter(name) for name in KeyFacts._fields},
+    {name: attrgetter(name) for name in ("size", "keys", "names", "fixed", "people", "visits",
+                                         "icc", "filters")},
     kinds=(
         _NONE,
-        replace(
-            _NONE, when=lambda it: it.tried and not it.explained,
-            headline="No subset of parameters explains these movements.",
-            title="The movement is not explained",
-            means="The fixed parameters are too far from those of these people, or the model is.",
-            todo=("Check the model, its fixed values and the units of the recordings.",),
-        ),
         replace(
             _NONE, when=lambda it: it.explained and not it.keys and it.hopeful,
             headline="{people} people and {visits} visits do not show whether a parameter is "
