@@ -51,9 +51,9 @@ class Facts:
         self.against = "next model"
         if self.limit:
             self.against = f"best model {'without a' if aware else 'with the'} limit"
-            self.free = [one for one in self.ranked if not _knows(one)]
-            self.others = [one for one in self.others if _knows(one) != aware]
-        # Best method that ignores the limit, or the second, or the best
+            self.free = _least_first([one for one in self.ranked if not _knows(one)])
+            self.others = self.free if aware else [one for one in self.others if _knows(one)]
+        # The method that ignores the limit, or the second, or the best
         self.unbounded = (*self.free, *self.others, self.best)[0]
         # Unexplained variance of the best of the others over that of the best
         self.times = unexplained((*self.others, self.best)[0]) / unexplained(self.best)
@@ -71,6 +71,13 @@ class Facts:
         if self.limit and self.others:
             needs = f"; the first needs up to {needed(self.best)}"
             self.sentence += f" with up to {needed(self.others[0])}" if aware else needs
+
+
+def _least_first(fits: list[MethodFit]) -> list[MethodFit]:
+    """The methods; of those as good as the best, first the one that needs the least command."""
+    near = [one for one in fits if unexplained(one) <= _WORSE * unexplained(fits[0])]
+    first = min(near, key=lambda one: largest_commands(one)[0], default=None)
+    return sorted(fits, key=lambda one: one is not first)
 
 
 def name_of(fit: MethodFit) -> str:

@@ -152,7 +152,7 @@ _WORDS = ("count", "good", "missed", "weights", "every", "aim", "close", "verb",
 _WIDE = Kind[_Facts](
     Level.AMBER, lambda it: it.good < it.count,
     "{verb} {good} of {count} {weights} to within {aim}.", "{more} {chosen}",
-    "Some intervals are too wide", "95 % intervals relative to the cost weight: {missed}.",
+    "Some intervals are too wide", "95 % intervals, relative to the assumed cost weight: {missed}.",
     "A difference of {aim} in these cost weights could not be detected in one person.",
     ("{record}", "{measure}",
      "Try stronger or longer perturbations, and more amplitudes and hold times.",

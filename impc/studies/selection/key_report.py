@@ -132,5 +132,5 @@ def _draw(found: KeyParameters, narrow: bool) -> Figure:
         colour = BLUE if item.kept else MUTED
         ax.plot(item.reliability, item.vaf, "o", color=colour, markersize=8,
                 markerfacecolor=BLUE if item.kept else PAPER)  # fmt: skip
-    ax.set_xlabel("Lowest reliability of the subset, ICC(A,k) (-)")
+    ax.set_xlabel("Lowest ICC of the subset (0 to 1)")
     return figure
