@@ -122,7 +122,7 @@ class _Facts:
 
 _SHOWN = Kind[_Facts](
     Level.GREEN, always,
-    "{all} methods were fitted to the same movement; {few} {need} no more than the limit.",
+    "{all} methods were tried on the same movement; {few} {need} no more than the limit.",
     "{finds} the true cost weights.{others}", badge="As expected",
 )  # fmt: skip
 RULES = Rules[_Facts](
@@ -161,7 +161,7 @@ def _keys(cases: Sequence[CaseResult]) -> list[Key]:
     within, found = len(_Facts(cases).within), cases[0].identifiability
     fixed = "numbers of the cost determined by the movement"
     return [
-        Key(str(len(EXAMPLE)), "methods", "compared", "on the same recordings"),
+        Key(str(len(EXAMPLE)), "methods", "tried", "on the same recordings"),
         Key(str(within), f"of {len(EXAMPLE)}", "stay within the limit", "in every case"),
         Key(str(found.rank), f"of {found.free}", fixed, f"impc chooses the other {found.chosen}"),
     ]

@@ -73,9 +73,7 @@ def selection_report(
     said += [f"{whom[1]} visits"] * (whom[1] > 1)
     copied: Copy | str = "There is no text to copy: no parameter may be reported."
     if verdict.level is not Level.RED:
-        results = (
-            f"{facts.estimated} of {size} parameters could be estimated together ({facts.names})."
-        )
+        results = f"{facts.estimated} of {size} parameters could be estimated ({facts.names})."
         results += f" {facts.reached} ended at the search range." * bool(facts.open_names)
         results += f" Because the others were fixed, {facts.shift}." * bool(facts.fixed)
         methods = _METHODS.format(size=size, whom=" with ".join(said), bound=found.bound)

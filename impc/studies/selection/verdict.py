@@ -48,16 +48,16 @@ class SelectFacts:
         self.stuck = ", ".join(f"{name} in {n} of {len(chosen)} fits" for name, n in stuck.items())
         which = "the fixed one is" if self.fixed == 1 else f"the {self.fixed} fixed ones are"
         self.condition = f", if {which} as assumed" if self.fixed else ""
-        self.worst = table.sort_values(BIAS).to_dict("records")[-1]
-        self.shift = f"{self.worst['parameter']} may be wrong by "
-        self.shift += f"up to {number(self.worst[BIAS])} % of its search range"
+        # Of the estimated parameters, or of all
+        shown = table[table["symbol"].isin(model.named(rest or found.free))]
+        self.worst = shown.sort_values(BIAS).to_dict("records")[-1]
+        wrong = f"up to {number(self.worst[BIAS])} % of its search range"
         if self.worst[BIAS] >= 100:
-            self.shift = f"{self.worst['parameter']} may be wrong by more than its whole search "
-            self.shift += "range, and is not usable"
+            wrong = "more than its whole search range, and is not usable"
+        self.shift = f"{self.worst['parameter']} may be wrong by {wrong}"
         # Whether all variances with the prior stay within the bound
-        self.kept = not self.fixed or all(
-            np.all(one.known.variance <= found.bound) for one in chosen
-        )
+        self.kept = all(np.all(one.known.variance <= found.bound) for one in chosen)
+        self.kept |= not self.fixed
         every = float(np.mean([np.mean(one.fit.vaf) for one in found.nominal.values()]))
         least = float(np.mean([np.mean(one.refit.vaf) for one in chosen]))
         self.vaf = f"{number(every)} % with all parameters, {number(least)} % with the chosen ones"
@@ -102,12 +102,12 @@ SELECT_RULES = Rules[SelectFacts](
         _ESTIMATED,
     ),
     may=(
-        Line(lambda it: it.estimated and not it.poor, "Can be estimated together: {names}.",
+        Line(lambda it: it.estimated and not it.poor, "Can be estimated: {names}.",
              "Report the estimates with the intervals on this page and the assumed values."),
     ),
     may_not=(
         Line(lambda it: it.open_names, "Values of {open_names}.",
-             "{reached} end at the search range."),
+             "Their 95 % intervals end at the search range."),
         Line(lambda it: it.fixed, "The fixed parameters.",
              "Their values are assumed, not estimated."),
         Line(lambda it: not it.kept, "Differences between people.",

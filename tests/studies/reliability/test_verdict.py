@@ -100,5 +100,9 @@ def test_both_intervals_stand_in_columns_of_their_own() -> None:
     for ends, method in ((("low", "high"), "generalised"), (("low_f", "high_f"), "F")):
         expected = icc(made, "A,k", method=method)  # type: ignore[arg-type]
         assert tuple(row[list(ends)]) == pytest.approx((expected.low, expected.high))
-    assert "Low (generalised)" in found.heads
+    people = np.degrees(made.mean(axis=1))
+    assert tuple(row[["mean", "sd", "people"]]) == pytest.approx(
+        (people.mean(), people.std(ddof=1), 10)
+    )
+    assert {"Low (generalised)", "Mean", "SD", "n (people)"} <= set(found.heads)
     assert "output" not in found.shown  # name in code
