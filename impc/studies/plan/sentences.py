@@ -221,7 +221,7 @@ def plan_checks(plan: Plan) -> list[Check]:
     exact = "Taken as exact: state how well it is known in [plant.uncertainty]."
     stated = "The intervals include the stated uncertainty of the body."
     falls = f"{100 * plan.best.falls:.0f} % of the simulated trials; {plan.settings.falls:g} % are "
-    free = f"Assumed. Without it {own} of {size} gains would be individually identified."
+    free = f"Assumed. Without it {own} of {size} gains would be determined one by one."
     rows = [
         (good, "Falls", f"{falls}accepted."),
         (good if limit else note, "Limit", limit or "Never reached, or none is assumed."),

@@ -217,7 +217,9 @@ def _visits(
         "Mean and SD over n people; analysis of variance over visits, uncorrected and with the "
         "Greenhouse-Geisser correction; change per visit with its 95 % CI."
     )
-    return _table(f"visits-{measure}", rows, caption, f"All visits: {MEASURES[measure]}")
+    labels = {f"sd_visit_{visit}": f"SD visit {visit}" for visit in visits}
+    labels |= {"p_greenhouse_geisser": "p (Greenhouse-Geisser)", "p_change": "p (change)"}
+    return _table(f"visits-{measure}", rows, caption, f"All visits: {MEASURES[measure]}", **labels)
 
 
 def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
@@ -270,8 +272,8 @@ def _correlations(result: Reliability, words: Mapping[str, str]) -> Finding:
         "Coefficient of multiple correlation of the responses within and between visits (1: "
         "identical curves), mean and SD over people; undefined: number of undefined coefficients."
     )
-    return _table("cmc", rows, caption, "Agreement of the responses in numbers",
-                  people="n (people)")  # fmt: skip
+    labels = {"people": "n (people)", "sd_within": "SD within", "sd_between": "SD between"}
+    return _table("cmc", rows, caption, "Agreement of the responses in numbers", **labels)
 
 
 def _mean_sd(values: Array) -> tuple[float, float, int]:

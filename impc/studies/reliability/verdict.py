@@ -192,7 +192,8 @@ def _claims(items: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Cl
     """One claim per measure, with its conditions and ICC."""
     found = []
     for name, own in _by_name(items, words).items():
-        where = " and ".join(item.condition for item in own if item.condition)
+        named = [item.condition for item in own if item.condition]
+        where = " and ".join(", ".join(part) for part in (named[:-1], named[-1:]) if part)
         each = "; ".join(f"{item.condition} {icc_text(item)}".strip() for item in own)
         where = f" in {where}" if where else ""
         found.append(Claim(f"That {name} is reliable{where}.", f"{each}."))

@@ -36,17 +36,18 @@ def key_report(
 ) -> Report:
     """Report of `impc key-parameters`."""
     facts, subsets = KeyFacts(model, found), found.selection
-    copied: Copy | str = "There is no text to copy: no subset passes all filters."
+    results = f"No parameters were shown to be repeatable (best subset: {facts.icc})."
     if facts.keys:
-        copied = Copy(
-            f"Subsets of {facts.size} parameters were kept if their variances were at most "
-            f"{subsets.bound:g} in every person and visit (unit: half the search range, squared), "
-            "if they explained the recordings, and if they were repeatable between visits (lower "
-            "end of the 95 % interval of ICC(A,k)). The other parameters were fixed at assumed "
-            "values.",
-            f"Key parameters of {facts.people} people with {facts.visits} visits: {facts.names} "
-            f"({facts.icc}, VAF {number(found.candidates[0].vaf)} %).",
-        )
+        results = f"Key parameters: {facts.names} ({facts.icc}, VAF "
+        results += f"{number(found.candidates[0].vaf)} %)."
+    copied = Copy(
+        f"Subsets of {facts.size} parameters were fitted to recordings of {facts.people} people "
+        f"with {facts.visits} visits, and kept if their variances were at most {subsets.bound:g} "
+        "in every person and visit (unit: half the search range, squared), if they explained the "
+        "recordings, and if they were repeatable between visits (lower end of the 95 % interval of "
+        "ICC(A,k)). The other parameters were fixed at assumed values.",
+        results,
+    )
     provenance = Provenance(command=command, inputs=inputs)
     return Report(
         "impc: key parameters", "key parameter report", KEY_RULES.verdict(facts),
@@ -62,7 +63,8 @@ def key_report(
                      "which the lower end of the ICC's interval counts."),
         keys=[
             Key(str(facts.keys), f"of {facts.size}", "key parameters", facts.names),
-            Key(str(facts.fixed), f"of {facts.size}", "parameters fixed", "as assumed"),
+            *([Key(str(facts.fixed), f"of {facts.size}", "parameters fixed", "as assumed")]
+              if facts.keys else []),
             Key(facts.least, "", "lowest ICC of the best subset", facts.begins),
         ],
         figures={"solution-space": partial(_draw, found)},

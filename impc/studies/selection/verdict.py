@@ -130,11 +130,11 @@ class KeyFacts:
         self.explained = len(explained)
         # Whether the ICC of a subset is high enough, but perhaps not its interval
         self.hopeful = any(item.reliability >= GOOD for item in explained)
-        self.least = "-" if best is None else number(best.reliability, 3)
-        self.begins = ""
-        if best is not None:
-            self.begins = f"95 % intervals begin at {number(best.certain, 3)} or above"
-        self.icc = f"ICC of at least {self.least}, {self.begins}"
+        self.least, self.begins, self.icc = "-", "", "no ICC could be computed"
+        if best is not None and np.isfinite(best.reliability):
+            self.least = number(best.reliability, 3)
+            self.begins = f"95 % intervals begin at {number(best.certain, 2)} or above"
+            self.icc = f"ICC of at least {self.least}, {self.begins}"
         width = 100 * TWO_SIDED * math.sqrt(subsets.bound)
         known = f"known to within {number(width, 2)} % of the search range"
         if width >= 100:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from impc.reporting.document import Checks, Copy, Report
+from impc.reporting.rendering import number
 from impc.studies.selection.analysis import select_study
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.key_report import key_report
@@ -99,6 +100,7 @@ def keyed(spread: float, people: int) -> Report:
     ("spread", "people", "badge", "headline"),
     [
         (0.3, 3, "Undecided", "3 people and 2 visits do not show"),
+        (0.1, 1, "Check before reporting", "No subset of parameters is shown to be repeatable"),
         (3.0, 30, "Check before reporting", "No subset of parameters is shown to be repeatable"),
         (0.02, 30, "Check before reporting", "2 of 3 parameters are key parameters"),
     ],
@@ -113,6 +115,10 @@ def test_the_interval_of_an_icc_decides_not_the_icc(
     assert table is not None
     best: Any = table.iloc[0]
     assert best["kept"] == (best["least_icc_low"] >= 0.6)
+    assert isinstance(report.copy, Copy)
+    one = people == 1  # no ICC
+    said = "no ICC could be" if one else f"ICC of at least {number(best['least_icc'])}"
+    assert said in report.copy.results
     if people == 3:
         assert best["least_icc"] > 0.75
         assert verdict.may == []
