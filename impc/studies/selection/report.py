@@ -20,7 +20,7 @@ from impc.reporting.verdict import Key
 from impc.studies.selection.verdict import BIAS, SELECT_RULES, STUCK, SelectFacts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
     from pathlib import Path
 
     from matplotlib.figure import Figure
@@ -150,15 +150,15 @@ def _intervals(
 ) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for subject, item in found.chosen.items():
-        bias = _bias(model, found, subject)
-        places = [_place(model, found.free, np.asarray(values))
-                  for values in (item.known.value, item.known.low, item.known.high)]  # fmt: skip
+        bias, known, free = _bias(model, found, subject), item.known, list(found.free)
+        places = np.stack([known.value, known.low, known.high]) - model.low[free]
+        places *= 50 / model.gain[free]
         for place, index in enumerate(found.free):
-            low, high = float(item.known.low[place]), float(item.known.high[place])
+            low, high = float(known.low[place]), float(known.high[place])
             row: dict[str, Any] = {
                 "subject": subject, "parameter": model.word(index), "symbol": model.names[index],
-                "unit": model.units[index], "value": float(item.known.value[place]), "low": low,
-                "high": high, "note": note_of(*(float(one[place]) for one in places)),
+                "unit": model.units[index], "value": float(known.value[place]), "low": low,
+                "high": high, "note": note_of(*map(float, places[:, place])),
                 _WIDTH: 50 * (high - low) / model.gain[index], BIAS: bias[place],
             }  # fmt: skip
             for name in ("value", "low", "high"):
@@ -176,12 +176,6 @@ def _bias(model: ParametricModel, found: StudySelection, subject: str) -> Array:
     rest = [index for index in range(model.size) if index not in free]
     moved = np.linalg.solve(F[np.ix_(free, free)], F[np.ix_(free, rest)])
     return np.asarray(50 * np.linalg.norm(moved * (model.deviation / model.gain)[rest], axis=1))
-
-
-def _place(model: ParametricModel, subset: Sequence[int], values: Array) -> Array:
-    """Positions of `values` of a subset in their search ranges, %."""
-    chosen = list(subset)
-    return np.asarray(50 * (values - model.low[chosen]) / model.gain[chosen])
 
 
 def note_of(value: float, low: float, high: float) -> str:
@@ -237,7 +231,7 @@ def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figu
             if free:
                 place, known = found.free.index(index), item.known
                 values = [one[place] for one in (known.value, known.low, known.high)]
-            x, *ends = _place(model, [index] * len(values), np.array(values))
+            x, *ends = scale * (np.array(values) - model.low[index])
             ax.plot(ends, [height] * len(ends), color=BLUE)
             mark = "<" if x < _AT_LIMIT else ">" if x > 100 - _AT_LIMIT else "o"
             ax.plot(x, height, mark, color=colour, clip_on=False)
