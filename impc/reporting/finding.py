@@ -18,7 +18,7 @@ import pandas as pd
 
 from impc.files.spreadsheet import as_data
 from impc.files.table import in_columns
-from impc.reporting.rendering import fixed, number
+from impc.reporting.rendering import fixed, number, sentence_case
 
 T = TypeVar("T")
 
@@ -82,8 +82,7 @@ class Finding:
     def heads(self) -> list[str]:
         """Column headings on the page."""
         words = {name: name.replace("percent", "(%)").replace("_", " ") for name in self.shown}
-        heads = [self.labels.get(name, words[name]) for name in self.shown]
-        return [head[:1].upper() + head[1:] for head in heads]
+        return [sentence_case(self.labels.get(name, words[name])) for name in self.shown]
 
     @property
     def rows(self) -> list[list[str]]:
