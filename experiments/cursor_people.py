@@ -35,8 +35,8 @@ from impc.model.structure import Structure
 from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.unknowns import NoisyUnknowns, Request, gain_space
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array, IntArray

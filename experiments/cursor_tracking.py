@@ -46,8 +46,8 @@ from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
 from impc.reporting.rendering import plain
 from impc.reporting.writer import write_files
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 from plants import cursor_plant
 
 __all__ = [

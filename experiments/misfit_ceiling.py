@@ -19,8 +19,8 @@ from impc.control.controller import Controller
 from impc.errors import ImpcError
 from impc.inverse.residuals import residual_only
 from impc.model.recordings import Recording
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 __all__ = ["short_of_truth"]
 

@@ -44,8 +44,8 @@ from impc.reporting.style import (
 )
 from impc.reporting.writer import write_files
 from impc.studies.compare.subject import compared_methods
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

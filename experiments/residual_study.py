@@ -39,8 +39,8 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 from impc.studies.simulated_people import simulate_subject
 
 __all__ = ["SUBJECTS", "Kind", "diagnosed", "fitted_subject"]

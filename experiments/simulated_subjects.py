@@ -24,8 +24,8 @@ from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import covariance_intervals, follows_command, gain_estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.recordings import Recording
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array, IntArray

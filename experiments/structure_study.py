@@ -33,8 +33,8 @@ from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.structure import Structure
 from impc.model.weights import Weights
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
     from impc.arrays import Array

@@ -24,8 +24,9 @@ from experiments.coverage import cart
 from impc.checking import replace
 from impc.model.riccati import solve_lqr
 from impc.reporting.finding import Level
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.facts import decided, named_gains
-from impc.studies.fit.subject import fit_problem, fit_recordings
+from impc.studies.fit.subject import fit_recordings
 from impc.studies.fit.verdict import GAIN, WEIGHTS, fallen_verdict, fit_verdict, forbidden
 
 if TYPE_CHECKING:

@@ -68,8 +68,8 @@ if TYPE_CHECKING:
     from impc.output_feedback.fit import fit_output_feedback as fit_output_feedback
     from impc.output_feedback.observer import Observer as Observer
     from impc.studies.estimate_page import report as report
+    from impc.studies.fit.asked import fit_problem as fit_problem
     from impc.studies.fit.settings import FitSettings as FitSettings
-    from impc.studies.fit.subject import fit_problem as fit_problem
 
     __version__: str
 
@@ -117,7 +117,7 @@ _NAMES = {
     "nonlinear.problem": "OptimalControlProblem",
     "studies.estimate_page": "report",
     "studies.fit.settings": "FitSettings",
-    "studies.fit.subject": "fit_problem",
+    "studies.fit.asked": "fit_problem",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -48,14 +48,11 @@ def command(
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.findings import read_truth  # noqa: PLC0415
+    from impc.studies.fit.first import FitProgress  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fit_report  # noqa: PLC0415
     from impc.studies.fit.settings import missing  # noqa: PLC0415
-    from impc.studies.fit.subject import (  # noqa: PLC0415
-        FitProgress,
-        fit_recordings,
-        stages,
-    )
+    from impc.studies.fit.subject import fit_recordings, stages  # noqa: PLC0415
 
     require_writable(out)
     if installed("impc.nonlinear") and _own_problem(files, plant_name, config, out, solver):

@@ -110,9 +110,8 @@ def read_subject(
     from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.reading import read_unit  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
-    from impc.studies.fit.asked import asked_plant  # noqa: PLC0415
+    from impc.studies.fit.asked import asked_plant, fit_problem  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
-    from impc.studies.fit.subject import fit_problem  # noqa: PLC0415
 
     configuration = read_configuration(config)
     settings = fit_settings(configuration.fit)

@@ -16,9 +16,10 @@ from impc.reporting.provenance import Provenance
 from impc.reporting.writer import owned, write_files
 from impc.studies.compare.report import compare_report
 from impc.studies.fit.figures import movement_figure
+from impc.studies.fit.first import FitProgress
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import FitProgress, fit_recordings
+from impc.studies.fit.subject import fit_recordings
 from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:

@@ -21,9 +21,9 @@ from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
 from impc.files.results import read_result
-from impc.studies.fit.asked import asked_plant
+from impc.studies.fit.asked import asked_plant, fit_problem
 from impc.studies.fit.settings import fit_settings
-from impc.studies.fit.subject import fit_problem, fit_recordings
+from impc.studies.fit.subject import fit_recordings
 from tests.support import easier_seat
 
 OWN_PLANT = """

@@ -17,8 +17,8 @@ from impc.cli.main import main
 from impc.cli.plant import read_subject
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings, require_whole
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 
 SAMPLES, RATE, OFFSET = 151, 1.5, 0.02
 CART = """

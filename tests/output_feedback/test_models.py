@@ -31,9 +31,10 @@ from impc.output_feedback.observer import Observer
 from impc.reporting.document import Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.rendering import plain
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings, fit_settings
-from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.subject import fit_recordings, stages
 from tests.inverse.test_regulator_span import late_body, late_problem
 from tests.output_feedback import fits
 from tests.output_feedback.fits import cart, fitted, least_squares, posed

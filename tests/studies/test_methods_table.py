@@ -21,8 +21,8 @@ from impc.model.plant import Plant
 from impc.model.weights import Weights
 from impc.reporting.document import json_bytes
 from impc.reporting.finding import csv_bytes
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 from impc.studies.methods_table import methods_data, methods_finding, until_its_end
 
 

@@ -29,9 +29,9 @@ from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_name
 from impc.studies.effort import Effort, fit_effort
-from impc.studies.fit.asked import asked_plant
+from impc.studies.fit.asked import asked_plant, fit_problem
 from impc.studies.fit.settings import fit_settings
-from impc.studies.fit.subject import fit_alone, fit_problem
+from impc.studies.fit.subject import fit_alone
 from impc.studies.fit.verdict import fit_verdict
 
 if TYPE_CHECKING:

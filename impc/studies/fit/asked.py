@@ -1,4 +1,4 @@
-"""Plant, bounds and structures from the settings of a fit and the recordings."""
+"""The problem of a fit from settings and recordings: plant, bounds, structures, unknowns."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.signal
 
-from impc.errors import InputError
+from impc.arrays import Array, frozen
+from impc.checking import checked, replace
+from impc.errors import DataError, InputError
 from impc.files.configuration import require_known
 from impc.files.plant_sources import make_plant, plant_family_of
+from impc.inverse.problem import Problem
+from impc.inverse.search import with_jumps
 from impc.model.bounds import Bounds
-from impc.model.foresight import with_observer, with_preview
+from impc.model.foresight import physical_states, with_observer, with_preview
 from impc.model.plant_family import PlantFamily
 from impc.model.rates import with_rates
 from impc.model.structure import Structure
@@ -20,7 +24,6 @@ from impc.model.structure import Structure
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from impc.arrays import Array
     from impc.files.plant_sources import PlantSource
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
@@ -191,3 +194,87 @@ def _largest_rate(values: Array, dt: float) -> float:
     rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt, mode="nearest")
     half = window // 2  # the filter is one-sided at the ends
     return float(np.nanmax(np.abs(rate[half:-half])))
+
+
+@checked
+def fit_problem(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    settings: FitSettings,
+    family: PlantFamily | None = None,
+) -> Problem:
+    """Pose the inverse problem of a subject with scaled outputs and unknown initial states.
+
+    Parameters
+    ----------
+    plant : Plant
+        Plant; its disturbances are the recorded perturbations.
+    recordings : sequence of Recording
+        Trials of one subject.
+    settings : FitSettings
+        Horizon, bounds and options.
+    family : PlantFamily, optional
+        Plant as a function of the physical parameters that are fitted with the gain.
+
+    Returns
+    -------
+    Problem
+        Each output is scaled by its root mean square over all trials.
+
+    Raises
+    ------
+    DataError, InputError, BoundsError
+        If there is no recording, a trial is too short, an output is zero in all trials, or a bound
+        cannot be set.
+
+    Examples
+    --------
+    >>> import control
+    >>> import impc
+    >>> plant = impc.Plant(control.ss([[1.1]], [[1]], [[1]], 0, 1))
+    >>> law = impc.Controller(plant, impc.Weights(1, 1), impc.Bounds(plant), horizon=3)
+    >>> trial = impc.Recording(plant, law.simulate([1.0], steps=30).x)
+    >>> problem = impc.fit_problem(plant, [trial], impc.FitSettings(horizon=3, u_max=0.5))
+    >>> problem.unknown_start, problem.bounds.u_max
+    (True, array([0.5]))
+    """
+    if not recordings:
+        raise DataError("recordings", "the list is empty", "pass at least one trial")
+    outputs = np.concatenate([trial.outputs for trial in recordings])
+    scale = np.sqrt(np.nanmean(outputs**2, axis=0))
+    for name, size in zip(plant.outputs, scale, strict=True):
+        if size == 0:
+            raise DataError(f"output {name}", "is zero in every trial", "check its column")
+    shortest = min(trial.samples for trial in recordings)
+    least = round(settings.settle / plant.dt) + physical_states(plant)
+    if shortest <= least:
+        raise DataError(
+            "recordings",
+            f"the shortest trial has {shortest} samples, but its initial state needs {least}",
+            "use longer trials, or lower [fit] settle",
+        )
+    require_dressed(plant, settings)
+    plant, family = moving_body(plant, family, settings)
+    posed = Problem(
+        plant,
+        fit_bounds(plant, settings, recordings),
+        settings.horizon,
+        tuple(_first_guess(plant, trial) for trial in recordings),
+        terminal_set=None if settings.terminal_set == "auto" else settings.terminal_set,
+        output_scale=scale,
+        offsets=settings.offsets,
+        signal_errors=settings.signal_errors,
+        unknown_start=True,
+        family=family,
+        structure=next(iter(fit_structures(plant, settings)), None),
+        feedback_states=settings.feedback_states,
+        solver=settings.solver,
+    )
+    return with_jumps(posed)
+
+
+def _first_guess(plant: Plant, trial: Recording) -> Recording:
+    """Start of the search for x0: rest, or the first output if there is no disturbance."""
+    if np.any(trial.disturbance) or np.any(trial.x0):
+        return trial
+    return replace(trial, x0=frozen(np.linalg.pinv(plant.C) @ np.nan_to_num(trial.outputs[0])))

@@ -10,8 +10,8 @@ import scipy.stats
 from experiments.coverage import cart
 from impc.inverse.noisy_fit import fit_controller
 from impc.studies.cohort.comparison import compare_cohort, not_identified
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 from tests.studies.cohort.carts import subject_trial
 
 SEED = 15

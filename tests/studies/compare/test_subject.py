@@ -32,9 +32,9 @@ from impc.studies.compare.subject import (
     compared_methods,
     stages,
 )
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import fit_problem
 from plants import yalmip_example
 from tests.support import easier_seat, kept_names
 

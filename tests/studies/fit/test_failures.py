@@ -14,7 +14,7 @@ from experiments.search_problems import stick
 from impc.errors import SolverError
 from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
-from impc.studies.fit import subject
+from impc.studies.fit import first, subject
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.subject import fit_recordings
@@ -76,8 +76,9 @@ def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.Mon
         raise SolverError("stage", "did not end", "try another")
 
     whole = fitted()
-    for name in ("estimate_draws", "lack_of_fit", "_terminal_set_difference"):
+    for name in ("estimate_draws", "_terminal_set_difference"):
         monkeypatch.setattr(subject, name, fails)
+    monkeypatch.setattr(first, "lack_of_fit", fails)
     result = fitted()
     assert set(result.failures) == {"drawn gains", "test of the model", "terminal set"}
     page = fit_report(result, Provenance()).page()

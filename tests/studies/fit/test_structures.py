@@ -20,7 +20,7 @@ from impc.model.weights import Weights
 from impc.reporting.document import Report
 from impc.reporting.finding import Level
 from impc.reporting.verdict import Verdict
-from impc.studies.fit.asked import fit_structures
+from impc.studies.fit.asked import fit_problem, fit_structures
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.structures import (
@@ -28,7 +28,7 @@ from impc.studies.fit.structures import (
     structure_section,
     structure_sentences,
 )
-from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.verdict import fit_verdict
 
 TABLE: dict[str, Any] = {

@@ -29,10 +29,12 @@ from impc.model.plant import Plant, change_coordinates
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
+from impc.studies.fit.asked import fit_problem
+from impc.studies.fit.first import FitProgress
 from impc.studies.fit.memory import FitMemory, open_memory
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings
-from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
+from impc.studies.fit.subject import fit_recordings, stages
 from tests.support import kept_names
 
 FEEDBACK = ["theta1", "theta2", "theta1_rate", "theta2_rate"]

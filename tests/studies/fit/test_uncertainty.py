@@ -13,9 +13,11 @@ from impc.assess.printed_gain import gain_estimate
 from impc.assess.profiles import profile_likelihood
 from impc.checking import replace
 from impc.errors import InputError
+from impc.studies.fit.asked import fit_problem
+from impc.studies.fit.first import FitProgress
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings, fit_settings
-from impc.studies.fit.subject import FitProgress, fit_problem, fit_recordings, stages
+from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.uncertainty import Alternative, fit_alternatives, verdict
 from tests.assess.cart_fits import cart_fit, cart_problem
 

@@ -25,13 +25,14 @@ from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import angles_in
 from impc.reporting.style import page_style
 from impc.studies.charts import trajectories
+from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.body_words import added_sentence
 from impc.studies.fit.facts import named_gains
 from impc.studies.fit.figures import movement_figure, shown_window, statements_figure
 from impc.studies.fit.report import fallen_report, fit_report
 from impc.studies.fit.result import FittedParameter
 from impc.studies.fit.settings import FitSettings, missing
-from impc.studies.fit.subject import fit_problem, fit_recordings, stages
+from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.verdict import GAIN, WEIGHTS, fit_verdict, forbidden
 
 if TYPE_CHECKING:
