@@ -18,7 +18,7 @@ import pandas as pd
 
 from impc.files.spreadsheet import as_data
 from impc.files.table import in_columns
-from impc.reporting.rendering import fixed, number
+from impc.reporting.rendering import fixed, p_value
 
 T = TypeVar("T")
 
@@ -83,7 +83,8 @@ class Finding:
         """Column headings on the page."""
         words = {name: name.replace("percent", "(%)").replace("_", " ") for name in self.shown}
         heads = [self.labels.get(name, words[name]) for name in self.shown]
-        return [head[:1].upper() + head[1:] for head in heads]
+        kept = map(re.compile(r"p(_|$)").match, self.shown)  # p-values stay lower-case
+        return [one if p else one[:1].upper() + one[1:] for one, p in zip(heads, kept, strict=True)]
 
     @property
     def rows(self) -> list[list[str]]:
@@ -133,5 +134,5 @@ def _shown(column: str, value: Any, digits: int) -> str:
     if not isinstance(value, float | np.floating):
         return str(value)
     if re.match(r"p(_|$)", column):
-        return "< 0.001" if value < 1e-3 else number(float(value), 2)
+        return p_value(float(value))
     return fixed(float(value), digits)
