@@ -73,46 +73,55 @@ class Comparison:
     p_holm: float = np.nan
     note: str = ""  # Reason why there is no number
 
-    @property
-    def asked(self) -> tuple[str, ...]:
-        """What is compared with what."""
-        return self.question, self.measure, self.condition, self.first, self.second
-
 
 class Mean(NamedTuple):
     """Weighted mean over people."""
 
-    value: float
-    error: float  # Standard error
-    freedom: float  # Degrees of freedom of the error
-    between: float  # Variance between people
-    spread: float  # SD of the values
-    people: float  # Number of people of equal shares to whom it corresponds
+    n: int  # Number of people
+    value: float = np.nan
+    error: float = np.nan  # Standard error
+    freedom: float = np.nan  # Degrees of freedom of the error
+    between: float = np.nan  # Variance between people
+    spread: float = np.nan  # SD of the values
+    people: float = np.nan  # Number of people of equal shares to whom it corresponds
 
     @property
-    def reach(self) -> float:
-        """Half of the 95 % interval."""
-        return float(scipy.stats.t.ppf(0.975, self.freedom)) * self.error
+    def lacks(self) -> str:
+        """Reason why nothing is said about it; empty if there is none."""
+        if self.n < _FEWEST:
+            return f"too few subjects ({self.n})"
+        few = self.people < _LEAST
+        return "one subject counts for more than all others together" if few else ""
+
+    @property
+    def ends(self) -> Array:
+        """The lower end of the 95 % interval, the mean, and the upper end."""
+        reach = scipy.stats.t.ppf(0.975, self.freedom) * self.error
+        return np.asarray(self.value + reach * np.array([-1.0, 0.0, 1.0]))
 
 
-def weighted_mean(values: Array, variances: Array) -> Mean:
-    """Mean of the `values` of people; variances of zero give them equal shares."""
+def weighted_mean(given: pd.Series[float], squares: pd.Series[float]) -> Mean:
+    """Mean of the values `given` of people, except NaN, with the `squares` of their errors.
+
+    Squares of zero give equal shares.
+    """
+    known = np.isfinite(given)
+    values, variances = np.asarray(given[known]), np.asarray(squares[known])
     n = len(values)
+    if n < _FEWEST:
+        return Mean(n)
     shares, between = np.full(n, 1 / n), float(np.var(values, ddof=1))
-    # All variances are equal if there are none; equal values have no heterogeneity.
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # equal values have no heterogeneity
         if variances.any():
-            least = 1e-12 * variances.max()
-            found = combine_effects(values, np.maximum(variances, least), "dl")
+            found = combine_effects(values, variances.clip(1e-12 * variances.max()), "dl")
             between = max(float(found.tau2), 0.0)
             shares = np.asarray(found.weights_rel_re if between else found.weights_rel_fe)
-        mean, squares = float(shares @ values), float(shares @ shares)
-        a = shares**2 / (1 - shares)
-        apart = (values - mean) ** 2
-        freedom = 1 / (squares + a.sum() ** 2 - a @ a)
-        spread = np.sqrt(shares @ apart / (1 - squares))
+        mean, of_squares = float(shares @ values), float(shares @ shares)
+        a, apart = shares**2 / (1 - shares), (values - mean) ** 2
+        freedom = float(1 / (of_squares + a.sum() ** 2 - a @ a))
+        spread = float(np.sqrt(shares @ apart / (1 - of_squares)))
         error = float(np.sqrt(a @ apart))
-    return Mean(mean, error, float(freedom), between, float(spread), 1 / squares)
+    return Mean(n, mean, error, freedom, between, spread, 1 / of_squares)
 
 
 def measures_of(units: pd.DataFrame, inner: Collection[str] = ()) -> tuple[str, ...]:
@@ -168,14 +177,10 @@ def _people(part: pd.DataFrame, measure: str, along: str) -> tuple[pd.DataFrame,
     return times / weights, (0 if equal else 1) / weights
 
 
-def mean_of(part: pd.DataFrame, measure: str) -> Mean | None:
-    """Mean of a measure over the people of the rows `part`; None for too few of them."""
-    values, variances = (table[""] for table in _people(part.assign(all=""), measure, "all"))
-    known = np.isfinite(values)
-    if known.sum() < _FEWEST:
-        return None
-    found = weighted_mean(np.asarray(values[known]), np.asarray(variances[known]))
-    return found if found.people >= _LEAST else None
+def mean_of(part: pd.DataFrame, measure: str) -> Mean:
+    """Mean of a measure over the people of the rows `part`."""
+    values, variances = _people(part.assign(all="all"), measure, "all")
+    return weighted_mean(values["all"], variances["all"]) if len(values) else Mean(0)
 
 
 def in_order(names: Iterable[str], reference: str) -> list[str]:
@@ -188,82 +193,57 @@ def in_order(names: Iterable[str], reference: str) -> list[str]:
 def compare_cohort(
     units: pd.DataFrame, reference: str = "", inner: Collection[str] = ()
 ) -> tuple[Comparison, ...]:
-    """All possible comparisons."""
+    """All possible comparisons, with p-values corrected over the measures of each question."""
     if len(units) == 0:
         return ()
     chosen, found = measures_of(units, inner), list[Comparison]()
-    for label, part in units.groupby("condition", sort=True, dropna=False):
-        visits = in_order(part["visit"], reference)
-        groups = in_order(sorted(set(part["group"])), reference)
-        several = groups if len(visits) > 1 else []
-        for question, names in (("group", groups), ("change", several), ("visit", visits)):
-            found += _all_pairs(part, Comparison(question, "", str(label)), names, chosen, visits)
-        if len(visits) > 1:
-            found += [_reliable(part, Comparison("reliability", name, str(label)))
-                      for name in chosen]  # fmt: skip
-    conditions = in_order(sorted(set(units["condition"])), reference)
-    found += _all_pairs(units, Comparison("condition", "", ""), conditions, chosen, [])
+
+    def ask(question: str, condition: str, names: Iterable[str]) -> None:
+        for pair in itertools.combinations(in_order(names, reference), 2):
+            asked = (Comparison(question, name, condition, *pair) for name in chosen)
+            tests = [difference_of(units, one, reference) for one in asked]
+            corrected = holm(np.array([item.p for item in tests])).tolist()
+            found.extend(map(lambda one, p: replace(one, p_holm=p), tests, corrected))
+
+    for condition, part in units.groupby("condition"):
+        name, groups, visits = str(condition), sorted(set(part["group"])), part["visit"]
+        several = visits.nunique() > 1
+        ask("group", name, groups)
+        ask("change", name, groups if several else ())
+        ask("visit", name, visits)
+        if several:
+            found += [_reliable(part, Comparison("reliability", one, name)) for one in chosen]
+    ask("condition", "", sorted(set(units["condition"])))
     return tuple(found)
 
 
-def _all_pairs(
-    part: pd.DataFrame, asked: Comparison, names: list[str], chosen: Collection[str],
-    visits: list[str],
-) -> list[Comparison]:  # fmt: skip
-    """Comparisons of all pairs of `names`, corrected for the number of measures."""
-    found: list[Comparison] = []
-    for first, second in itertools.combinations(names, 2):
-        pair = [
-            _tested(part, replace(asked, measure=one, first=first, second=second), visits)
-            for one in chosen
-        ]
-        corrected = holm(np.array([item.p for item in pair]))
-        found += [replace(item, p_holm=float(p)) for item, p in zip(pair, corrected, strict=True)]
-    return found
-
-
-def _tested(part: pd.DataFrame, asked: Comparison, visits: list[str]) -> Comparison:
+def difference_of(units: pd.DataFrame, asked: Comparison, reference: str) -> Comparison:
     """t-test of the difference between two means, or of the mean difference of pairs."""
-    pair = [asked.first, asked.second]
-    if asked.question == "change":
-        samples = _changes(part, asked, visits)
+    pair, along = [asked.first, asked.second], asked.question
+    part = units if along == "condition" else units[units["condition"] == asked.condition]
+    if along == "change":
+        values, variances = _changes(part, asked.measure, reference)
     else:
-        values, variances = (
-            table.reindex(columns=pair) for table in _people(part, asked.measure, asked.question)
-        )
-        if asked.question == "group":
-            samples = [(values[name], variances[name]) for name in pair]
-        else:
-            both = (values[pair[1]] - values[pair[0]], variances.sum(axis=1, skipna=False))
-            samples = [both]
-    n = sum(int(variance.notna().sum()) for _, variance in samples)
-    known = [
-        (np.asarray(value[np.isfinite(value)]), np.asarray(variance[np.isfinite(value)]))
-        for value, variance in samples
-    ]
-    if min(len(value) for value, _ in known) < _FEWEST:
-        return replace(asked, n=n, note=f"too few subjects ({sum(len(v) for v, _ in known)})")
-    means = [weighted_mean(*sample) for sample in known]
-    if min(mean.people for mean in means) < _LEAST:
-        return replace(asked, n=n, note="one subject counts for more than all others together")
-    return _compared(replace(asked, n=n), means, [len(value) for value, _ in known])
-
-
-def _compared(asked: Comparison, means: list[Mean], sizes: list[int]) -> Comparison:
-    """Difference of two means, or a mean difference, with its test."""
+        values, variances = _people(part, asked.measure, along)
+    values, variances = values.reindex(columns=pair), variances.reindex(columns=pair)
+    samples = [(values[name], variances[name]) for name in pair]
+    if along in ("visit", "condition"):
+        samples = [(values[pair[1]] - values[pair[0]], variances.sum(axis=1, skipna=False))]
+    asked = replace(asked, n=sum(int(variance.notna().sum()) for _, variance in samples))
+    means = [weighted_mean(*sample) for sample in samples]
     squares = np.array([mean.error**2 for mean in means])
-    error, last = float(np.sqrt(squares.sum())), means[-1]
-    if not error:
-        return replace(asked, note="all subjects have the same value")
-    each = np.array([mean.freedom for mean in means])
+    notes = [mean.lacks for mean in means if mean.lacks]
+    if notes or not squares.any():
+        return replace(asked, note=(*notes, "all subjects have the same value")[0])
+    each, error = np.array([mean.freedom for mean in means]), float(np.sqrt(squares.sum()))
     freedom = float(squares.sum() ** 2 / np.sum(squares**2 / each))
-    estimate = last.value - sum(mean.value for mean in means[:-1])
-    reach = float(scipy.stats.t.ppf(0.975, freedom)) * error
-    effect = last.value / last.spread
+    estimate, effect = means[0].value, means[0].value / means[0].spread
     if len(means) == 2:
-        both = zip(means[::-1], sizes[::-1], strict=True)
-        effect = effectsize_smd(*(one for mean, size in both
-                                  for one in (mean.value, mean.spread, size)))[0]  # fmt: skip
+        first, second = means
+        estimate = second.value - first.value
+        effect, _ = effectsize_smd(second.value, second.spread, second.n,
+                                   first.value, first.spread, first.n)  # fmt: skip
+    reach = float(scipy.stats.t.ppf(0.975, freedom)) * error
     return replace(
         asked, estimate=estimate, low=estimate - reach, high=estimate + reach,
         between=float(np.sqrt(np.mean([mean.between for mean in means]))), effect=float(effect),
@@ -271,20 +251,19 @@ def _compared(asked: Comparison, means: list[Mean], sizes: list[int]) -> Compari
     )  # fmt: skip
 
 
-def _changes(
-    part: pd.DataFrame, asked: Comparison, visits: list[str]
-) -> list[tuple[pd.Series[float], pd.Series[float]]]:
+def _changes(part: pd.DataFrame, measure: str, reference: str) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Change per visit (least-squares slope over visits) of each subject, by group."""
-    values, variances = (
-        table.reindex(columns=visits) for table in _people(part, asked.measure, "visit")
-    )
-    place = values.notna() * np.arange(float(len(visits)))
-    place = place.where(values.notna()).sub(place.where(values.notna()).mean(axis=1), axis=0)
-    weight = place.div((place**2).sum(axis=1).replace(0.0, np.nan), axis=0)
-    slope = (weight * values).sum(axis=1, min_count=2)
-    variance = (weight**2 * variances).sum(axis=1, min_count=2)
-    group = part.groupby("subject")["group"].first()
-    return [(slope[group == name], variance[group == name]) for name in (asked.first, asked.second)]
+    visits = in_order(part["visit"], reference)
+    values, variances = (table[visits] for table in _people(part, measure, "visit"))
+    place = (values.notna() * np.arange(len(visits))).where(values.notna())
+    place = place.sub(place.mean(axis=1), axis=0)
+    weight = place.div((place**2).sum(axis=1), axis=0)
+    found = pd.DataFrame({
+        "value": (weight * values).sum(axis=1, min_count=2),
+        "variance": (weight**2 * variances).sum(axis=1, min_count=2),
+    })  # fmt: skip
+    found = found.join(part.groupby("subject")["group"].first()).set_index("group", append=True)
+    return found["value"].unstack("group"), found["variance"].unstack("group")
 
 
 def _reliable(part: pd.DataFrame, asked: Comparison) -> Comparison:

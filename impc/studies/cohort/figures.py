@@ -57,10 +57,8 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
         title = f"{label.capitalize()} {block!s}" if block else "All people"
         ax.text(0, at, title, weight="bold", **across)
         mean = mean_of(part.loc[part.index.isin(cohort.usable.index)], cohort.measure)
-        if mean is not None:
-            ends = cohort.scale(cohort.measure) * (mean.value + mean.reach * np.array([-1, 0, 1]))
-            ends = np.exp(ends) if cohort.measure.startswith(LOGARITHM) else ends
-            _mean(ax, ends, at, len(part), across)
+        if not mean.lacks:
+            _mean(ax, cohort.shown(cohort.measure, mean.ends), at, len(part), across)
         for row in part.to_dict("records"):
             at -= 1
             if rows <= _NAMED:

@@ -16,7 +16,7 @@ from impc.files.units import si_unit
 from impc.studies.cohort.sheet import checked_name, read_sheet
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
 # Name of a column -> other names, as `_bare` writes them.
@@ -152,33 +152,25 @@ def _values(
     wrong = {row: "leave the cell empty, or write n/a" for row, cell in given.items()
              if cell.lower().lstrip("+-") in _NO_NUMBERS}  # fmt: skip
     rest = {row: cell for row, cell in given.items() if row not in wrong}
-    texts = {row: cell for row, cell in rest.items()
-             if not (_POINT.fullmatch(cell) or _COMMA.fullmatch(cell))}  # fmt: skip
-    if name in _UNITS:
-        wrong |= dict.fromkeys(texts, f"write a number in {_GIVE[name]}")
-    elif texts:
-        known = _SEXES if name == "sex" else {}
-        return _listed(name, column, wrong, lambda cell: known.get(_bare(cell), cell), faults)
     commas = {row: cell for row, cell in rest.items() if _COMMA.fullmatch(cell)}
-    if commas and all(map(_THOUSANDS.fullmatch, commas.values())):
-        wrong |= dict.fromkeys(
-            commas, "may have a thousands separator, write it with a decimal point"
-        )
-    elif commas and any("." in cell for cell in rest.values()):
-        wrong |= dict.fromkeys(commas, "use only decimal points or only commas")
+    texts = [row for row in rest if row not in commas and not _POINT.fullmatch(rest[row])]
+    numeric = name in _UNITS or not texts
     numbers = {row: float(cell.replace(",", ".")) for row, cell in rest.items() if row not in texts}
-    wrong |= {row: "give a finite number, or n/a"
-              for row, value in numbers.items() if not math.isfinite(value)}  # fmt: skip
-    return _listed(name, column, wrong, lambda cell: factor * float(cell.replace(",", ".")), faults)
+    if numeric:
+        wrong |= dict.fromkeys(texts, f"write a number in {_GIVE.get(name)}")
+        wrong |= {row: "give a finite number, or n/a"
+                  for row, value in numbers.items() if not math.isfinite(value)}  # fmt: skip
+        if commas and all(map(_THOUSANDS.fullmatch, commas.values())):
+            why = "may have a thousands separator, write it with a decimal point"
+            wrong |= dict.fromkeys(commas, why)
+        elif any("." in cell for cell in rest.values()):
+            wrong |= dict.fromkeys(commas, "use only decimal points or only commas")
+    faults += [f"row {row}, {name}: {given[row]!a}, {why}" for row, why in wrong.items()]
+    known = _SEXES if name == "sex" else {}
 
+    def value(row: int) -> float | str | None:
+        if row in wrong or row not in given:
+            return None
+        return factor * numbers[row] if numeric else known.get(_bare(given[row]), given[row])
 
-def _listed(
-    name: str, column: Sequence[str], wrong: Mapping[int, str],
-    convert: Callable[[str], float | str], faults: list[str],
-) -> list[float | str | None]:  # fmt: skip
-    """Converted cells; None for empty ones and those that are `wrong`, which become faults."""
-    faults += [f"row {row}, {name}: {column[row - 2]!a}, {why}" for row, why in wrong.items()]
-    return [
-        None if cell in _EMPTY or row in wrong else convert(cell)
-        for row, cell in enumerate(column, start=2)
-    ]
+    return [value(row) for row in range(2, len(column) + 2)]

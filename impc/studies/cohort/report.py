@@ -75,13 +75,15 @@ def write_report(
         write_files(store.folder, {_address(subject): page.page().encode()})
     described = next((fit for unit in study.units if (fit := store.fit(unit.name))), {})
     cohort = Cohort(tables["units"], described, failures.units, study.reference)
+    known = {name: cohort.units.get(f"K_determined{name[1:]}") for name in cohort.measures}
+    unknown = {name: len(one) - int(one.sum()) for name, one in known.items() if one is not None}
     data = {
         "units": len(study.units),
         "fitted": len(cohort.units),
         "failed": failures.units,
         "failed_replicates": failures.replicates,
         "digests": store.digests,
-        "not_determined": _not_determined(cohort),
+        "not_determined": {name: count for name, count in unknown.items() if count},
         "outliers": list(cohort.units["unit"][cohort.far.notna()]) if cohort.outliers else [],
     }
     beside = [Finding(name, table, _BESIDE[name]) for name, table in tables.items()]
@@ -89,15 +91,6 @@ def write_report(
     report = replace(report, data=data, beside=beside)
     write_files(store.folder, report.files(pdf=pdf))
     return report
-
-
-def _not_determined(cohort: Cohort) -> dict[str, int]:
-    """Number of units that do not determine a compared gain, by its column, if there are any."""
-    known = {name: cohort.units.get(f"K_determined{name[1:]}") for name in cohort.measures}
-    counts = {
-        name: int((~one.astype(bool)).sum()) for name, one in known.items() if one is not None
-    }
-    return {name: count for name, count in counts.items() if count}
 
 
 def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -> Report:
@@ -110,7 +103,7 @@ def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -
     copied: Copy | str = "There is no comparison to copy."
     if cohort.lead is not None:
         others = " ".join(f"{claim.text} {claim.why}" for claim in verdict.may[1:])
-        without = cohort.without_warned(cohort.lead) if verdict.alerts else ""
+        without = cohort.without_warned() if verdict.alerts else ""
         results = f"{verdict.headline} {verdict.sentence} {others}{without}".strip()
         copied = Copy(_METHODS.format(people=people), results)
     caption = (
@@ -156,13 +149,11 @@ def comparisons(cohort: Cohort) -> Finding:
     """Table of all comparisons; logarithms are shown as ratios."""
     rows = []
     for item in cohort.compared:
-        ends, unit, si = (
-            cohort.shown(item),
-            cohort.unit(item.measure),
-            cohort.plant_unit(item.measure),
-        )
+        own = np.array([item.estimate, item.low, item.high])
+        ends, unit = cohort.shown(item.measure, own), cohort.unit(item.measure)
+        si = cohort.plant_unit(item.measure)
         if item.question == "reliability":
-            unit = si = "-"
+            ends, unit, si = own, "-", "-"
         elif item.measure.startswith(LOGARITHM):
             unit = "ratio"
         rows.append({

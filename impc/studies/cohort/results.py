@@ -11,7 +11,13 @@ import numpy as np
 from impc.model.plant import UNKNOWN
 from impc.reporting.finding import Level
 from impc.reporting.rendering import number, p_value
-from impc.studies.cohort.comparison import compare_cohort, interval_of, measures_of, outlying
+from impc.studies.cohort.comparison import (
+    compare_cohort,
+    difference_of,
+    interval_of,
+    measures_of,
+    outlying,
+)
 from impc.studies.fit.facts import between, with_unit
 
 if TYPE_CHECKING:
@@ -19,6 +25,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+    from impc.arrays import Array
     from impc.studies.cohort.comparison import Comparison
 
 #: Prefix of columns of logarithms, which are compared as ratios.
@@ -54,19 +61,21 @@ class Cohort:
         """Number of fits with a warning."""
         return len(self._of(Level.AMBER, Level.RED))
 
+    @property
+    def people(self) -> int:
+        """Number of people with a fit."""
+        return int(self.units["subject"].nunique())
+
     @cached_property
     def measures(self) -> tuple[str, ...]:
         """Columns of `units` that are compared."""
         inner = self.described.get("inner", ())
         return measures_of(self.units, inner) if len(self.units) else ()
 
-    def _compare(self, units: pd.DataFrame) -> tuple[Comparison, ...]:
-        return compare_cohort(units, self.reference, self.described.get("inner", ()))
-
     @cached_property
     def compared(self) -> tuple[Comparison, ...]:
         """All comparisons of green and amber fits."""
-        return self._compare(self.usable)
+        return compare_cohort(self.usable, self.reference, self.described.get("inner", ()))
 
     @cached_property
     def tested(self) -> list[Comparison]:
@@ -147,7 +156,7 @@ class Cohort:
 
     def amount(self, item: Comparison) -> tuple[str, str, str]:
         """Difference and its interval, both without unit, and the unit with "less" or "more"."""
-        ends = self.shown(item)
+        ends = self.shown(item.measure, np.array([item.estimate, item.low, item.high]))
         if item.measure.startswith(LOGARITHM):
             return number(float(ends[0])), between(*ends[1:]), "times"
         # For negative gains, a lower value is "more".
@@ -157,13 +166,9 @@ class Cohort:
         unit = self.unit(item.measure).replace("%", "percentage points")
         return number(abs(ends[0])), between(low, high), f"{unit} {word}"
 
-    def shown(self, item: Comparison) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        """Estimate and both ends as pages show them; logarithms as ratios."""
-        ends = np.array([item.estimate, item.low, item.high])
-        if item.question == "reliability":
-            return ends
-        return np.exp(ends) if item.measure.startswith(LOGARITHM) else (
-            self.scale(item.measure) * ends)  # fmt: skip
+    def shown(self, measure: str, values: Array) -> Array:
+        """Values of a measure as pages show them; logarithms as ratios."""
+        return np.exp(values) if measure.startswith(LOGARITHM) else self.scale(measure) * values
 
     def sentence(self, item: Comparison) -> str:
         """Sentence on a difference."""
@@ -182,13 +187,9 @@ class Cohort:
         else:
             than = "as high {} as" if item.measure.startswith(LOGARITHM) else "{} than"
             said = f"the {name} is {amount} {than.format(second)} {first}"
-        where = f" ({item.condition})" if item.condition and self.conditions > 1 else ""
+        several = item.condition and self.units["condition"].nunique() > 1
+        where = f" ({item.condition})" if several else ""
         return f"{said[:1].upper()}{said[1:]}{where}."
-
-    @property
-    def conditions(self) -> int:
-        """Number of conditions."""
-        return int(self.units["condition"].nunique())
 
     def numbers(self, item: Comparison) -> str:
         """Interval, number of people, SD between them, p-value and effect size."""
@@ -209,36 +210,26 @@ class Cohort:
             return "", 0, 0
         known = self.usable.get(f"K_determined{gains[0][1:]}")
         rows = self.usable if known is None else self.usable[known.astype(bool)]
-        return self.name(gains[0]), rows["subject"].nunique(), self.units["subject"].nunique()
+        return self.name(gains[0]), rows["subject"].nunique(), self.people
 
-    @cached_property
-    def _without_outliers(self) -> dict[tuple[str, ...], Comparison]:
-        kept = self.usable[self.far.reindex(self.usable.index).isna()]
-        return {item.asked: item for item in self._compare(kept)} if self.outliers else {}
-
-    @cached_property
-    def _without_warnings(self) -> dict[tuple[str, ...], Comparison]:
-        return {item.asked: item for item in self._compare(self._of(Level.GREEN))}
-
-    def without_warned(self, item: Comparison | None) -> str:
-        """A difference in fits without a warning, as a sentence; empty without a difference."""
-        return self._without("fits with a warning", self._without_warnings, item)
+    def without_warned(self) -> str:
+        """The leading difference in fits without a warning, as a sentence; empty without one."""
+        return self._only(self._of(Level.GREEN), "fits with a warning", self.lead)
 
     def without_outliers(self, item: Comparison | None) -> str:
         """A difference without the fits to be looked at; empty without such fits."""
         which = f"the {self.outliers} fit{'s' * (self.outliers > 1)} to look at"
-        return self._without(which, self._without_outliers, item) if self.outliers else ""
+        kept = self.usable[self.far[self.usable.index].isna()]
+        return self._only(kept, which, item if self.outliers else None)
 
-    def _without(
-        self, which: str, found: dict[tuple[str, ...], Comparison], item: Comparison | None
-    ) -> str:
+    def _only(self, kept: pd.DataFrame, without: str, item: Comparison | None) -> str:
         if item is None:
             return ""
-        other = found.get(item.asked)
-        if other is None or not np.isfinite(other.p):
-            return f" Without {which}, too few people are left."
+        other = difference_of(kept, item, self.reference)
+        if other.note:
+            return f" Without {without}, too few people are left."
         value, ends, unit = self.amount(other)
-        return f" Without {which} it is {value} {unit} (95 % CI {ends}, n = {other.n})."
+        return f" Without {without} it is {value} {unit} (95 % CI {ends}, n = {other.n})."
 
 
 def effect_name(item: Comparison) -> str:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from impc.reporting.finding import Level
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim, Verdict
 from impc.studies.cohort.results import LOGARITHM, SIGNIFICANT, Cohort
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 # Share of fits with a warning, or of missing fits, above which the report is amber.
 _MANY = 0.1
@@ -47,35 +50,25 @@ def _differences(cohort: Cohort) -> list[Claim]:
     ]
 
 
-def _kind_of_pair(cohort: Cohort) -> str:
-    lead = cohort.lead
-    return {"visit": "visits", "condition": "conditions"}.get(
-        lead.question if lead else "", "groups"
-    )
-
-
 def _none_found(cohort: Cohort) -> bool:
     return cohort.lead is not None and cohort.lead.p_holm > SIGNIFICANT
 
 
-_WORDS = {
+_WORDS: dict[str, Callable[[Any], object]] = {
+    "of": lambda c: c,  # {of.warned}: a number of the cohort
     "fits": lambda c: len(c.units),
     "asked": lambda c: len(c.units) + len(c.failed),
-    "people": lambda c: c.units["subject"].nunique(),
-    "warned": lambda c: c.warned,
-    "warnings": _warnings,
-    "without_warned": lambda c: c.without_warned(c.lead),
-    "far": lambda c: c.outliers,
-    "outliers": _outliers,
-    "without_outliers": lambda c: c.without_outliers(c.lead),
     "failed": lambda c: len(c.failed),
     "reason": lambda c: next(iter(c.failed.values())),
+    "warnings": _warnings,
+    "without_warned": Cohort.without_warned,
+    "outliers": _outliers,
+    "without_outliers": lambda c: c.without_outliers(c.lead),
     "gain": lambda c: c.determined[0],
     "known": lambda c: c.determined[1],
     "all": lambda c: c.determined[2],
-    "unknown": lambda c: c.determined[2] - c.determined[1],
     "measure": lambda c: "cost weight" if c.measure.startswith(LOGARITHM) else "gain",
-    "pair": _kind_of_pair,
+    "pair": lambda c: {"visit": "visits", "condition": "conditions"}.get(c.lead.question, "groups"),
     "sentence": lambda c: c.sentence(c.lead),
     "estimate": lambda c: c.sentence(c.lead)[:-1],
     "numbers": lambda c: c.numbers(c.lead),
@@ -84,7 +77,7 @@ _WORDS = {
 }
 # Alerts of red and of amber reports.
 _WARNED: dict[str, Any] = {
-    "title": "{warned} of {fits} fits have a warning",
+    "title": "{of.warned} of {fits} fits have a warning",
     "found": "{warnings}{without_warned}",
     "means": "The gains of these people may be biased by more than their intervals show; a bias "
     "that differs between groups looks like a difference between people.",
@@ -118,7 +111,7 @@ _RESULT: Rules[Cohort] = Rules(
             "At least three people in each group, or with both visits, are needed.",
         ),
         Kind(
-            Level.GREEN, lambda c: c.lead is None, "Fitted people: {people}.",
+            Level.GREEN, lambda c: c.lead is None, "Fitted people: {of.people}.",
             "There are too few people in two groups, or with two visits, for a comparison.",
         ),
         Kind(
@@ -138,7 +131,7 @@ _RULES: Rules[Cohort] = Rules(
              **_WARNED),
         Kind(
             Level.AMBER, lambda c: c.outliers, "{result}", "{details}",
-            "{far} of {fits} fits are far from the others of their group",
+            "{of.outliers} of {fits} fits are far from the others of their group",
             "Subjects, and a gain relative to their group's median: {outliers}.",
             "A gain above three times, or below a third, of the median is more often a wrong fit "
             "than an unusual person. One such fit can move the mean of a group.",
@@ -171,7 +164,7 @@ _RULES: Rules[Cohort] = Rules(
              "What the groups try to minimise.",
              "Many weights lead to the same gain. Set [fit.structure] to compare weights."),
         Line(lambda c: c.lead and c.determined[1] < c.determined[2],
-             "The {gain} of {unknown} of {all} people, each alone.", "It is not determined."),
+             "The {gain} of a single person, except in {known} of {all}.", "It is not determined."),
         Line(lambda c: c.lead and c.warned, "Gains of single people whose fit has a warning.",
              "See Subjects."),
     ),

@@ -54,7 +54,7 @@ def test_an_interval_covers_in_a_small_simulation() -> None:
 def test_equal_errors_are_students_t() -> None:
     values = np.random.default_rng(2).standard_normal(7)
     for variances in (np.zeros(7), np.full(7, 0.01), np.full(7, 1e-30)):
-        found = weighted_mean(values, variances)
+        found = weighted_mean(pd.Series(values), pd.Series(variances))
         assert found.value == pytest.approx(values.mean())
         assert found.error == pytest.approx(scipy.stats.sem(values))
         assert found.freedom == pytest.approx(6.0)
@@ -67,9 +67,9 @@ def test_shares_are_inverse_variances_plus_the_variance_between_people() -> None
     w = 1 / variances
     q = w @ (values - w @ values / w.sum()) ** 2
     between = (q - 2) / (w.sum() - w @ w / w.sum())
-    found = weighted_mean(values, variances)
+    found = weighted_mean(pd.Series(values), pd.Series(variances))
     assert found.between == pytest.approx(between)
     assert found.value == pytest.approx(np.average(values, weights=1 / (variances + between)))
-    found = weighted_mean(values / 4, variances)
+    found = weighted_mean(pd.Series(values) / 4, pd.Series(variances))
     assert found.between == 0.0
     assert found.value == pytest.approx(np.average(values / 4, weights=w))
