@@ -41,7 +41,7 @@ from impc.errors import DataError
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Sequence
 
     from impc.arrays import Array
 
@@ -218,7 +218,7 @@ def compare_cohort(
 
 
 def difference_of(units: pd.DataFrame, asked: Comparison, reference: str) -> Comparison:
-    """t-test of the difference between two means, or of the mean difference of pairs."""
+    """A comparison as `asked`, in the table `units`."""
     pair, along = [asked.first, asked.second], asked.question
     part = units if along == "condition" else units[units["condition"] == asked.condition]
     if along == "change":
@@ -230,7 +230,11 @@ def difference_of(units: pd.DataFrame, asked: Comparison, reference: str) -> Com
     if along in ("visit", "condition"):
         samples = [(values[pair[1]] - values[pair[0]], variances.sum(axis=1, skipna=False))]
     asked = replace(asked, n=sum(int(variance.notna().sum()) for _, variance in samples))
-    means = [weighted_mean(*sample) for sample in samples]
+    return t_test(asked, [weighted_mean(*sample) for sample in samples])
+
+
+def t_test(asked: Comparison, means: Sequence[Mean]) -> Comparison:
+    """t-test of the difference between two means (the second minus the first), or of one mean."""
     squares = np.array([mean.error**2 for mean in means])
     notes = [mean.lacks for mean in means if mean.lacks]
     if notes or not squares.any():

@@ -83,11 +83,6 @@ class Cohort:
         return sorted((item for item in self.compared if np.isfinite(item.p)), key=_rank)
 
     @property
-    def differing(self) -> list[Comparison]:
-        """Differences that are found."""
-        return [item for item in self.tested if item.p_holm <= SIGNIFICANT]
-
-    @property
     def lead(self) -> Comparison | None:
         """Comparison in the headline: of gains, or of cost weights within a structure."""
         return next((one for one in self.tested if one.measure.startswith(_LEADING)), None)

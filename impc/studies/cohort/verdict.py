@@ -43,7 +43,8 @@ def _differences(cohort: Cohort) -> list[Claim]:
     lead = cohort.lead
     if lead is None or lead.p_holm > SIGNIFICANT:
         return []
-    shown = [one for one in cohort.differing if not one.measure.startswith("centre")][:6]
+    found = (one for one in cohort.tested if one.p_holm <= SIGNIFICANT)
+    shown = [one for one in found if not one.measure.startswith("centre")][:6]
     return [
         Claim(cohort.sentence(one), f"{cohort.numbers(one)}.{cohort.without_outliers(one)}")
         for one in shown
@@ -108,7 +109,7 @@ _RESULT: Rules[Cohort] = Rules(
             Level.GREEN,
             lambda c: c.lead is None and any(one.measure[:2] == "K." for one in c.compared),
             "Gains are known well enough in too few people for a comparison.",
-            "At least three people in each group, or with both visits, are needed.",
+            "Each mean needs at least three people whose gains are known about equally well.",
         ),
         Kind(
             Level.GREEN, lambda c: c.lead is None, "Fitted people: {of.people}.",
