@@ -156,6 +156,9 @@ participants = "participants.tsv"
 time = "time"
 
 {SIGNALS.replace("LIMIT", _LIMIT)}
+[plant.uncertainty]
+all = 0                          # simulated bodies are exact; leave this table out for people
+
 [fit]
 horizon = {HORIZON}                     # samples of 0.01 s
 u_max = {given["torque_limit"]}                      # N m

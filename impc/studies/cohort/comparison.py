@@ -7,8 +7,9 @@ these shares p (of sum 1) as given, and the variances from the values y and mean
 
     SE^2 = sum a (y - m)^2,    df = 1 / (sum p^2 + (sum a)^2 - sum a^2),    a = p^2 / (1 - p)
 
-(HC2 with Satterthwaite's degrees of freedom, Bell and McCaffrey 2002). With equal shares, as for
-measures without a standard error, the tests are Welch's and Student's. Hartung and Knapp's error is
+(HC2 with Satterthwaite's degrees of freedom, Bell and McCaffrey 2002), but not below the error that
+the fits leave to a common value, (sum 1 / variance)^-1/2. With equal shares, as for measures
+without a standard error, the tests are Welch's and Student's. Hartung and Knapp's error is
 not used: a gain that the recordings do not determine stays near the start of the search, so that it
 deviates less than its variance says. In simulated groups of 5 to 20 people with a third of such
 fits their 95 % interval covers 85 to 92 %, this one 94 to 97 % (test_weighted_means.py).
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 _FEWEST = 3  # People in each mean
 _LEAST = 2.0  # People of equal shares to whom a mean must correspond, 1 / sum p^2
+_KNOWN = 1e9  # Degrees of freedom of a standard error that the fits state
 _COST_WEIGHT = "log_cost_weight."
 # Usual names of what the others are compared with.
 _USUAL = re.compile(r"(?<![^\W_])(eo|open|baseline|pre|control)(?![^\W_])", re.IGNORECASE)
@@ -121,6 +123,9 @@ def weighted_mean(given: pd.Series[float], squares: pd.Series[float]) -> Mean:
         freedom = float(1 / (of_squares + a.sum() ** 2 - a @ a))
         spread = float(np.sqrt(shares @ apart / (1 - of_squares)))
         error = float(np.sqrt(a @ apart))
+        least = float(np.sum(1 / variances) ** -0.5) if variances.any() else 0.0
+    if error < least:
+        error, freedom = least, _KNOWN
     return Mean(n, mean, error, freedom, between, spread, 1 / of_squares)
 
 

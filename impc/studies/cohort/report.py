@@ -219,8 +219,8 @@ def subjects(study: Study, cohort: Cohort) -> Finding:
     plain = [one for one in ("group", "visit", "condition", "why") if table[one].nunique() < 2]
     return Finding(
         "subjects", table,
-        "All subjects and visits; click a heading to sort. Determined: the 95 % interval is not "
-        "wider than the gain itself.",
+        "All subjects and visits; click a heading to sort. Determined: the recordings identify "
+        "the gain, and its 95 % interval is not wider than the gain itself.",
         digits=4,
         labels={
             **{head: f"{words}, VAF (%)" for head, words in signals.items()}, **_INTERVAL,

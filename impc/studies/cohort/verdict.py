@@ -143,7 +143,8 @@ _RULES: Rules[Cohort] = Rules(
             Level.AMBER, lambda c: c.determined[1] < _FEW * c.determined[2],
             "{result}", "{details}",
             "The {gain} is determined in only {known} of {all} people",
-            "In the others the 95 % interval is wider than the gain itself.",
+            "In the others the 95 % interval is wider than the gain itself, or a change of other "
+            "gains makes up for one of this gain.",
             "All people count, each by how well their gain is known: the means rest mostly on few "
             "people, and only large differences are found.",
             ("Record more or longer trials, or use a stronger perturbation; impc plan shows how "

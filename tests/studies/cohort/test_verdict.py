@@ -41,7 +41,7 @@ def cohort(
             moved = visit if visits > 1 else group == "second"
             level = "red" if number in red else "amber" if number in warned else "green"
             gain = mean + shift * moved + spread * rng.standard_normal()
-            half = 1.96e5 if number in wide else 58.8
+            half = 1.96e5 if number in wide else 0.98 * spread
             rows.append({
                 "unit": f"sub-{number}_ses-{visit}", "subject": str(number),
                 "visit": str(visit + 1),

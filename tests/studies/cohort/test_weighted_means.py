@@ -61,6 +61,13 @@ def test_intervals_cover_in_a_small_simulation() -> None:
     assert width < 0.7 * differences(drawn[:200], weighted=False)[1]
 
 
+def test_undetermined_gains_that_agree_are_not_known_well() -> None:
+    """Six values near the start of the search, each known to +- 2000: their mean is to +- 800."""
+    values = pd.Series([470.0, 480.0, 460.0, 475.0, 465.0, 470.0])
+    low, _, high = weighted_mean(values, pd.Series(np.full(6, 1000.0**2))).ends
+    assert (high - low) / 2 == pytest.approx(1.96 * 1000 / np.sqrt(6), rel=1e-3)
+
+
 def test_equal_errors_are_students_t() -> None:
     values = np.random.default_rng(2).standard_normal(7)
     for variances in (np.zeros(7), np.full(7, 0.01), np.full(7, 1e-30)):
