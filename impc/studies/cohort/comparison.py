@@ -176,8 +176,8 @@ def _people(part: pd.DataFrame, measure: str, along: str) -> tuple[pd.DataFrame,
     variances = _variances(part, measure)
     equal = not variances.fillna(1.0).any()
     weight = (1.0 + variances) if equal else (1 / variances.clip(lower=1e-300)).fillna(0.0)
-    rows = part.assign(weight=weight, times=weight * part[measure]).dropna(subset=[measure])
-    sums = rows.groupby(["subject", along])[["weight", "times"]].sum()
+    rows = part[["subject", along]].assign(weight=weight, times=weight * part[measure])
+    sums = rows.dropna(subset=["times"]).groupby(["subject", along])[["weight", "times"]].sum()
     weights, times = (sums[name].unstack(along) for name in ("weight", "times"))
     return times / weights, (0 if equal else 1) / weights
 
