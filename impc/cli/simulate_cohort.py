@@ -157,7 +157,7 @@ time = "time"
 
 {SIGNALS.replace("LIMIT", _LIMIT)}
 [plant.uncertainty]
-all = "1 %"                      # simulated bodies are almost exact; leave this table out for people
+all = "1 %"                      # simulated bodies are known; leave this table out for people
 
 [fit]
 horizon = {HORIZON}                     # samples of 0.01 s

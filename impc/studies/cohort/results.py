@@ -33,6 +33,8 @@ LOGARITHM = "log_cost_weight."
 _LEADING = ("K.", LOGARITHM)
 # Questions about means, in the order of preference.
 _QUESTIONS = ("group", "change", "condition", "visit")
+# Of the headline of a fit that determines no gain (`impc.studies.fit.verdict`).
+_UNCERTAIN = "do not determine its gains"
 #: Corrected p-value of a difference that is found.
 SIGNIFICANT = 0.05
 
@@ -57,9 +59,16 @@ class Cohort:
         return self._of(Level.GREEN, Level.AMBER)
 
     @cached_property
+    def with_warning(self) -> pd.DataFrame:
+        """Units with a warning, except that no gain is determined: such a fit counts little."""
+        found = self._of(Level.AMBER, Level.RED)
+        uncertain = found["headline"].str.contains(_UNCERTAIN) if len(found) else found.index < 0
+        return found[~uncertain]
+
+    @property
     def warned(self) -> int:
         """Number of fits with a warning."""
-        return len(self._of(Level.AMBER, Level.RED))
+        return len(self.with_warning)
 
     @property
     def people(self) -> int:
@@ -209,7 +218,9 @@ class Cohort:
 
     def without_warned(self) -> str:
         """The leading difference in fits without a warning, as a sentence; empty without one."""
-        return self._only(self._of(Level.GREEN), "fits with a warning", self.lead)
+        return self._only(
+            self.units.drop(index=self.with_warning.index), "fits with a warning", self.lead
+        )
 
     def without_outliers(self, item: Comparison | None) -> str:
         """A difference without the fits to be looked at; empty without such fits."""

@@ -26,7 +26,7 @@ def cohort_verdict(cohort: Cohort) -> Verdict:
 
 def _warnings(cohort: Cohort) -> str:
     """The most frequent warnings with their numbers."""
-    heads = cohort.units.loc[cohort.units["level"] != Level.GREEN.value, "headline"]
+    heads = cohort.with_warning["headline"]
     return " ".join(f"{head.rstrip('.')} ({count})."
                     for head, count in Counter(heads).most_common(3))  # fmt: skip
 

@@ -153,6 +153,14 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
     assert "n = 16" in alert.found
 
 
+def test_fits_that_determine_no_gain_are_no_warning_of_the_study() -> None:
+    made = cohort(-139.0, warned=(3, 4, 12, 13))
+    said = "The model explains the movement, but the recordings do not determine its gains."
+    units = made.units.assign(headline=made.units["headline"].where(made.units.index != 3, said))
+    assert Cohort(units, FIT, {}).warned == 3
+    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), FIT, {})).level is Level.GREEN
+
+
 def test_too_few_gains_are_no_comparison() -> None:
     found = cohort_verdict(cohort(-139.0, wide=tuple(range(9))))
     assert found.level is Level.AMBER
