@@ -156,9 +156,6 @@ participants = "participants.tsv"
 time = "time"
 
 {SIGNALS.replace("LIMIT", _LIMIT)}
-[plant.uncertainty]
-all = "1 %"                      # simulated bodies are known; leave this table out for people
-
 [fit]
 horizon = {HORIZON}                     # samples of 0.01 s
 u_max = {given["torque_limit"]}                      # N m
