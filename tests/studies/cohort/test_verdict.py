@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from impc.studies.cohort.report import comparisons, subjects
 from impc.studies.cohort.results import Cohort
 from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.verdict import cohort_verdict
+from impc.studies.fit.verdict import fit_verdict
 
 FIT: dict[str, Any] = {
     "words": {"command": "commanded torque", "theta1": "seat tilt"},
@@ -156,6 +158,7 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
 def test_fits_that_determine_no_gain_are_no_warning_of_the_study() -> None:
     made = cohort(-139.0, warned=(3, 4, 12, 13))
     said = "The model explains the movement, but the recordings do not determine its gains."
+    assert said in Path(fit_verdict.__code__.co_filename).read_text(encoding="utf-8")
     units = made.units.assign(headline=made.units["headline"].where(made.units.index != 3, said))
     assert Cohort(units, FIT, {}).warned == 3
     assert cohort_verdict(Cohort(units.drop(index=[12, 13]), FIT, {})).level is Level.GREEN
