@@ -28,7 +28,7 @@ from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_problem
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
+    from impc.arrays import Array, IntArray
     from impc.model.plant import Plant
 
 __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
@@ -91,7 +91,7 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     )
 
 
-def _shown(plant: Plant) -> Array:
+def _shown(plant: Plant) -> IntArray:
     """Places of the states whose gains the report shows, for a plant with one control."""
     return np.flatnonzero(~follows_command(plant))
 

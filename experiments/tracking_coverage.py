@@ -84,7 +84,7 @@ def covered(task: tuple[str, int]) -> tuple[int, int, int]:
     table = found.intervals()
     true = np.ravel(law.K)
     inside = (table["low"] <= true) & (true <= table["high"])
-    known = table["identified"].to_numpy(dtype=bool)
+    known = table["determined"].to_numpy(dtype=bool)
     return int(known.sum()), int((inside & known).sum()), int(np.count_nonzero(run.status))
 
 

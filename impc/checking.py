@@ -428,6 +428,7 @@ _KINDS: dict[str, Kind] = {
     "Path": _path,
     "Any": _as_it_is,
     "tuple[tuple[str, str], ...]": _as_it_is,
+    "tuple[tuple[str, float], ...]": _as_it_is,
     "Mapping[str, Any]": _mapping,
     "Mapping[str, ArrayLike]": _columns,
     "Mapping[str, str]": _mapping_of(_text),

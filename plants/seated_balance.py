@@ -84,7 +84,13 @@ def seated_balance_plant(
     n, m = plant.B.shape
     # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also for singular A.
     held = scipy.linalg.expm(np.block([[plant.A, plant.B], [np.zeros((m, n + m))]]) * sample_time)
-    return _named(held[:n, :n], held[:n, n:], sample_time, "seated_balance")
+    return _named(
+        held[:n, :n],
+        held[:n, n:],
+        sample_time,
+        "seated_balance",
+        parameters or SeatedBalanceParameters(),
+    )
 
 
 def continuous_seated_balance_plant(
@@ -117,7 +123,7 @@ def continuous_seated_balance_plant(
     A, B = np.zeros((n, n)), np.zeros((n, 2))
     A[:4, :4], A[:4, -1], A[4:, 4:] = by_state, by_input[:, 0], chain.A
     B[:4, 1], B[4:, 0] = by_input[:, 1], chain.B
-    return _named(A, B, 0.0, "seated_balance_continuous")
+    return _named(A, B, 0.0, "seated_balance_continuous", parameters)
 
 
 @functools.cache
@@ -231,7 +237,7 @@ def _mass(p: Any, angle: ca.SX) -> ca.SX:
     return matrix
 
 
-def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:
+def _named(A: Any, B: Any, sample_time: float, name: str, p: SeatedBalanceParameters) -> Any:
     n = A.shape[0]
     delays = [f"delay_{k}" for k in range(1, n - 4)]
     units = {
@@ -254,5 +260,9 @@ def _named(A: Any, B: Any, sample_time: float, name: str) -> Any:
         **{name: f"neural delay, state {k}" for k, name in enumerate(delays, 1)},
         "muscle_torque": "muscle torque",
         **dict(zip(_INPUTS, _INPUT_WORDS, strict=True)),
+    }
+    system.gravity = {
+        "theta1": p.gravity * (p.m1 * p.l1 + p.m2 * p.l12),
+        "theta2": p.gravity * p.m2 * p.l2,
     }
     return with_units(system, units, words)

@@ -65,7 +65,8 @@ def _key_equations(yaw: dict[str, Any]) -> list[Entry]:
                 "impc.studies.selection.key_parameters:key_parameters",
                 "impc.studies.reliability.icc:icc",
             ),
-            f"Least of all candidates {least:.2f}.",
+            f"Least of all candidates {least:.2f}. impc asks for the lower end of the 95 %"
+            " interval, at least .60.",
             Verdict.REPRODUCED,
         ),
     ]

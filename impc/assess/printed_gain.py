@@ -200,10 +200,10 @@ def interval_table(fitted: Estimate) -> pd.DataFrame:
     -------
     pandas.DataFrame
         Index: name, such as "K.u.x1" for the entry from state x1 to input u. Columns: `unit`,
-        `value`, `low`, `high`; `identified`, whether the recordings identify this number
-        individually; and `determined`, whether also half of the interval is at most half of the
-        value. Values are least-squares estimates along the identified directions and can
-        differ from K, which belongs to weights (docs/why/intervals.md).
+        `value`, `low`, `high`; and `determined`, whether the recordings identify this number
+        individually, and half of the interval is at most half of the value. Values are
+        least-squares estimates along the identified directions and can differ from K, which
+        belongs to weights (docs/why/intervals.md).
     """
     return _table(gain_estimate(fitted))
 
@@ -235,10 +235,10 @@ def _table(found: GainEstimate) -> pd.DataFrame:
     items = covariance_intervals(found, found.covariance, "sandwich")
     units += [UNKNOWN] * (len(items) - len(units))  # of parameters
     rows = [
-        (item.name, unit, item.value, item.low, item.high, item.identified, item.determined)
+        (item.name, unit, item.value, item.low, item.high, item.determined)
         for item, unit in zip(items, units, strict=True)
     ]
-    heads = ["name", "unit", "value", "low", "high", "identified", "determined"]
+    heads = ["name", "unit", "value", "low", "high", "determined"]
     return pd.DataFrame(rows, columns=heads).set_index("name")
 
 

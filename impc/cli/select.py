@@ -69,7 +69,8 @@ def command(
         found = select_study(named, settings, run)
     line = f"impc select {study_file.name} --model {source.name}"
     truths = read_truths(study_file.absolute().parent, source.model)
-    page = selection_report(source.model, found, line, inputs, truths)
+    people, visits = (len(set(names)) for names in zip(*recorded, strict=True))
+    page = selection_report(source.model, found, line, inputs, truths, (people, visits))
     written = write_files(out, page.files(pdf=pdf))
     kept_results(out).forget()
     _print(page, "unit", "value", "low", "high")
@@ -150,7 +151,11 @@ def read_model_study(
     help="Largest allowed variance of a parameter, in squared halves of its range.",
 )
 @click.option("--vaf", type=Number(), default=69.0, help="Smallest allowed mean VAF, %.")
-@click.option("--icc", type=Number(), default=0.75, help="Smallest allowed ICC(A,k).")
+@click.option(
+    "--icc",
+    type=Number(),
+    help="Smallest allowed lower end of the 95 % interval of ICC(A,k). Default: 0.6, good.",
+)
 @page_options
 @scheduler_options
 @yes_option
@@ -161,7 +166,7 @@ def key_command(
     out: Path,
     bound: float,
     vaf: float,
-    icc: float,
+    icc: float | None,
     cluster: Cluster,
     yes: bool,
     pdf: bool,
@@ -175,10 +180,12 @@ def key_command(
     from impc.cli.console import FEWER_STARTS, require_consent  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.effort import key_evaluations, selection_effort  # noqa: PLC0415
+    from impc.studies.reliability.icc import GOOD  # noqa: PLC0415
     from impc.studies.selection.key_parameters import key_parameters  # noqa: PLC0415
     from impc.studies.selection.key_report import key_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 
+    icc = GOOD if icc is None else icc
     study, source, recorded, inputs = read_model_study(study_file, model_name, allowed)
     settings = select_settings(study.configuration.select)
     effort = selection_effort(source.model, recorded.values(), key_evaluations(settings))

@@ -44,10 +44,9 @@ def regress_commands(problem: Problem, gain: Array, metric: Array) -> CommandReg
     """Regress the recorded commands; a `gain` (m, n) and `metric` (m, m) define active bounds."""
     if not all(len(trial.commands) for trial in problem.recordings):
         raise DataError(
-            "commands",
-            "needs recorded commands; these recordings have none",
+            "recorded commands are needed", "these files have none",
             "pass Recording(..., commands=...)",
-        )
+        )  # fmt: skip
     controller = controller_for(problem, gain, metric)
     x, u, used = [], [], 0
     for trial, states in zip(problem.recordings, _states(problem), strict=True):

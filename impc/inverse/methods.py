@@ -311,7 +311,7 @@ _TABLE = (
     ),
     Method(
         "clipped_lqr",
-        "cut off at the limit",
+        "no planning ahead, cut at the limit",
         "The gain of inverse MPC with its command cut off at the limit: it does not plan ahead.",
         _cut_off,
         lambda problem, start: of_gain(

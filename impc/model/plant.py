@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import scipy.linalg
 
-from impc.arrays import Array, System, frozen
+from impc.arrays import Array, System, finite_array, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import PlantError, brief
 from impc.model.body import Body, read_body
@@ -61,6 +61,9 @@ class Plant(Value):
         Pairs of signal and unit; `unit` looks one up.
     words : tuple of (str, str)
         Pairs of signal and description; `word` looks one up.
+    gravity : tuple of (str, float)
+        Pairs of an angle and m g h, the moment of gravity in N m/rad, from `system.gravity`; the
+        report gives gains as a share of it.
     commands : tuple of str
         States that are the last command of a control (`with_rates`); usually none.
     body : Body or None
@@ -110,6 +113,7 @@ class Plant(Value):
     outputs: tuple[str, ...]
     units: tuple[tuple[str, str], ...]
     words: tuple[tuple[str, str], ...]
+    gravity: tuple[tuple[str, float], ...]
     body: Body | None
     observer: Array
     ahead: int
@@ -155,6 +159,7 @@ class Plant(Value):
             outputs=tuple(system.output_labels),
             units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
             words=_texts(system, "words", words, 'text, as in {"angle": "tilt of the seat"}'),
+            gravity=_gravity(system),
             body=None if moves is None else read_body(moves, order, len(matrices["A"])),
             observer=frozen(np.zeros(len(rest))),
             ahead=0,
@@ -261,6 +266,17 @@ def _texts(system: Any, kind: str, given: Any, such: str) -> tuple[tuple[str, st
                 f"map the name of a signal to a {such}",
             )
     return pairs
+
+
+def _gravity(system: Any) -> tuple[tuple[str, float], ...]:
+    """Pairs (state, moment of gravity) from the system's own attribute, if it has one."""
+    given = getattr(system, "gravity", {})
+    if not isinstance(given, Mapping) or not given.keys() <= set(system.state_labels):
+        raise PlantError(
+            "plant.gravity", f"is {brief(given)}", 'map names of angles to m g h: {"angle": 60.0}'
+        )
+    values = finite_array("plant.gravity", list(given.values()), (len(given),))
+    return tuple(zip(given, values.tolist(), strict=True))
 
 
 def _sample_time(dt: object) -> float:

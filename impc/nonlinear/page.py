@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,10 +14,11 @@ from impc.inverse.estimates import Status
 from impc.nonlinear.combinations import interval
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
+from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.shown_units import shown_as
 from impc.reporting.style import BLUE, HALF, PHONE, RECORDED, new_figure, strip
-from impc.reporting.verdict import Alert, Claim, Key, Verdict
+from impc.reporting.verdict import Key
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -52,6 +53,35 @@ class OptimalFit(Frozen):
     known: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # fixed: value and unit
     settings: Mapping[str, Any] = field(default_factory=dict)  # as the user gave them
 
+    @property
+    def vaf(self) -> dict[str, float]:
+        """VAF of each measured signal, %."""
+        found = signal_vaf(self.estimate).items()
+        return {name: value for name, value in found if np.isfinite(value)}
+
+    @property
+    def poor(self) -> list[str]:
+        """Signals that are not explained."""
+        return [name for name, value in self.vaf.items() if value < _LITTLE]
+
+    @property
+    def explained(self) -> str:
+        """VAF of each signal in words."""
+        each = ", ".join(f"{_words(name)} {number(one, 4)} %" for name, one in self.vaf.items())
+        return f"Variance accounted for: {each}"
+
+    @property
+    def open(self) -> list[str]:
+        """Parameters that are not identified."""
+        found = self.estimate.combinations.unidentified
+        return list(dict.fromkeys(key for one in found for key in one.exponents))
+
+    @property
+    def usable(self) -> bool:
+        """Whether a value may be reported."""
+        found = self.estimate
+        return bool(found.settled and not self.poor and found.combinations.identified)
+
 
 def signal_vaf(estimate: OptimalControlEstimate) -> dict[str, float]:
     """VAF of each state and input over all recordings in %; NaN where nothing was measured."""
@@ -83,38 +113,57 @@ def reached(estimate: OptimalControlEstimate) -> pd.DataFrame:
     return pd.DataFrame(found, columns=heads)
 
 
-def _verdict(fit: OptimalFit, explained: str) -> Verdict:
-    """Verdict of the fit, most severe case first."""
-    vaf, found = signal_vaf(fit.estimate), fit.estimate.combinations
-    poor = ", ".join(_words(name) for name, value in vaf.items() if value < _LITTLE)
-    open_ones = ", ".join(dict.fromkeys(key for one in found.unidentified for key in one.exponents))
-    explains = "The problem explains this movement"
-    if not fit.estimate.settled:
-        headline = "The search stopped before it converged."
-        return Verdict(Level.RED, headline, "Do not use its parameters.")
-    if poor:
-        headline = "The problem explains less than half of this movement."
-        said = f"This concerns {poor}: equations, cost or limits do not fit the recordings."
-        return Verdict(Level.RED, headline, said)
-    if not found.identified:
-        headline = f"{explains}, but no parameter is identified."
-        return Verdict(Level.RED, headline, f"{explained}.")
-    level, headline, alerts = Level.GREEN, f"{explains}, and each parameter is identified.", []
-    names = ", ".join(one.name for one in found.identified)
-    may_not = [Claim("This cost is the only one.", "Another form may explain the movement too.")]
-    if open_ones:
-        level, headline = Level.AMBER, f"{explains}, but {open_ones} cannot be determined."
-        alerts = [Alert(
-            level,
-            "Some parameters are not identified",
-            " ".join(one.sentence for one in found.unidentified),
-            "Other values of these parameters lead to the same movement.",
-            ["Report the products that are identified, with their intervals.",
-             "Fix one of these parameters, or record a movement that depends on it."],
-        )]  # fmt: skip
-        may_not.insert(0, Claim("Values that are not identified.", f"{open_ones}."))
-    may = [Claim("Identified values, with their intervals.", f"{names}.")]
-    return Verdict(level, headline, f"{explained}.", alerts, may, may_not)
+_EXPLAINS = Kind[OptimalFit](
+    Level.GREEN, always, "The problem explains this movement, and each parameter is identified.",
+    "{explained}.",
+)  # fmt: skip
+RULES = Rules[OptimalFit](
+    {
+        "explained": lambda it: it.explained,
+        "poor": lambda it: ", ".join(_words(name) for name in it.poor),
+        "open": lambda it: ", ".join(it.open),
+        "names": lambda it: ", ".join(one.name for one in it.estimate.combinations.identified),
+        "each": lambda it: " ".join(one.sentence for one in it.estimate.combinations.unidentified),
+    },
+    kinds=(
+        Kind(Level.RED, lambda it: not it.estimate.settled,
+             "The search stopped before it converged.", "Do not use its parameters."),
+        Kind(Level.RED, lambda it: it.poor,
+             "The problem explains less than half of this movement.",
+             "This concerns {poor}: equations, cost or limits do not fit the recordings."),
+        replace(
+            _EXPLAINS, level=Level.RED, when=lambda it: not it.estimate.combinations.identified,
+            headline="The problem explains this movement, but no parameter is identified.",
+        ),
+        replace(
+            _EXPLAINS, level=Level.AMBER, when=lambda it: it.open,
+            headline="The problem explains this movement, but {open} cannot be determined.",
+            title="Some parameters are not identified", found="{each}",
+            means="Other values of these parameters lead to the same movement.",
+            todo=("Report the products that are identified, with their intervals.",
+                  "Fix one of these parameters, or record a movement that depends on it."),
+        ),
+        replace(
+            _EXPLAINS, level=Level.AMBER, when=lambda it: len(it.trials) == 1,
+            title="One recording cannot check itself",
+            found="All parameters were fitted to one recording, and none is left to predict.",
+            means="The problem may explain this movement and not the next one.",
+            todo=("Record at least two movements, and fit them together.",
+                  "Report the parameters with their intervals as those of one movement."),
+        ),
+        _EXPLAINS,
+    ),
+    may=(
+        Line(lambda it: it.usable, "Identified values, with their intervals.", "{names}."),
+    ),
+    may_not=(
+        Line(lambda it: it.usable and it.open, "Values that are not identified.", "{open}."),
+        Line(lambda it: it.usable, "How well other movements are predicted.",
+             "No recording was left out."),
+        Line(lambda it: it.usable, "This cost is the only one.",
+             "Another form may explain the movement too."),
+    ),
+)  # fmt: skip
 
 
 def _words(name: str) -> str:
@@ -131,12 +180,9 @@ def estimate_report(estimate: OptimalControlEstimate, provenance: Provenance) ->
 def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
     """Report, result.json, tables of parameters, products and samples, and the figure."""
     estimate, problem = fit.estimate, fit.estimate.problem
-    vaf = {name: value for name, value in signal_vaf(estimate).items() if np.isfinite(value)}
-    each = ", ".join(f"{_words(name)} {number(value, 4)} %" for name, value in vaf.items())
-    explained = f"Variance accounted for: {each}"
-    verdict, table, limits = _verdict(fit, explained), _parameters(fit), reached(estimate)
+    verdict, table, limits = RULES.verdict(fit), _parameters(fit), reached(estimate)
     count, alone = len(estimate.theta), int(np.sum(np.isfinite(estimate.combinations.deviations)))
-    lowest = min(vaf.values(), default=0.0)
+    lowest = min(fit.vaf.values(), default=0.0)
     keys = [
         Key(number(lowest, 4), "%", "lowest VAF of a signal"),
         Key(str(alone), f"of {count}", "parameters identified"),
@@ -144,13 +190,13 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
           for row in limits.nlargest(1, "at_its_limit").itertuples()),
     ]  # fmt: skip
     given = {"Problem": provenance.plant_name, **provenance.plant_arguments, **fit.settings}
-    own = [(_words(key).capitalize(), Markup("<code>{}</code>").format(value))
+    own = [(sentence_case(_words(key)), Markup("<code>{}</code>").format(value))
            for key, value in given.items() if value not in (None, "")]  # fmt: skip
     values = "; ".join(f"{row[0]} {row[1]} {row[4]} (95 % CI {row[2]} to {row[3]})"
-                       for row in table.rows[:count])  # fmt: skip
+                       for row in table.rows[:count] if row[5] != "no")  # fmt: skip
     notes = " ".join(f"{name}: {'; '.join(one)}." for name, one in
                      zip(fit.trials, fit.findings, strict=True) if one)  # fmt: skip
-    search = f"{_status(estimate).value.capitalize()} after {estimate.evaluations} evaluations."
+    search = f"{sentence_case(_status(estimate).value)} after {estimate.evaluations} evaluations."
     checks = [
         Check(Level.GREEN if estimate.settled else Level.RED, "Search", search),
         Check(Level.NOTE if notes else Level.GREEN, "Recordings", notes or "No notes."),
@@ -174,8 +220,8 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
                 f"Grey: recorded; blue: model, from the first state only ({fit.trials[0]})."),
         keys,
         {"movement": lambda narrow: _draw_movement(fit, narrow)},
-        Copy(methods, f"{explained}. {values}.") if verdict.level is Level.GREEN
-        else "Text to copy appears here when no check is open.",
+        Copy(methods, f"{fit.explained}. {values}.") if fit.usable
+        else "There is no text to copy: no value may be reported.",
         beside=[_samples(fit), Finding("limits", limits, "Samples at a limit.")],
         data=_data(fit, provenance),
         provenance=provenance,
@@ -201,7 +247,7 @@ def _draw_movement(fit: OptimalFit, narrow: bool) -> Figure:
     axes = np.atleast_1d(figure.subplots(len(drawn[:_MOST_PANELS]), 1, sharex=True))
     for ax, (name, pair) in zip(axes, drawn, strict=False):
         factor, unit = shown_as(problem.units.get(name, "-"))
-        strip(ax, f"{_words(name).capitalize()} ({unit})")
+        strip(ax, f"{sentence_case(_words(name))} ({unit})")
         for values, color, width in zip(pair, (RECORDED, BLUE), (4.5, 1.4), strict=True):
             time = (fit.dt or 1.0) * np.arange(len(values))
             ax.plot(time, factor * values, color=color, linewidth=width)

@@ -18,7 +18,7 @@ import pandas as pd
 
 from impc.files.spreadsheet import as_data
 from impc.files.table import in_columns
-from impc.reporting.rendering import fixed, p_value
+from impc.reporting.rendering import fixed, p_value, sentence_case
 
 T = TypeVar("T")
 
@@ -84,7 +84,7 @@ class Finding:
         words = {name: name.replace("percent", "(%)").replace("_", " ") for name in self.shown}
         heads = [self.labels.get(name, words[name]) for name in self.shown]
         kept = map(re.compile(r"p(_|$)").match, self.shown)  # p-values stay lower-case
-        return [one if p else one[:1].upper() + one[1:] for one, p in zip(heads, kept, strict=True)]
+        return [one if p else sentence_case(one) for one, p in zip(heads, kept, strict=True)]
 
     @property
     def rows(self) -> list[list[str]]:

@@ -92,6 +92,12 @@ def _sealed(text: str) -> dict[str, str]:
     return {"text": Markup(text), "sha256": seal}  # safe: no user input in our own files
 
 
+def sentence_case(text: str) -> str:
+    """Text with a capital first letter; a first word that may be a name or unit keeps its case."""
+    plain_word = re.match(r"[a-z]{2,}(?![\w\[])", text)
+    return f"{text[0].upper()}{text[1:]}" if plain_word else text
+
+
 def number(value: float, digits: int = 3) -> str:
     """Format a `value` for a table cell to `digits` significant digits."""
     if np.isnan(value):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from impc.model.plant import UNKNOWN
 from impc.model.signal_errors import KINDS
+from impc.reporting.rendering import sentence_case
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -81,8 +82,7 @@ def words_of(plant: Plant, feature: str) -> str:
 
 def axis_label(plant: Plant, name: str) -> str:
     """Label of a signal with its shown unit, for example "Seat tilt (°)"."""
-    words = signal_name(plant, name)
-    return f"{words[:1].upper()}{words[1:]} ({shown_unit(plant, name)[1]})"
+    return f"{sentence_case(signal_name(plant, name))} ({shown_unit(plant, name)[1]})"
 
 
 def body_sentence(plant: Plant) -> str:

@@ -13,7 +13,6 @@ from impc.inverse.estimates import Estimate
 from impc.reporting.document import Report, Section
 from impc.reporting.finding import Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.verdict import Alert
 from impc.reporting.writer import owned, write_files
 from impc.studies.compare.report import compare_report
 from impc.studies.fit.figures import movement_figure
@@ -112,30 +111,13 @@ def _document(fit: MethodFit) -> Report:
     page = replace(page, window=f"impc: {label}", kind="estimate of one method")
     if page.verdict.level is Level.RED:
         return page
-    todo = "Use impc compare."
-    if fit.name == _OURS:
-        todo = "Call impc.report with settings, or use impc fit."
-    alert = Alert(
-        Level.AMBER,
-        "Intervals and left-out trials are missing",
-        "This page shows the result of one method on the trials that it was fitted to.",
-        "The uncertainty of gain and cost weights is unknown.",
-        [todo],
-    )
     drawn: Any = SimpleNamespace(fitted=fit.estimate, inverse_mpc=fit, given=problem)
     return replace(
         page,
         sections=[*page.sections, Section("Gain and cost weights", page.beside[:2])],
         beside=page.beside[2:],
         meta=(label, *page.meta[2:]),
-        verdict=replace(
-            page.verdict,
-            level=Level.AMBER,
-            sentence=fit.estimate.status.sentence,
-            alerts=[alert],
-        ),
         hero=_PICTURE,
         figures={"trial-1": lambda narrow: movement_figure(drawn, 0, narrow)},
-        copy=None,
         data={**page.data, "starts": problem.starts, "logarithms": problem.logarithms},
     )

@@ -170,6 +170,9 @@ def test_page_tables_terminal_and_numbers_say_the_same(folder: Path, done: Resul
         assert sentence in page
         assert sentence in done.stdout.replace("\n  ", " ")
     assert "far is not identified: near its value it affects nothing that was measured." in page
+    results = page.partition("Copy for your paper")[2]
+    assert "mass" in results  # amber: what may be reported can be copied, and nothing else
+    assert not re.search(r"\bfar [\d.]+ \(95 % CI", results)
     table = pd.read_csv(out / "parameters.csv").set_index("parameter")
     kept = found.table("parameters").set_index("parameter")
     np.testing.assert_array_equal(table["value"], kept["value"])
@@ -219,7 +222,11 @@ def test_the_same_page_from_python(folder: Path, done: Result, tmp_path: Path) -
     ours = {path.name for path in (folder / "out").iterdir() if path.is_file()}
     assert names == (ours - {".impc"}) | {"movement.svg"}
     content = read_result(tmp_path).content
-    assert content["verdict"]["level"] == "green"
+    assert content["verdict"]["level"] == "amber"  # one recording: nothing is left to check it
+    assert content["verdict"]["alerts"][0]["title"] == "One recording cannot check itself"
+    assert any("recording was left out" in one for one in content["verdict"]["may_not_report"])
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert "was fitted to 1 recording by nonlinear least squares" in page.replace("\u00a0", " ")
     assert content["findings"]["parameters"]["table"]["start"][0] == 0.5
     with pytest.raises(impc.InputError, match="estimate: expected a Estimate, got dict of 3"):
         impc.report(start, tmp_path)  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from impc.reporting.finding import Level
+from impc.reporting.rendering import sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim
 
@@ -48,3 +49,19 @@ def test_a_step_without_words_is_left_out() -> None:
     (alert,) = RULES.verdict(6).alerts
     assert list(alert.todo) == ["Look."]
     assert list(RULES.verdict(12).alerts[0].todo) == ["Take 11."]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("seat tilt, 4 N m", "Seat tilt, 4 N m"),
+        ("EMG left (mV)", "EMG left (mV)"),
+        ("mV", "mV"),
+        ("x[0]", "x[0]"),
+        ("theta1 (rad)", "theta1 (rad)"),
+        ("p, corrected", "p, corrected"),
+        ("", ""),
+    ],
+)
+def test_names_and_units_keep_their_case(text: str, shown: str) -> None:
+    assert sentence_case(text) == shown

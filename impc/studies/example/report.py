@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from impc.control.named_solver import described
 from impc.model.weights import condition_number, normalised
 from impc.reporting.document import Block, Lines, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.style import HALF, WIDE
 from impc.reporting.verdict import Key, Verdict
 from impc.studies.example.cases import BOUND, EXAMPLE, LOST, SETTINGS, true_weights
@@ -40,10 +43,11 @@ _SETTING = (
     "dissertation (Michigan State University, 2018)."
 )
 _GAIN = (
-    "With one command, the controller depends on Q and R only through its gain, so no recording "
-    "distinguishes two pairs of cost weights with the same gain. The printed pair is set by "
-    "convention: the smallest condition number. Interpret the gain and the limit, and treat Q as "
-    "one of many equivalent choices. Here the convention happens to give the true weights."
+    "With one command, the movement depends on Q and R only through the gain: the command per unit "
+    "of each state. No recording distinguishes two pairs of cost weights with the same gain. impc "
+    "prints the pair whose costs differ least between directions (smallest condition number). "
+    "Interpret the gain and the limit, and treat Q as one of many equivalent choices. Here the "
+    "rule happens to choose the true weights."
 )
 _CODE = Markup("<code>{}</code>")
 _YOURS = (
@@ -95,38 +99,71 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     )
 
 
-def _within(cases: Sequence[CaseResult]) -> list[str]:
-    """Methods that stay within the limit in every case."""
-    return [name for name in EXAMPLE if all(one.method(name).bound_kept for one in cases)]
+class _Facts:
+    """Methods that stay within the limit in every case, and those that find the true weights."""
+
+    def __init__(self, cases: Sequence[CaseResult]) -> None:
+        each = {name: [case.method(name) for case in cases] for name in EXAMPLE}
+        self.within = [name for name, own in each.items() if all(one.bound_kept for one in own)]
+        self.found = [
+            name for name in self.within
+            if all(one.residual is not None and one.residual <= _FOUND for one in each[name])
+        ]  # fmt: skip
+        self.largest = max(
+            (one.max_abs_u for name, own in each.items() for one in own
+             if name not in self.within and one.max_abs_u is not None), default=0.0,
+        )  # fmt: skip
+        names = " and ".join(f"“{method_label(name)}”" for name in self.found) or "No method"
+        self.finds, self.others = f"{names} find{'s' * (len(self.found) < 2)}", ""
+        if self.largest:
+            self.others = f" The others need a command of up to {self.largest:.3g}; the limit is "
+            self.others += f"{BOUND:g}."
+
+
+_SHOWN = Kind[_Facts](
+    Level.GREEN, always,
+    "{all} methods were tried on the same movement; {few} {need} no more than the limit.",
+    "{finds} the true cost weights.{others}", badge="As expected",
+)  # fmt: skip
+RULES = Rules[_Facts](
+    {
+        "all": lambda _: _COUNTS[len(EXAMPLE)],
+        "few": lambda it: _COUNTS[len(it.within)].lower(),
+        "need": lambda it: "needs" if len(it.within) == 1 else "need",
+    }
+    | {name: attrgetter(name) for name in ("finds", "others")},
+    kinds=(
+        replace(
+            _SHOWN, level=Level.AMBER, when=lambda it: not it.found, badge="Not as expected",
+            title="No method found the cost weights of the simulation",
+            found="{finds} the true cost weights and stays within the limit.",
+            means="On this computer the example does not show what it should.",
+            todo=("Compare result.json with that of another computer.",),
+        ),
+        _SHOWN,
+    ),
+    may=(Line(lambda it: it.found and it.largest, "The limit must be part of the model.",
+              "Methods that ignore it need a command that was not available."),),
+    may_not=(
+        Line(always, "Anything about a person.", "The movement is simulated."),
+        Line(always, "That these cost weights are the only ones.",
+             "Others lead to the same movement; here a rule happens to choose the true ones."),
+    ),
+)  # fmt: skip
 
 
 def example_verdict(cases: Sequence[CaseResult]) -> Verdict:
     """Verdict: methods that stay within the limit and methods that find the true weights."""
-    within, found, others = _within(cases), [], [0.0]
-    for name in EXAMPLE:
-        results = [case.method(name) for case in cases]
-        if name not in within:
-            others += [one.max_abs_u for one in results if one.max_abs_u is not None]
-        elif all(one.residual is not None and one.residual <= _FOUND for one in results):
-            found.append(f"“{method_label(name)}”")
-    verb = "needs" if len(within) == 1 else "need"
-    finds = f"{' and '.join(found) or 'No method'} find{'s' * (len(found) < 2)}"
-    rest = f" The others need a command of up to {max(others):.3g}; the limit is {BOUND:g}."
-    return Verdict(
-        Level.NOTE,
-        f"{_COUNTS[len(EXAMPLE)]} methods were fitted to the same movement; "
-        f"{_COUNTS[len(within)].lower()} {verb} no more than the limit.",
-        f"{finds} the true cost weights.{rest if any(others) else ''}",
-    )
+    return RULES.verdict(_Facts(cases))
 
 
 def _keys(cases: Sequence[CaseResult]) -> list[Key]:
-    within, found = len(_within(cases)), cases[0].identifiability
-    fixed = "directions of the cost weights identified"
+    within, found = len(_Facts(cases).within), cases[0].identifiability
+    fixed = "numbers of the cost determined by the movement"
     return [
-        Key(str(len(EXAMPLE)), "methods", "compared", "on the same recordings"),
+        Key(str(len(EXAMPLE)), "methods", "tried", "on the same recordings"),
         Key(str(within), f"of {len(EXAMPLE)}", "stay within the limit", "in every case"),
-        Key(str(found.rank), f"of {found.free}", fixed, f"{found.chosen} set by convention"),
+        Key(str(found.rank), f"of {found.free}", fixed, f"impc chooses the other {found.chosen}"),
     ]
 
 
@@ -175,7 +212,8 @@ def methods_finding(case: CaseResult) -> Finding:
     return Finding(
         f"methods-{case.name}",
         table,
-        f"Case {case.name}: cost weights Q at R = 1, gain K, misfit of the states (2-norm), and "
+        f"Case {case.name}: cost weights Q if that of the command, R, is 1; gain K (command per "
+        "unit of each state); misfit (root of the summed squared differences of all states); and "
         "the largest command u.",
         digits=3,
         labels={"largest_u": "Largest u", "kept": "Limit kept"},

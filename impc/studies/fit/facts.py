@@ -8,7 +8,7 @@ import numpy as np
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names, follows_command
-from impc.reporting.rendering import fixed, number
+from impc.reporting.rendering import fixed, number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.result import LITTLE
 
@@ -253,7 +253,7 @@ def shares_text(result: FitResult) -> str:
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:
-    """VAF (p,) by which the model is judged, and where: of the gain if no weights have it.
+    """VAF (p,) that counts, and where it was taken; of the gain if no weights have it.
 
     Left-out trials count if there are any and the fitted ones are explained.
     """
@@ -326,5 +326,5 @@ def statement_text(plant: Plant, item: Statement) -> str:
     more = "less" if item.holds is False else "more"
     if item.kind == "order":
         return f"A typical {one} costs {more} than a typical {other}."
-    pair = f"{one[:1].upper()}{one[1:]} and {other}"
+    pair = f"{sentence_case(one)} and {other}"
     return f"{pair} to the same side cost {more} than to opposite sides."

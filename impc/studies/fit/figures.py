@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import FuncFormatter, NullLocator
 
+from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
 from impc.reporting.style import (
     BLUE,
@@ -125,7 +126,7 @@ def residual_figure(result: FitResult, narrow: bool) -> Figure:
     figure = new_figure(PHONE if narrow else 5.4, 3.5)
     above, below = figure.subplots(2, 1)
     name = signal_name(plant, plant.outputs[0])
-    strip(above, f"{name[:1].upper()}{name[1:]}, recorded minus model ({unit})")
+    strip(above, f"{sentence_case(name)}, recorded minus model ({unit})")
     strip(below, "Autocorrelation (no unit)")
     lags = min(round(_LAGS / plant.dt), min(map(len, series)) // 4)
     for k, part in enumerate(series):
@@ -208,7 +209,7 @@ def frequency_figure(result: FitResult, found: FrequencyResponse, narrow: bool) 
         _plain_log(magnitude, "y")
         words = signal_name(plant, name)
         unit = "no unit" if unit == per else f"{unit} per {per}"
-        magnitude.set_title(f"{words[:1].upper()}{words[1:]}, magnitude ({unit})")
+        magnitude.set_title(f"{sentence_case(words)}, magnitude ({unit})")
         phase.set_title("Phase (°)")
         coherence.set_title("Coherence (no unit)")
         coherence.set_xscale("log")
@@ -231,7 +232,7 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
         one, other = signal_name(plant, item.first), signal_name(plant, item.second)
         same = "" if item.kind == "order" else ": same vs opposite side"
         label = f"{one} {'+' if same else 'vs'} {other}{same}"
-        labels.append(label[:1].upper() + label[1:])
+        labels.append(sentence_case(label))
         low, high = np.clip(ends[row], -reach, reach)
         colour, width = (BLUE, 7) if item.made else (RECORDED, 5)
         ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt")

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from impc.assess.printed_gain import Interval
     from impc.assess.weights_ranges import Statement
     from impc.model.plant import Plant
+    from impc.studies.fit.facts import GainRow
     from impc.studies.fit.result import FitResult
 
 # Smallest component of a direction that is printed.
@@ -39,7 +40,15 @@ _OTHER = ("block", "profile")
 
 def per_unit_finding(result: FitResult) -> Finding:
     """Opposing command per shown unit of each state whose single gain has a meaning."""
-    several = result.given.plant.m > 1
+    plant, several = result.given.plant, result.given.plant.m > 1
+    gravity = dict(plant.gravity)
+
+    def share(row: GainRow) -> float:
+        """Gain as a share of m g h, if the plant states that of the state and is in N m."""
+        _, control, state = row.interval.name.split(".", 2)
+        stated = state in gravity and plant.unit(control) == "N m"
+        return (row.interval.value or np.nan) / gravity[state] if stated else np.nan
+
     table = table_of(
         [row for _, row in named_gains(result)],
         {
@@ -49,10 +58,16 @@ def per_unit_finding(result: FitResult) -> Finding:
             "low": lambda row: float(row.low),
             "high": lambda row: float(row.high),
             "unit": lambda row: row.unit,
+            **({"share_of_m_g_h": share} if gravity else {}),
             "determined": lambda row: row.determined,
         },
     )
-    labels = {"for_every": "For every ...", "low": "95 % CI, low", "high": "95 % CI, high"}
+    labels = {
+        "for_every": "For every ...",
+        "low": "95 % CI, low",
+        "high": "95 % CI, high",
+        "share_of_m_g_h": "Share of m g h",
+    }
     count = len(result.estimate.rivals)
     other = "another end" if count == 1 else f"{count} other ends"
     ends = f" Intervals include {other} of the search with an equally good fit." if count else ""

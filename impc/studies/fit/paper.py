@@ -9,7 +9,7 @@ import numpy as np
 from impc.model.foresight import physical_disturbances
 from impc.reporting.document import Copy
 from impc.reporting.finding import Level
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.aim import aim_sentences
 from impc.studies.fit.facts import (
@@ -48,7 +48,7 @@ def _methods(result: FitResult, provenance: Provenance) -> list[str]:
     bounded = f"with the command limited to ±{limit}" if limit else "without a limit"
     version = provenance.versions["impc"]
     said = [
-        f"{names[:1].upper()}{names[1:]} of one person, from {count} ({seconds:.3g} s in all), "
+        f"{sentence_case(names)} of one person, from {count} ({seconds:.3g} s in all), "
         f"were analysed by inverse model predictive control (Ramadan 2018; impc {version}). "
         f"{_pushed(result)}Signals recorded at a higher rate were resampled to {rate} samples per "
         "second with a zero-phase low-pass filter.",

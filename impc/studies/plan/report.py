@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import Block, Checks, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
-from impc.reporting.shown_units import shown_unit
+from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, PHONE, RULE, new_figure
 from impc.studies.plan.sentences import (
     expected,
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 _TRIALS = Picture(
     "trials",
     "Width of the interval of each cost weight over the number of trials, and the target",
-    "Largest distance of a 95 % interval's end from the assumed cost weight, to first order. Lower "
-    "is better. Dashed: difference to be detected.",
+    "How far an estimate may be from the truth (95 % interval, approximation). Lower is better. "
+    "Dashed: difference to be detected.",
 )
 _LINES = ((BLUE, "o", "-"), (GREEN, "s", "--"), (INK, "^", ":"), (MUTED, "D", "-."))
 # Height of a line of text relative to the axis; largest width that is drawn, %.
@@ -145,8 +145,8 @@ def _experiments(plan: Plan) -> Finding:
     return Finding(
         "experiments",
         pd.DataFrame(rows),
-        "Widest interval: largest distance of its end from the assumed cost weight; to first order "
-        "if it has no end. A-optimal: smallest mean variance (selected). D-optimal: smallest "
+        "Widest interval: how far an estimate may be from the truth; an approximation if the "
+        "interval has no end. A-optimal: smallest mean variance (selected). D-optimal: smallest "
         "joint confidence region.",
         digits=3,
         labels={
@@ -183,8 +183,8 @@ def _cost_weights(plan: Plan) -> Finding:
     return Finding(
         "cost_weights",
         table,
-        "Expected 95 % intervals in the best experiment, at a cost weight of 1 for the first "
-        "command.",
+        "Expected 95 % intervals in the best experiment. The cost weight of "
+        f"{signal_name(person.controller.plant, person.controller.plant.controls[0])} is 1.",
         digits=3,
         labels={
             "interval": "Relative to assumed",

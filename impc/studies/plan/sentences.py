@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +13,10 @@ from impc.assess.covariance import TWO_SIDED
 from impc.assess.expected import MULTIPLES
 from impc.reporting.document import Check, Copy
 from impc.reporting.finding import Level
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
+from impc.reporting.rules import Kind, Rules, always
 from impc.reporting.shown_units import shown_unit, signal_name, words_of
-from impc.reporting.verdict import Alert, Key, Verdict
+from impc.reporting.verdict import Key, Verdict
 from impc.studies.fit.facts import with_unit
 
 if TYPE_CHECKING:
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
 
 # Intervals within this factor are printed in percent; widest (log) that is printed in percent.
 _NARROW, _FACTOR = 1.5, math.log(3)
+_PARTS = {"half": 1 / 2, "a third": 1 / 3, "a quarter": 1 / 4, "a fifth": 1 / 5, "a tenth": 1 / 10}
+_NEAR = 0.1  # Relative distance within which a share is called by its fraction
 _HELD = 0.8  # Smallest acceptable coverage of the intervals in simulated fits
 
 
@@ -94,61 +99,88 @@ def trials_needed(plan: Plan) -> float:
 
 
 def stated_as(item: WeightInterval) -> str:
-    """Interval relative to the assumed value: "-7 to +8 %", "0.4 to 2.1 times"."""
+    """Interval relative to the assumed value: "-7 to +8 %", "between a third and 2.1 times"."""
     low, high = (math.exp(end - item.value) for end in (item.low, item.high))
     if math.isinf(item.high):
-        return "not determined" if low == 0 else f"{number(low, 2)} times or more"
+        return "not determined" if low == 0 else f"{_part(low)} of the assumed value or more"
     if low > 1 / _NARROW and high < _NARROW:
         ends = [f"{100 * (end - 1):+.2g}".replace("-", "\u2212") for end in (low, high)]
         return f"{ends[0]} to {ends[1]} %"
-    return f"{number(low, 2)} to {number(high, 2)} times"
+    return f"between {_part(low)} and {number(high, 2)} times"
+
+
+def _part(share: float) -> str:
+    """A share in words if it is near a simple fraction, otherwise its number."""
+    near = (word for word, part in _PARTS.items() if abs(share / part - 1) < _NEAR)
+    return next(near, number(share, 2))
+
+
+class _Facts:
+    """Numbers and phrases of the verdict."""
+
+    def __init__(self, plan: Plan) -> None:
+        found, needed, tried = expected(plan), trials_needed(plan), len(plan.outcomes)
+        sides, aim = [half(item) for item in found.intervals], target(plan)
+        self.count, self.good = len(sides), sum(side <= aim for side in sides)
+        self.missed = "; ".join(
+            f"{name}: {stated_as(item)}"
+            for name, item, side in zip(weight_names(plan), found.intervals, sides, strict=True)
+            if side > aim
+        )
+        self.weights = "cost weight" if self.count == 1 else "cost weights"
+        self.every = {1: "the", 2: "both"}.get(self.count, f"all {self.count}")
+        self.aim, worst = f"{plan.settings.difference:g} %", max(sides)
+        self.close = f"a factor of {number(math.exp(worst), 2)}"
+        if worst < _FACTOR:
+            self.close = f"{number(100 * math.expm1(worst), 2)} %"
+        ends = "ies" if plan.settings.trials == 1 else "y"
+        self.verb = f"{sentence_case(_experiment(plan))} identif{ends}"
+        which = f"best of {tried} experiments" if tried > 1 else "only simulated experiment"
+        self.chosen = f"This is the {which}: {design_name(plan, plan.best.design)}."
+        self.more, self.record = f"{max(widths(plan)[0]):g} trials would not be enough.", ""
+        if math.isfinite(needed):
+            self.more = f"{needed:.0f} trials would be enough for all."
+            self.record = f"Record {needed:.0f} trials."
+        self.measure = ""
+        if found.body is not None:
+            self.measure = "Measure the body more exactly; the table of the body lists the "
+            self.measure += "parameters."
+
+
+_WORDS = ("count", "good", "missed", "weights", "every", "aim", "close", "verb", "chosen", "more",
+          "record", "measure")  # fmt: skip
+_WIDE = Kind[_Facts](
+    Level.AMBER, lambda it: it.good < it.count,
+    "{verb} {good} of {count} {weights} to within {aim}.", "{more} {chosen}",
+    "Some intervals are too wide", "95 % intervals, relative to the assumed cost weight: {missed}.",
+    "A difference of {aim} in these cost weights could not be detected in one person.",
+    ("{record}", "{measure}",
+     "Try stronger or longer perturbations, and more amplitudes and hold times.",
+     "Assign cost weights to fewer features, or accept a larger difference."),
+    badge="Depends",
+)  # fmt: skip
+RULES = Rules[_Facts](
+    {name: attrgetter(name) for name in _WORDS},
+    kinds=(
+        replace(
+            _WIDE, level=Level.RED, when=lambda it: not it.good, title="All intervals are too wide",
+            headline="{verb} no cost weight to within {aim}.", badge="Not enough",
+        ),
+        _WIDE,
+        Kind(Level.GREEN, always, "{verb} {every} {weights} to within {close}.", "{chosen}",
+             badge="Enough"),
+    ),
+)  # fmt: skip
 
 
 def plan_verdict(plan: Plan) -> Verdict:
     """Verdict: whether the intervals of the experiment are narrow enough."""
-    found, aim = expected(plan), f"{plan.settings.difference:g} %"
-    sides, tried = [half(item) for item in found.intervals], len(plan.outcomes)
-    good, count, worst = sum(side <= target(plan) for side in sides), len(sides), max(sides)
-    weights = "cost weight" if count == 1 else "cost weights"
-    verb = f"{_experiment(plan)} identif{'ies' if plan.settings.trials == 1 else 'y'}"
-    which = f"best of {tried} experiments" if tried > 1 else "only experiment that was simulated"
-    chosen = f"This is the {which}: {design_name(plan, plan.best.design)}."
-    if good == count:
-        close = f"a factor of {number(math.exp(worst), 2)}"
-        if worst < _FACTOR:
-            close = f"{number(100 * math.expm1(worst), 2)} %"
-        every = {1: "the", 2: "both"}.get(count, f"all {count}")
-        headline = f"{verb} {every} {weights} to within {close}."
-        return Verdict(Level.GREEN, headline, chosen, badge="Enough")
-    needed, steps = trials_needed(plan), []
-    more = f"{max(widths(plan)[0]):g} trials would not be enough."
-    if math.isfinite(needed):
-        more = f"{needed:.0f} trials would be enough for all."
-        steps = [f"Record {needed:.0f} trials."]
-    if found.body is not None:
-        steps.append("Measure the body more exactly; the table of the body lists the parameters.")
-    level, badge = (Level.AMBER, "Depends") if good else (Level.RED, "Not enough")
-    missed = "; ".join(
-        f"{name}: {stated_as(item)}"
-        for name, item, side in zip(weight_names(plan), found.intervals, sides, strict=True)
-        if side > target(plan)
-    )
-    alert = Alert(
-        level,
-        "Some intervals are too wide" if good else "All intervals are too wide",
-        f"{missed[:1].upper()}{missed[1:]} (95 % intervals relative to the cost weight).",
-        f"A difference of {aim} in these cost weights could not be detected in one person.",
-        [*steps, "Try stronger or longer perturbations, and more amplitudes and hold times.",
-         "Assign cost weights to fewer features, or accept a larger difference."],
-    )  # fmt: skip
-    which = f"{good} of {count} {weights}" if good else "no cost weight"
-    headline = f"{verb} {which} to within {aim}."
-    return Verdict(level, headline, f"{more} {chosen}", [alert], badge=badge)
+    return RULES.verdict(_Facts(plan))
 
 
 def _experiment(plan: Plan) -> str:
     settings, name = plan.settings, design_name(plan, plan.best.design)
-    words = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten")
+    words = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
     count, s = settings.trials, "" if settings.trials == 1 else "s"
     many = words[count - 1] if count <= len(words) else str(count)
     if settings.files:
@@ -189,7 +221,7 @@ def plan_checks(plan: Plan) -> list[Check]:
     exact = "Taken as exact: state how well it is known in [plant.uncertainty]."
     stated = "The intervals include the stated uncertainty of the body."
     falls = f"{100 * plan.best.falls:.0f} % of the simulated trials; {plan.settings.falls:g} % are "
-    free = f"Assumed. Without it {own} of {size} gains would be individually identified."
+    free = f"Assumed. Without it {own} of {size} gains would be determined one by one."
     rows = [
         (good, "Falls", f"{falls}accepted."),
         (good if limit else note, "Limit", limit or "Never reached, or none is assumed."),
@@ -213,7 +245,7 @@ def plan_copy(plan: Plan) -> Copy | str:
         return "No number of persons would be enough to detect the difference."
     return Copy(
         f"The sample size was computed for one assumed person, simulated with "
-        f"{_experiment(plan).lower()}. Persons within a group were assumed to differ by "
+        f"{_experiment(plan)}. Persons within a group were assumed to differ by "
         f"{settings.between:g} % (standard deviation of the logarithm of a cost weight), in "
         "addition to the expected error of each estimate.",
         f"To detect a difference of {settings.difference:g} % between two groups with a power of "

@@ -26,7 +26,6 @@ import numpy as np
 from impc.errors import DataError
 from impc.studies.reliability.anova import (
     learning_trend,
-    paired_tests,
     variance_components,
     visit_anova,
 )
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.model.recordings import Recording
-    from impc.studies.reliability.anova import Anova, PairedTest, Trend, VarianceComponent
+    from impc.studies.reliability.anova import Anova, Trend, VarianceComponent
     from impc.studies.reliability.icc import Icc, MeasurementError
     from impc.studies.reliability.measures import ComplexArray, Passband, TransferFunction
 
@@ -75,7 +74,6 @@ class MeasureResult:
     # SEM and minimal detectable change (95 %) of the score of one visit, in its unit
     error: MeasurementError | None = None
     anova: Anova | None = None
-    pairs: tuple[PairedTest, ...] = ()
     trend: Trend | None = None  # Change from visit to visit (learning)
     # Variance of subjects, visits and trials; empty if there are too few trials
     components: tuple[VarianceComponent, ...] = ()
@@ -154,7 +152,7 @@ def analyse(trials: Trials) -> Reliability:
                     [[float(one[place]) for one in found.get(key, ())] for key in row]
                     for row in keys
                 ]
-                measures.append(_measure(name, output, condition, table, visits))
+                measures.append(_measure(name, output, condition, table))
             own = [
                 [[one[:, place] for one in curves[key]] for key in row if key in curves]
                 for row in keys
@@ -171,7 +169,6 @@ def _measure(
     output: str,
     condition: str,
     table: list[list[list[float]]],
-    visits: tuple[str, ...],
 ) -> MeasureResult:
     """Analyse the scores of all trials, by subject and visit; an empty list is a missing cell."""
     scores = np.array([[np.mean(cell) if cell else np.nan for cell in row] for row in table])
@@ -185,7 +182,6 @@ def _measure(
         if found["icc"].left_out:
             notes.append(f"{found['icc'].left_out} subjects lack a visit and are left out")
         found["anova"] = visit_anova(scores)
-        found["pairs"] = paired_tests(scores, visits)
         found["trend"] = learning_trend(scores)
     except DataError as error:
         notes.append(str(error))

@@ -21,20 +21,15 @@ Negative estimates are not truncated.
 
 from __future__ import annotations
 
-import itertools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
 from scipy.stats import chi2
 
 from impc.arrays import Array
-from impc.assess.several_tests import holm
 from impc.errors import DataError
 from impc.studies.reliability.icc import complete_rows, mean_squares
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 # Tail probability of a 95 % interval on each side.
 _TAIL = 0.025
@@ -49,16 +44,6 @@ class Anova(NamedTuple):
     epsilon: float  # Greenhouse-Geisser epsilon, between 1 / (k - 1) and 1
     p_corrected: float  # Both degrees of freedom times epsilon
     left_out: int  # Number of subjects without all visits
-
-
-class PairedTest(NamedTuple):
-    """Paired t-test between two visits."""
-
-    first: str  # Visits
-    second: str
-    difference: float  # Mean of second minus first, in the score's unit
-    p: float  # Uncorrected
-    p_holm: float  # With Holm's correction over all pairs
 
 
 class Trend(NamedTuple):
@@ -83,22 +68,6 @@ def visit_anova(scores: Array) -> Anova:
         float(scipy.stats.f.sf(F, share * freedom[0], share * freedom[1])) for share in (1, epsilon)
     )
     return Anova(F, freedom, p, epsilon, corrected, left_out)
-
-
-def paired_tests(scores: Array, visits: Sequence[str]) -> tuple[PairedTest, ...]:
-    """Tests of all pairs of visits, on subjects with both; `scores` (subjects, visits)."""
-    rows = []
-    for i, j in itertools.combinations(range(len(visits)), 2):
-        both = scores[np.all(np.isfinite(scores[:, [i, j]]), axis=1)]
-        if len(both) < 2:
-            raise DataError(
-                f"visits {visits[i]} and {visits[j]}", f"share {len(both)} subjects", "2 are needed"
-            )
-        test: Any = scipy.stats.ttest_rel(both[:, j], both[:, i])
-        p = float(test.pvalue)
-        rows.append((visits[i], visits[j], float(np.mean(both[:, j] - both[:, i])), p))
-    corrected = holm(np.array([row[3] for row in rows]))
-    return tuple(PairedTest(*row, float(p)) for row, p in zip(rows, corrected, strict=True))
 
 
 def learning_trend(scores: Array) -> Trend:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.signal
 
+from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import shown_angle
 from impc.reporting.style import (
     BLUE,
@@ -75,7 +76,7 @@ def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
         labels.append(item.condition if name == before else f"{name}, {item.condition}".strip(", "))
     ax.set_yticks(range(len(labels)), labels)
     ax.set(ylim=(len(items) - 0.4, -1.3), xlim=(least, 1.0))
-    ax.set_xlabel("ICC(A,k) between visits, 95 % CI (-)", loc="left")
+    ax.set_xlabel("ICC between visits, with its 95 % interval (0 to 1)", loc="left")
     ax.xaxis.set_label_position("top")
     ax.tick_params(axis="y", length=0)
     return figure
@@ -113,7 +114,7 @@ def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
     axes = figure.subplots(len(signals), 2, squeeze=False, sharex="col")
     time = np.arange(trial.samples) / trials.rate
     for (left, right), (name, values, unit) in zip(axes, signals, strict=True):
-        strip(left, f"{name[:1].upper()}{name[1:]} ({unit})")
+        strip(left, f"{sentence_case(name)} ({unit})")
         left.plot(time, values, color=BLUE, linewidth=1.0)
         frequency, power = scipy.signal.periodogram(values, trials.rate, detrend=False)
         inside = result.band.excited[result.band.excited < len(power)]
@@ -148,7 +149,7 @@ def _responses(
             below.semilogx(found.frequency, phase, **style)
     for (above, below), output in zip(axes.T, outputs, strict=True):
         name = word_of(output, trials.words)
-        above.set_title(f"{name[:1].upper()}{name[1:]}, magnitude ({unit}/(N m))")
+        above.set_title(f"{sentence_case(name)}, magnitude ({unit}/(N m))")
         below.set_title("Phase (°)")
         below.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend(loc="lower left")

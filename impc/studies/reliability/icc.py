@@ -40,6 +40,8 @@ from impc.errors import DataError, InputError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+#: Lower end of a 95 % interval from which an ICC is called reliable: good by Cicchetti (1994).
+GOOD = 0.60
 _ALIKE = 1e-24  # Relative size of mean squares that is rounding error
 _LEVEL = 0.95
 #: ICC of a single score, or of the mean over all occasions.

@@ -12,12 +12,12 @@ from impc.errors import DataError
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, probability, sentence_case
 from impc.reporting.verdict import Key
 from impc.studies.reliability.analysis import MEASURES
 from impc.studies.reliability.anova import learning_trend
 from impc.studies.reliability.figures import reliability_figures
-from impc.studies.reliability.icc import icc
+from impc.studies.reliability.icc import complete_rows, icc
 from impc.studies.reliability.verdict import (
     change_text,
     icc_text,
@@ -92,7 +92,7 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
             f"change {change_text(item)}"
             for item in sways
         )
-        copied = Copy(_METHODS.format(size=size, **ends), f"{results[0].upper()}{results[1:]}.")
+        copied = Copy(_METHODS.format(size=size, **ends), f"{sentence_case(results)}.")
         own: list[Block] = [tables["icc-rms"], tables["icc-energy"]]
         sections = {"ICC": own, "Change of one person": [_BLAND_ALTMAN], **sections}
     return Report(
@@ -133,7 +133,8 @@ def _checks(result: Reliability, words: Mapping[str, str]) -> list[Check]:
         p = holm(np.array([item.trend.p for item in tests if item.trend]))
         changed = [f"{measure_name(item, words)}, {item.condition}"
                    for item, one in zip(tests, p, strict=True) if one <= 0.05]  # fmt: skip
-        said = f"No change of sway over the visits was found (smallest Holm p {number(min(p), 2)})."
+        said = f"No change of sway over the visits was found ({probability(min(p))} or more, "
+        said += "corrected by Holm's method)."
         if changed:
             said = f"Sway changes from visit to visit: {'; '.join(changed)}."
         found.append(Check(Level.AMBER if changed else Level.GREEN, "Learning", said))
@@ -177,15 +178,18 @@ def _icc(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -
             (value, low, high, people, _), other = item.icc, icc(item.scores, "A,k")
             row |= {"icc": value, "low": low, "high": high, "low_f": other.low}
             row |= {"high_f": other.high, "reliability": interval_band(low, high)}
-            row |= _row(item, words, sem=item.error.sem, mdc=item.error.mdc) | {"people": people}
+            mean, sd, _ = _mean_sd(np.mean(complete_rows(item.scores)[0], axis=1))
+            row |= _row(item, words, mean=mean, sd=sd, sem=item.error.sem, mdc=item.error.mdc)
+            row |= {"people": people}
         rows.append(row | {"notes": "; ".join(item.notes)})
     caption = (
         "ICC(A,k), agreement of the mean over visits, with two 95 % intervals: generalised (Tian "
         "and Cappelleri 2004), used on this page, and F (McGraw and Wong 1996), too narrow for few "
-        "and different visits. SEM and smallest detectable change refer to a single visit."
+        "and different visits. Mean and SD: over people, of the mean over visits. SEM and smallest "
+        "detectable change refer to a single visit."
     )
     labels = {"low": "Low (generalised)", "high": "High (generalised)", "low_f": "Low (F)"}
-    labels |= {"icc": "ICC", "high_f": "High (F)", "sem": "SEM"}
+    labels |= {"icc": "ICC", "high_f": "High (F)", "sem": "SEM", "sd": "SD", "people": "n (people)"}
     folded = "" if measure == "rms" else "ICC of the band energy"
     mdc = "Smallest detectable change"
     return _table(f"icc-{measure}", rows, caption, folded, mdc=mdc, **labels)
@@ -197,10 +201,11 @@ def _visits(
     rows = []
     for item in own:
         spread: dict[str, float] = {}
+        counts: dict[str, int] = {}
         for visit, column in zip(visits, item.scores.T, strict=True):
-            mean, sd = _mean_sd(column)
+            mean, sd, counts[f"n_visit_{visit}"] = _mean_sd(column)
             spread |= {f"mean_visit_{visit}": mean, f"sd_visit_{visit}": sd}
-        row = _row(item, words, **spread)
+        row = _row(item, words, **spread) | counts
         if item.anova is not None:
             row |= {"F": item.anova.F, "p": item.anova.p}
             row |= {"p_greenhouse_geisser": item.anova.p_corrected}
@@ -209,10 +214,12 @@ def _visits(
             row |= _row(item, words, change_per_visit=slope, low=low, high=high) | {"p_change": p}
         rows.append(row)
     caption = (
-        "Mean and SD over people; analysis of variance over visits, uncorrected and with the "
+        "Mean and SD over n people; analysis of variance over visits, uncorrected and with the "
         "Greenhouse-Geisser correction; change per visit with its 95 % CI."
     )
-    return _table(f"visits-{measure}", rows, caption, f"All visits: {MEASURES[measure]}")
+    labels = {f"sd_visit_{visit}": f"SD visit {visit}" for visit in visits}
+    labels |= {"p_greenhouse_geisser": "p (Greenhouse-Geisser)", "p_change": "p (change)"}
+    return _table(f"visits-{measure}", rows, caption, f"All visits: {MEASURES[measure]}", **labels)
 
 
 def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
@@ -226,16 +233,16 @@ def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
                 change, low, high, p = learning_trend(np.column_stack([means[0], own]))
             except DataError:
                 change, low, high, p = (np.nan,) * 4
-            mean = float(np.nanmean(own))
-            row = _row(item, words, mean=mean, difference=change, low=low, high=high)
-            rows.append(row | {"against": first, "p": p})
+            mean, sd, count = _mean_sd(own)
+            row = _row(item, words, mean=mean, sd=sd, difference=change, low=low, high=high)
+            rows.append(row | {"people": count, "against": first, "p": p})
     for row, corrected in zip(rows, holm(np.array([row["p"] for row in rows])), strict=True):
         row["p_holm"] = float(corrected)
     caption = (
         "Sway in each condition minus that in the first, means over visits; paired t-test over "
-        "people with 95 % CI; p (Holm) is corrected over all rows."
+        "people with 95 % CI; the second p is corrected over all rows by Holm's method."
     )
-    return _table("conditions", rows, caption, p_holm="p (Holm)")
+    return _table("conditions", rows, caption, p_holm="p, corrected", sd="SD", people="n (people)")
 
 
 def _components(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -> Finding:
@@ -253,19 +260,23 @@ def _components(measure: str, own: Sequence[MeasureResult], words: Mapping[str, 
 def _correlations(result: Reliability, words: Mapping[str, str]) -> Finding:
     rows: list[dict[str, Any]] = []
     for item in result.cmc:
-        (within, sd_within), (between, sd_between) = map(_mean_sd, (item.within, item.between))
+        within, sd_within, _ = _mean_sd(item.within)
+        between, sd_between, count = _mean_sd(item.between)
         rows.append({
             "signal": word_of(item.output, words), "output": item.output,
             "condition": item.condition, "within_visits": within, "sd_within": sd_within,
-            "between_visits": between, "sd_between": sd_between, "undefined": item.undefined,
+            "between_visits": between, "sd_between": sd_between, "people": count,
+            "undefined": item.undefined,
         })  # fmt: skip
     caption = (
         "Coefficient of multiple correlation of the responses within and between visits (1: "
         "identical curves), mean and SD over people; undefined: number of undefined coefficients."
     )
-    return _table("cmc", rows, caption, "Agreement of the responses in numbers")
+    labels = {"people": "n (people)", "sd_within": "SD within", "sd_between": "SD between"}
+    return _table("cmc", rows, caption, "Agreement of the responses in numbers", **labels)
 
 
-def _mean_sd(values: Array) -> tuple[float, float]:
+def _mean_sd(values: Array) -> tuple[float, float, int]:
+    """Mean, SD and number of the values that are not missing."""
     scores = pd.Series(values)
-    return float(scores.mean()), float(scores.std())
+    return float(scores.mean()), float(scores.std()), int(scores.count())

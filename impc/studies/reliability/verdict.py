@@ -6,14 +6,18 @@ after Cicchetti (1994), whatever the estimate (docs/howto/reliability_selection.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.reporting.finding import Level
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
+from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.shown_units import shown_angle
-from impc.reporting.verdict import Alert, Claim, Verdict
+from impc.reporting.verdict import Claim, Verdict
+from impc.studies.reliability.icc import GOOD
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,7 +26,6 @@ if TYPE_CHECKING:
 
 #: Upper ends and names of the bands of an ICC (Cicchetti 1994).
 BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
-_GOOD = 0.60
 _COUNTS = {2: "both", 3: "all three", 4: "all four"}
 
 
@@ -73,47 +76,81 @@ def known(result: Reliability) -> list[MeasureResult]:
     return sorted(found, key=lambda item: (item.measure != "rms", order(item.output)))
 
 
+class _Facts:
+    """Cases with an ICC, by whether their intervals reach the band good."""
+
+    def __init__(self, result: Reliability, words: Mapping[str, str]) -> None:
+        cases = known(result)
+        self.words, self.people, self.visits = words, len(result.subjects), len(result.visits)
+        self.sways = [item for item in cases if item.measure == "rms"]
+        self.good = [item for item in cases if _reaches(item)]
+        self.poor = [item for item in cases if not _reaches(item)]
+        self.cases, self.bad = len(cases), len(self.poor)
+        self.reliable = sum(map(_reaches, self.sways))
+        # Whether an interval reaches the band good, so that more people may show it
+        self.hopeful = any(_reaches(item, low=False) for item in self.sways)
+        self.lowest = ""
+        if self.sways:
+            least = lowest(self.sways)
+            self.lowest = f"{icc_text(least)}, {measure_name(least, words)}, {least.condition}"
+
+
 def _reaches(item: MeasureResult, *, low: bool = True) -> bool:
     """Whether the lower or the upper end of its interval is good or better."""
-    return item.icc is not None and (item.icc.low if low else item.icc.high) >= _GOOD
+    return item.icc is not None and (item.icc.low if low else item.icc.high) >= GOOD
+
+
+_EACH = Kind[_Facts](
+    Level.GREEN, always, "{each}",
+    "A measure is called reliable if the 95 % CI of its ICC begins at 0.60 or above. Lowest: "
+    "{lowest}.",
+    badge="Reliable",
+)  # fmt: skip
+_PART = replace(
+    _EACH, level=Level.AMBER, when=lambda it: 0 < it.reliable < len(it.sways),
+    badge="Reliable in part", title="Not all measures are shown to be reliable",
+    found="In {bad} of {cases} cases the interval of the ICC begins below 0.60.",
+    means="In these cases the order of the people may differ at the next visit. A wide interval "
+    "means that {people} people and {visits} visits are too few.",
+    todo=("Measure more people, or the same people at more visits.",
+          "Average over more trials or visits before you compare people."),
+)  # fmt: skip
+RULES = Rules[_Facts](
+    {name: attrgetter(name) for name in ("lowest", "bad", "cases", "people", "visits")}
+    | {"each": lambda it: _headline(it.sways, it.words)},
+    kinds=(
+        Kind(
+            Level.AMBER, lambda it: not it.sways,
+            "These recordings cannot show whether the test is reliable.", badge="Undecided",
+            title="No ICC can be computed",
+            found="An ICC needs at least two people with scores at all of two or more visits.",
+            means="Whether people differ from each other by more than from visit to visit is open.",
+            todo=("Measure the same people again, in the same conditions.",),
+        ),
+        replace(
+            _PART, level=Level.RED, badge="Not reliable",
+            when=lambda it: it.sways and not it.reliable and not it.hopeful,
+        ),
+        replace(
+            _PART, badge="Undecided", when=lambda it: it.sways and not it.reliable and it.hopeful,
+            headline="{people} people and {visits} visits do not show whether sway is reliable.",
+        ),
+        _PART,
+        _EACH,
+    ),
+    may=(lambda it: _claims(it.good, it.words),),
+    may_not=(
+        lambda it: _claims(it.poor, it.words),
+        Line(lambda it: it.sways,
+             "That the test is reliable for other people, tasks or times between visits.",
+             "An ICC is lower in people who differ less from each other."),
+    ),
+)  # fmt: skip
 
 
 def reliability_verdict(result: Reliability, words: Mapping[str, str]) -> Verdict:
     """Verdict of a reliability study."""
-    sways = [item for item in known(result) if item.measure == "rms"]
-    people, visits = len(result.subjects), len(result.visits)
-    if not sways:
-        headline = "These recordings cannot show whether the test is reliable."
-        said = ("An ICC needs at least two people with scores at all of two or more visits: "
-                "measure the same people again, in the same conditions.")  # fmt: skip
-        return Verdict(Level.AMBER, headline, said, badge="Undecided")
-    good, least = sum(map(_reaches, sways)), lowest(sways)
-    sentence = (
-        "A measure is called reliable if the 95 % CI of its ICC begins at 0.60 or above. Lowest: "
-        f"{icc_text(least)}, {measure_name(least, words)}, {least.condition}."
-    )
-    level, badge, headline = Level.AMBER, "Reliable in part", _headline(sways, words)
-    if good == len(sways):
-        level, badge = Level.GREEN, "Reliable"
-    elif not good and any(_reaches(item, low=False) for item in sways):
-        badge = "Undecided"
-        headline = f"{people} people and {visits} visits do not show whether sway is reliable."
-    elif not good:
-        level, badge = Level.RED, "Not reliable"
-    bad = [item for item in known(result) if not _reaches(item)]
-    alert = Alert(
-        Level.AMBER, "Not all measures are shown to be reliable",
-        f"In {len(bad)} of {len(known(result))} cases the interval of the ICC begins below 0.60.",
-        "In these cases the order of the people may differ at the next visit. A wide interval "
-        f"means that {people} people and {visits} visits are too few.",
-        ("Measure more people, or the same people at more visits.",
-         "Average over more trials or visits before you compare people."),
-    )  # fmt: skip
-    others = Claim("That the test is reliable for other people, tasks or times between visits.",
-                   "An ICC is lower in people who differ less from each other.")  # fmt: skip
-    may = _claims([item for item in known(result) if _reaches(item)], words)
-    alerts = [] if level is Level.GREEN else [alert]
-    return Verdict(level, headline, sentence, alerts, may, [*_claims(bad, words), others], badge)
+    return RULES.verdict(_Facts(result, words))
 
 
 def lowest(items: Sequence[MeasureResult]) -> MeasureResult:
@@ -138,21 +175,26 @@ def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
         where = f" in {' and '.join(good)}"
         if len(good) == len(own):
             where = f" in {_COUNTS.get(len(own), 'all')} conditions" if len(own) > 1 else ""
-        open_still = any(_reaches(item, low=False) for item in own)
-        no = "not shown to be reliable" if open_still else "not reliable"
+        no = (
+            "not shown to be reliable"
+            if any(_reaches(item, low=False) for item in own)
+            else "not reliable"
+        )
         parts.setdefault(f"reliable{where}" if good else no, []).append(name)
     said = "; ".join(
         f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} {what}"
         for what, names in sorted(parts.items(), key=lambda item: item[0][:3] == "not")
     )
-    return f"{said[:1].upper()}{said[1:]}."
+    return f"{sentence_case(said)}."
 
 
 def _claims(items: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Claim]:
-    """One claim per measure, with its conditions."""
+    """One claim per measure, with its conditions and ICC."""
     found = []
     for name, own in _by_name(items, words).items():
-        text = ", ".join([name, *(item.condition for item in own if item.condition)])
+        named = [item.condition for item in own if item.condition]
+        where = " and ".join(", ".join(part) for part in (named[:-1], named[-1:]) if part)
         each = "; ".join(f"{item.condition} {icc_text(item)}".strip() for item in own)
-        found.append(Claim(f"{text[:1].upper()}{text[1:]}.", f"{each}."))
+        where = f" in {where}" if where else ""
+        found.append(Claim(f"That {name} is reliable{where}.", f"{each}."))
     return found

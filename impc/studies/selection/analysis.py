@@ -33,11 +33,9 @@ from impc.studies.selection.estimation import (
 )
 from impc.studies.selection.fisher import (
     Information,
-    NullDirection,
     Selection,
     fisher_information,
     largest_subsets,
-    null_directions,
     sweep,
     unseen_scalings,
 )
@@ -60,8 +58,6 @@ class StudySelection:
     nominal: Mapping[str, Nominal]
     # Sweep over bounds with (5.5): largest variance over all subjects and visits
     worst_case: tuple[Selection, ...]
-    # Subsets that are among the largest of every subject at the bound (chapter 4)
-    intersection: tuple[tuple[int, ...], ...]
     # Refitted subset: the best of the worst case at the bound, or at the first bound of the sweep
     # with a feasible one; otherwise the most frequent subset of the subjects
     free: tuple[int, ...]
@@ -84,9 +80,6 @@ def select_study(
     worst = sweep(informations, settings.bounds, settings.least)
     at_bound = largest_subsets(informations, settings.bound, settings.least)
     bound, free = _free(at_bound, worst, nominal)
-    largest = (
-        set(largest_subsets([F], settings.bound, settings.least).subsets) for F in informations
-    )
     chosen = run(fit_chosen, Chosen, {name: (trials[name], settings, free) for name in trials})
     seconds = {
         "fim": float(np.mean([item.seconds for item in nominal.values()])),
@@ -98,7 +91,6 @@ def select_study(
     return StudySelection(
         nominal,
         worst,
-        tuple(sorted(set.intersection(*largest))),
         free,
         bound,
         chosen,
@@ -129,7 +121,6 @@ class Nominal:
 
     fit: Estimate  # Fit of all parameters
     information: Information  # At this fit
-    unseen: tuple[NullDirection, ...]
     # Sets of parameters whose common scaling changes the outputs by less than their noise
     scalings: tuple[tuple[str, ...], ...]
     sweep: tuple[Selection, ...]
@@ -158,8 +149,7 @@ def fit_nominal(
     found = fisher_information(model, np.array(nominal.theta), trials)
     swept = sweep([found.F], settings.bounds, settings.least)
     seconds = time.perf_counter() - started
-    unseen, scalings = null_directions(model, found), unseen_scalings(model, found)
-    return Nominal(nominal, found, unseen, scalings, swept, seconds)
+    return Nominal(nominal, found, unseen_scalings(model, found), swept, seconds)
 
 
 def fit_chosen(

@@ -1,4 +1,4 @@
-"""Fisher information of normalised parameters, its null directions, and feasible subsets.
+"""Fisher information of normalised parameters, and feasible subsets.
 
     F = (1 / sigma^2) sum_k (dy_k/dt)' (dy_k/dt)                 (A.2), (A.6)
 
@@ -17,6 +17,7 @@ grown by one parameter at a time from feasible sets, with the same result as exh
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -40,20 +41,11 @@ class Information(Frozen):
     """Fisher information of all trials."""
 
     F: Array  # (k, k), in normalised units
-    # Column 0: singular values (decreasing) of the sensitivity to the logarithms of the parameters
-    # over sigma; other columns: right singular vectors (k, 1 + k)
-    relative: Array
+    theta: Array  # Parameters (k,) at which it is computed
     variance: float  # Residual variance sigma^2
-    rank: int  # Number of singular values above 1e-6 of the largest
-
-
-@dataclass(frozen=True)
-class NullDirection:
-    """Combination of parameters without effect on the outputs."""
-
-    # Parameter -> component of the direction of relative changes, largest first
-    shares: dict[str, float]
-    sentence: str  # Description in words
+    # Number of singular values of the sensitivity to the logarithms of the parameters above 1e-6 of
+    # the largest
+    rank: int
 
 
 def fisher_information(
@@ -63,19 +55,15 @@ def fisher_information(
     errors, table = stacked(model, theta, trials)
     squares = sum(float(np.sum(part**2)) for part in errors)
     sigma2 = squares / (len(table) - model.size) if variance is None else variance
-    sigma = np.sqrt(max(sigma2, 1e-300))
-    in_logarithms = table / model.gain * theta
-    _, logarithmic, relative = np.linalg.svd(in_logarithms / sigma, full_matrices=False)
-    rank = int(np.count_nonzero(logarithmic > _RANK * logarithmic[0]))
-    both = np.column_stack([logarithmic, relative])
-    return Information(frozen(table.T @ table / sigma2), frozen(both), float(sigma2), rank)
+    sizes = np.linalg.svd(table / model.gain * theta, compute_uv=False)
+    rank = int(np.count_nonzero(sizes > _RANK * sizes[0]))
+    return Information(frozen(table.T @ table / sigma2), frozen(theta), float(sigma2), rank)
 
 
 def common_scaling(model: ParametricModel, found: Information, names: Sequence[str]) -> float:
     """Change of the outputs if `names` are scaled by e together, in SDs of the noise."""
-    together = np.array([float(name in names) for name in model.names])
-    values, vectors = found.relative[:, 0], found.relative[:, 1:]
-    return float(np.linalg.norm(values * (vectors @ together)))
+    moved = np.isin(model.names, names) * np.asarray(found.theta) / model.gain
+    return math.sqrt(max(float(moved @ np.asarray(found.F) @ moved), 0.0))
 
 
 def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[str, ...], ...]:
@@ -91,24 +79,6 @@ def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[s
         for kind, names in kinds.items()
         if kind and len(names) > 1 and common_scaling(model, found, names) <= 1
     )
-
-
-def null_directions(model: ParametricModel, found: Information) -> tuple[NullDirection, ...]:
-    """Null directions in relative changes of the parameters, smallest singular value first."""
-    values, vectors = found.relative[:, 0], found.relative[:, 1:]
-    nulls = []
-    for index in range(model.size - 1, found.rank - 1, -1):
-        v = vectors[index] * np.sign(vectors[index][np.argmax(np.abs(vectors[index]))])
-        order = np.argsort(-np.abs(v), kind="stable")
-        shares = {model.names[place]: float(v[place]) for place in order if abs(v[place]) >= 0.1}
-        parts = ", ".join(f"{name} {share:+.2f}" for name, share in shares.items())
-        seen = float(values[index] / values[0])
-        sentence = (
-            f"changing {parts} (relative changes) together changes the outputs by {seen:.0e} times "
-            "the change along the best identified direction"
-        )
-        nulls.append(NullDirection(shares, sentence))
-    return tuple(nulls)
 
 
 _EPS = float(np.finfo(np.float64).eps)

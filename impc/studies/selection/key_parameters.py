@@ -4,7 +4,8 @@ Four consecutive filters (5.5):
 
     variability        max over subjects and visits of max diag F_s^-1 <= v
     goodness of fit    mean VAF of the refitted subset above a threshold
-    reliability        min over the subset of ICC(A,k) between visits >= rho (5.6), (5.7)
+    reliability        min over the subset of ICC(A,k) between visits (5.6), (5.7); here the lower
+                       end of its 95 % interval >= rho, because an ICC of few people varies much
     diversity          number of distinct pathways in the subset; the largest is selected
 """
 
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.studies.reliability.icc import icc
+from impc.studies.reliability.icc import GOOD, icc
 from impc.studies.selection.analysis import Nominal, fit_nominal
 from impc.studies.selection.estimation import Estimate, estimate
 from impc.studies.selection.fisher import largest_subsets, sweep
@@ -39,7 +40,9 @@ class Candidate:
     variance: float  # Largest variance over subjects and visits, in normalised units
     vaf: float  # Mean VAF over subjects and visits, %
     reliability: float  # Smallest ICC(A,k) of its parameters; NaN if undefined
+    certain: float  # Smallest lower end of their 95 % intervals; NaN if undefined
     diversity: int  # Number of pathways
+    explained: bool  # Whether it passes goodness of fit
     kept: bool  # Whether it passes goodness of fit and reliability
 
 
@@ -81,7 +84,7 @@ def key_parameters(
     *,
     bound: float = 0.35,
     least_vaf: float = 69.0,
-    least_reliability: float = 0.75,
+    least_reliability: float = GOOD,
     most: int = 20,
 ) -> KeyParameters:
     """Select key parameters of a study; `recorded` by (subject, visit)."""
@@ -97,12 +100,14 @@ def key_parameters(
         vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
         tables = [between_visits(table) for table in _by_visit(recorded, fits, subset)]
         # (5.6): minimum over the subset; NaN without several subjects and visits.
-        reliability = float(np.min([np.nan if one is None else one.value for one in tables]))
-        kept = vaf > least_vaf and reliability >= least_reliability
-        diversity = len({model.pathways[index] for index in subset})
-        candidates.append(
-            Candidate(subset, selection.variances[place], vaf, reliability, diversity, kept)
+        reliability, certain = (
+            float(np.min([np.nan if one is None else one[end] for one in tables])) for end in (0, 1)
         )
+        diversity, explained = len({model.pathways[index] for index in subset}), vaf > least_vaf
+        candidates.append(Candidate(
+            subset, selection.variances[place], vaf, reliability, certain, diversity, explained,
+            explained and certain >= least_reliability,
+        ))  # fmt: skip
     candidates.sort(
         key=lambda item: (not item.kept, -item.diversity, -np.nan_to_num(item.reliability))
     )
@@ -132,4 +137,4 @@ def _by_visit(
 
 def between_visits(values: Array) -> Icc | None:
     """ICC(A,k) of a parameter's `values` (subjects, visits); None for one subject or visit."""
-    return icc(values, "A,k") if min(values.shape) >= 2 else None
+    return icc(values, "A,k", "generalised") if min(values.shape) >= 2 else None

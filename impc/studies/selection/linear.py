@@ -102,10 +102,7 @@ def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
 
 
 def _joined(A: Array, B: Array) -> Array:
-    n, d = B.shape
-    joined = np.zeros((n + d, n + d))
-    joined[:n, :n], joined[:n, n:] = A, B
-    return joined
+    return np.pad(np.hstack([A, B]), ((0, B.shape[1]), (0, 0)))
 
 
 @njit(cache=True, nogil=True)

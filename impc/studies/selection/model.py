@@ -53,16 +53,14 @@ class ParametricModel(Frozen):
     jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
     meanings: tuple[str, ...] = ()
 
-    @property
-    def words(self) -> tuple[tuple[str, str], ...]:
-        """Glossary: parameters with meaning, pathway and unit."""
-        return tuple(
-            (name, f"{meaning[0].upper()}{meaning[1:]}{f' ({path})' * bool(path)}, in {unit}.")
-            for name, meaning, path, unit in zip(
-                self.names, self.meanings, self.pathways, self.units, strict=True
-            )
-            if meaning
-        )
+    def word(self, index: int) -> str:
+        """Meaning of a parameter in words, or its name."""
+        meaning = self.meanings[index] if self.meanings else ""
+        return meaning or self.names[index].replace("_", " ")
+
+    def words(self, subset: Sequence[int]) -> str:
+        """Parameters of a `subset` in words, separated by commas."""
+        return ", ".join(self.word(index) for index in subset)
 
     def named(self, subset: Sequence[int]) -> list[str]:
         """Names of the parameters whose indices are `subset`."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import math
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,10 +16,11 @@ from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PHONE, RECORDED, RULE, new_figure
-from impc.reporting.verdict import Alert, Claim, Key, Verdict
+from impc.reporting.verdict import Key
+from impc.studies.selection.verdict import BIAS, SELECT_RULES, STUCK, SelectFacts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
     from pathlib import Path
 
     from matplotlib.figure import Figure
@@ -27,20 +28,18 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.digests import Inputs
     from impc.studies.selection.analysis import StudySelection
-    from impc.studies.selection.estimation import PriorFit
     from impc.studies.selection.model import ParametricModel
 
-_OPEN = "not determined"
-_POOR, _AT_LIMIT = 50.0, 0.1  # VAF of a poor model, %; distance to a limit in the figure, %
-_BIAS, _WIDTH = "bias_percent_of_the_range", "width_percent_of_the_range"
+_AT_LIMIT = 0.1  # Distance in % of the search range that counts as at a limit
+_WIDTH = "width_percent_of_the_range"
 _LABELS = {
     "low": "95 % CI low", "high": "95 % CI high", "sd": "SD between people", "value": "Estimate",
-    _WIDTH: "95 % CI width (% of range)", _BIAS: "Bias from fixing (% of range)",
+    _WIDTH: "95 % CI width (% of range)", BIAS: "Bias from fixing (% of range)",
 }  # fmt: skip
 _CAPTION = (
-    "Blue: identifiable, with 95 % intervals that allow for the SD between people in the other "
-    "parameters. Grey dots: fit of all parameters, not identifiable; grey bars: assumed value and "
-    "SD between people. One mark per subject; arrows: at a limit of the search."
+    "Blue: fitted, with 95 % intervals that allow for the SD between people in the other "
+    "parameters. Grey dots: fit of all parameters; grey bars: assumed value and SD between people. "
+    "One mark per person and visit; arrows: at a limit of the search."
 )
 _BY_SUBJECT = (
     "Estimates with 95 % intervals that allow for the SD between people in the fixed parameters. "
@@ -48,84 +47,57 @@ _BY_SUBJECT = (
     "to first order, root sum of squares over the fixed parameters, each wrong by one SD."
 )
 _METHODS = (
-    "A model with {size} parameters was fitted to recordings of {people} subjects by least squares "
-    "within search limits. The largest subset whose variances, by the Fisher information, are at "
-    "most {bound:g} in each subject (unit: half the search range, squared) was selected. The "
-    "others were fixed at assumed values; 95 % intervals allow for their SD between people."
+    "A model with {size} parameters was fitted to recordings of {whom} by least squares within "
+    "search limits. The largest subset whose variances, by the Fisher information, are at most "
+    "{bound:g} in each of them (unit: half the search range, squared) was selected. The others "
+    "were fixed at assumed values; 95 % intervals allow for their SD between people."
 )
-
-
-class _Facts(NamedTuple):
-    """Phrases and numbers shared by verdict, checks and the text for a paper."""
-
-    names: str  # Names of the identifiable parameters
-    free: str  # Their number in words
-    fixed: int  # Number of fixed parameters
-    worst: str  # Parameter with the largest bias by fixing the others
-    bias: str  # That bias, % of its search range
-    shift: str  # Both in words
-    kept: bool  # Whether all variances with the prior stay within the bound
-    stuck: str  # Estimates at a limit of the search; empty if there are none
-    vaf: str  # VAF in words
-    poor: bool  # Whether the model explains less than half
-
-
-def _facts(model: ParametricModel, found: StudySelection, table: pd.DataFrame) -> _Facts:
-    chosen, fixed = found.chosen.values(), model.size - len(found.free)
-    worst = table.sort_values(_BIAS).to_dict("records")[-1]
-    bias = number(worst[_BIAS])
-    narrow = all(np.all(one.known.variance <= found.bound) for one in chosen)
-    ends = Counter(table.loc[table["note"].str.contains("estimate at"), "parameter"])
-    every = float(np.mean([np.mean(one.fit.vaf) for one in found.nominal.values()]))
-    least = float(np.mean([np.mean(one.refit.vaf) for one in chosen]))
-    return _Facts(
-        names_of(model, found.free), f"{len(found.free)} of {model.size} parameters", fixed,
-        worst["parameter"], bias, f"{bias} % of the search range ({worst['parameter']})",
-        not fixed or narrow, ", ".join(f"{name} in {one} of {len(chosen)}"
-                                       for name, one in ends.items()),
-        f"{number(every)} % with all parameters, {number(least)} % with the identifiable ones",
-        every < _POOR,
-    )  # fmt: skip
 
 
 def selection_report(
     model: ParametricModel,
     found: StudySelection,
     command: str,
-    inputs: Inputs,
+    inputs: Inputs | None,
     truths: Mapping[str, Array],
+    whom: tuple[int, int] = (1, 1),
 ) -> Report:
-    """Report of `impc select`; `truths` are the true parameters (k,) of simulated subjects."""
+    """Report of `impc select`; `truths` are the true parameters (k,) of simulated subjects.
+
+    `whom` are the numbers of people and visits.
+    """
     table = _intervals(model, found, truths)
-    facts, truth = _facts(model, found, table), _truth(table)
-    fixed, people, size = facts.fixed, len(found.chosen), model.size
-    provenance = Provenance(command=command, inputs=inputs)
-    copied: Copy | str = "There is no text to copy: the model does not explain the movement."
-    if not facts.poor:
-        results = f"{facts.free} were identifiable together ({facts.names}). VAF: {facts.vaf}."
-        if fixed:
-            results += f" Fixing the others may bias an estimate by up to {facts.shift}."
-        copied = Copy(_METHODS.format(size=size, people=people, bound=found.bound), results)
+    facts, truth, size = SelectFacts(model, found, table), _truth(table), model.size
+    verdict, provenance = SELECT_RULES.verdict(facts), Provenance(command=command, inputs=inputs)
+    said = [f"{whom[0]} {'person' if whom[0] == 1 else 'people'}"]
+    said += [f"{whom[1]} visits"] * (whom[1] > 1)
+    copied: Copy | str = "There is no text to copy: no parameter may be reported."
+    if verdict.level is not Level.RED:
+        results = f"{facts.estimated} of {size} parameters could be estimated ({facts.names})."
+        results += f" {facts.reached} ended at the search range." * bool(facts.open_names)
+        results += f" Because the others were fixed, {facts.shift}." * bool(facts.fixed)
+        methods = _METHODS.format(size=size, whom=" with ".join(said), bound=found.bound)
+        copied = Copy(methods, f"{results} VAF: {facts.vaf}.")
     return Report(
-        "impc: parameters that can be estimated", "parameter report", _verdict(facts),
+        "impc: parameters that can be estimated", "parameter report", verdict,
         [
             Section("Parameters", [
                 Finding("parameters", _by_parameter(model, found, table),
-                        "Medians over subjects, and largest bias.", labels=_LABELS,
+                        "Medians over people and visits, and largest bias.", labels=_LABELS,
                         hidden=() if any(model.meanings) else ["symbol"], digits=3),
-                Finding("intervals", table, _BY_SUBJECT, folded="All subjects in numbers",
+                Finding("intervals", table, _BY_SUBJECT, folded="All people in numbers",
                         labels=_LABELS, hidden=["symbol"]),
             ]),
             Section("Checks", [Checks([*_checks(model, found, facts), *truth])]),
             Section("Provenance", [Terms(provenance.terms)]),
         ],
-        meta=["Selection of parameters", f"{people} subjects", provenance.made[:10]],
+        meta=["Selection of parameters", *said, provenance.made[:10]],
         hero=Picture("parameters", "Estimates of all parameters in their search ranges", _CAPTION),
         keys=[
-            Key(str(len(found.free)), f"of {size}", "parameters identifiable", facts.names),
-            Key(str(fixed), f"of {size}", "parameters fixed", "at assumed values"),
-            Key(facts.bias if fixed else "0", "% of the search range", "largest bias from fixing",
-                facts.worst if fixed else ""),
+            Key(str(facts.estimated), f"of {size}", "parameters estimated", facts.names),
+            Key(str(facts.fixed), f"of {size}", "parameters fixed", "at assumed values"),
+            Key(number(facts.worst[BIAS]) if facts.fixed else "0", "% of the search range",
+                "largest bias from fixing", facts.worst["parameter"] if facts.fixed else ""),
         ],
         figures={"parameters": partial(_forest, model, found)},
         copy=copied,
@@ -134,70 +106,42 @@ def selection_report(
     )  # fmt: skip
 
 
-def _verdict(facts: _Facts) -> Verdict:
-    if facts.poor:
-        headline = "The model explains less than half of this movement."
-        return Verdict(Level.RED, headline, "Do not interpret its parameters.")
-    fixed, kept, stuck = facts.fixed, facts.kept, facts.stuck
-    condition = f", if the other {fixed} {'is' if fixed == 1 else 'are'} as assumed" * bool(fixed)
-    shifted = " If a fixed parameter is wrong, these are biased." * (not kept)
-    alert = Alert(
-        Level.AMBER, "The estimates depend on parameters that were fixed",
-        f"Fixing the other {fixed} may bias an estimate by up to {facts.shift}.",
-        "If a subject differs from the assumed values, the estimates are biased. The intervals on "
-        "this page include this error; intervals for exactly known values do not.",
-        ["Report the assumed values, and the intervals on this page.",
-         "Measure fixed parameters in another experiment, or use a richer movement of the target."],
-    )  # fmt: skip
-    may = [Claim(f"{facts.free} are identifiable together.", f"{facts.names}."),
-           Claim("Their estimates, with the assumed values of the others.",
-                 "With the intervals on this page.")]  # fmt: skip
-    may_not = [
-        (fixed, "The fixed parameters.", "Their values are assumed, not estimated."),
-        (
-            not kept,
-            "Differences between subjects.",
-            f"Fixing the others may bias estimates by up to {facts.shift}.",
-        ),
-        (stuck, "Estimates at a limit of the search.", f"{stuck} subjects."),
-        (True, "That other parameters have no effect.", "The recordings cannot separate them."),
-    ]
-    return Verdict(
-        Level.GREEN if kept and not stuck else Level.AMBER,
-        f"{facts.free} can be estimated{condition}.",
-        f"The recordings identify {facts.names} together.{shifted}",
-        [] if kept else [alert], may, [Claim(text, why) for there, text, why in may_not if there],
-    )  # fmt: skip
-
-
-def _checks(model: ParametricModel, found: StudySelection, facts: _Facts) -> list[Check]:
+def _checks(model: ParametricModel, found: StudySelection, facts: SelectFacts) -> list[Check]:
     scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
     together = " ".join(
-        f"Scaling {names_of(model, [model.names.index(name) for name in names])} together (by a "
-        "factor of e) changes the outputs by less than their noise."
+        f"These {len(names)} can all be {math.e:.1f} times larger without a change that exceeds "
+        f"the noise: {model.words([model.names.index(name) for name in names])}."
         for names in scalings
     )
-    good, doubt = Level.GREEN, Level.AMBER
-    return [
-        Check(good if facts.kept else doubt, "Bias from fixing",
-              f"Up to {facts.shift}, if each fixed parameter is wrong by one SD between people. "
-              "The intervals allow for it." if facts.fixed else "No parameter is fixed."),
-        Check(doubt if facts.stuck else good, "Search limits",
-              f"Estimates at a limit of the search: {facts.stuck or 'none'}."),
-        Check(Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
-        *([Check(Level.NOTE, "Combinations", together)] if together else []),
-        Check(Level.NOTE, "Another method", f"LASSO selects {names_of(model, found.lasso)}."),
+    good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
+    ends = (
+        f"{facts.reached} end at the search range."
+        if facts.open_names
+        else ("All 95 % intervals are inside the search range.")
+    )
+    rows = [
+        (good if facts.kept else doubt, "Bias from fixing",
+         f"If each fixed parameter is wrong by one SD between people, {facts.shift}. The intervals "
+         "allow for it." if facts.fixed else "No parameter is fixed."),
+        (doubt if facts.open_names else good, "Search range",
+         f"{ends} Estimates at a limit: {facts.stuck or 'none'}."),
+        (Level.RED if facts.poor else good, "Movement explained", f"VAF {facts.vaf}."),
+        *([(note, "Combinations", together)] if together else []),
+        (note, "Another method", f"LASSO selects {model.words(found.lasso)}."),
+        (note, "Another question", "impc key-parameters asks which parameters are repeatable "
+         "between visits and allows wider intervals, so it may name others."),
     ]  # fmt: skip
+    return [Check(*row) for row in rows]
 
 
 def _by_parameter(
     model: ParametricModel, found: StudySelection, intervals: pd.DataFrame
 ) -> pd.DataFrame:
     table = pd.DataFrame({
-        "parameter": [said(model, index) for index in range(model.size)], "symbol": model.names,
+        "parameter": [model.word(index) for index in range(model.size)], "symbol": model.names,
         "unit": model.units, "assumed": model.typical, "sd": model.deviation,
     }).iloc[_ordered(model, found)]  # fmt: skip
-    kinds = {"value": "median", _WIDTH: "median", _BIAS: "max"}
+    kinds = {"value": "median", _WIDTH: "median", BIAS: "max"}
     return table.join(intervals.groupby("symbol").agg(kinds), on="symbol")
 
 
@@ -206,14 +150,16 @@ def _intervals(
 ) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for subject, item in found.chosen.items():
-        bias = _bias(model, found, subject)
+        bias, known, free = _bias(model, found, subject), item.known, list(found.free)
+        places = np.stack([known.value, known.low, known.high]) - model.low[free]
+        places *= 50 / model.gain[free]
         for place, index in enumerate(found.free):
-            low, high = float(item.known.low[place]), float(item.known.high[place])
+            low, high = float(known.low[place]), float(known.high[place])
             row: dict[str, Any] = {
-                "subject": subject, "parameter": said(model, index), "symbol": model.names[index],
-                "unit": model.units[index], "value": float(item.known.value[place]), "low": low,
-                "high": high, "note": _note(model, index, item.known, low, high),
-                _WIDTH: 50 * (high - low) / model.gain[index], _BIAS: bias[place],
+                "subject": subject, "parameter": model.word(index), "symbol": model.names[index],
+                "unit": model.units[index], "value": float(known.value[place]), "low": low,
+                "high": high, "note": note_of(*map(float, places[:, place])),
+                _WIDTH: 50 * (high - low) / model.gain[index], BIAS: bias[place],
             }  # fmt: skip
             for name in ("value", "low", "high"):
                 row[f"others_exact_{name}"] = float(getattr(item.exact, name)[place])
@@ -232,13 +178,13 @@ def _bias(model: ParametricModel, found: StudySelection, subject: str) -> Array:
     return np.asarray(50 * np.linalg.norm(moved * (model.deviation / model.gain)[rest], axis=1))
 
 
-def _note(model: ParametricModel, index: int, item: PriorFit, low: float, high: float) -> str:
-    """Note on an interval that reaches a search limit; else empty."""
-    ends = {"lower": low <= model.low[index], "upper": high >= model.high[index]}
-    if all(ends.values()):
-        return _OPEN
-    at = "estimate at its" if index in item.fit.at_bound else "ends at the"
-    return "".join(f"one-sided: {at} {name} limit" for name, here in ends.items() if here)
+def note_of(value: float, low: float, high: float) -> str:
+    """Note on an interval that reaches an end of the search range (positions in %); else empty."""
+    ends = ["lower"] * (low < _AT_LIMIT) + ["upper"] * (high > 100 - _AT_LIMIT)
+    if not ends:
+        return ""
+    said = "not determined" if len(ends) > 1 else f"one-sided: ends at the {ends[0]} limit"
+    return said + STUCK * (not _AT_LIMIT <= value <= 100 - _AT_LIMIT)
 
 
 def read_truths(folder: Path, model: ParametricModel) -> dict[str, Array]:
@@ -290,7 +236,7 @@ def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figu
             mark = "<" if x < _AT_LIMIT else ">" if x > 100 - _AT_LIMIT else "o"
             ax.plot(x, height, mark, color=colour, clip_on=False)
         x, y, side = (0, row - 0.4, "left") if narrow else (-5, row, "right")
-        ax.text(x, y, said(model, index), color=colour, va="center", ha=side)
+        ax.text(x, y, model.word(index), color=colour, va="center", ha=side)
     ax.vlines([0, 100], -0.5, len(order) - 0.5, color=RULE, linewidth=0.8, zorder=0)
     ax.set(xlim=(-4, 104), ylim=(len(order) - 0.5, -0.7), yticks=[])
     ax.set_xlabel("Position in the search range (%)")
@@ -326,14 +272,3 @@ def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
             for item in found.worst_case
         ],
     }
-
-
-def said(model: ParametricModel, index: int) -> str:
-    """Meaning of a parameter in words, or its name."""
-    meaning = model.meanings[index] if model.meanings else ""
-    return meaning or model.names[index].replace("_", " ")
-
-
-def names_of(model: ParametricModel, subset: Sequence[int]) -> str:
-    """Parameters of a subset in words, separated by commas."""
-    return ", ".join(said(model, index) for index in subset)

@@ -21,6 +21,7 @@ from impc.model.weights import Weights
 from impc.reporting.document import Checks, Copy, Report
 from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
+from impc.reporting.rendering import number
 from impc.studies.compare.report import compare_report
 from impc.studies.compare.subject import compare_recordings
 from impc.studies.methods_figure import by_score, methods_figure
@@ -54,12 +55,24 @@ def changed(fits: tuple[MethodFit, ...], name: str, **fields: object) -> tuple[M
     return tuple(replace(fit, **fields) if fit.name == name else fit for fit in fits)
 
 
-def test_only_models_with_a_limit_fit(problem: Problem, compared: tuple[MethodFit, ...]) -> None:
+def test_what_is_left_unexplained_without_the_limit(
+    problem: Problem, compared: tuple[MethodFit, ...]
+) -> None:
     report = compare_report(problem, compared, PROVENANCE)
     verdict = report.verdict
     assert verdict.level is Level.GREEN
-    assert verdict.headline == ("Only models with a torque limit fit without exceeding 1 N m.")
     best, other = by_score(compared)[0], next(f for f in by_score(compared) if not f.keeps_bounds)
+    assert np.mean(100 - other.held_out) > 1000 * np.mean(100 - best.held_out)
+    assert verdict.headline == (
+        "Without the torque limit of 1 N m, over 1000 times as much variance is left "
+        f"unexplained, and {number(other.largest_input[0])} N m would be needed."
+    )
+    fitted = sum(fit.estimate.K is not None for fit in compared)
+    assert fitted < len(compared)  # no recorded commands, and no weights with the gain
+    assert report.meta[1] == f"{fitted} of {len(compared)} methods fitted"
+    assert isinstance(report.copy, Copy)
+    assert report.copy.methods.startswith(f"{fitted} models were fitted to 2 trials")
+    assert "Recorded commands are needed: these files have none." in shown(report)
     assert report.keys[0].value == f"{np.mean(best.held_out):.2f}"
     lead = np.mean(best.held_out) - np.mean(other.held_out)
     assert float(report.keys[1].value) == pytest.approx(lead, rel=5e-3)
@@ -130,7 +143,25 @@ def test_a_best_model_beyond_the_limit_is_amber(
     assert report.verdict.level is Level.AMBER
     assert "needs more than 1 N m" in report.verdict.headline
     assert "unknown_limit" in report.verdict.alerts[0].todo[0]
-    assert isinstance(report.copy, str)
+    assert "N m; the limit was given as 1 N m" in report.verdict.alerts[0].found
+    assert isinstance(report.copy, Copy)
+    assert "best model with the limit explained 90.00 %" in report.copy.results
+
+
+def test_a_limit_without_which_as_much_is_explained_is_not_said_to_matter(
+    problem: Problem, compared: tuple[MethodFit, ...]
+) -> None:
+    poorer = tuple(
+        fit if fit.keeps_bounds else replace(fit, held_out=np.full((2, 2), 96.0))
+        for fit in (replace(fit, held_out=np.full((2, 2), 98.0)) for fit in compared)
+    )
+    headline = compare_report(problem, poorer, PROVENANCE).verdict.headline
+    assert headline.startswith("Without the torque limit of 1 N m, 2 times as much variance")
+    same = np.full((2, 2), 99.0)
+    alike = tuple(replace(fit, held_out=same, vaf=same[0]) for fit in compared)
+    verdict = compare_report(problem, alike, PROVENANCE).verdict
+    assert verdict.headline.startswith("Models without the torque limit explain as much")
+    assert not any("matters" in claim.text for claim in verdict.may)
 
 
 def test_a_limit_that_no_model_reaches_decides_nothing(

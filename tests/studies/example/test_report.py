@@ -82,7 +82,7 @@ def test_the_page_says_who_stays_within_the_limit(
     case_a: CaseResult, provenance: Provenance
 ) -> None:
     report = example_report([case_a], provenance)
-    assert report.verdict.level is Level.NOTE
+    assert (report.verdict.level, report.verdict.words) == (Level.GREEN, "As expected")
     assert "two need no more than the limit" in report.verdict.headline
     assert [key.value for key in report.keys] == ["7", "2", "2"]
     assert "up to 1.23" in report.verdict.sentence
@@ -90,7 +90,8 @@ def test_the_page_says_who_stays_within_the_limit(
     page = html.unescape(re.sub("<[^>]*>", "", main))
     assert page.index("impc inspect trial_1.csv") < page.index("impc fit trial_*.csv")
     assert not re.search(r"\((\d\.\d+|[Tt]able)", page)  # no numbers of the dissertation
-    assert 'class="badge' not in main
+    assert 'class="badge big green' in main
+    assert "The movement is simulated." in page
     files = report.files(pdf=True)
     assert files["figures/comparison-case-A.svg"].lstrip().startswith(b"<?xml")
     assert files["figures/comparison-case-A.pdf"].startswith(b"%PDF")
@@ -104,3 +105,10 @@ def test_another_method_within_the_limit_is_counted(case_a: CaseResult) -> None:
     verdict = example_verdict([replace(case_a, methods=methods), case_a])
     assert "two need" in verdict.headline  # of all cases
     assert "three need" in example_verdict([replace(case_a, methods=methods)]).headline
+
+
+def test_an_example_that_finds_nothing_says_so_in_a_box(case_a: CaseResult) -> None:
+    methods = tuple(replace(item, residual=0.1) for item in case_a.methods)
+    verdict = example_verdict([replace(case_a, methods=methods)])
+    assert verdict.level is Level.AMBER
+    assert verdict.alerts[0].found.startswith("No method finds the true cost weights")

@@ -11,6 +11,7 @@ import scipy.stats
 
 from experiments.printed_intervals import carts
 from impc.arrays import Array
+from impc.assess.weight_profiles import WeightInterval
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import InputError, SolverError
@@ -28,6 +29,7 @@ from impc.studies.plan.sentences import (
     plan_checks,
     plan_copy,
     plan_verdict,
+    stated_as,
     target,
     trials_needed,
     widths,
@@ -165,6 +167,21 @@ def test_trials_that_are_needed_are_enough() -> None:
     assert again.best.expected is not None
     wide = max(half(item) for item in again.best.expected.intervals)
     assert wide > target(plan)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [
+        (0.93, 1.08, "\u22127 to +8 %"),
+        (0.23, 4.4, "between a quarter and 4.4 times"),
+        (0.41, 2.0, "between 0.41 and 2 times"),
+        (0.5, math.inf, "half of the assumed value or more"),
+        (0.0, math.inf, "not determined"),
+    ],
+)
+def test_an_interval_is_relative_to_the_assumed_value(low: float, high: float, words: str) -> None:
+    ends = [math.log(end) if end else -math.inf for end in (low, high)]
+    assert stated_as(WeightInterval(0.0, *ends)) == words
 
 
 def test_who_is_compared_by_a_weight_without_an_end_is_told_so() -> None:

@@ -1,4 +1,4 @@
-"""Analysis of variance, paired tests and variance components against statsmodels and simulation."""
+"""Analysis of variance, trends and variance components against statsmodels and simulation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from impc.arrays import Array
 from impc.errors import DataError
 from impc.studies.reliability.anova import (
     learning_trend,
-    paired_tests,
     variance_components,
     visit_anova,
 )
@@ -48,17 +47,6 @@ def test_greenhouse_geisser_of_a_published_matrix() -> None:
     above = k**2 * (np.mean(np.diag(S)) - S.mean()) ** 2
     below = (k - 1) * (np.sum(S**2) - 2 * k * np.sum(S.mean(axis=1) ** 2) + k**2 * S.mean() ** 2)
     assert visit_anova(table).epsilon == pytest.approx(above / below)
-
-
-def test_paired_tests_and_holm() -> None:
-    table = scores()
-    found = paired_tests(table, ("1", "2", "3"))
-    assert [(item.first, item.second) for item in found] == [("1", "2"), ("1", "3"), ("2", "3")]
-    ps = [item.p for item in found]
-    for item, (i, j) in zip(found, ((0, 1), (0, 2), (1, 2)), strict=True):
-        assert item.p == pytest.approx(scipy.stats.ttest_rel(table[:, j], table[:, i]).pvalue)
-    smallest = min(found, key=lambda item: item.p)
-    assert smallest.p_holm == pytest.approx(min(3 * min(ps), 1.0))
 
 
 def test_learning_trend() -> None:

@@ -66,8 +66,8 @@ def test_the_badge_goes_by_the_lower_end() -> None:
     found = reliability_verdict(study(scores(30, 3, 0.002), scores(30, 3, 0.02, 0.0)), WORDS)
     assert found.level is Level.AMBER
     assert found.headline.startswith("Seat sway is reliable; trunk sway is not")
-    assert [claim.text for claim in found.may] == ["Seat sway, EO."]
-    assert found.may_not[0].text == "Trunk sway, EO."
+    assert [claim.text for claim in found.may] == ["That seat sway is reliable in EO."]
+    assert found.may_not[0].text == "That trunk sway is reliable in EO."
 
 
 def test_no_reliability_is_red() -> None:
@@ -86,7 +86,8 @@ def test_few_subjects_decide_nothing_however_high_the_estimate() -> None:
 
 def test_one_visit_shows_nothing() -> None:
     found = reliability_verdict(study(scores(4, 1, 0.01)), WORDS)
-    assert (found.badge, found.may) == ("Undecided", ())
+    assert (found.badge, found.may) == ("Undecided", [])
+    assert "at least two people" in found.alerts[0].found
 
 
 def test_both_intervals_stand_in_columns_of_their_own() -> None:
@@ -99,5 +100,9 @@ def test_both_intervals_stand_in_columns_of_their_own() -> None:
     for ends, method in ((("low", "high"), "generalised"), (("low_f", "high_f"), "F")):
         expected = icc(made, "A,k", method=method)  # type: ignore[arg-type]
         assert tuple(row[list(ends)]) == pytest.approx((expected.low, expected.high))
-    assert "Low (generalised)" in found.heads
+    people = np.degrees(made.mean(axis=1))
+    assert tuple(row[["mean", "sd", "people"]]) == pytest.approx(
+        (people.mean(), people.std(ddof=1), 10)
+    )
+    assert {"Low (generalised)", "Mean", "SD", "n (people)"} <= set(found.heads)
     assert "output" not in found.shown  # name in code

@@ -18,7 +18,6 @@ from impc.studies.selection.fisher import (
     common_scaling,
     fisher_information,
     largest_subsets,
-    null_directions,
     subset_variances,
     unseen_scalings,
 )
@@ -80,9 +79,6 @@ def test_rank_and_what_is_not_seen() -> None:
     before, after = (MODEL.simulate(theta, TRIALS[0].input) for theta in (NOMINAL, moved))
     assert 1 - np.sum((after - before) ** 2) / np.sum(before**2) > 0.9999999
     assert common_scaling(MODEL, FOUND, ("Kvis",)) > 100
-    identified = null_directions(MODEL, FOUND)
-    assert len(identified) == 4
-    assert any({"Kvis", "Kvcr", "Kccr"} <= set(item.shares) for item in identified)
 
 
 @pytest.mark.parametrize("bound", [0.05, 0.25, 0.95])

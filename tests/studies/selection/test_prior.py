@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from impc.cli.main import main
 from impc.errors import InputError
 from impc.studies.selection.estimation import PriorFit, estimate, estimate_with_prior
 from impc.studies.selection.model import ParametricModel, Trial, parametric_model
-from impc.studies.selection.report import _note, read_truths
+from impc.studies.selection.report import note_of, read_truths
 from tests.studies.selection.test_methods import MINE, blood_study
 
 RANGE, NOISE, SAMPLES = 10.0, 0.5, 150
@@ -100,12 +99,22 @@ def test_an_estimate_at_its_bound_has_a_one_sided_interval() -> None:
     assert found.fit.at_bound == (0,)
     assert found.high[0] == 1
     assert 0.8 < found.low[0] < 0.97
-    ends = float(found.low[0]), float(found.high[0])
-    assert _note(model, 0, found, *ends) == "one-sided: estimate at its upper limit"
-    assert _note(model, 0, found, -0.9, 0.9) == ""
-    assert _note(model, 0, found, -1.0, 1.0) == "not determined"
-    inner = replace(found, fit=replace(found.fit, at_bound=()))
-    assert _note(model, 0, inner, -1.0, 0.2) == "one-sided: ends at the lower limit"
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "note"),
+    [
+        (50, 10, 90, ""),
+        (100, 90, 100, "one-sided: ends at the upper limit; estimate at a limit"),
+        (30, 0, 60, "one-sided: ends at the lower limit"),
+        (0, 0, 100, "not determined; estimate at a limit"),
+        (50, 0, 100, "not determined"),
+    ],
+)
+def test_a_note_says_what_reaches_the_search_range(
+    value: float, low: float, high: float, note: str
+) -> None:
+    assert note_of(value, low, high) == note
 
 
 def test_a_parameter_without_effect_is_not_determined() -> None:
