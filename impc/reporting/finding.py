@@ -82,9 +82,7 @@ class Finding:
     def heads(self) -> list[str]:
         """Column headings on the page."""
         words = {name: name.replace("percent", "(%)").replace("_", " ") for name in self.shown}
-        heads = [self.labels.get(name, words[name]) for name in self.shown]
-        kept = map(re.compile(r"p(_|$)").match, self.shown)  # p-values stay lower-case
-        return [one if p else sentence_case(one) for one, p in zip(heads, kept, strict=True)]
+        return [sentence_case(self.labels.get(name, words[name])) for name in self.shown]
 
     @property
     def rows(self) -> list[list[str]]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
 from impc.reporting.style import (
     BLUE,
     HALF,
@@ -73,7 +73,7 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
     words = cohort.name(cohort.measure)
-    ax.set_xlabel(f"{words[:1].upper()}{words[1:]} ({cohort.unit(cohort.measure)})", loc="left")
+    ax.set_xlabel(f"{sentence_case(words)} ({cohort.unit(cohort.measure)})", loc="left")
     ax.xaxis.set_label_position("top")
     return figure
 
@@ -98,7 +98,7 @@ def subject_figure(fit: Mapping[str, Any], narrow: bool) -> Figure:
     for index, ax in enumerate(axes):
         factor, unit = fit["shown_units"][index]
         words = fit["words"].get(fit["outputs"][index], fit["outputs"][index])
-        strip(ax, f"{words[:1].upper()}{words[1:]} ({unit})")
+        strip(ax, f"{sentence_case(words)} ({unit})")
         ax.plot(time, factor * recorded[: len(time), index], color=RECORDED, linewidth=4.5)
         ax.plot(time, factor * simulated[: len(time), index], color=BLUE)
     axes[-1].set_xlabel("Time (s)")

@@ -14,7 +14,7 @@ from impc.files.checks import FELL
 from impc.reporting.document import Block, Check, Checks, Copy, Lines, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key, Verdict
 from impc.reporting.writer import write_files
 from impc.studies.cohort.figures import forest, subject_figure
@@ -111,7 +111,7 @@ def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -
         "95 % CI; a fit with a wide interval counts little. Lines that reach the edge go on. "
         "Hollow: not determined. Square: far from the others of its group, look at this fit."
     )
-    alternative = f"{name[:1].upper()}{name[1:]} of every person, by group, with intervals"
+    alternative = f"{sentence_case(name)} of every person, by group, with intervals"
     return Report(
         "impc cohort", "cohort report", verdict,
         [
