@@ -190,9 +190,9 @@ class Estimate(Frozen):
     >>> found.status.sentence
     'The weights reproduce the recordings to a relative error of 1e-9.'
     >>> found.intervals().round(3)
-                unit  value    low   high  identified  determined
+                unit  value    low   high  determined
     name
-    K.u[0].x[0]   SI  0.538  0.538  0.538        True        True
+    K.u[0].x[0]   SI  0.538  0.538  0.538        True
     >>> found.vaf, found.outputs[0].shape
     (array([100.]), (21, 1))
     """

@@ -18,7 +18,7 @@ import pandas as pd
 
 from impc.files.spreadsheet import as_data
 from impc.files.table import in_columns
-from impc.reporting.rendering import fixed, number, sentence_case
+from impc.reporting.rendering import fixed, p_value, sentence_case
 
 T = TypeVar("T")
 
@@ -132,5 +132,5 @@ def _shown(column: str, value: Any, digits: int) -> str:
     if not isinstance(value, float | np.floating):
         return str(value)
     if re.match(r"p(_|$)", column):
-        return "< 0.001" if value < 1e-3 else number(float(value), 2)
+        return p_value(float(value))
     return fixed(float(value), digits)

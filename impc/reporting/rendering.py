@@ -115,6 +115,11 @@ def probability(value: float) -> str:
     return "p < 0.001" if value < 1e-3 else f"p = {number(value, 2)}"
 
 
+def p_value(value: float) -> str:
+    """Format a p-value as statistics programs do: three digits, no zero before the point."""
+    return "< .001" if value < 1e-3 else f"{value:.3f}".replace("0.", ".", 1)
+
+
 def fixed(value: float, digits: int = 3) -> str:
     """Format as `number` does, but keep trailing zeros (13.0)."""
     text = number(value, digits)

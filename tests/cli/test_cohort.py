@@ -152,6 +152,7 @@ def test_going_on_repeats_nothing(study: Path, undisturbed: Path) -> None:
     done = run_here(study, undisturbed, "--workers", "1")
     assert done.exit_code == 0, done.stderr
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+    assert "columns that the plant has no argument for: age (not used)" in done.stdout
 
 
 @contextmanager

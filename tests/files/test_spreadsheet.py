@@ -15,7 +15,8 @@ from impc.errors import DataError, InputError, OutputError
 from impc.files.formats import read_table, write_table
 from impc.files.spreadsheet import workbook_bytes
 from impc.files.table import make_table
-from impc.studies.cohort.sheet import column_values, read_sheet
+from impc.studies.cohort.participants import read_participants
+from impc.studies.cohort.sheet import read_sheet
 from tests.files.samples import ods_file, pushed_seat
 
 SEAT = pushed_seat(50)
@@ -157,7 +158,7 @@ def test_participants_in_a_workbook(tmp_path: Path, ending: str) -> None:
         book(path, rows)
     sheet = read_sheet(path)
     assert [row["subject"] for row in sheet.rows] == ["1", "2"]
-    assert column_values(sheet, "mass") == [79.7, 68.0]
+    assert [one.values["mass"] for one in read_participants(path).values()] == [79.7, 68.0]
     path.write_bytes(b"PK\x03\x04")
     with pytest.raises(InputError, match="is damaged and cannot be read"):
         read_sheet(path)

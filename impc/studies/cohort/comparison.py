@@ -1,60 +1,74 @@
-"""Comparison of groups and visits of a cohort, measure by measure.
+"""Comparison of groups, visits and conditions of a cohort, measure by measure.
 
-    two groups     Welch's t-test on subject means over visits, Hedges' g
-    two visits     paired t-test on subjects with both visits, d_z = mean / SD of the differences
-    both           Welch's t-test on the subjects' changes per visit
-    all visits     mixed model of cost weights within a structure: group, visit, subject
-    reliability    ICC(A,1) between visits
+A mean over people is that of a random-effects meta-analysis: each person counts by the inverse of
+the variance of the estimate plus the variance between people, after DerSimonian and Laird (Paule
+and Mandel's variance grows with few uncertain gains that are far off). Its standard error takes
+these shares p (of sum 1) as given, and the variances from the values y and mean m:
 
-A gain that the recordings of a unit do not identify is treated as missing (`not_identified`).
+    SE^2 = sum a (y - m)^2,    df = 1 / (sum p^2 + (sum a)^2 - sum a^2),    a = p^2 / (1 - p)
+
+(HC2 with Satterthwaite's degrees of freedom, Bell and McCaffrey 2002), but not below the error that
+the fits leave to a common value, (sum 1 / variance)^-1/2. With equal shares, as for measures
+without a standard error, the tests are Welch's and Student's. Hartung and Knapp's error is
+not used: a gain that the recordings do not determine stays near the start of the search, so that it
+deviates less than its variance says. In simulated groups of 5 to 20 people with a third of such
+fits their 95 % interval covers 85 to 92 %, this one 94 to 97 % (test_weighted_means.py).
+
+    group         means of people over visits, Welch's degrees of freedom; effect: Hedges' g
+    visit         people with both visits, mean of differences over their SD
+    condition     the same for two conditions
+    change        change per visit of people in two groups
+    reliability   ICC(A,1) between visits, not weighted
+
 P-values are also given after Holm's correction over the measures of one question.
 """
 
 from __future__ import annotations
 
 import itertools
-import warnings
+import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy.stats
-from statsmodels.regression.mixed_linear_model import MixedLM
+from statsmodels.stats.meta_analysis import combine_effects, effectsize_smd
 
+from impc.assess.covariance import TWO_SIDED
 from impc.assess.several_tests import holm
 from impc.checking import replace
-from impc.errors import DataError, one_line
+from impc.errors import DataError
 from impc.studies.reliability.icc import icc
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    import pandas as pd
+    from collections.abc import Collection, Iterable, Sequence
 
     from impc.arrays import Array
 
-    _Test = Callable[[pd.DataFrame, "Comparison"], "Comparison"]
-
-_FEWEST = 3
+_FEWEST = 3  # People in each mean
+_LEAST = 2.0  # People of equal shares to whom a mean must correspond, 1 / sum p^2
+_KNOWN = 1e9  # Degrees of freedom of a standard error that the fits state
 _COST_WEIGHT = "log_cost_weight."
-# Largest standard error over the median size of an entry. The unit's own value is not used, because
-# the remaining values would then be too large on average. Well identified small entries are kept:
-# entries with true value zero have a median size of 0.67 standard errors.
-_LARGEST = 2.0
+# Usual names of what the others are compared with.
+_USUAL = re.compile(r"(?<![^\W_])(eo|open|baseline|pre|control)(?![^\W_])", re.IGNORECASE)
+# Ratio of a gain to the median of its group, up or down, at which the fit is to be looked at.
+_FAR = 3.0
 
 
 @dataclass(frozen=True)
 class Comparison:
     """One comparison of one measure in one condition; missing numbers are NaN."""
 
-    question: str  # "group", "visit", "change", "mixed" or "reliability"
+    question: str  # "group", "visit", "condition", "change" or "reliability"
     measure: str
     condition: str
-    first: str = ""  # Compared groups or visits; empty for the reliability
+    first: str = ""  # Compared groups, visits or conditions; empty for the reliability
     second: str = ""
     estimate: float = np.nan  # Difference of means (second minus first), or ICC
     low: float = np.nan  # 95 % interval
     high: float = np.nan
+    between: float = np.nan  # SD between people, without the uncertainty of their fits
     effect: float = np.nan  # Hedges' g or d_z
     p: float = np.nan
     n: int = 0  # Number of subjects
@@ -62,162 +76,233 @@ class Comparison:
     note: str = ""  # Reason why there is no number
 
 
-def measures_of(units: pd.DataFrame) -> tuple[str, ...]:
+class Mean(NamedTuple):
+    """Weighted mean over people."""
+
+    n: int  # Number of people
+    value: float = np.nan
+    error: float = np.nan  # Standard error
+    freedom: float = np.nan  # Degrees of freedom of the error
+    between: float = np.nan  # Variance between people
+    spread: float = np.nan  # SD of the values
+    people: float = np.nan  # Number of people of equal shares to whom it corresponds
+
+    @property
+    def lacks(self) -> str:
+        """Reason why nothing is said about it; empty if there is none."""
+        if self.n < _FEWEST:
+            return f"too few subjects ({self.n})"
+        few = self.people < _LEAST
+        return "one subject counts for more than all others together" if few else ""
+
+    @property
+    def ends(self) -> Array:
+        """The lower end of the 95 % interval, the mean, and the upper end."""
+        reach = scipy.stats.t.ppf(0.975, self.freedom) * self.error
+        return np.asarray(self.value + reach * np.array([-1.0, 0.0, 1.0]))
+
+
+def weighted_mean(given: pd.Series[float], squares: pd.Series[float]) -> Mean:
+    """Mean of the values `given` of people, except NaN, with the `squares` of their errors.
+
+    Squares of zero give equal shares.
+    """
+    known = np.isfinite(given)
+    values, variances = np.asarray(given[known]), np.asarray(squares[known])
+    n = len(values)
+    if n < _FEWEST:
+        return Mean(n)
+    shares, between = np.full(n, 1 / n), float(np.var(values, ddof=1))
+    with np.errstate(divide="ignore", invalid="ignore"):  # equal values have no heterogeneity
+        if variances.any():
+            found = combine_effects(values, variances.clip(1e-12 * variances.max()), "dl")
+            between = max(float(found.tau2), 0.0)
+            shares = np.asarray(found.weights_rel_re if between else found.weights_rel_fe)
+        mean, of_squares = float(shares @ values), float(shares @ shares)
+        a, apart = shares**2 / (1 - shares), (values - mean) ** 2
+        freedom = float(1 / (of_squares + a.sum() ** 2 - a @ a))
+        spread = float(np.sqrt(shares @ apart / (1 - of_squares)))
+        error = float(np.sqrt(a @ apart))
+        least = float(np.sum(1 / variances) ** -0.5) if variances.any() else 0.0
+    if error < least:
+        error, freedom = least, _KNOWN
+    return Mean(n, mean, error, freedom, between, spread, 1 / of_squares)
+
+
+def measures_of(units: pd.DataFrame, inner: Collection[str] = ()) -> tuple[str, ...]:
     """Columns of the table `units` that are compared, independent of the data.
 
     Logarithms of cost weights within a structure (without one: cost weights of recorded outputs in
-    the analytic centre), gains on recorded outputs and their rates (all gains if no state has the
-    name of an output), and VAF. Gains on delay or muscle states are left out: they have little
-    meaning, and more measures reduce the power after Holm's correction.
+    the analytic centre), gains on recorded outputs and their rates (if no state has the name of an
+    output: all gains except on `inner` states), and VAF. More measures reduce the power after
+    Holm's correction.
     """
     outputs = [name.removeprefix("vaf.") for name in units.columns if name.startswith("vaf.")]
     shown = {*outputs, *(f"{name}_rate" for name in outputs)}
     gains = [name for name in units.columns if name.startswith("K.")]
     named = [name for name in gains if name.split(".", 2)[2] in shown]
+    others = [name for name in gains if name.split(".", 2)[2] not in inner]
     penalised = [name for name in units.columns if name.startswith(_COST_WEIGHT)]
     centre = [name for name in units.columns if name in {f"centre_weight.{o}" for o in outputs}]
     shares = [name for name in units.columns if name.startswith("vaf.")]
-    return (*penalised, *(named or gains), *(() if penalised else centre), *shares)
+    return (*penalised, *(named or others), *(() if penalised else centre), *shares)
 
 
-def compare_cohort(units: pd.DataFrame) -> tuple[Comparison, ...]:
-    """All possible comparisons; gains that a unit does not identify are missing."""
+def interval_of(units: pd.DataFrame, measure: str) -> pd.DataFrame:
+    """Columns value, low and high of a measure; without ends they are NaN."""
+    kind, _, rest = measure.partition(".")
+    value = units[measure].astype(float)
+    ends = {end: units.get(f"{kind}_{end}.{rest}", value * np.nan) for end in ("low", "high")}
+    return pd.DataFrame({"value": value, **ends}).astype(float)
+
+
+def _variances(units: pd.DataFrame, measure: str) -> pd.Series[float]:
+    """Squares of the standard errors of a measure; zeros for a measure without."""
+    kind, _, rest = measure.partition(".")
+    given = units.get(f"{kind}_deviation.{rest}")
+    if given is not None:
+        return given.astype(float) ** 2
+    ends = interval_of(units, measure)
+    if ends["low"].notna().any():
+        return ((ends["high"] - ends["low"]) / (2 * TWO_SIDED)) ** 2
+    return pd.Series(0.0, units.index)
+
+
+def _people(part: pd.DataFrame, measure: str, along: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Values and variances by subject and the column `along`: weighted means of their units.
+
+    Without a standard error (infinite or unknown) a value is NaN and its variance infinite.
+    """
+    variances = _variances(part, measure)
+    equal = not variances.fillna(1.0).any()
+    weight = (1.0 + variances) if equal else (1 / variances.clip(lower=1e-300)).fillna(0.0)
+    rows = part[["subject", along]].assign(weight=weight, times=weight * part[measure])
+    sums = rows.dropna(subset=["times"]).groupby(["subject", along])[["weight", "times"]].sum()
+    weights, times = (sums[name].unstack(along) for name in ("weight", "times"))
+    return times / weights, (0 if equal else 1) / weights
+
+
+def mean_of(part: pd.DataFrame, measure: str) -> Mean:
+    """Mean of a measure over the people of the rows `part`."""
+    values, variances = _people(part.assign(all="all"), measure, "all")
+    return weighted_mean(values["all"], variances["all"]) if len(values) else Mean(0)
+
+
+def in_order(names: Iterable[str], reference: str) -> list[str]:
+    """Distinct names that are not empty; the reference comes first."""
+    given = [name for name in dict.fromkeys(names) if name]
+    first = [reference] if reference in given else [one for one in given if _USUAL.search(one)]
+    return [*first[:1], *(name for name in given if name not in first[:1])]
+
+
+def compare_cohort(
+    units: pd.DataFrame, reference: str = "", inner: Collection[str] = ()
+) -> tuple[Comparison, ...]:
+    """All possible comparisons, with p-values corrected over the measures of each question."""
     if len(units) == 0:
         return ()
-    chosen = measures_of(units)
-    penalised = [name for name in chosen if name.startswith(_COST_WEIGHT)]
-    found: list[Comparison] = []
-    for label, part in only_identified(units).groupby("condition", sort=True, dropna=False):
-        condition, visits = str(label), list(dict.fromkeys(part["visit"]))
-        between: dict[str, tuple[_Test, Sequence[str]]] = {"group": (_groups, chosen)}
-        if len(visits) > 1:
-            between |= {"change": (_changes, chosen), "mixed": (_mixed, penalised)}
-        for pair in itertools.combinations(sorted(set(part["group"]) - {""}), 2):
-            for question, (test, names) in between.items():
-                asked = [Comparison(question, name, condition, *pair) for name in names]
-                found += _holm([test(part, one) for one in asked])
-        for pair in itertools.combinations(visits, 2):
-            asked = [Comparison("visit", name, condition, *pair) for name in chosen]
-            found += _holm([_visits(part, one) for one in asked])
-        if len(visits) > 1:
-            found += [_reliable(part, Comparison("reliability", name, condition))
-                      for name in chosen]  # fmt: skip
+    chosen, found = measures_of(units, inner), list[Comparison]()
+
+    def ask(question: str, condition: str, names: Iterable[str]) -> None:
+        for pair in itertools.combinations(in_order(names, reference), 2):
+            asked = (Comparison(question, name, condition, *pair) for name in chosen)
+            tests = [difference_of(units, one, reference) for one in asked]
+            corrected = holm(np.array([item.p for item in tests])).tolist()
+            found.extend(map(lambda one, p: replace(one, p_holm=p), tests, corrected))
+
+    for condition, part in units.groupby("condition"):
+        name, groups, visits = str(condition), sorted(set(part["group"])), part["visit"]
+        several = visits.nunique() > 1
+        ask("group", name, groups)
+        ask("change", name, groups if several else ())
+        ask("visit", name, visits)
+        if several:
+            found += [_reliable(part, Comparison("reliability", one, name)) for one in chosen]
+    ask("condition", "", sorted(set(units["condition"])))
     return tuple(found)
 
 
-def _groups(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    means = part.groupby(["group", "subject"])[asked.measure].mean().dropna()
-    return _welch(asked, *(np.asarray(means.get(name, [])) for name in (asked.first, asked.second)))
+def difference_of(units: pd.DataFrame, asked: Comparison, reference: str) -> Comparison:
+    """A comparison as `asked`, in the table `units`."""
+    pair, along = [asked.first, asked.second], asked.question
+    part = units if along == "condition" else units[units["condition"] == asked.condition]
+    if along == "change":
+        values, variances = _changes(part, asked.measure, reference)
+    else:
+        values, variances = _people(part, asked.measure, along)
+    values, variances = values.reindex(columns=pair), variances.reindex(columns=pair)
+    samples = [(values[name], variances[name]) for name in pair]
+    if along in ("visit", "condition"):
+        samples = [(values[pair[1]] - values[pair[0]], variances.sum(axis=1, skipna=False))]
+    asked = replace(asked, n=sum(int(variance.notna().sum()) for _, variance in samples))
+    return t_test(asked, [weighted_mean(*sample) for sample in samples])
 
 
-def _welch(asked: Comparison, a: Array, b: Array) -> Comparison:
-    if min(len(a), len(b)) < _FEWEST:
-        return _nothing(asked, len(a) + len(b))
-    return _tested(asked, scipy.stats.ttest_ind(b, a, equal_var=False), b.mean() - a.mean(),
-                   _hedges(a, b), len(a) + len(b))  # fmt: skip
+def t_test(asked: Comparison, means: Sequence[Mean]) -> Comparison:
+    """t-test of the difference between two means (the second minus the first), or of one mean."""
+    squares = np.array([mean.error**2 for mean in means])
+    notes = [mean.lacks for mean in means if mean.lacks]
+    if notes or not squares.any():
+        return replace(asked, note=(*notes, "all subjects have the same value")[0])
+    each, error = np.array([mean.freedom for mean in means]), float(np.sqrt(squares.sum()))
+    freedom = float(squares.sum() ** 2 / np.sum(squares**2 / each))
+    estimate, effect = means[0].value, means[0].value / means[0].spread
+    if len(means) == 2:
+        first, second = means
+        estimate = second.value - first.value
+        effect, _ = effectsize_smd(second.value, second.spread, second.n,
+                                   first.value, first.spread, first.n)  # fmt: skip
+    reach = float(scipy.stats.t.ppf(0.975, freedom)) * error
+    return replace(
+        asked, estimate=estimate, low=estimate - reach, high=estimate + reach,
+        between=float(np.sqrt(np.mean([mean.between for mean in means]))), effect=float(effect),
+        p=2 * float(scipy.stats.t.sf(abs(estimate) / error, freedom)),
+    )  # fmt: skip
 
 
-def _tested(asked: Comparison, test: Any, estimate: float, effect: float, n: int) -> Comparison:
-    """Comparison with the results of a t-test of SciPy."""
-    low, high = map(float, test.confidence_interval(0.95))
-    return replace(asked, estimate=float(estimate), low=low, high=high, effect=float(effect),
-                   p=float(test.pvalue), n=n)  # fmt: skip
-
-
-def _visits(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    wide = part.pivot_table(index="subject", columns="visit", values=asked.measure)
-    wide = wide.reindex(columns=[asked.first, asked.second]).dropna()
-    if len(wide) < _FEWEST:
-        return _nothing(asked, len(wide))
-    difference = np.asarray(wide[asked.second] - wide[asked.first])
-    mean, spread = difference.mean(), difference.std(ddof=1)
-    effect = mean / spread if spread else np.nan
-    return _tested(asked, scipy.stats.ttest_1samp(difference, 0.0), mean, effect, len(wide))
-
-
-def _changes(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    """Welch's t-test on each subject's change per visit (least-squares slope over visits)."""
-    place = {visit: index for index, visit in enumerate(dict.fromkeys(part["visit"]))}
-    slopes: dict[str, list[float]] = {asked.first: [], asked.second: []}
-    for (group, _), rows in part.dropna(subset=[asked.measure]).groupby(["group", "subject"]):
-        if group in slopes and rows["visit"].nunique() > 1:
-            visits = [place[visit] for visit in rows["visit"]]
-            slopes[group].append(float(np.polyfit(visits, rows[asked.measure], 1)[0]))
-    return _welch(asked, *map(np.array, slopes.values()))
-
-
-def _mixed(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    """Group effect in a mixed model with visit effects and subject intercepts (REML)."""
-    pair = [asked.first, asked.second]
-    rows = part[part["group"].isin(pair)].dropna(subset=[asked.measure])
-    each = rows.groupby("group")["subject"].nunique().reindex(pair, fill_value=0)
-    n = int(each.sum())
-    if each.min() < _FEWEST:
-        return _nothing(asked, n)
-    visits = list(dict.fromkeys(rows["visit"]))[1:]
-    second = [rows["group"] == asked.second, *(rows["visit"] == visit for visit in visits)]
-    design = [np.ones(len(rows)), *(one.to_numpy(float) for one in second)]
-    with warnings.catch_warnings(record=True) as raised:
-        warnings.simplefilter("always")
-        scores = np.asarray(rows[asked.measure], float)
-        fitted = MixedLM(scores, np.transpose(design), rows["subject"]).fit(reml=True)
-    effect, error = float(fitted.params[1]), float(fitted.bse[1])
-    if not (np.isfinite(error) and error > 0) or not fitted.converged:
-        why = "; ".join(str(item.message) for item in raised[:1]) or "no standard error"
-        note = f"the mixed model did not converge ({one_line(why)[:60]})"
-        return replace(asked, n=n, note=note)
-    # n - 2 degrees of freedom between subjects: exact if every subject has all visits.
-    reach = float(scipy.stats.t.ppf(0.975, n - 2)) * error
-    p = 2 * float(scipy.stats.t.sf(abs(effect) / error, n - 2))
-    return replace(asked, estimate=effect, low=effect - reach, high=effect + reach, p=p, n=n)
+def _changes(part: pd.DataFrame, measure: str, reference: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Change per visit (least-squares slope over visits) of each subject, by group."""
+    visits = in_order(part["visit"], reference)
+    values, variances = (table[visits] for table in _people(part, measure, "visit"))
+    place = (values.notna() * np.arange(len(visits))).where(values.notna())
+    place = place.sub(place.mean(axis=1), axis=0)
+    weight = place.div((place**2).sum(axis=1), axis=0)
+    found = pd.DataFrame({
+        "value": (weight * values).sum(axis=1, min_count=2),
+        "variance": (weight**2 * variances).sum(axis=1, min_count=2),
+    })  # fmt: skip
+    found = found.join(part.groupby("subject")["group"].first()).set_index("group", append=True)
+    return found["value"].unstack("group"), found["variance"].unstack("group")
 
 
 def _reliable(part: pd.DataFrame, asked: Comparison) -> Comparison:
-    wide = part.pivot_table(index="subject", columns="visit", values=asked.measure)
+    values, _ = _people(part, asked.measure, "visit")
     try:
-        found = icc(wide.to_numpy(), "A,1")
+        found = icc(values.to_numpy(), "A,1")
     except DataError:
-        return _nothing(asked, len(wide.dropna()))
+        n = len(values.dropna())
+        return replace(asked, n=n, note=f"too few subjects ({n})")
     return replace(asked, estimate=found.value, low=found.low, high=found.high, n=found.subjects)
 
 
-def _hedges(a: Array, b: Array) -> float:
-    """Hedges' g: difference divided by the pooled SD, corrected for small samples."""
-    freedom = len(a) + len(b) - 2
-    pooled = np.sqrt(((len(a) - 1) * a.var(ddof=1) + (len(b) - 1) * b.var(ddof=1)) / freedom)
-    if pooled == 0:
-        return float("nan")
-    return float((b.mean() - a.mean()) / pooled * (1 - 3 / (4 * freedom - 1)))
+def outlying(units: pd.DataFrame, measures: Collection[str]) -> pd.Series[float]:
+    """Ratio of a gain of each unit to its group's median if it is far from 1, else NaN.
 
-
-def _nothing(asked: Comparison, n: int) -> Comparison:
-    return replace(asked, n=n, note=f"too few subjects ({n})")
-
-
-def _holm(found: list[Comparison]) -> list[Comparison]:
-    corrected = holm(np.array([item.p for item in found]))
-    return [replace(item, p_holm=float(p)) for item, p in zip(found, corrected, strict=True)]
-
-
-def not_identified(units: pd.DataFrame) -> dict[str, int]:
-    """Number of units that do not identify a gain, by its column; zero counts are omitted.
-
-    An entry is identified if its standard error is at most twice the median size of the entry over
-    all units with a standard error. The standard error includes unidentified directions
-    (`GainCovariance.entries`).
+    Far is above 3, or below a third with an interval that excludes the median. Gains whose median
+    is below twice the median of their standard errors are not looked at.
     """
-    gains = units.filter(regex=r"^K\.")
-    lost = (only_identified(units)[gains.columns].isna() & gains.notna()).sum()
-    return {str(name): int(count) for name, count in lost.items() if count}
-
-
-def only_identified(units: pd.DataFrame) -> pd.DataFrame:
-    """The table `units` with NaN for gains that a unit does not identify."""
-    kept = units.copy()
-    for name in units.columns:
-        beside = f"K_deviation{name[1:]}"
-        if name.startswith("K.") and beside in units.columns:
-            deviation = units[beside].astype(float)
-            usual = units[name].astype(float).abs()[np.isfinite(deviation)].median()
-            kept[name] = units[name].where(deviation <= _LARGEST * usual)
-    return kept
+    found = pd.Series(np.nan, units.index)
+    for name in measures:
+        if not name.startswith("K."):
+            continue
+        ends = interval_of(units, name)
+        table = ends.assign(error=np.sqrt(_variances(units, name)))
+        usual = table.groupby([units["condition"], units["group"]])
+        median = usual["value"].transform("median")
+        excluded = (ends["low"] > median) | (ends["high"] < median)
+        ratio = ends["value"] / median
+        far = (ratio > _FAR) | ((ratio < 1 / _FAR) & excluded)
+        far &= median.abs() > 2 * usual["error"].transform("median")
+        far &= usual["value"].transform("count") >= _FEWEST
+        found = found.where(found.notna() | ~far, ratio)
+    return found

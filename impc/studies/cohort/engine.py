@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from impc.studies.pool import Pool, Result
 
 # Entries of a fit that its replicates need.
-_NEEDED = ("starts", "logarithms", "errors", "K", "S", "Q", "R")
+_NEEDED = ("starts", "logarithms", "errors", "added", "K", "S", "Q", "R")
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,22 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.stats
 
-from impc.reporting.rendering import number
-from impc.reporting.style import BLUE, HALF, INK, MUTED, PHONE, RECORDED, RULE, new_figure, strip
-from impc.studies.cohort.verdict import LOGARITHM
+from impc.reporting.rendering import number, sentence_case
+from impc.reporting.style import (
+    BLUE,
+    HALF,
+    INK,
+    MUTED,
+    PHONE,
+    RECORDED,
+    RULE,
+    VERMILLION,
+    new_figure,
+    strip,
+)
+from impc.studies.cohort.comparison import mean_of
+from impc.studies.cohort.results import LOGARITHM
 from impc.studies.fit.facts import between
 
 if TYPE_CHECKING:
@@ -19,58 +30,57 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from impc.arrays import Array
-    from impc.studies.cohort.verdict import Cohort
+    from impc.studies.cohort.results import Cohort
 
 _NAMED = 45  # Largest number of rows with names of subjects
 
 
 def forest(cohort: Cohort, narrow: bool) -> Figure:
     """Forest plot: one row per unit with its interval, and the mean of each group or visit."""
-    lead, units = cohort.lead, cohort.units.join(cohort.ends)
-    units = units if lead is None else units[units["condition"] == lead.condition]
-    label = "visit" if lead is not None and lead.question == "visit" else "group"
-    blocks = units.sort_values("shown", ascending=False).groupby(label)
+    lead, units = cohort.lead, cohort.units.join(cohort.ends).assign(far=cohort.far)
+    label = lead.question if lead is not None and lead.question in units else "group"
+    if lead is not None and label != "condition":
+        units = units[units["condition"] == lead.condition]
+    blocks = units.sort_values("value", ascending=False).groupby(label)
     rows = len(units) + len(blocks)
     figure = new_figure(PHONE if narrow else HALF, float(np.clip(0.9 + 0.16 * rows, 2.6, 6.4)))
     ax, at = figure.subplots(), 0.0
     if cohort.measure.startswith(LOGARITHM):
         ax.set_xscale("log")
-    column = "value" if units["value"].count() > 2 else "shown"
-    low, high = ax.xaxis.get_transform().transform([units[column].min(), units[column].max()])
+    # The axis shows all values that are determined.
+    seen = units["value"][units["determined"]] if units["determined"].sum() > 2 else units["value"]
+    low, high = ax.xaxis.get_transform().transform([seen.min(), seen.max()])
     pad = 0.6 * (high - low) or 1.0  # wider intervals are cut off
     ax.set_xlim(*ax.xaxis.get_transform().inverted().transform([low - pad, high + pad]))
     across: Any = {"transform": ax.get_yaxis_transform(), "va": "center"}
     for block, part in blocks:
         title = f"{label.capitalize()} {block!s}" if block else "All people"
         ax.text(0, at, title, weight="bold", **across)
-        means = part.groupby("subject")["value"].mean().dropna().to_numpy(float)
-        if len(means) > 1:
-            _mean(ax, means, at, len(part), cohort.measure.startswith(LOGARITHM), across)
+        mean = mean_of(part.loc[part.index.isin(cohort.usable.index)], cohort.measure)
+        if not mean.lacks:
+            _mean(ax, cohort.shown(cohort.measure, mean.ends), at, len(part), across)
         for row in part.to_dict("records"):
             at -= 1
             if rows <= _NAMED:
                 ax.text(-0.015, at, row["subject"], ha="right", fontsize=9, color=MUTED, **across)
             ax.plot([row["low"], row["high"]], [at, at], color=BLUE, linewidth=1.3)
-            known = np.isfinite(row["value"])
-            shown = row["value"] if known else np.clip(row["shown"], *ax.get_xlim())
-            ax.plot(shown, at, "o", color=BLUE if known else MUTED, markersize=4.5,
-                    markerfacecolor=BLUE if known else "none")  # fmt: skip
+            known, far = row["determined"], np.isfinite(row["far"])
+            colour = VERMILLION if far else BLUE if known else MUTED
+            ax.plot(np.clip(row["value"], *ax.get_xlim()), at, "s" if far else "o", color=colour,
+                    markersize=4.5, markerfacecolor=colour if known else "none")  # fmt: skip
         at -= 1.6
     ax.set_ylim(at + 0.8, 0.9)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
     words = cohort.name(cohort.measure)
-    ax.set_xlabel(f"{words[:1].upper()}{words[1:]} ({cohort.unit(cohort.measure)})", loc="left")
+    ax.set_xlabel(f"{sentence_case(words)} ({cohort.unit(cohort.measure)})", loc="left")
     ax.xaxis.set_label_position("top")
     return figure
 
 
-def _mean(ax: Axes, means: Array, at: float, rows: int, ratio: bool, across: Any) -> None:
+def _mean(ax: Axes, ends: Array, at: float, rows: int, across: Any) -> None:
     """Draw the mean over people with its interval behind their rows."""
-    own = np.log(means) if ratio else means
-    reach = scipy.stats.t.ppf(0.975, len(own) - 1) * scipy.stats.sem(own)
-    ends = own.mean() + reach * np.array([-1.0, 0.0, 1.0])
-    low, value, high = np.exp(ends) if ratio else ends
+    low, value, high = ends
     height = [at - rows - 0.3, at - 0.5]
     ax.fill_betweenx(height, low, high, color=RULE, linewidth=0, zorder=0)
     ax.plot([value, value], height, color=INK, linewidth=1.2, zorder=1)
@@ -88,7 +98,7 @@ def subject_figure(fit: Mapping[str, Any], narrow: bool) -> Figure:
     for index, ax in enumerate(axes):
         factor, unit = fit["shown_units"][index]
         words = fit["words"].get(fit["outputs"][index], fit["outputs"][index])
-        strip(ax, f"{words[:1].upper()}{words[1:]} ({unit})")
+        strip(ax, f"{sentence_case(words)} ({unit})")
         ax.plot(time, factor * recorded[: len(time), index], color=RECORDED, linewidth=4.5)
         ax.plot(time, factor * simulated[: len(time), index], color=BLUE)
     axes[-1].set_xlabel("Time (s)")

@@ -11,18 +11,17 @@ from markupsafe import Markup
 
 from impc.checking import replace
 from impc.files.checks import FELL
-from impc.model.plant import UNKNOWN
 from impc.reporting.document import Block, Check, Checks, Copy, Lines, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
-from impc.reporting.rendering import number
+from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key, Verdict
 from impc.reporting.writer import write_files
-from impc.studies.cohort.comparison import measures_of, not_identified
 from impc.studies.cohort.figures import forest, subject_figure
+from impc.studies.cohort.results import LOGARITHM, Cohort
 from impc.studies.cohort.study import safe_name
 from impc.studies.cohort.tables import cohort_tables, or_nan
-from impc.studies.cohort.verdict import LOGARITHM, Cohort, cohort_verdict
+from impc.studies.cohort.verdict import cohort_verdict
 from impc.studies.fit.facts import between
 
 if TYPE_CHECKING:
@@ -39,17 +38,18 @@ _BESIDE = {
 _QUESTIONS = {
     "group": "between groups",
     "visit": "between visits",
+    "condition": "between conditions",
     "change": "change per visit, between groups",
-    "mixed": "between groups, over all visits (mixed model)",
     "reliability": "ICC(A,1) between visits",
 }
 _METHODS = (
     "The recordings of {people} people were analysed by inverse model predictive control, one fit "
-    "for each person, visit and condition. Groups were compared by Welch's t-test on the means of "
-    "people over their visits (effect size: Hedges' g), visits by paired t-tests (Cohen's d of the "
-    "differences). P-values were corrected by Holm's method over the measures of one question. "
-    "Gains with a standard error above twice the median size of that gain were treated as not "
-    "identified and left out."
+    "for each person, visit and condition. Means over people are those of a random-effects "
+    "meta-analysis: each fit counts by the inverse of its variance plus the variance between "
+    "people (DerSimonian and Laird), with robust standard errors (HC2) and Satterthwaite's degrees "
+    "of freedom. Groups were compared on the means of people over their visits (effect size: "
+    "Hedges' g), visits and conditions by the differences of each person (Cohen's d). "
+    "P-values were corrected by Holm's method over the measures of one question."
 )
 #: Name of a level -> badge of a fit in a table, and the level; worst last.
 _BADGES = {
@@ -74,15 +74,17 @@ def write_report(
         page = _subject_page(subject, own, store, failures)
         write_files(store.folder, {_address(subject): page.page().encode()})
     described = next((fit for unit in study.units if (fit := store.fit(unit.name))), {})
-    cohort = Cohort(tables["units"], described, failures.units)
-    lost, measures = not_identified(cohort.units), measures_of(cohort.units)
+    cohort = Cohort(tables["units"], described, failures.units, study.reference)
+    known = {name: cohort.units.get(f"K_determined{name[1:]}") for name in cohort.measures}
+    unknown = {name: len(one) - int(one.sum()) for name, one in known.items() if one is not None}
     data = {
         "units": len(study.units),
         "fitted": len(cohort.units),
         "failed": failures.units,
         "failed_replicates": failures.replicates,
         "digests": store.digests,
-        "not_identified": {name: count for name, count in lost.items() if name in measures},
+        "not_determined": {name: count for name, count in unknown.items() if count},
+        "outliers": list(cohort.units["unit"][cohort.far.notna()]) if cohort.outliers else [],
     }
     beside = [Finding(name, table, _BESIDE[name]) for name, table in tables.items()]
     report = _page(study, cohort, _checks(study, store, failures, cohort), command)
@@ -106,14 +108,15 @@ def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -
         copied = Copy(_METHODS.format(people=people), results)
     caption = (
         "One row per fit, with its 95 % CI if there is one. Grey band: mean of the people with its "
-        "95 % CI. Lines that reach the edge go on. Hollow: not identified, and not compared."
+        "95 % CI; a fit with a wide interval counts little. Lines that reach the edge go on. "
+        "Hollow: not determined. Square: far from the others of its group, look at this fit."
     )
-    alternative = f"{name[:1].upper()}{name[1:]} of every person, by group, with intervals"
+    alternative = f"{sentence_case(name)} of every person, by group, with intervals"
     return Report(
         "impc cohort", "cohort report", verdict,
         [
             Section("Comparisons", compared or ["None: there is one group and one visit only."]),
-            Section("Subjects", [_subjects(study, cohort)]),
+            Section("Subjects", [subjects(study, cohort)]),
             Section("Checks", [Checks(checks)]),
             Section("Provenance", [Terms([("Recordings", recordings), *provenance.terms])]),
         ],
@@ -131,15 +134,14 @@ def _address(subject: str) -> str:
 
 
 def _keys(cohort: Cohort) -> list[Key]:
-    (name, known, of), fits = cohort.identified, len(cohort.units)
+    (name, known, of), fits = cohort.determined, len(cohort.units)
     keys = []
     if cohort.lead is not None:
-        value, ends = cohort.amount(cohort.lead)
-        first, _, unit = value.partition(" ")
+        value, ends, unit = cohort.amount(cohort.lead)
         what = f"difference, {cohort.name(cohort.lead.measure)}"
-        keys = [Key(first, unit, what, f"95 % CI {ends}")]
+        keys = [Key(value, unit, what, f"95 % CI {ends}")]
     if name:
-        keys.append(Key(f"{known} of {of}", "people", f"{name} identified", "others: not compared"))
+        keys.append(Key(f"{known} of {of}", "people", f"{name} determined", "others count little"))
     return [*keys, Key(f"{cohort.warned} of {fits}", "fits", "with a warning", "see Subjects")]
 
 
@@ -147,18 +149,21 @@ def comparisons(cohort: Cohort) -> Finding:
     """Table of all comparisons; logarithms are shown as ratios."""
     rows = []
     for item in cohort.compared:
-        ends, unit = np.array([item.estimate, item.low, item.high]), cohort.unit(item.measure)
+        own = np.array([item.estimate, item.low, item.high])
+        ends, unit = cohort.shown(item.measure, own), cohort.unit(item.measure)
+        si = cohort.plant_unit(item.measure)
         if item.question == "reliability":
-            unit = "-"
+            ends, unit, si = own, "-", "-"
         elif item.measure.startswith(LOGARITHM):
-            ends, unit = np.exp(ends), "ratio"
+            unit = "ratio"
         rows.append({
             "measure": cohort.name(item.measure), "question": _QUESTIONS[item.question],
             "condition": item.condition,
             "compared": f"{item.second} - {item.first}" if item.first else "",
             **dict(zip(("difference", "low", "high"), map(float, ends), strict=True)),
-            "unit": unit, "n": item.n, "effect": item.effect, "p": item.p, "p_holm": item.p_holm,
-            "note": item.note,
+            "unit": unit, "n": item.n, "sd_between": item.between * cohort.scale(item.measure),
+            "effect": item.effect, "p": item.p, "p_holm": item.p_holm, "note": item.note,
+            "difference_si": item.estimate, "low_si": item.low, "high_si": item.high, "unit_si": si,
         })  # fmt: skip
     table = pd.DataFrame(rows)
     weights = (
@@ -167,23 +172,27 @@ def comparisons(cohort: Cohort) -> Finding:
         else "Central cost weights are a convention, the same for all people: compare gains first."
     )
     caption = (
-        "Difference of means (second minus first) or ICC(A,1), with 95 % CI. Effect: Hedges' g; "
-        "between visits Cohen's d of the differences. n: number of people. p (Holm): corrected "
-        f"over the measures of one question. {weights}"
+        "Difference of means (second minus first) or ICC(A,1), with 95 % CI. n: number of people. "
+        "SD: how much people differ, without the uncertainty of their fits. Effect: Hedges' g; "
+        "between visits or conditions Cohen's d of the differences. p_holm: corrected over the "
+        f"measures of one question. {weights}"
     )
     heads = ("question", "condition", "compared", "note")
     return Finding(
         "comparisons", table, caption, digits=3,
         folded="All comparisons in numbers" if len(table) > 12 else "",
-        labels={**_INTERVAL, "p_holm": "p (Holm)"},
-        hidden=[name for name in heads if table[name].nunique() < 2],
+        labels={**_INTERVAL, "p_holm": "p_holm", "sd_between": "SD between people"},
+        hidden=[
+            *(name for name in heads if table[name].nunique() < 2),
+            *("difference_si", "low_si", "high_si", "unit_si"),
+        ],
     )  # fmt: skip
 
 
-def _subjects(study: Study, cohort: Cohort) -> Finding:
+def subjects(study: Study, cohort: Cohort) -> Finding:
     """Table of all units with a badge and a link to their pages."""
     rows, name = [], cohort.name(cohort.measure)
-    found = cohort.units.join(cohort.ends) if cohort.measure else cohort.units
+    found = cohort.units.join(cohort.ends).assign(far=cohort.far) if name else cohort.units
     made = {row["unit"]: row for row in found.to_dict("records")}
     signals = {f"vaf.{one}": cohort.word(one) for one in cohort.described.get("outputs", ())}
     for unit in study.units:
@@ -195,23 +204,30 @@ def _subjects(study: Study, cohort: Cohort) -> Finding:
             row |= {"verdict": _BADGES[own["level"]][0]}
             row |= {head: own[head] for head in ("value", "low", "high", *signals)}
             row |= {"at_limit_percent": 100 * float(own["saturated"])}
-            row |= {"why": "" if own["level"] == Level.GREEN.value else own["headline"]}
+            far = f"Look at it: a gain is {own['far']:.2g} times its group's median."
+            row |= {"determined": own["determined"], "why": " ".join(filter(None, (
+                "" if own["level"] == Level.GREEN.value else own["headline"],
+                far if np.isfinite(own["far"]) else "")))}  # fmt: skip
         rows.append(row)
     heads = ["subject", "group", "visit", "condition", "verdict", "value", "low", "high"]
-    table = pd.DataFrame(rows, columns=[*heads, *signals, "at_limit_percent", "why"])
+    table = pd.DataFrame(rows, columns=[*heads, "determined", *signals, "at_limit_percent", "why"])
     table.insert(5, "measure", name)
     table.insert(9, "unit", cohort.unit(cohort.measure))
+    si = [f"{head}_si" for head in ("value", "low", "high")]
+    table[si] = table[["value", "low", "high"]].astype(float) / cohort.scale(cohort.measure)
+    table["unit_si"] = cohort.plant_unit(cohort.measure)
     plain = [one for one in ("group", "visit", "condition", "why") if table[one].nunique() < 2]
     return Finding(
         "subjects", table,
-        "All subjects and visits; click a heading to sort. Without a number: not identified.",
+        "All subjects and visits; click a heading to sort. Determined: the recordings identify "
+        "the gain, and its 95 % interval is not wider than the gain itself.",
         digits=4,
         labels={
             **{head: f"{words}, VAF (%)" for head, words in signals.items()}, **_INTERVAL,
             "value": f"{name} ({cohort.unit(cohort.measure)})",
             "at_limit_percent": "At limit (% of time)",
         },
-        hidden=["measure", "unit", *plain],
+        hidden=["measure", "unit", *si, "unit_si", *plain],
         links={unit.subject: _address(unit.subject) for unit in study.units},
         badges=dict(_BADGES.values()) | {"Not fitted": Level.RED},
     )  # fmt: skip
@@ -220,7 +236,7 @@ def _subjects(study: Study, cohort: Cohort) -> Finding:
 def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> list[Check]:
     """Checks over all fits; amber if they restrict what may be reported."""
     units, total, warned = cohort.units, len(study.units), cohort.warned
-    fits, (name, known, of) = len(units), cohort.identified
+    fits, (name, known, of) = len(units), cohort.determined
     never = int(np.sum(units["saturated"] == 0)) if fits else 0
     refused = int(units.get("structure_refused", pd.Series(dtype=bool)).sum())
     drawn = fits * int(study.configuration.fit.get("replicates", 0))
@@ -228,8 +244,10 @@ def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> l
     cases = (
         (True, fits == total, "Fits", f"{fits} of {total} fits are complete."),
         (True, not warned, "Warnings", f"{warned} of {fits} fits have a warning."),
-        (name, known == of, "Identified",
-         f"The {name} is identified in {known} of {of} people; the others are not compared."),
+        (name, known == of, "Determined",
+         f"The {name} is determined in {known} of {of} people; the others count little."),
+        (fits, not cohort.outliers, "Outliers",
+         f"{cohort.outliers} of {fits} fits are far from the others of their group."),
         (never, None, "Limit",
          f"{never} of {fits} fits never reach the torque limit, so they cannot check it."),
         ("structure_refused" in units.columns, refused <= 0.1 * fits, "Structure",
@@ -294,7 +312,7 @@ def _subject_keys(fit: Mapping[str, Any]) -> list[Key]:
         Key(number(100 * fit["saturated"]), "% of the time", "at the torque limit"),
         *(Key(number(row["gain"]), row["unit"], f"gain on {row['state']}",
               f"95 % CI {between(row['low'], row['high'])}")
-          for row in _gains(fit) if row["identified"]),
+          for row in _gains(fit) if row["determined"]),
     ][:3]  # fmt: skip
 
 
@@ -316,15 +334,17 @@ def _blocks(unit: Unit, fit: Mapping[str, Any]) -> list[Block]:
 
 
 def _gains(fit: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """All entries of the gain; with an interval if individually identified."""
+    """Entries of the gain with a meaning, in shown units."""
     words, rows = fit["words"], []
     for i, control in enumerate(fit["controls"]):
         for j, state in enumerate(fit["states"]):
-            known, gain = bool(fit["K_identified"][i][j]), float(fit["K"][i][j])
-            reach = 1.96 * or_nan(fit["K_deviation"][i][j]) if known else np.nan
+            if state in fit["inner"]:
+                continue
+            factor, unit, *_ = fit["shown_gains"][f"K.{control}.{state}"]
+            gain, *ends = (factor * or_nan(fit[name][i][j]) for name in ("K", "K_low", "K_high"))
             rows.append({
                 "state": words.get(state, state), "control": words.get(control, control),
-                "gain": gain, "low": gain - reach, "high": gain + reach,
-                "unit": fit["units"].get(f"K.{control}.{state}", UNKNOWN), "identified": known,
+                "gain": gain, "low": ends[0], "high": ends[1], "unit": unit,
+                "determined": bool(fit["K_determined"][i][j]),
             })  # fmt: skip
     return rows

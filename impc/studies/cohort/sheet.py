@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import csv
-import math
-import re
+import unicodedata
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,9 +15,8 @@ if TYPE_CHECKING:
 
 # Largest file in bytes; 100 000 participants of 100 characters are 10 MB.
 _LARGEST = 100_000_000
-_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
-_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+|[+-]?\d{1,3}(\.\d{3})+")
+_BETWEEN = frozenset(" .+-_")
+_LONGEST = 64  # Characters of a name
 
 
 @dataclass(frozen=True)
@@ -67,10 +65,13 @@ def _cells(where: str, path: Path) -> list[list[str]]:
             raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
         if path.suffix.lower() in (".xlsx", ".ods"):
             return [row for row in cells_apart(path, _LARGEST) if any(row)]
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise InputError(where, f"cannot be read ({reason})", "check path and encoding") from None
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(where, f"cannot be read ({error.strerror})", "check the path") from None
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:  # as a German Excel writes it
+        text = content.decode("cp1252", "replace")
     if "\0" in text:
         raise InputError(where, "contains a NUL character", "save it again as UTF-8 text")
     first = text.partition("\n")[0]
@@ -81,28 +82,22 @@ def _cells(where: str, path: Path) -> list[list[str]]:
         raise InputError(where, f"cannot be read ({error})", "save it again as CSV") from None
 
 
-def column_values(sheet: Sheet, name: str) -> list[float | str | None]:
-    """Cells of the column `name`: numbers if all are numbers, else text; None if empty."""
-    cells = [row[name] for row in sheet.rows]
-    given = [cell for cell in cells if cell not in ("", "n/a")]
-    where = f"{sheet.where}: column {name}"
-    commas = [cell for cell in given if _COMMA.fullmatch(cell)]
-    if not all(_POINT.fullmatch(cell) or _COMMA.fullmatch(cell) for cell in given):
-        for cell in given:
-            if cell.lower().lstrip("+-") in ("nan", "na", "inf", "infinity"):
-                raise InputError(where, f"has {cell!a}", "leave the cell empty, or write n/a")
-        return [cell if cell in given else None for cell in cells]
-    points = [cell for cell in given if "." in cell]
-    if commas and points:
+def checked_name(where: str, what: str, text: str) -> str:
+    """Strip and normalise (NFC) a name; InputError if it is not safe."""
+    name = unicodedata.normalize("NFC", text.strip())
+    bad = [letter for letter in name if not (letter.isalnum() or letter in _BETWEEN)]
+    if bad:
         raise InputError(
-            where, f"has {points[0]} and {commas[0]}", "use only decimal points or only commas"
-        )
-    if commas and all(_THOUSANDS.fullmatch(cell) for cell in commas):
+            f"{where}: {what} {name[:_LONGEST]!a}", f"contains {bad[0]!a}",
+            "use letters, digits, spaces and . + - _",
+        )  # fmt: skip
+    if name and not name[0].isalnum():
         raise InputError(
-            where, f"{commas[0]} may have a thousands separator", "write it with a decimal point"
+            f"{where}: {what} {name!a}", f"begins with {name[0]!a}", "begin with a letter or digit"
         )
-    numbers = {cell: float(cell.replace(",", ".")) for cell in given}
-    for cell, value in numbers.items():
-        if not math.isfinite(value):
-            raise InputError(where, f"has {cell}", "give a finite number, or n/a")
-    return [numbers.get(cell) for cell in cells]
+    if len(name) > _LONGEST:
+        raise InputError(
+            f"{where}: {what} {name[:_LONGEST]!a}...", f"has {len(name)} characters",
+            f"use at most {_LONGEST}",
+        )  # fmt: skip
+    return name

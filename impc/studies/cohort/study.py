@@ -19,7 +19,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-import unicodedata
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +28,8 @@ import msgspec
 from impc.errors import InputError
 from impc.files.configuration import Configuration, read_configuration
 from impc.files.formats import FORMATS
-from impc.studies.cohort.sheet import column_values, read_sheet
+from impc.studies.cohort.participants import Participant, read_participants
+from impc.studies.cohort.sheet import checked_name, read_sheet
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -48,8 +48,8 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model : str, optional
         Import path ``module:function`` of the model of `impc select` and `impc key-parameters`.
     recordings : str, optional
-        Path pattern of the recordings with {subject}, {visit}, {condition} and {trial}. Exactly one
-        of `recordings`, `table` and `bids` is required.
+        Path pattern of the recordings with {subject}, {visit}, {condition} and {trial}; a final .*
+        finds all formats. Exactly one of `recordings`, `table` and `bids` is required.
     table : str, optional
         Table with the columns file and subject, and optionally visit, condition and trial.
     bids : str, optional
@@ -57,6 +57,9 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     participants : str, optional
         Table with a column subject (or participant_id), optionally a column group; other columns
         that are arguments of the plant, such as mass, replace those of [plant] for that subject.
+    reference : str, optional
+        Group, visit or condition with which the others are compared. By default EO, open, baseline,
+        pre or control if a name contains this word, else the first in the order of names.
     """
 
     plant: str | None = None
@@ -65,6 +68,7 @@ class StudyTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     table: str | None = None
     bids: str | None = None
     participants: str | None = None
+    reference: str | None = None
 
 
 #: Labels of a unit.
@@ -80,8 +84,9 @@ class Unit:
     condition: str  # Empty if the study has none
     files: tuple[Path, ...]  # In the order of the trials
     group: str = ""  # Empty if there is no column group
-    # Other columns of the participants for this subject
+    # Other columns of the participants for this subject, and the row of the table
     person: Mapping[str, float | str] = field(default_factory=dict)
+    row: int = 0
 
     @property
     def name(self) -> str:
@@ -103,30 +108,36 @@ class Study:
     configuration: Configuration  # Signals and settings of all fits
     units: tuple[Unit, ...]  # In the order of subject, visit and condition
     model: str = ""  # Import path of the model; empty if not given
+    reference: str = ""  # Group, visit or condition of comparison; empty for the usual one
 
 
 def read_study(path: Path) -> Study:
     """Read the study at `path` and find its recordings without opening them."""
     configuration = read_configuration(path, "study", "model", "select")
     table = _table(path, configuration)
-    people = _people(path.parent / table.participants) if table.participants else None
+    named = table.participants
+    people = read_participants(path.parent / named) if named else None
     together: dict[tuple[str, str, str], list[tuple[str, Path]]] = {}
     found = _found(path, table)
     _require_once(path, found)
     for labels, file in found:
         key = (labels["subject"], labels["visit"], labels["condition"])
         together.setdefault(key, []).append((labels["trial"], file))
-    units = []
+    units, missing = [], dict[str, None]()
     for key in sorted(together, key=lambda item: tuple(map(_natural, item))):
         trials = sorted(together[key], key=lambda item: (_natural(item[0]), str(item[1])))
         files = tuple(file for _, file in trials)
-        if people is not None and key[0] not in people:
-            raise InputError(
-                f"{path}: subject {key[0]}", f"is not in {table.participants}", "add a row"
-            )
-        units.append(Unit(*key, files, *(people[key[0]] if people else ())))
+        own = (people or {}).get(key[0], Participant())
+        if people is not None and not own.row:
+            missing[key[0]] = None
+        units.append(Unit(*key, files, own.group, own.values, own.row))
+    if missing:
+        raise InputError(f"{path}: subject {', '.join(missing)}", f"is not in {named}", "add a row")
     _require_distinct(path, units)
-    return Study(table.plant or "", configuration, tuple(units), table.model or "")
+    _require_reference(path, table.reference, units)
+    return Study(
+        table.plant or "", configuration, tuple(units), table.model or "", table.reference or ""
+    )
 
 
 def _table(path: Path, configuration: Configuration) -> StudyTable:
@@ -159,27 +170,6 @@ def _found(path: Path, table: StudyTable) -> list[Found]:
         raise InputError(where, f"cannot be searched ({error.strerror})", "check it") from None
     if not found:
         raise InputError(where, "matches no file", "check the path")
-    return found
-
-
-def _people(path: Path) -> dict[str, tuple[str, dict[str, float | str]]]:
-    """Subject -> group and other columns."""
-    sheet = read_sheet(path)
-    named = [name for name in ("subject", "participant_id") if name in sheet.heads]
-    others = [name for name in sheet.heads if name not in (*named, "group")]
-    values = {name: column_values(sheet, name) for name in others}
-    found: dict[str, tuple[str, dict[str, float | str]]] = {}
-    for number, row in enumerate(sheet.rows):
-        text = next((row[name] for name in named if row[name]), "")
-        subject = checked_name(sheet.where, "subject", text.removeprefix("sub-"))
-        if not subject:
-            raise InputError(
-                sheet.where, "has a row without subject", "name the column subject, fill every row"
-            )
-        if subject in found:
-            raise InputError(sheet.where, f"has two rows of subject {subject}", "remove one")
-        person = {name: value for name in others if (value := values[name][number]) is not None}
-        found[subject] = checked_name(sheet.where, "group", row.get("group", "")), person
     return found
 
 
@@ -219,6 +209,15 @@ def _require_distinct(path: Path, units: Iterable[Unit]) -> None:
             )
 
 
+def _require_reference(path: Path, reference: str | None, units: Iterable[Unit]) -> None:
+    """Raise InputError if no group, visit or condition has the name `reference`."""
+    names = {name for one in units for name in (one.group, one.visit, one.condition) if name}
+    if reference is not None and reference not in names:
+        problem = f"{reference!a} is no group, visit or condition"
+        remedy = f"use one of {', '.join(sorted(names)) or 'none: there are none'}"
+        raise InputError(f"{path}: study.reference", problem, remedy)
+
+
 #: Labels of a trial.
 KEYS = ("subject", "visit", "condition", "trial")
 _ENTITIES = {"subject": "sub", "visit": "ses", "condition": "task", "trial": "run"}
@@ -234,8 +233,8 @@ def find_by_pattern(where: str, folder: Path, pattern: str) -> list[Found]:
         folder = Path(Path(pattern).anchor)
         pattern = pattern[len(folder.as_posix()) :]
     matching = re.compile(_expression(where, pattern))
-    parts = re.split(r"(\{\w+\})", pattern)
-    wild = "".join("*" if part.startswith("{") else glob.escape(part) for part in parts)
+    parts = re.split(r"(\{\w+\}|(?<=\.)\*$)", pattern)
+    wild = "".join("*" if part[:1] in ("{", "*") else glob.escape(part) for part in parts)
     found = []
     for file in sorted(folder.glob(wild)):
         match = matching.fullmatch(file.relative_to(folder).as_posix())
@@ -264,9 +263,11 @@ def _expression(where: str, pattern: str) -> str:
             where, f"has nothing between {together[0]}", "add a separator, or use `table`"
         )
     expression = ""
-    for part in re.split(r"(\{\w+\})", Path(pattern).as_posix()):
+    for part in re.split(r"(\{\w+\}|\.\*$)", Path(pattern).as_posix()):
         group = f"(?P<{part[1:-1]}>"
-        if not part.startswith("{"):
+        if part == ".*":  # any format
+            expression += f"(?i:{'|'.join(map(re.escape, FORMATS))})"
+        elif not part.startswith("{"):
             expression += re.escape(part)
         else:
             expression += f"(?P={part[1:-1]})" if group in expression else f"{group}{_NAME})"
@@ -305,28 +306,3 @@ def _printable(file: Path) -> str:
     """Printable form of a path, whose name may contain control characters or invalid bytes."""
     text = str(file).encode("utf-8", "backslashreplace").decode()
     return text if text.isprintable() else ascii(text)[1:-1]
-
-
-_BETWEEN = frozenset(" .+-_")
-_LONGEST = 64
-
-
-def checked_name(where: str, what: str, text: str) -> str:
-    """Strip and normalise (NFC) a name; InputError if it is not safe."""
-    name = unicodedata.normalize("NFC", text.strip())
-    bad = [letter for letter in name if not (letter.isalnum() or letter in _BETWEEN)]
-    if bad:
-        raise InputError(
-            f"{where}: {what} {name[:_LONGEST]!a}", f"contains {bad[0]!a}",
-            "use letters, digits, spaces and . + - _",
-        )  # fmt: skip
-    if name and not name[0].isalnum():
-        raise InputError(
-            f"{where}: {what} {name!a}", f"begins with {name[0]!a}", "begin with a letter or digit"
-        )
-    if len(name) > _LONGEST:
-        raise InputError(
-            f"{where}: {what} {name[:_LONGEST]!a}...", f"has {len(name)} characters",
-            f"use at most {_LONGEST}",
-        )  # fmt: skip
-    return name

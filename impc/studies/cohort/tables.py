@@ -60,7 +60,8 @@ def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
         given = fit[name] if isinstance(fit[name], dict) else {"": fit[name]}
         row |= {f"{name}.{signal}".rstrip("."): value for signal, value in given.items()}
     row["saturated"] = fit["saturated"]
-    for name in ("K", "K_deviation", "K_identified", "K_of_weights"):
+    for name in ("K", "K_deviation", "K_low", "K_high", "K_identified", "K_determined",
+                 "K_of_weights"):  # fmt: skip
         row |= _gain(fit, name, fit[name])
     reported = next(iter(fit["readings"].values()))
     of_states = {"dominant": reported["dominant"], "cost_weight": np.diag(reported["Q"])}

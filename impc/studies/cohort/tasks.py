@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import itertools
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,18 +19,22 @@ import psutil
 
 from impc.assess.assessments import assessed
 from impc.assess.covariance import TWO_SIDED
+from impc.assess.printed_gain import follows_command
 from impc.assess.resampling import replicate
 from impc.checking import replace
 from impc.errors import DataError, ImpcError
 from impc.files.checks import FELL
+from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest, digest, source_digest, versions
-from impc.files.plant_sources import plant_source
+from impc.files.plant_sources import made_by, plant_source
 from impc.files.reading import read_unit
-from impc.model.plant import gain_unit, weight_unit
+from impc.model.plant import UNKNOWN, gain_unit, weight_unit
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in, shown_unit, signal_name
+from impc.studies.cohort.participants import require_faultless
 from impc.studies.effort import Effort, fit_effort
 from impc.studies.fit.asked import asked_plant, fit_problem
+from impc.studies.fit.facts import one_of
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_alone
 from impc.studies.fit.verdict import fit_verdict
@@ -59,13 +64,24 @@ class FitTask:
 
 
 def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
-    """Tasks by unit, and reasons for units without a task; reads all files for the digests."""
+    """Tasks by unit, and reasons for units without a task; reads all files for the digests.
+
+    InputError if the plant refuses the values of a participant.
+    """
     unused = set(unused_columns(study, source))
     tasks: dict[str, FitTask] = {}
     failed: dict[str, str] = {}
+    refused: dict[str, list[str]] = {}  # Reason -> rows of participants
+    made: set[int] = set()
     for unit in study.units:
         person = {name: value for name, value in unit.person.items() if name not in unused}
         arguments = dict(study.configuration.plant) | person
+        if person and unit.row not in made:
+            made.add(unit.row)
+            try:
+                made_by(replace(source, arguments=arguments))
+            except ImpcError as error:
+                refused.setdefault(error.problem, []).append(f"row {unit.row} ({unit.subject})")
         files = tuple(str(file.resolve()) for file in unit.files)
         try:
             made_of = unit_digest(files, source.name, arguments, study.configuration)
@@ -73,17 +89,23 @@ def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], 
             failed[unit.name] = str(error)
         else:
             tasks[unit.name] = FitTask(files, source.name, arguments, study.configuration, made_of)
+    faults = [f"{', '.join(rows)}: plant {source.name} {why}" for why, rows in refused.items()]
+    require_faultless("participants", faults)
     return tasks, failed
 
 
 def unused_columns(study: Study, source: PlantSource) -> tuple[str, ...]:
     """Columns of the participants that are not arguments of the plant."""
     names = {name: None for unit in study.units for name in unit.person}
-    if ":" not in source.name:  # a file with matrices has no arguments
+    if not names or ":" not in source.name:  # a file with matrices has no arguments
         return tuple(names)
-    taken = inspect.signature(source.make).parameters
-    if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in taken.values()):
-        return ()
+    kinds = {one.kind for one in inspect.signature(source.make).parameters.values()}
+    taken = source.defaults()
+    if inspect.Parameter.VAR_KEYWORD in kinds:  # then the plant lists its parameters
+        first = next(unit.person for unit in study.units if unit.person)
+        needed = {name: value for name, value in first.items() if taken.get(name) == FILL_IN}
+        made = made_by(replace(source, arguments={**source.arguments, **needed}))
+        taken |= getattr(made, "parameters", {})
     return tuple(name for name in names if name not in taken)
 
 
@@ -182,7 +204,10 @@ def _described(result: FitResult) -> dict[str, Any]:
     result = replace(result, falls=tuple(line for line in first.findings if FELL in line))
     family = estimate.problem.family
     known = () if family is None else family.names
-    halves = np.array([(one.high - one.low) / 2 for one in result.gain_intervals])
+    ends = np.array([(one.low, one.high) for one in result.gain_intervals]).T
+    # An interval over several ends of the search is not symmetric: its longer side counts.
+    halves = np.max(np.abs(ends - np.ravel(estimate.K)), axis=0)
+    determined = np.array([one.determined for one in result.gain_intervals])
     bounds = result.given.bounds
     return {
         **_named(plant),
@@ -193,6 +218,9 @@ def _described(result: FitResult) -> dict[str, Any]:
         "K": estimate.K,
         "S": estimate.S,
         "K_deviation": (halves / TWO_SIDED).reshape(K.shape),
+        "K_low": ends[0].reshape(K.shape),
+        "K_high": ends[1].reshape(K.shape),
+        "K_determined": determined.reshape(K.shape),
         "K_identified": estimate.covariance.individually_identified,
         "K_of_weights": K,
         "Q": weights.Q,
@@ -222,11 +250,10 @@ def _described(result: FitResult) -> dict[str, Any]:
 def _named(plant: Plant) -> dict[str, Any]:
     """Names and units for the pages of a cohort."""
     names = (*plant.outputs, *plant.states, *plant.controls)
-    units = {
-        f"K.{control}.{state}": gain_unit(plant, control, state)
-        for control in plant.controls
-        for state in plant.states
-    } | {f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states}
+    pairs = list(itertools.product(plant.controls, plant.states))
+    units = {f"K.{control}.{state}": gain_unit(plant, control, state) for control, state in pairs}
+    units |= {f"centre_weight.{name}": weight_unit(plant, name, name) for name in plant.states}
+    inner = follows_command(plant)
     return {
         "states": plant.states,
         "controls": plant.controls,
@@ -235,7 +262,20 @@ def _named(plant: Plant) -> dict[str, Any]:
         "words": {name: signal_name(plant, name) for name in names},
         # Units of the compared measures, by their columns in units.csv.
         "units": {name: "-" if unit == "1" else unit for name, unit in units.items()},
+        # Gains as pages show them: factor, unit, unit of the command, and for what it is given.
+        "shown_gains": {f"K.{pair[0]}.{pair[1]}": _shown_gain(plant, *pair) for pair in pairs},
+        # States whose single gains have no meaning.
+        "inner": [] if inner.all() else list(np.array(plant.states)[inner]),
     }
+
+
+def _shown_gain(plant: Plant, control: str, state: str) -> tuple[float, str, str, str]:
+    (scale, top), (factor, of) = shown_unit(plant, control), shown_unit(plant, state)
+    unit = gain_unit(plant, control, state)
+    if unit != UNKNOWN and (scale, factor) != (1.0, 1.0):
+        unit = unit.replace("rad", "°")
+    per = f"{one_of(of)} of {signal_name(plant, state)}"
+    return scale / factor, "-" if unit == "1" else unit, top, per
 
 
 def _trajectory(fit: MethodFit) -> dict[str, Any]:

@@ -1,266 +1,173 @@
-"""Verdict of a cohort: which groups or visits differ, by how much, and warnings."""
+"""Verdict of a cohort: which groups, visits or conditions differ, by how much, and warnings."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from impc.model.plant import UNKNOWN
 from impc.reporting.finding import Level
-from impc.reporting.rendering import number, probability
-from impc.reporting.verdict import Alert, Claim, Verdict
-from impc.studies.cohort.comparison import compare_cohort, measures_of, only_identified
-from impc.studies.fit.facts import between
+from impc.reporting.rules import Kind, Line, Rules, always
+from impc.reporting.verdict import Claim, Verdict
+from impc.studies.cohort.results import LOGARITHM, SIGNIFICANT, Cohort
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable
 
-    import pandas as pd
-
-    from impc.studies.cohort.comparison import Comparison
-
-#: Prefix of columns of logarithms, which are compared as ratios.
-LOGARITHM = "log_cost_weight."
-_LEADING = ("K.", LOGARITHM)
-# Questions about means, in the order of preference.
-_QUESTIONS = ("group", "mixed", "change", "visit")
 # Share of fits with a warning, or of missing fits, above which the report is amber.
 _MANY = 0.1
-# Share of people with an identified gain below which the report is amber.
+# Share of people with a determined gain below which the report is amber.
 _FEW = 0.7
-
-
-@dataclass(frozen=True)
-class Cohort:
-    """Results of a cohort for page, figures and terminal."""
-
-    units: pd.DataFrame  # Table units.csv
-    described: Mapping[str, Any]  # Content of any fit: signals and their units
-    failed: Mapping[str, str]  # Unit -> reason why it has no fit
-
-    def _of(self, *levels: Level) -> pd.DataFrame:
-        """Units whose fits have one of the levels."""
-        wanted = [level.value for level in levels]
-        return self.units[self.units["level"].isin(wanted)] if len(self.units) else self.units
-
-    @cached_property
-    def usable(self) -> pd.DataFrame:
-        """Units with a green or amber fit; gains that are not identified are NaN."""
-        return only_identified(self._of(Level.GREEN, Level.AMBER))
-
-    @cached_property
-    def warned(self) -> int:
-        """Number of fits with a warning."""
-        return len(self._of(Level.AMBER, Level.RED))
-
-    @cached_property
-    def compared(self) -> tuple[Comparison, ...]:
-        """All comparisons of green and amber fits."""
-        return compare_cohort(self._of(Level.GREEN, Level.AMBER))
-
-    @cached_property
-    def tested(self) -> list[Comparison]:
-        """Comparisons with a p-value, most important first."""
-        return sorted((item for item in self.compared if np.isfinite(item.p)), key=_rank)
-
-    @property
-    def lead(self) -> Comparison | None:
-        """Comparison in the headline: of gains, or of cost weights within a structure."""
-        return next((one for one in self.tested if one.measure.startswith(_LEADING)), None)
-
-    @property
-    def measure(self) -> str:
-        """Measure of the first figure; empty without units."""
-        chosen = measures_of(self.units) if len(self.units) else ()
-        return self.lead.measure if self.lead else next(iter(chosen), "")
-
-    @cached_property
-    def ends(self) -> pd.DataFrame:
-        """Measure of each unit with its interval; NaN if not identified, except "shown"."""
-        kind, _, rest = self.measure.partition(".")
-        value = self.usable[self.measure].reindex(self.units.index).astype(float)
-        low, high = (self.units.get(f"{kind}_{end}.{rest}", value) for end in ("low", "high"))
-        if kind == "K":
-            reach = 1.96 * self.units.get(f"K_deviation.{rest}", np.nan)
-            low, high = value - reach, value + reach
-        shown = self.units[self.measure].astype(float)
-        found = value.to_frame("value").assign(low=low, high=high, shown=shown)
-        return found.map(np.exp) if self.measure.startswith(LOGARITHM) else found
-
-    def word(self, signal: str) -> str:
-        """Name of a signal in words."""
-        return str(self.described.get("words", {}).get(signal, signal.replace("_", " ")))
-
-    def name(self, measure: str) -> str:
-        """Name of a column of units.csv in words."""
-        kind, _, rest = measure.partition(".")
-        if kind == "K":
-            control, _, state = rest.partition(".")
-            several = len(self.described.get("controls", ())) > 1
-            return f"gain on {self.word(state)}" + f" ({self.word(control)})" * several
-        words = {"vaf": "variance accounted for, {}", "centre_weight": "central cost weight of {}",
-                 "log_cost_weight": "cost weight of {}"}  # fmt: skip
-        return words.get(kind, kind.replace("_", " ")).format(self.word(rest))
-
-    def unit(self, measure: str) -> str:
-        """Unit of a measure; "-" for logarithms."""
-        known = {"vaf": "%", "log_cost_weight": "-"} | self.described.get("units", {})
-        return str(known.get(measure, known.get(measure.partition(".")[0], UNKNOWN)))
-
-    def amount(self, item: Comparison) -> tuple[str, str]:
-        """Difference with unit and "less" or "more", and its interval in the same form."""
-        ends = np.array([item.estimate, item.low, item.high])
-        if item.measure.startswith(LOGARITHM):
-            value, low, high = np.exp(ends)
-            return f"{number(float(value))} times", f"{between(low, high)} times"
-        # For negative gains, a lower value is "more".
-        below = item.measure.startswith("K.") and self.usable[item.measure].median() < 0
-        word = "less" if (item.estimate < 0) != below else "more"
-        low, high = sorted(np.sign(item.estimate or 1.0) * ends[1:])
-        unit = self.unit(item.measure)
-        said = f"{'percentage points' if unit == '%' else unit} {word}"
-        return f"{number(abs(item.estimate))} {said}", f"{between(low, high)} {said}"
-
-    def sentence(self, item: Comparison) -> str:
-        """Sentence on a difference."""
-        (amount, _), name = self.amount(item), self.name(item.measure)
-        visit = item.question == "visit"
-        first, second = (
-            f"at visit {one}" if visit
-            else f"in the {one} group" if len(one) > 1 and one.isalpha() else f"in group {one}"
-            for one in (item.first, item.second)
-        )  # fmt: skip
-        if item.question == "change":
-            said = f"from visit to visit, the {name} rises by {amount} {second} than {first}"
-        elif item.measure.startswith("K."):
-            _, control, state = item.measure.split(".", 2)
-            who = f"{second} people apply" if visit else f"{second[3:]} applies"
-            than = first if visit else first[3:].removesuffix(" group")
-            effort = self.word(control).removeprefix("commanded ")
-            said = f"{who} {amount} {effort} per {self.word(state)} than {than}"
-        else:
-            than = "as high {} as" if item.measure.startswith(LOGARITHM) else "{} than"
-            said = f"the {name} is {amount} {than.format(second)} {first}"
-        where = f" ({item.condition})" if self.units["condition"].nunique() > 1 else ""
-        return f"{said[:1].upper()}{said[1:]}{where}."
-
-    def numbers(self, item: Comparison) -> str:
-        """Interval, number of people, p-value and effect size."""
-        effect = "Cohen's d" if item.question == "visit" else "Hedges' g"
-        size = f", {effect} = {number(item.effect)}" if np.isfinite(item.effect) else ""
-        ends = self.amount(item)[1]
-        return f"95 % CI {ends}, n = {item.n} people, Holm {probability(item.p_holm)}{size}"
-
-    @cached_property
-    def identified(self) -> tuple[str, int, int]:
-        """First gain, number of people in whom it is identified, number of all fitted people."""
-        gains = [name for name in (self.measure, *measures_of(self.units)) if name[:2] == "K."]
-        if not gains:
-            return "", 0, 0
-        known = self.usable.loc[self.usable[gains[0]].notna(), "subject"]
-        return self.name(gains[0]), known.nunique(), self.units["subject"].nunique()
-
-    def without_warned(self) -> str:
-        """Sentence on the leading difference in fits without a warning; empty if there is none."""
-        for item in compare_cohort(self._of(Level.GREEN)) if self.lead else ():
-            if _asked(item) == _asked(self.lead) and np.isfinite(item.p):
-                value, ends = self.amount(item)
-                return f" Without fits with a warning it is {value} (95 % CI {ends}, n = {item.n})."
-        return " Without fits with a warning, too few people are left." if self.lead else ""
-
-
-def _asked(item: Comparison | None) -> tuple[str, ...]:
-    if item is None:
-        return ()
-    return item.question, item.measure, item.condition, item.first, item.second
-
-
-def _rank(item: Comparison) -> tuple[bool, int, bool, float]:
-    last = not item.measure.startswith(_LEADING)
-    return not item.p_holm <= 0.05, _QUESTIONS.index(item.question), last, item.p
 
 
 def cohort_verdict(cohort: Cohort) -> Verdict:
     """Verdict of a cohort."""
-    fits, lead = len(cohort.units), cohort.lead
-    if not len(cohort.usable):
-        said = f"{fits} of {fits + len(cohort.failed)} fits are complete; none may be reported."
-        alerts = _alerts(cohort, Level.RED)
-        return Verdict(Level.RED, "No fit of this study can be used.", said, alerts)
-    alerts = _alerts(cohort, Level.AMBER)
-    level = Level.AMBER if alerts else Level.GREEN
-    if lead is None:
-        headline = f"Fitted people: {cohort.units['subject'].nunique()}."
-        said = "There are too few people in two groups, or with two visits, for a comparison."
-        if any(item.measure.startswith("K.") for item in cohort.compared):
-            headline = "Gains are identified in too few people for a comparison."
-            said = "At least three people in each group, or with both visits, are needed."
-        return Verdict(level, headline, said, alerts)
-    numbers = cohort.numbers(lead)
-    if lead.p_holm > 0.05:
-        what = "visits" if lead.question == "visit" else "groups"
-        kind = "cost weight" if lead.measure.startswith(LOGARITHM) else "gain"
-        said = f"Estimate: {cohort.sentence(lead)[:-1]} ({numbers}). This is not significant after "
-        said += "correction for several tests. It does not show that they are equal."
-        may = [Claim("That no difference was found, with the interval above.")]
-        headline = f"No difference in a {kind} between the {what} was found."
-        return Verdict(level, headline, said, alerts, may, _may_not(cohort))
-    differing = [one for one in cohort.tested if one.p_holm <= 0.05]
-    may = [Claim(cohort.sentence(item), f"{cohort.numbers(item)}.") for item in differing
-           if not item.measure.startswith("centre")][:6]  # centre: by convention # fmt: skip
-    return Verdict(level, cohort.sentence(lead), f"{numbers}.", alerts, may, _may_not(cohort))
+    return _RULES.verdict(cohort)
 
 
-def _alerts(cohort: Cohort, level: Level) -> list[Alert]:
-    warned, fits, failed = cohort.warned, len(cohort.units), len(cohort.failed)
-    found = []
-    if warned > _MANY * fits:
-        heads = cohort.units.loc[cohort.units["level"] != Level.GREEN.value, "headline"]
-        each = " ".join(f"{head.rstrip('.')} ({count})."
-                        for head, count in Counter(heads).most_common(3))  # fmt: skip
-        found.append(Alert(
-            level, f"{warned} of {fits} fits have a warning", f"{each}{cohort.without_warned()}",
-            "The gains of these people may be biased by more than their intervals show; a bias "
-            "that differs between groups looks like a difference between people.",
-            ("Open the pages of these people; run impc fit for one and follow its warnings.",
-             "Change the settings in the same way for all people, and run the study again.",
-             "Report the difference with and without these people."),
-        ))  # fmt: skip
-    name, known, of = cohort.identified
-    if known < _FEW * of:
-        found.append(Alert(
-            level, f"The {name} is identified in only {known} of {of} people",
-            "In the others its standard error is more than twice the median size of this gain.",
-            "The remaining people may differ from all people of the study, and small groups show "
-            "only large differences.",
+def _warnings(cohort: Cohort) -> str:
+    """The most frequent warnings with their numbers."""
+    heads = cohort.with_warning["headline"]
+    return " ".join(f"{head.rstrip('.')} ({count})."
+                    for head, count in Counter(heads).most_common(3))  # fmt: skip
+
+
+def _outliers(cohort: Cohort) -> str:
+    """The fits to be looked at: "P03 (3.4 times)"."""
+    far = cohort.units.assign(ratio=cohort.far).dropna(subset=["ratio"])
+    return ", ".join(f"{row['subject']} ({row['ratio']:.2g} times)"
+                     for row in far.to_dict("records")[:8])  # fmt: skip
+
+
+def _differences(cohort: Cohort) -> list[Claim]:
+    """The differences that are found; central weights are a convention."""
+    lead = cohort.lead
+    if lead is None or lead.p_holm > SIGNIFICANT:
+        return []
+    found = (one for one in cohort.tested if one.p_holm <= SIGNIFICANT)
+    shown = [one for one in found if not one.measure.startswith("centre")][:6]
+    return [
+        Claim(cohort.sentence(one), f"{cohort.numbers(one)}.{cohort.without_outliers(one)}")
+        for one in shown
+    ]
+
+
+def _none_found(cohort: Cohort) -> bool:
+    return cohort.lead is not None and cohort.lead.p_holm > SIGNIFICANT
+
+
+_WORDS: dict[str, Callable[[Any], object]] = {
+    "of": lambda c: c,  # {of.warned}: a number of the cohort
+    "fits": lambda c: len(c.units),
+    "asked": lambda c: len(c.units) + len(c.failed),
+    "failed": lambda c: len(c.failed),
+    "reason": lambda c: next(iter(c.failed.values())),
+    "warnings": _warnings,
+    "without_warned": Cohort.without_warned,
+    "outliers": _outliers,
+    "without_outliers": lambda c: c.without_outliers(c.lead),
+    "gain": lambda c: c.determined[0],
+    "known": lambda c: c.determined[1],
+    "all": lambda c: c.determined[2],
+    "measure": lambda c: "cost weight" if c.measure.startswith(LOGARITHM) else "gain",
+    "pair": lambda c: {"visit": "visits", "condition": "conditions"}.get(c.lead.question, "groups"),
+    "sentence": lambda c: c.sentence(c.lead),
+    "estimate": lambda c: c.sentence(c.lead)[:-1],
+    "numbers": lambda c: c.numbers(c.lead),
+    "result": lambda c: _RESULT.verdict(c).headline,
+    "details": lambda c: _RESULT.verdict(c).sentence,
+}
+# Alerts of red and of amber reports.
+_WARNED: dict[str, Any] = {
+    "title": "{of.warned} of {fits} fits have a warning",
+    "found": "{warnings}{without_warned}",
+    "means": "The gains of these people may be biased by more than their intervals show; a bias "
+    "that differs between groups looks like a difference between people.",
+    "todo": (
+        "Open the pages of these people; run impc fit for one and follow its warnings.",
+        "Change the settings in the same way for all people, and run the study again.",
+        "Report the difference with and without these people.",
+    ),
+}
+_FAILED: dict[str, Any] = {
+    "title": "{failed} of {asked} fits failed",
+    "found": "First reason: {reason}.",
+    "means": "The remaining people may differ from all people of the study.",
+    "todo": (
+        "Correct the recordings that are named under Subjects.",
+        "Run the same command again: finished fits are kept.",
+    ),
+}
+_NONE = (
+    "No fit of this study can be used.",
+    "{fits} of {asked} fits are complete; none may be reported.",
+)
+#: What was found, apart from warnings.
+_RESULT: Rules[Cohort] = Rules(
+    _WORDS,
+    (
+        Kind(
+            Level.GREEN,
+            lambda c: c.lead is None and any(one.measure[:2] == "K." for one in c.compared),
+            "Gains are known well enough in too few people for a comparison.",
+            "Each mean needs at least three people whose gains are known about equally well.",
+        ),
+        Kind(
+            Level.GREEN, lambda c: c.lead is None, "Fitted people: {of.people}.",
+            "There are too few people in two groups, or with two visits, for a comparison.",
+        ),
+        Kind(
+            Level.GREEN, _none_found, "No difference in a {measure} between the {pair} was found.",
+            "Estimate: {estimate} ({numbers}). This is not significant after correction for "
+            "several tests. It does not show that they are equal.{without_outliers}",
+        ),
+        Kind(Level.GREEN, always, "{sentence}", "{numbers}.{without_outliers}"),
+    ),
+)  # fmt: skip
+_RULES: Rules[Cohort] = Rules(
+    _WORDS,
+    (
+        Kind(Level.RED, lambda c: not len(c.usable) and len(c.units), *_NONE, **_WARNED),
+        Kind(Level.RED, lambda c: not len(c.usable) and c.failed, *_NONE, **_FAILED),
+        Kind(Level.AMBER, lambda c: c.warned > _MANY * len(c.units), "{result}", "{details}",
+             **_WARNED),
+        Kind(
+            Level.AMBER, lambda c: c.outliers, "{result}", "{details}",
+            "{of.outliers} of {fits} fits are far from the others of their group",
+            "Subjects, and a gain relative to their group's median: {outliers}.",
+            "A gain above three times, or below a third, of the median is more often a wrong fit "
+            "than an unusual person. One such fit can move the mean of a group.",
+            ("Look at these people under Subjects and at their recordings.",
+             "Report the difference with and without them."),
+        ),
+        Kind(
+            Level.AMBER, lambda c: c.determined[1] < _FEW * c.determined[2],
+            "{result}", "{details}",
+            "The {gain} is determined in only {known} of {all} people",
+            "In the others the 95 % interval is wider than the gain itself, or a change of other "
+            "gains makes up for one of this gain.",
+            "All people count, each by how well their gain is known: the means rest mostly on few "
+            "people, and only large differences are found.",
             ("Record more or longer trials, or use a stronger perturbation; impc plan shows how "
              "many.",
              "Set [fit.structure]: a few cost weights need less data than ten gains."),
-        ))  # fmt: skip
-    if failed > _MANY * (fits + failed):
-        found.append(Alert(
-            level, f"{failed} of {fits + failed} fits failed",
-            f"First reason: {next(iter(cohort.failed.values()))}.",
-            "The remaining people may differ from all people of the study.",
-            ("Correct the recordings that are named under Subjects.",
-             "Run the same command again: finished fits are kept."),
-        ))  # fmt: skip
-    return found
-
-
-def _may_not(cohort: Cohort) -> list[Claim]:
-    name, known, of = cohort.identified
-    structured = "structure_refused" in cohort.units.columns
-    cases = (
-        (True, "That groups or visits are equal if no difference was found.",
-         "The interval of a difference shows how large it may be."),
-        (not structured, "What the groups try to minimise.",
-         "Many weights lead to the same gain. Set [fit.structure] to compare weights."),
-        (known < of, f"The {name} of {of - known} of {of} people.", "It is not identified."),
-        (cohort.warned, "Gains of single people whose fit has a warning.", "See Subjects."),
-    )  # fmt: skip
-    return [Claim(text, why) for holds, text, why in cases if holds]
+        ),
+        Kind(Level.AMBER, lambda c: len(c.failed) > _MANY * (len(c.units) + len(c.failed)),
+             "{result}", "{details}", **_FAILED),
+        Kind(Level.GREEN, always, "{result}", "{details}"),
+    ),
+    may=(
+        Line(_none_found, "That no difference was found, with the interval above."),
+        _differences,
+    ),
+    may_not=(
+        Line(lambda c: c.lead, "That groups or visits are equal if no difference was found.",
+             "The interval of a difference shows how large it may be."),
+        Line(lambda c: c.lead and "structure_refused" not in c.units.columns,
+             "What the groups try to minimise.",
+             "Many weights lead to the same gain. Set [fit.structure] to compare weights."),
+        Line(lambda c: c.lead and c.determined[1] < c.determined[2],
+             "The {gain} of a single person, except in {known} of {all}.", "It is not determined."),
+        Line(lambda c: c.lead and c.warned, "Gains of single people whose fit has a warning.",
+             "See Subjects."),
+    ),
+)  # fmt: skip

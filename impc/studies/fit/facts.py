@@ -103,8 +103,8 @@ def named_gains(result: FitResult) -> list[tuple[str, GainRow]]:
 
 def ends_words(result: FitResult) -> str:
     """How far apart searches from different starts end, for the first gain; empty for one end."""
-    (_, row), *_ = named_gains(result)
-    if not result.estimate.rivals or not row.interval.value:
+    row = next((row for _, row in named_gains(result)), None)
+    if row is None or not result.estimate.rivals or not row.interval.value:
         return ""
     place = entry_names(result.given.plant).index(row.interval.name)
     values = [float(np.ravel(one.K)[place]) for one in (result.estimate, *result.estimate.rivals)]

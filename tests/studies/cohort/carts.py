@@ -49,10 +49,10 @@ def write_study(
 ) -> Path:
     """Write a study with one trial per visit; return the path of study.toml."""
     rng = np.random.default_rng(seed)
-    people = ["subject,group,drag"]
+    people = ["subject,group,drag,age"]
     for number in range(1, subjects + 1):
         group = "a" if number <= subjects / 2 else "b"
-        people.append(f"{number:02d},{group},0.3")
+        people.append(f"{number:02d},{group},0.3,{20 + number}")
         cost_weight = (4.0 if group == "a" else 8.0) * float(np.exp(0.1 * rng.standard_normal()))
         for visit in range(1, visits + 1):
             trial = subject_trial(int(rng.integers(2**31)), cost_weight)

@@ -1,4 +1,4 @@
-"""Comparison of groups and visits against SciPy; gains that are not identified."""
+"""Comparison of groups, visits and conditions against SciPy; uncertain gains; outliers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import scipy.stats
 
 from experiments.coverage import cart
 from impc.inverse.noisy_fit import fit_controller
-from impc.studies.cohort.comparison import compare_cohort, not_identified
+from impc.studies.cohort.comparison import compare_cohort, in_order, outlying
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
 from tests.studies.cohort.carts import subject_trial
@@ -114,35 +114,84 @@ def gains(deviations: dict[int, float]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=heads)
 
 
-def test_a_gain_of_629_with_a_deviation_of_1700_is_not_tested() -> None:
-    units = gains({3: 1700.0})
-    units.loc[3, "K.u.x"] = 629.0
+def test_two_wild_gains_do_not_carry_a_mean() -> None:
+    """Gains known to -1500 to 4000 count little, and all ten people are counted."""
+    units = gains({3: 1400.0, 5: 1400.0})
+    units.loc[[3, 5], "K.u.x"] = 3000.0
     (found,) = compare_cohort(units)
-    rest = units.drop(index=3)
+    rest = units.drop(index=[3, 5])
     a, b = (rest.loc[rest["group"] == group, "K.u.x"] for group in "ab")
-    assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
-    assert found.n == 9
-    assert not_identified(units) == {"K.u.x": 1}
+    assert found.n == 10
+    assert found.estimate == pytest.approx(b.mean() - a.mean(), abs=10)
+    assert found.high - found.low < 350
+    (unweighted,) = compare_cohort(units.drop(columns="K_deviation.u.x"))
+    assert unweighted.estimate > 850
+    assert unweighted.high - unweighted.low > 2500
 
 
-def test_a_gain_without_a_deviation_is_not_tested() -> None:
-    units = gains({0: np.nan, 5: np.inf})
-    (found,) = compare_cohort(units)
-    assert found.n == 8
-    assert not_identified(units) == {"K.u.x": 2}
+@pytest.mark.parametrize("error", [np.nan, np.inf])
+def test_a_gain_without_an_error_is_counted_and_has_no_weight(error: float) -> None:
+    (found,) = compare_cohort(gains({0: error, 5: error}))
+    (rest,) = compare_cohort(gains({}).drop(index=[0, 5]))
+    assert (found.n, rest.n) == (10, 8)
+    assert (found.estimate, found.p) == (rest.estimate, rest.p)
 
 
-def test_nothing_told_is_nothing_compared() -> None:
+def test_nothing_known_is_nothing_compared() -> None:
     units = gains(dict.fromkeys(range(10), np.nan))
     (found,) = compare_cohort(units)
     assert np.isnan(found.p)
     assert found.note == "too few subjects (0)"
     both = compare_cohort(pd.concat([units, units.assign(visit="2")]))
     assert {item.note for item in both} == {"too few subjects (0)"}
+    (found,) = compare_cohort(gains(dict.fromkeys((0, 2, 4, 6), 1e5)))
+    assert found.note == "one subject counts for more than all others together"
 
 
-def test_a_gain_about_zero_is_told_where_all_are_told_as_well() -> None:
-    """Values near zero are kept: twenty draws around zero, seed 3."""
-    units = gains({})
+def test_a_value_without_a_number_changes_no_weights() -> None:
+    units = table(10, 1)
+    units.loc[0, "vaf.y"] = np.nan
+    found = next(item for item in compare_cohort(units) if item.measure == "vaf.y")
+    a, b = (units.loc[units["group"] == group, "vaf.y"].dropna() for group in "ab")
+    assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
+
+
+def test_conditions_are_paired_and_the_reference_comes_first() -> None:
+    units = table(8, 2).assign(condition=lambda found: found["visit"].map({"1": "EC", "2": "EO"}))
+    units["visit"] = "1"
+    found = next(item for item in compare_cohort(units) if item.question == "condition")
+    wide = units.pivot_table(index="subject", columns="condition", values="K.u.x")
+    assert (found.first, found.second, found.n) == ("EO", "EC", 8)
+    assert found.p == pytest.approx(scipy.stats.ttest_rel(wide["EC"], wide["EO"]).pvalue)
+    other = next(item for item in compare_cohort(units, "EC") if item.question == "condition")
+    assert (other.first, other.estimate) == ("EC", -found.estimate)
+
+
+@pytest.mark.parametrize(
+    ("names", "reference", "first"),
+    [
+        (["EC", "EO"], "", "EO"),
+        (["eyes closed", "Eyes Open"], "", "Eyes Open"),
+        (["post", "pre-test"], "", "pre-test"),
+        (["A", "Control"], "", "Control"),
+        (["LBP", "Controls"], "", "LBP"),
+        (["opened", "presbyopia"], "", "opened"),
+        (["A", "control", "Z"], "Z", "Z"),
+        (["", "week_4", "Baseline_1"], "", "Baseline_1"),
+    ],
+)
+def test_the_reference(names: list[str], reference: str, first: str) -> None:
+    assert in_order(names, reference)[0] == first
+
+
+def test_far_gains_are_found_and_uncertain_small_ones_are_not() -> None:
+    units = gains({1: 400.0, 3: 20.0})
+    units.loc[[0, 1, 3], "K.u.x"] = 3000.0, 100.0, 100.0
+    half = 1.96 * units["K_deviation.u.x"]
+    units["K_low.u.x"], units["K_high.u.x"] = units["K.u.x"] - half, units["K.u.x"] + half
+    far = outlying(units, ["K.u.x"])
+    assert far.dropna().index.tolist() == [0, 3]
+    assert far[0] == pytest.approx(3000 / 820)
+    assert far[3] == pytest.approx(100 / 800)
     units["K.u.x"] = 20 * np.random.default_rng(3).standard_normal(10)
-    assert not_identified(units) == {}
+    assert outlying(units, ["K.u.x"]).notna().sum() == 0  # about zero no ratio has a meaning

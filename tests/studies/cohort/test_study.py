@@ -164,7 +164,8 @@ PEOPLE = [
     ("subject\tmass\n1\t70,5\n", {"mass": 70.5}),
     ("subject;mass;note\n1;70,5;a, b\n", {"mass": 70.5, "note": "a, b"}),
     ("subject,mass,sex\n1,1e2,n/a\n", {"mass": 100.0}),
-    ("subject,mass\n1,1_000\n", {"mass": "1_000"}),
+    ("subject,note\n1,1_000\n", {"note": "1_000"}),
+    ("subject,mass\n1,1_000\n", "write a number in kg"),
     ("subject;mass\n1;70.5\n2;70,5\n", "decimal points or only commas"),
     ('subject,mass\n1,"1,234"\n', "may have a thousands"),
     ("subject;mass\n1;70,500\n", "may have a thousands"),
@@ -173,6 +174,25 @@ PEOPLE = [
     ("subject,mass\n1,1e999\n", "give a finite number"),
     ("subject,mass\n1,70\n1,80\n", "two rows of subject 1"),
     ("subject,mass,mass\n1,70,80\n", "has 2 columns 'mass'"),
+    (
+        "Proband;Alter;Masse (kg);Größe (cm)\n1;44;70,5;178\n",
+        {"age": 44.0, "mass": 70.5, "height": 1.78},
+    ),
+    (
+        "participant_id\tweight [g]\tGroesse (m)\nsub-1\t70500\t1.78\n",
+        {"mass": 70.5, "height": 1.78},
+    ),
+    (
+        "VP;mass_kg;Körpergröße / cm;Geschlecht (m/w)\n1;70;178;w\n",
+        {"mass": 70.0, "height": 1.78, "sex": "female"},
+    ),
+    ("subject,sex\n1,M\n", {"sex": "male"}),
+    ("subject,gender\n1,F\n", {"sex": "female"}),
+    ("subject,Geschlecht\n1,männlich\n", {"sex": "male"}),
+    ("subject,sex\n1,divers\n", {"sex": "divers"}),
+    ("subject,tau_d (ms),mass,weight\n1,80,70,71\n", {"tau_d": 0.08, "mass": 70.0, "weight": 71.0}),
+    ("subject,height (kg)\n1,70\n", "kg is no unit of height, use m"),
+    ("subject,Masse,Gewicht\n1,70,80\n", "'Masse' and 'Gewicht' are both mass"),
     ("subject,mass\n1,70,5\n", "row 2 has 3 cells"),
     ("subject,group\n1,a/b\n", "contains '/'"),
     ("subject,mass\n", "has no rows"),
@@ -182,13 +202,63 @@ PEOPLE = [
 @pytest.mark.parametrize(("text", "expected"), PEOPLE)
 def test_participants(tmp_path: Path, text: str, expected: str | dict[str, float | str]) -> None:
     touch(tmp_path, "s1.csv")
-    (tmp_path / "p.csv").write_text(text)
+    (tmp_path / "p.csv").write_text(text, encoding="utf-8")
     path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')
     if isinstance(expected, str):
         with pytest.raises(InputError, match=expected):
             read_study(path)
     else:
-        assert read_study(path).units[0].person == expected
+        assert read_study(path).units[0].person == pytest.approx(expected)
+
+
+def test_all_faults_of_participants_are_said_at_once(tmp_path: Path) -> None:
+    touch(tmp_path, "s1.csv")
+    rows = ["Proband;Gruppe;Masse (kg)", "1;a;ca. 70", "1;a/b;70", ";a;nan", "2;a;71,5"]
+    (tmp_path / "p.csv").write_bytes("\n".join(rows).encode("cp1252"))
+    path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')
+    with pytest.raises(InputError) as caught:
+        read_study(path)
+    for part in (
+        "row 2, mass: 'ca. 70'", "row 3, group: contains '/'", "row 3: two rows of subject 1",
+        "row 4: has a row without subject", "row 4, mass: 'nan'", "nothing was fitted",
+    ):  # fmt: skip
+        assert part in str(caught.value)
+
+
+def test_what_the_plant_refuses_is_said_before_any_fit(tmp_path: Path) -> None:
+    touch(tmp_path, "s1.csv", "s2.csv", "s3.csv")
+    (tmp_path / "p.csv").write_text("subject,mass,height,sex\n1,70,178,m\n2,70,1.8,f\n3,70,1.8,d\n")
+    path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')
+    source = plant_source("plants:seated_balance_for", {})
+    with pytest.raises(InputError, match=r"row 2 \(1\): .*height.*row 4 \(3\): .*sex"):
+        study_tasks(read_study(path), source)
+
+
+def test_a_further_column_does_not_stop_the_seat(tmp_path: Path) -> None:
+    """The seat takes any parameter by name, but no age."""
+    touch(tmp_path, "s1.csv")
+    (tmp_path / "p.csv").write_text("Proband;Alter;Masse (kg);k_h;BMI (kg/m2)\n1;44;70,5;25;22\n")
+    path = study(tmp_path, 'recordings = "s{subject}.csv"\nparticipants = "p.csv"')
+    found, source = read_study(path), plant_source("plants:seated_balance_for", {})
+    assert unused_columns(found, source) == ("age", "BMI")
+    tasks, _ = study_tasks(found, source)
+    assert tasks["sub-1"].arguments == {"mass": 70.5, "k_h": 25.0}
+
+
+def test_formats_may_be_mixed(tmp_path: Path) -> None:
+    touch(tmp_path, "P1_1.csv", "P1_2.xlsx", "P2_1.XLSX", "P2_1.doc")
+    units = read_study(study(tmp_path, 'recordings = "{subject}_{trial}.*"')).units
+    assert [[file.name for file in unit.files] for unit in units] == [
+        ["P1_1.csv", "P1_2.xlsx"], ["P2_1.XLSX"],
+    ]  # fmt: skip
+
+
+def test_an_unknown_reference_is_refused(tmp_path: Path) -> None:
+    touch(tmp_path, "1_EO.csv", "1_EC.csv")
+    text = 'recordings = "{subject}_{condition}.csv"\nreference = '
+    assert read_study(study(tmp_path, f"{text}'EC'")).reference == "EC"
+    with pytest.raises(InputError, match=r"'eyes' is no group, .*; use one of EC, EO"):
+        read_study(study(tmp_path, f"{text}'eyes'"))
 
 
 @pytest.mark.parametrize("name", [b"s1\xff.csv", b"s1\n2.csv", b"s1\x1b[2J.csv"])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-import scipy.stats
 
 from impc.checking import replace
 from impc.errors import InputError
@@ -59,30 +56,6 @@ def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]
     assert found["group"].low < np.log(2.0) < found["group"].high
     assert found["group"].p < 0.05
     assert cost_weight.notna().all()
-
-
-def made_up(subjects: int, visits: int) -> pd.DataFrame:
-    rng = np.random.default_rng(4)
-    rows = []
-    for number in range(subjects):
-        own = rng.standard_normal()
-        for visit in range(visits):
-            score = own + 0.4 * visit + 0.7 * (number % 2) + 0.5 * rng.standard_normal()
-            rows.append((str(number), str(visit), "", "ab"[number % 2], score))
-    return pd.DataFrame(
-        rows, columns=["subject", "visit", "condition", "group", "log_cost_weight.x"]
-    )
-
-
-def test_the_mixed_model_of_whole_tables_is_students_t_on_subject_means() -> None:
-    units = made_up(14, 3)
-    (found,) = (item for item in compare_cohort(units) if item.question == "mixed")
-    means = units.groupby(["group", "subject"])["log_cost_weight.x"].mean()
-    test: Any = scipy.stats.ttest_ind(means["b"], means["a"], equal_var=True)
-    assert found.estimate == pytest.approx(means["b"].mean() - means["a"].mean(), abs=1e-6)
-    assert found.p == pytest.approx(test.pvalue, rel=1e-3)
-    interval = test.confidence_interval(0.95)
-    assert (found.low, found.high) == pytest.approx((interval.low, interval.high), abs=1e-3)
 
 
 def test_a_unit_without_a_structure_has_no_columns_for_it() -> None:

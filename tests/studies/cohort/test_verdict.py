@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from impc.files.configuration import Configuration, RecordingTable
 from impc.reporting.finding import Level
 from impc.studies.cohort.figures import forest
-from impc.studies.cohort.report import comparisons
-from impc.studies.cohort.verdict import Cohort, cohort_verdict
+from impc.studies.cohort.report import comparisons, subjects
+from impc.studies.cohort.results import Cohort
+from impc.studies.cohort.study import Study, Unit
+from impc.studies.cohort.verdict import cohort_verdict
+from impc.studies.fit.verdict import fit_verdict
 
 FIT: dict[str, Any] = {
     "words": {"command": "commanded torque", "theta1": "seat tilt"},
     "units": {"K.command.theta1": "N m/rad"},
+    "shown_gains": {
+        "K.command.theta1": [np.pi / 180, "N m/°", "N m", "1° of seat tilt"],
+    },
     "controls": ["command"],
     "outputs": ["theta1"],
 }
@@ -34,13 +42,16 @@ def cohort(
         for visit in range(visits):
             moved = visit if visits > 1 else group == "second"
             level = "red" if number in red else "amber" if number in warned else "green"
+            gain = mean + shift * moved + spread * rng.standard_normal()
+            half = 1.96e5 if number in wide else 0.98 * spread
             rows.append({
                 "unit": f"sub-{number}_ses-{visit}", "subject": str(number),
                 "visit": str(visit + 1),
                 "condition": "", "group": group if visits == 1 else "", "level": level,
                 "headline": "It fits." if level == "green" else "The body model does not fit.",
-                GAIN: mean + shift * moved + spread * rng.standard_normal(),
-                "K_deviation.command.theta1": 1e5 if number in wide else 30.0,
+                GAIN: gain, "K_deviation.command.theta1": half / 1.96,
+                "K_low.command.theta1": gain - half, "K_high.command.theta1": gain + half,
+                "K_determined.command.theta1": number not in wide,
                 "vaf.theta1": 99.0 + 0.1 * rng.random(), "saturated": 0.1,
             })  # fmt: skip
     return Cohort(pd.DataFrame(rows), FIT, {})
@@ -51,12 +62,12 @@ def test_the_headline_has_direction_size_and_unit() -> None:
     found = cohort_verdict(made)
     assert found.level is Level.GREEN
     assert found.headline == (
-        "The second group applies 139 N m/rad less torque per seat tilt than the first."
+        "The second group answers 1° of seat tilt with 2.43 N m less torque than the first group."
     )
     for part in (
         "n = 20 people",
-        "95 % CI 138.99 to 139.12 N m/rad less",
-        "Holm p < 0.001",
+        "95 % CI 2.4258 to 2.4281 N m/° less",
+        "p_holm < .001",
         "Hedges' g",
     ):
         assert part in found.sentence
@@ -64,30 +75,73 @@ def test_the_headline_has_direction_size_and_unit() -> None:
 
 def test_a_gain_below_zero_is_larger_the_lower_it_is() -> None:
     made = cohort(-139.0, spread=0.1, mean=-800.0)
-    assert "139 N m/rad more torque" in cohort_verdict(made).headline
+    assert "2.43 N m more torque" in cohort_verdict(made).headline
 
 
 def test_visits_of_one_group_are_compared() -> None:
     found = cohort_verdict(cohort(50.0, spread=0.1, visits=2))
-    assert found.headline.startswith("At visit 2 people apply 50 N m/rad")
-    assert found.headline.endswith("more torque per seat tilt than at visit 1.")
+    assert found.headline.startswith("At visit 2 people answer 1° of seat tilt with 0.872 N m")
+    assert found.headline.endswith("more torque than at visit 1.")
 
 
 def test_no_difference_is_no_claim_that_groups_are_alike() -> None:
     found = cohort_verdict(cohort(0.0))
     assert found.headline == "No difference in a gain between the groups was found."
     assert any("equal" in claim.text for claim in found.may_not)
+    assert "p_holm = .208" in found.sentence
 
 
-def test_only_what_is_identified_and_usable_is_compared() -> None:
+def test_all_usable_fits_count_and_uncertain_ones_little() -> None:
     made = cohort(-139.0, wide=(0, 1), red=(19,))
+    made.units.loc[0, GAIN] = 5000.0
     lead = made.lead
     assert lead is not None
-    assert lead.n == 17
+    assert lead.n == 19
     kept = made.units.drop(index=[0, 1, 19])
     means = kept.groupby("group")[GAIN].mean()
-    assert lead.estimate == pytest.approx(means["second"] - means["first"])
-    assert made.identified[1:] == (17, 20)
+    assert lead.estimate == pytest.approx(means["second"] - means["first"], abs=0.5)
+    assert made.determined[1:] == (17, 20)
+
+
+def test_fits_far_from_their_group_are_named_and_tried_without() -> None:
+    """Two wrong gains, known well: the page marks them and gives the difference without them."""
+    made = cohort(-139.0)
+    ends = [GAIN, "K_low.command.theta1", "K_high.command.theta1"]
+    made.units.loc[[3, 15], ends] = 3000.0, 2900.0, 3100.0
+    found = cohort_verdict(made)
+    assert found.level is Level.AMBER
+    assert found.headline == "No difference in a gain between the groups was found."
+    assert "Without the 2 fits to look at it is 2.6 N m/° less" in found.sentence
+    (alert,) = found.alerts
+    assert alert.title == "2 of 20 fits are far from the others of their group"
+    assert "3 (3.7 times), 15 (4.6 times)" in alert.found
+    (axes,) = forest(made, narrow=False).axes
+    assert sum(line.get_marker() == "s" for line in axes.lines) == 2
+    study = Study("", Configuration(RecordingTable(), {}), tuple(
+        Unit(row["subject"], "0", "", (), row["group"])
+        for row in made.units.to_dict("records")
+    ))  # fmt: skip
+    table = subjects(study, made).table
+    assert table is not None
+    marked = table[table["why"].str.startswith("Look at it: a gain is")]
+    assert marked["subject"].tolist() == ["3", "15"]
+    assert marked["value"].tolist() == pytest.approx([3000 * np.pi / 180] * 2)
+    assert marked["value_si"].tolist() == pytest.approx([3000.0] * 2)
+
+
+def test_the_reference_is_subtracted() -> None:
+    made = cohort(-139.0, spread=0.1)
+    renamed = made.units.assign(
+        group=made.units["group"].map({"first": "LBP", "second": "control"})
+    )
+    for reference, first in (("", "control"), ("LBP", "LBP")):
+        table = comparisons(Cohort(renamed, FIT, {}, reference)).table
+        assert table is not None
+        assert table["compared"].iloc[0].endswith(f" - {first}")
+        assert (table["difference"].iloc[0] > 0) == (first == "control")
+        row = table.iloc[0]
+        assert (row["unit"], row["unit_si"]) == ("N m/°", "N m/rad")
+        assert row["difference"] == pytest.approx(row["difference_si"] * np.pi / 180)
 
 
 def test_warnings_make_it_amber_and_are_tried_without() -> None:
@@ -97,14 +151,23 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
     assert found.level is Level.AMBER
     (alert,) = found.alerts
     assert alert.title == "4 of 20 fits have a warning"
-    assert "Without fits with a warning it is 1" in alert.found
+    assert "Without fits with a warning it is 2.6 N m/° less" in alert.found
     assert "n = 16" in alert.found
+
+
+def test_fits_that_determine_no_gain_are_no_warning_of_the_study() -> None:
+    made = cohort(-139.0, warned=(3, 4, 12, 13))
+    said = "The model explains the movement, but the recordings do not determine its gains."
+    assert said in Path(fit_verdict.__code__.co_filename).read_text(encoding="utf-8")
+    units = made.units.assign(headline=made.units["headline"].where(made.units.index != 3, said))
+    assert Cohort(units, FIT, {}).warned == 3
+    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), FIT, {})).level is Level.GREEN
 
 
 def test_too_few_gains_are_no_comparison() -> None:
     found = cohort_verdict(cohort(-139.0, wide=tuple(range(9))))
     assert found.level is Level.AMBER
-    assert "identified in too few people" in found.headline
+    assert "known well enough in too few people" in found.headline
 
 
 def test_no_usable_fit_is_red() -> None:
@@ -113,7 +176,7 @@ def test_no_usable_fit_is_red() -> None:
     assert cohort_verdict(Cohort(pd.DataFrame(), {}, {"sub-1": "no"})).level is Level.RED
 
 
-def test_people_whose_gain_is_not_identified_are_hollow() -> None:
+def test_people_whose_gain_is_not_determined_are_hollow() -> None:
     made = cohort(-139.0, wide=(0, 1))
     for narrow in (False, True):
         (axes,) = forest(made, narrow).axes

@@ -1,0 +1,257 @@
+"""Results of a cohort in the words and units of its page, figures and terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impc.model.plant import UNKNOWN
+from impc.reporting.finding import Level
+from impc.reporting.rendering import number, p_value
+from impc.studies.cohort.comparison import (
+    compare_cohort,
+    difference_of,
+    interval_of,
+    measures_of,
+    outlying,
+)
+from impc.studies.fit.facts import between, with_unit
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import pandas as pd
+
+    from impc.arrays import Array
+    from impc.studies.cohort.comparison import Comparison
+
+#: Prefix of columns of logarithms, which are compared as ratios.
+LOGARITHM = "log_cost_weight."
+_LEADING = ("K.", LOGARITHM)
+# Questions about means, in the order of preference.
+_QUESTIONS = ("group", "change", "condition", "visit")
+# Of the headline of a fit that determines no gain (`impc.studies.fit.verdict`).
+_UNCERTAIN = "do not determine its gains"
+#: Corrected p-value of a difference that is found.
+SIGNIFICANT = 0.05
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Results of a cohort for page, figures and terminal."""
+
+    units: pd.DataFrame  # Table units.csv
+    described: Mapping[str, Any]  # Content of any fit: signals and their units
+    failed: Mapping[str, str]  # Unit -> reason why it has no fit
+    reference: str = ""  # Group, visit or condition of comparison; empty for the usual one
+
+    def _of(self, *levels: Level) -> pd.DataFrame:
+        """Units whose fits have one of the levels."""
+        wanted = [level.value for level in levels]
+        return self.units[self.units["level"].isin(wanted)] if len(self.units) else self.units
+
+    @cached_property
+    def usable(self) -> pd.DataFrame:
+        """Units with a green or amber fit."""
+        return self._of(Level.GREEN, Level.AMBER)
+
+    @cached_property
+    def with_warning(self) -> pd.DataFrame:
+        """Units with a warning, except that no gain is determined: such a fit counts little."""
+        found = self._of(Level.AMBER, Level.RED)
+        uncertain = found["headline"].str.contains(_UNCERTAIN) if len(found) else found.index < 0
+        return found[~uncertain]
+
+    @property
+    def warned(self) -> int:
+        """Number of fits with a warning."""
+        return len(self.with_warning)
+
+    @property
+    def people(self) -> int:
+        """Number of people with a fit."""
+        return int(self.units["subject"].nunique())
+
+    @cached_property
+    def measures(self) -> tuple[str, ...]:
+        """Columns of `units` that are compared."""
+        inner = self.described.get("inner", ())
+        return measures_of(self.units, inner) if len(self.units) else ()
+
+    @cached_property
+    def compared(self) -> tuple[Comparison, ...]:
+        """All comparisons of green and amber fits."""
+        return compare_cohort(self.usable, self.reference, self.described.get("inner", ()))
+
+    @cached_property
+    def tested(self) -> list[Comparison]:
+        """Comparisons with a p-value, most important first."""
+        return sorted((item for item in self.compared if np.isfinite(item.p)), key=_rank)
+
+    @property
+    def lead(self) -> Comparison | None:
+        """Comparison in the headline: of gains, or of cost weights within a structure."""
+        return next((one for one in self.tested if one.measure.startswith(_LEADING)), None)
+
+    @property
+    def measure(self) -> str:
+        """Measure of the first figure; empty without units."""
+        return self.lead.measure if self.lead else next(iter(self.measures), "")
+
+    @cached_property
+    def far(self) -> pd.Series[float]:
+        """Ratio of a gain to its group's median for fits to be looked at, else NaN."""
+        return outlying(self.usable, self.measures).reindex(self.units.index)
+
+    @property
+    def outliers(self) -> int:
+        """Number of usable fits to be looked at."""
+        return int(self.far.notna().sum())
+
+    @cached_property
+    def ends(self) -> pd.DataFrame:
+        """Measure of each unit with its interval in shown units, and whether it is determined."""
+        found = interval_of(self.units, self.measure)
+        ratio, scale = self.measure.startswith(LOGARITHM), self.scale(self.measure)
+        found = found.map(np.exp) if ratio else scale * found
+        kind, _, rest = self.measure.partition(".")
+        known = self.units.get(f"{kind}_determined.{rest}", True)
+        usable = self.units.index.isin(self.usable.index)
+        return found.assign(determined=known & usable).astype({"determined": bool})
+
+    def word(self, signal: str) -> str:
+        """Name of a signal in words."""
+        return str(self.described.get("words", {}).get(signal, signal.replace("_", " ")))
+
+    def name(self, measure: str) -> str:
+        """Name of a column of units.csv in words."""
+        kind, _, rest = measure.partition(".")
+        if kind == "K":
+            control, _, state = rest.partition(".")
+            several = len(self.described.get("controls", ())) > 1
+            return f"gain on {self.word(state)}" + f" ({self.word(control)})" * several
+        words = {"vaf": "variance accounted for, {}", "centre_weight": "central cost weight of {}",
+                 "log_cost_weight": "cost weight of {}"}  # fmt: skip
+        return words.get(kind, kind.replace("_", " ")).format(self.word(rest))
+
+    def scale(self, measure: str) -> float:
+        """Factor from a column of units.csv to the numbers on pages."""
+        return float(self._gain(measure)[0])
+
+    def unit(self, measure: str) -> str:
+        """Unit of a measure on pages; "-" for logarithms."""
+        return str(self._gain(measure)[1])
+
+    def plant_unit(self, measure: str) -> str:
+        """Unit of a column of units.csv."""
+        known = {"vaf": "%", "log_cost_weight": "-"} | self.described.get("units", {})
+        return str(known.get(measure, known.get(measure.partition(".")[0], UNKNOWN)))
+
+    def _gain(self, measure: str) -> tuple[float, str, str, str]:
+        """Factor, unit, unit of the command, and for what a gain is given."""
+        own = self.plant_unit(measure)
+        found: tuple[float, str, str, str] = self.described.get("shown_gains", {}).get(
+            measure, (1.0, own, own, f"1 of {self.word(measure.rpartition('.')[2])}")
+        )
+        return found
+
+    def amount(self, item: Comparison) -> tuple[str, str, str]:
+        """Difference and its interval, both without unit, and the unit with "less" or "more"."""
+        ends = self.shown(item.measure, np.array([item.estimate, item.low, item.high]))
+        if item.measure.startswith(LOGARITHM):
+            return number(float(ends[0])), between(*ends[1:]), "times"
+        # For negative gains, a lower value is "more".
+        below = item.measure.startswith("K.") and self.usable[item.measure].median() < 0
+        word = "less" if (item.estimate < 0) != below else "more"
+        low, high = sorted(np.sign(item.estimate or 1.0) * ends[1:])
+        unit = self.unit(item.measure).replace("%", "percentage points")
+        return number(abs(ends[0])), between(low, high), f"{unit} {word}"
+
+    def shown(self, measure: str, values: Array) -> Array:
+        """Values of a measure as pages show them; logarithms as ratios."""
+        return np.exp(values) if measure.startswith(LOGARITHM) else self.scale(measure) * values
+
+    def sentence(self, item: Comparison) -> str:
+        """Sentence on a difference."""
+        value, _, unit = self.amount(item)
+        amount, name = f"{value} {unit}", self.name(item.measure)
+        first, second = (_place(item.question, one) for one in (item.first, item.second))
+        if item.question == "change":
+            said = f"from visit to visit, the {name} rises by {amount} {second} than {first}"
+        elif item.measure.startswith("K."):
+            _, control, _ = item.measure.split(".", 2)
+            effort, (*_, top, per) = self.word(control), self._gain(item.measure)
+            amount = f"{value} {top} {unit.rpartition(' ')[2]} {effort.removeprefix('commanded ')}"
+            groups = item.question == "group"
+            who = f"{second[3:]} answers" if groups else f"{second} people answer"
+            said = f"{who} {per} with {amount} than {first[3:] if groups else first}"
+        else:
+            than = "as high {} as" if item.measure.startswith(LOGARITHM) else "{} than"
+            said = f"the {name} is {amount} {than.format(second)} {first}"
+        several = item.condition and self.units["condition"].nunique() > 1
+        where = f" ({item.condition})" if several else ""
+        return f"{said[:1].upper()}{said[1:]}{where}."
+
+    def numbers(self, item: Comparison) -> str:
+        """Interval, number of people, SD between them, p-value and effect size."""
+        size = f", {effect_name(item)} = {number(item.effect)}" if np.isfinite(item.effect) else ""
+        _, ends, unit = self.amount(item)
+        apart = number(item.between * self.scale(item.measure))
+        differ = f" who differ by an SD of {with_unit(apart, self.unit(item.measure))}"
+        people = f"n = {item.n} people{differ * (item.measure[:2] == 'K.' and item.between > 0)}"
+        p = p_value(item.p_holm)
+        p_holm = f"p_holm {p}" if p[0] == "<" else f"p_holm = {p}"
+        return f"95 % CI {ends} {unit}, {people}, {p_holm}{size}"
+
+    @cached_property
+    def determined(self) -> tuple[str, int, int]:
+        """First gain, number of people in whom it is determined, number of all fitted people."""
+        gains = [name for name in (self.measure, *self.measures) if name[:2] == "K."]
+        if not gains:
+            return "", 0, 0
+        known = self.usable.get(f"K_determined{gains[0][1:]}")
+        rows = self.usable if known is None else self.usable[known.astype(bool)]
+        return self.name(gains[0]), rows["subject"].nunique(), self.people
+
+    def without_warned(self) -> str:
+        """The leading difference in fits without a warning, as a sentence; empty without one."""
+        return self._only(
+            self.units.drop(index=self.with_warning.index), "fits with a warning", self.lead
+        )
+
+    def without_outliers(self, item: Comparison | None) -> str:
+        """A difference without the fits to be looked at; empty without such fits."""
+        which = f"the {self.outliers} fit{'s' * (self.outliers > 1)} to look at"
+        kept = self.usable[self.far[self.usable.index].isna()]
+        return self._only(kept, which, item if self.outliers else None)
+
+    def _only(self, kept: pd.DataFrame, without: str, item: Comparison | None) -> str:
+        if item is None:
+            return ""
+        other = difference_of(kept, item, self.reference)
+        if other.note:
+            return f" Without {without}, too few people are left."
+        value, ends, unit = self.amount(other)
+        return f" Without {without} it is {value} {unit} (95 % CI {ends}, n = {other.n})."
+
+
+def effect_name(item: Comparison) -> str:
+    """Name of the effect size."""
+    return "Cohen's d" if item.question in ("visit", "condition") else "Hedges' g"
+
+
+def _place(question: str, name: str) -> str:
+    """A group, visit or condition in a sentence."""
+    if question == "visit":
+        return f"at visit {name}"
+    if question == "condition":
+        return f"in condition {name}"
+    return f"in the {name} group" if len(name) > 1 and name.isalpha() else f"in group {name}"
+
+
+def _rank(item: Comparison) -> tuple[bool, int, bool, float]:
+    last = not item.measure.startswith(_LEADING)
+    return not item.p_holm <= SIGNIFICANT, _QUESTIONS.index(item.question), last, item.p
