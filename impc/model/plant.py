@@ -63,7 +63,7 @@ class Plant(Value):
         Pairs of signal and description; `word` looks one up.
     gravity : tuple of (str, float)
         Pairs of an angle and m g h, the moment of gravity in N m/rad, from `system.gravity`; the
-        report gives gains as a share of it.
+        report gives gains in multiples of it.
     commands : tuple of str
         States that are the last command of a control (`with_rates`); usually none.
     body : Body or None

@@ -43,8 +43,8 @@ def per_unit_finding(result: FitResult) -> Finding:
     plant, several = result.given.plant, result.given.plant.m > 1
     gravity = dict(plant.gravity)
 
-    def share(row: GainRow) -> float:
-        """Gain as a share of m g h, if the plant states that of the state and is in N m."""
+    def times(row: GainRow) -> float:
+        """Gain over m g h, if the plant states that of the state and is in N m."""
         _, control, state = row.interval.name.split(".", 2)
         stated = state in gravity and plant.unit(control) == "N m"
         return (row.interval.value or np.nan) / gravity[state] if stated else np.nan
@@ -58,7 +58,7 @@ def per_unit_finding(result: FitResult) -> Finding:
             "low": lambda row: float(row.low),
             "high": lambda row: float(row.high),
             "unit": lambda row: row.unit,
-            **({"share_of_m_g_h": share} if gravity else {}),
+            **({"times_m_g_h": times} if gravity else {}),
             "determined": lambda row: row.determined,
         },
     )
@@ -66,7 +66,7 @@ def per_unit_finding(result: FitResult) -> Finding:
         "for_every": "For every ...",
         "low": "95 % CI, low",
         "high": "95 % CI, high",
-        "share_of_m_g_h": "Share of m g h",
+        "times_m_g_h": "Times m g h",
     }
     count = len(result.estimate.rivals)
     other = "another end" if count == 1 else f"{count} other ends"

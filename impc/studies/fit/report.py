@@ -262,9 +262,11 @@ def _lasting(result: FitResult, found: LastingResponse) -> str:
         return ""
     at_once = scale / factor * quick.value
     change = "part of it is taken back, and" if abs(value) < abs(at_once) else "more is added, and"
+    gravity = dict(plant.gravity).get(found.state)
+    times = f", {number(found.value / gravity, 2)} times m g h" if gravity else ""
     return (
         f"A quick {words} of {one_of(unit)} is answered with {fixed(at_once)} {of}. If it lasts, "
-        f"{change} {fixed(value)} {of} remain (95 % CI {between(low, high)})."
+        f"{change} {fixed(value)} {of} remain (95 % CI {between(low, high)}){times}."
     )
 
 
