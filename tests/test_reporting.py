@@ -25,7 +25,6 @@ from impc.reporting.document import (
     Copy,
     Fold,
     Lines,
-    Pair,
     Quiet,
     Report,
     Section,
@@ -141,7 +140,6 @@ def every_block() -> Report:
         Checks([Check(Level.GREEN, EVIL, EVIL)]),
         alert,
         Fold(EVIL, (EVIL,)),
-        Pair(EVIL, EVIL),
     )
     return Report(
         EVIL,
@@ -169,8 +167,8 @@ def test_every_block_is_escaped_and_there() -> None:
     shown.feed(page)
     # Window, kind, meta, headline, sentence, 4 of the key, 3 claims, 2 to copy, section; twice 4 of
     # an alert; 2 paragraphs, 2 lines, 2 of a term, caption, sentence, 2 cells, caption of the
-    # figure, its titles and texts in two drawings, quiet, 2 of a check, 2 of a fold, 2 of a pair.
-    assert sum(text.count(EVIL) for text in shown.found) == 15 + 8 + 2 + 2 + 2 + 4 + 1 + 4 + 1 + 6
+    # figure, its titles and texts in two drawings, quiet, 2 of a check, 2 of a fold.
+    assert sum(text.count(EVIL) for text in shown.found) == 15 + 8 + 2 + 2 + 2 + 4 + 1 + 4 + 1 + 4
     assert 'href="#in-short"' in page
     assert 'id="in-short"' in page
 

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
-from impc.assess.assessments import simulated_vaf
 from impc.assess.profiles import QUANTILE, FitCurve, standard_error
 from impc.checking import replace
 from impc.errors import InputError
@@ -26,7 +24,6 @@ from impc.model.plant_family import LIMIT
 if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
 
 # Largest number of rounds of limit and controller, and a change of the limit that ends them.
 _ROUNDS, _STAYS = 5, 0.01
@@ -36,9 +33,6 @@ _NEAR = np.array([1.25, 1.1, 1.0, 0.9, 0.8])
 # Limits tried first, relative to the largest command: without a limit a seated subject's fitted
 # command peaks at 200 times the true one. Each gain follows the one before.
 _GRID = np.geomspace(1.05, 0.003, 20)
-# Points of a curve for figures, relative to the limit of the fit, neighbours first. More
-# evaluations change the unexplained variance by a tenth and take three times as long.
-_SHARES, _FEW = (0.9, 0.75, 1.15, 1.5), 6
 
 
 @dataclass(frozen=True)
@@ -120,54 +114,3 @@ def _typical_peak(fitted: Estimate, control: int) -> float:
     runs = simulated(fitted.problem, fitted.gain, fitted.metric)
     command = np.concatenate([np.abs(run.applied[:, control]) for run in runs])
     return float(np.quantile(command, 0.995))
-
-
-@dataclass(frozen=True)
-class LimitCurve(Frozen):
-    """Unexplained variance against the limit of one control."""
-
-    control: str
-    given: float  # The limit of the fit
-    limits: Array  # In the unit of the control (t,), ascending
-    unexplained: Array  # 100 - VAF, % (t, p); NaN without a gain
-
-    @property
-    def left(self) -> Array:
-        """Unexplained variance summed over outputs (t,); infinite without a gain."""
-        return np.asarray(np.nan_to_num(self.unexplained, nan=np.inf).sum(axis=1))
-
-    @property
-    def best(self) -> int:
-        """Index of the limit with the least unexplained variance."""
-        return int(np.argmin(self.left))
-
-    @property
-    def own(self) -> int:
-        """Index of the limit of the fit."""
-        return int(np.argmin(np.abs(self.limits - self.given)))
-
-
-def limit_curve(fitted: Estimate, control: int) -> LimitCurve | None:
-    """Curve around a finite symmetric limit; None if there is none."""
-    problem = fitted.problem.with_body_fixed()
-    given = float(problem.bounds.u_max[control])
-    if not np.isfinite(given) or problem.bounds.u_min[control] != -given or problem.plant.commands:
-        return None
-    problem = with_free_limit(problem, control, given)
-    name = problem.plant.controls[control]
-    curve = FitCurve(problem, fitted.gain, fitted.metric, f"{LIMIT}.{name}", _FEW)
-    curve.tried[0.0] = curve.start[1]
-    for share in _SHARES:
-        curve.loss(float(np.log(share)))
-    limits = given * np.exp(curve.finite)
-    unexplained = [_unexplained(curve.tried[at], len(problem.plant.C)) for at in curve.finite]
-    return LimitCurve(name, given, frozen(limits), frozen(unexplained))
-
-
-def _unexplained(found: Fitted | None, outputs: int) -> Array:
-    """100 - VAF, % (p,); NaN if no gain stabilises with so low a limit."""
-    if found is None:
-        return np.full(outputs, np.nan)
-    problem, K, S = found.problem, np.array(found.K), np.array(found.S)
-    shares = simulated_vaf(problem.plant, problem.recordings, simulated(problem, K, S))
-    return np.asarray(100 - shares)

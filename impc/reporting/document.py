@@ -70,16 +70,8 @@ class Fold:
     blocks: Sequence[Block]
 
 
-@dataclass(frozen=True)
-class Pair:
-    """Two blocks side by side; one below the other on a phone."""
-
-    left: Block
-    right: Block
-
-
 #: Content of a section; a str is a paragraph.
-Block = str | Finding | Picture | Chart | Lines | Terms | Quiet | Checks | Alert | Fold | Pair
+Block = str | Finding | Picture | Chart | Lines | Terms | Quiet | Checks | Alert | Fold
 
 
 @dataclass(frozen=True)
@@ -195,8 +187,6 @@ def _flat(blocks: Sequence[Block]) -> list[Block]:
         inside: Sequence[Block] = ()
         if isinstance(item, Fold):
             inside = item.blocks
-        elif isinstance(item, Pair):
-            inside = (item.left, item.right)
         elif isinstance(item, Finding) and item.figure is not None:
             inside = (item.figure,)
         found += [item, *_flat(inside)]

@@ -10,7 +10,7 @@ from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, true_controller
 from experiments.simulated_subjects import noisy_recordings
 from impc.assess import input_limits
-from impc.assess.input_limits import LimitEstimate, input_limit, limit_curve, with_limit
+from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
 from impc.assess.profiles import QUANTILE
 from impc.control.closed_loop import simulate
 from impc.inverse.noisy_fit import fit_controller
@@ -88,14 +88,3 @@ def test_with_limit_changes_one_input_only() -> None:
     assert np.isinf(with_limit(fitted.problem, np.inf).bounds.u_min[0])
     with pytest.raises(impc.InputError, match="control"):
         input_limit(fitted, 1)
-
-
-def test_the_true_limit_is_the_best_of_the_curve() -> None:
-    curve = limit_curve(cart_fit(4), 0)
-    assert curve is not None
-    assert limit_curve(cart_fit(4, u_max=None), 0) is None
-    assert curve.given == 1.0
-    assert curve.limits[np.nanargmin(curve.unexplained[:, 0])] == 1.0
-    here = curve.unexplained[curve.limits == 1.5, 0]
-    there = 100 - np.array(cart_fit(4, u_max=1.5).vaf)
-    np.testing.assert_allclose(here, there, rtol=0.15)

@@ -59,9 +59,8 @@ def between(low: float, high: float) -> str:
 
 
 def limit_ends(found: LimitFound) -> str:
-    """Interval of an estimated limit, or the neighbouring limits that were tried."""
-    ends = between(found.low, found.high)
-    return f"95 % CI {ends}" if found.fitted else f"best of the limits tried; next ones {ends}"
+    """Interval of an estimated limit."""
+    return f"95 % CI {between(found.low, found.high)}"
 
 
 def with_unit(value: str, unit: str) -> str:

@@ -15,7 +15,6 @@ from impc.reporting.style import (
     HALF,
     INK,
     MUTED,
-    PAPER,
     PHONE,
     RECORDED,
     RULE,
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.assess.frequency_response import FrequencyResponse
-    from impc.assess.input_limits import LimitCurve
     from impc.studies.fit.result import FitResult
 
 _WINDOW, _PHONE_WINDOW = 10.0, 6.0  # s
@@ -142,29 +140,6 @@ def residual_figure(result: FitResult, narrow: bool) -> Figure:
     below.axhspan(-band, band, color=RULE, linewidth=0, zorder=0)
     above.set_xlabel("Time (s)")
     below.set_xlabel("Lag (s)")
-    return figure
-
-
-def limit_figure(result: FitResult, curve: LimitCurve, narrow: bool) -> Figure:
-    """Unexplained variance against the limit assumed in the fit."""
-    plant = result.given.plant
-    factor, unit = shown_unit(plant, curve.control)
-    figure = new_figure(PHONE if narrow else 5.4, 3.5)
-    ax = figure.subplots()
-    limits = factor * curve.limits
-    marks = (("o", "-", BLUE, BLUE), ("s", "--", MUTED, PAPER), ("^", ":", INK, PAPER))
-    for column, name in enumerate(plant.outputs[:_MOST]):
-        mark, line, colour, face = marks[column]
-        values = curve.unexplained[:, column]
-        ax.plot(limits, values, marker=mark, linestyle=line, color=colour, markerfacecolor=face,
-                label=signal_name(plant, name))  # fmt: skip
-    used = factor * float(result.given.bounds.u_max[plant.controls.index(curve.control)])
-    ax.axvline(used, color=VERMILLION, linewidth=1.2, linestyle=(0, (4, 3)), label="given limit")
-    ax.set_yscale("log")
-    _plain_log(ax, "y")
-    ax.set_title("Variance not explained (%)")
-    ax.set_xlabel(f"Limit assumed in the fit ({unit})")
-    ax.legend()
     return figure
 
 

@@ -187,7 +187,7 @@ def parameter_findings(result: FitResult) -> list[Finding]:
 
 
 def limit_findings(result: FitResult) -> list[Finding]:
-    """Limits of the commands, other horizons and the limit curve, as far as computed."""
+    """Limits of the commands and other horizons, as far as computed."""
     found, plant = [], result.given.plant
     if result.uncertainty.limits:
         table = table_of(
@@ -219,15 +219,6 @@ def limit_findings(result: FitResult) -> list[Finding]:
             "smallest. VAF (%): in left-out trials."
         )
         found.append(Finding("alternatives", table, caption))
-    if result.curves:
-        rows = [
-            {"input": curve.control, "limit": float(limit)}
-            | {f"unexplained_{name}_percent": float(value)
-               for name, value in zip(plant.outputs, values, strict=True)}
-            for curve in result.curves
-            for limit, values in zip(curve.limits, curve.unexplained, strict=True)
-        ]  # fmt: skip
-        found.append(Finding("limit_curve", pd.DataFrame(rows), folded="The curve in numbers"))
     return found
 
 

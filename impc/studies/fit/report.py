@@ -19,7 +19,6 @@ from impc.reporting.document import (
     Draw,
     Fold,
     Lines,
-    Pair,
     Quiet,
     Report,
     Section,
@@ -187,8 +186,6 @@ def _draws(result: FitResult, window: int) -> dict[str, Draw]:
         "methods": functools.partial(methods_figure, result.methods[::-1]),
         "residuals": functools.partial(figures.residual_figure, result),
     }
-    for place, curve in enumerate(result.curves):
-        found[f"limit-{place + 1}"] = functools.partial(figures.limit_figure, result, curve)
     if result.response is not None:
         response = functools.partial(figures.frequency_figure, result, result.response)
         found["frequency-response"] = response
@@ -291,21 +288,8 @@ def _limit(result: FitResult, doubtful: bool) -> list[Block]:
     return [
         said,
         methods,
-        *_limit_pictures(result)[1:],
         *findings.limit_findings(result),
         Fold("All methods in numbers", [methods_finding(result.methods[::-1])]),
-    ]
-
-
-def _limit_pictures(result: FitResult) -> list[Block]:
-    return [
-        Picture(
-            f"limit-{place + 1}",
-            "Variance not explained against the limit of the command in the fit",
-            "Limit curve: each point is a separate fit with that limit. The lowest point fits "
-            "best.",
-        )
-        for place in range(len(result.curves))
     ]
 
 
@@ -385,10 +369,9 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
     )
     names = {index: trial_name(result, index) for index in shown_trials(result)}
     chart = Chart("Trials", trajectories(result.fitted.problem, result.methods[::-1], names))
-    curves = _limit_pictures(result)
     return [
         Checks(checks),
-        Pair(curves[0], residuals) if curves else residuals,
+        residuals,
         Fold("Every trial in numbers", [findings.agreement_finding(result)]),
         Fold("Every trial, to explore", [chart]),
         *([] if result.lack[-1] is None else [lack_finding(result.given.plant, result.lack[-1])]),
@@ -416,30 +399,19 @@ def _limit_check(result: FitResult) -> list[Check]:
     if not result.met:
         return [Check(Level.NOTE, "Limit", "Never reached: the recordings cannot check it.")]
     if found is None:
+        last = result.lack[-1]
+        tested = [one for one in (last.errors if last else ()) if one.name == LIMIT]
         if result.culprit is not None and result.culprit.name == LIMIT:
             return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
-        if result.curves and all(curve.best == curve.own for curve in result.curves):
-            said = _best_of_curve(result)
-            return [Check(Level.GREEN, "Limit", said)]
-        return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not estimated.")]
+        if tested and last is not None and not last.alarm:
+            said = f"the residual points to no other ({probability(tested[0].probability)})"
+            return [Check(Level.GREEN, "Limit", f"Given as {limit}; {said}.")]
+        return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not tested.")]
     said = (
         f"Given as {limit}; the recordings point to {number(found.value)} {found.unit} "
         f"({limit_ends(found)})."
     )
     return [Check(Level.AMBER if found.disagrees else Level.GREEN, "Limit", said)]
-
-
-def _best_of_curve(result: FitResult) -> str:
-    """That the given limit is the best of those tried, which are counted."""
-    curve, (factor, unit) = (
-        result.curves[0],
-        shown_unit(result.given.plant, result.curves[0].control),
-    )
-    tried = factor * np.array(curve.limits)
-    return (
-        f"Of {len(tried)} limits tried ({number(tried.min())} to {number(tried.max())} {unit}) "
-        f"{number(factor * curve.given)} {unit} fits best."
-    )
 
 
 def _model(result: FitResult) -> Check:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
     from impc.assess.frequency_response import FrequencyResponse
-    from impc.assess.input_limits import LimitCurve
     from impc.assess.intent import Intent
     from impc.assess.lack_of_fit import LackOfFit, ModelError
     from impc.assess.printed_gain import GainEstimate, Interval
@@ -42,8 +41,6 @@ if TYPE_CHECKING:
 #: Largest number of trials on a page: 500 trials gave 51 MB and needed 6.3 GB of memory.
 MOST_TRIALS = 24
 
-# Another limit of the curve is better if its residual is below this share of the given limit's.
-_BETTER = 0.7
 #: VAF (%) of an output below which a fit is not usable.
 LITTLE = 50.0
 
@@ -84,7 +81,6 @@ class LimitFound(NamedTuple):
     high: float
     unit: str
     known: float  # Largest difference from the given limit that its stated uncertainty allows
-    fitted: bool = True  # True: low and high are a 95 % interval; False: the next limits tried
 
     @property
     def disagrees(self) -> bool:
@@ -129,7 +125,6 @@ class FitResult:
     ceiling: Ceiling | None = None
     # Gain by regression on recorded commands (`command_regression`); None if there are none
     commands: pd.DataFrame | None = None
-    curves: tuple[LimitCurve, ...] = ()  # For the inputs that reach their limit
     response: FrequencyResponse | None = None  # From the perturbation to the outputs
     falls: tuple[str, ...] = ()  # Trials that ended in a fall and were not fitted, with the time
 
@@ -146,12 +141,6 @@ class FitResult:
                 half = TWO_SIDED * one.deviation
                 return self._limit(control, one.nominal, one.value, one.value - half,
                                    one.value + half)  # fmt: skip
-        for curve in self.curves:
-            best = curve.best
-            if curve.left[best] < _BETTER * curve.left[curve.own]:
-                around = curve.limits[[max(best - 1, 0), min(best + 1, len(curve.limits) - 1)]]
-                found = self._limit(curve.control, curve.given, curve.limits[best], *around)
-                return found._replace(fitted=False)
         return None
 
     def _limit(self, control: str, *numbers: float) -> LimitFound:

@@ -19,7 +19,6 @@ from impc.arrays import Array, frozen
 from impc.assess.assessments import evaluate_method
 from impc.assess.ceiling import ceiling
 from impc.assess.frequency_response import frequency_response
-from impc.assess.input_limits import LimitCurve, limit_curve
 from impc.assess.intent import intent
 from impc.assess.printed_gain import command_regression, gain_estimate
 from impc.assess.structures import assess_structure, no_structure
@@ -110,7 +109,7 @@ def fit_recordings(
 def fit_alone(problem: Problem, settings: FitSettings) -> FitResult:
     """Fit a subject as `fit_recordings` does, without what only its own page shows.
 
-    Left out are the other methods, the set of weights, limit curves and analyses on request.
+    Left out are the other methods, the set of weights and analyses on request.
     """
     settings = replace(settings, structures=[], methods=[], profiles=[], horizons=[])
     settings = replace(settings, unknown_limit=False, replicates=0, observer=None)
@@ -162,7 +161,7 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         at = plant, K, np.array(fitted.metrics), np.array(common["intent"].sizes)
         return weights_summary_or_reason(*at, draws, pool.map)
 
-    methods, held_out, weights_found, curves = _beside_it(
+    methods, held_out, weights_found = _beside_it(
         estimate, own, others, settings, progress, attempt, whole_set, rejected=test.rejected
     )
     structures = _structures(problem, settings, fitted, progress)
@@ -182,7 +181,6 @@ def _fitted(problem: Problem, settings: FitSettings, progress: FitProgress) -> F
         person=attempt("subject with sensory noise", person, None),
         ceiling=ceiling(fitted.problem, settings.settle),
         commands=attempt("regression of commands", functools.partial(_regressed, fitted), None),
-        curves=curves,
         response=frequency_response(fitted.problem, methods[-1].runs),
         seconds=time.perf_counter() - started,
         **common,
@@ -217,13 +215,6 @@ def _with_held_out(own: MethodFit, held: Sequence[HeldOut]) -> MethodFit:
     return replace(own, held_out=frozen([item.vaf for item in held])) if held else own
 
 
-def _curves(fitted: Estimate, own: MethodFit) -> tuple[LimitCurve, ...]:
-    """Limit curve of each input that reaches its limit."""
-    reached = own.largest_input >= (1 - 1e-6) * np.asarray(fitted.problem.bounds.u_max)
-    found = [limit_curve(fitted, int(control)) for control in np.flatnonzero(reached)]
-    return tuple(curve for curve in found if curve is not None)
-
-
 def _regressed(fitted: Estimate) -> pd.DataFrame | None:
     """Gain by regression on recorded commands; None without them, or for command changes."""
     problem = fitted.problem
@@ -256,13 +247,8 @@ def _beside_it(
     whole_set: Callable[[ThreadPoolExecutor], tuple[WeightsSummary | None, str]],
     *,
     rejected: bool,
-) -> tuple[
-    tuple[MethodFit, ...],
-    tuple[HeldOut, ...],
-    tuple[WeightsSummary | None, str],
-    tuple[LimitCurve, ...],
-]:
-    """Other methods, left-out trials, limit curves and the set of weights, in parallel."""
+) -> tuple[tuple[MethodFit, ...], tuple[HeldOut, ...], tuple[WeightsSummary | None, str]]:
+    """Other methods, left-out trials and the set of weights, in parallel."""
     held_out: list[HeldOut | None] = []
     fitted, trials = own.estimate, len(own.estimate.problem.recordings)
     with threads(_THREADS) as pool:
@@ -273,7 +259,6 @@ def _beside_it(
             pool.submit(attempt, _without(index), functools.partial(without, index), None)
             for index in range(trials if _leaves_out(trials, settings) else 0)
         ]
-        limits = pool.submit(attempt, "limit curve", functools.partial(_curves, fitted, own), ())
         for found in others:
             progress.done(found.estimate.method)
         found_set = whole_set(pool)
@@ -281,11 +266,10 @@ def _beside_it(
         for index, other in enumerate(pending):
             held_out.append(other.result())
             progress.done(_without(index))
-        curves = limits.result()
     held = tuple(one for one in held_out if one is not None)
     if len(held) < len(held_out):
         held = ()  # the table has rows for all trials or for none
-    return (*others, _with_held_out(own, held)), held, found_set, curves
+    return (*others, _with_held_out(own, held)), held, found_set
 
 
 def _person(
