@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import os
 import re
@@ -215,6 +216,17 @@ def test_a_report_is_its_files() -> None:
         "level": "red", "sentences": [EVIL], "table": {"=a": [EVIL, "=1+1"], "p_b": [0.1, EVIL]}
     }  # fmt: skip
     assert b"\n'=1+1," in files["numbers.csv"]
+
+
+def test_no_heading_of_the_workbook_is_there_twice() -> None:
+    """Two columns may share a heading if the page shows one of them."""
+    table = pd.DataFrame({"vaf": [1.0], "held_out_vaf": [2.0]})
+    same = dict.fromkeys(table.columns, "VAF (%)")
+    finding = Finding("methods", table, labels=same, hidden=("held_out_vaf",))
+    verdict = Verdict(Level.NOTE, "A", "b")
+    files = Report("a", "A", verdict, [Section("One", [finding])]).files()
+    sheet = pd.read_excel(io.BytesIO(files["tables.xlsx"]), "methods", header=None)
+    assert sheet.iloc[0].tolist() == ["VAF (%)", "held_out_vaf"]
 
 
 # Writing

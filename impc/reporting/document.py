@@ -148,7 +148,11 @@ class Report:
     def files(self, *, pdf: bool = False) -> dict[str, bytes]:
         """Files by name: page, result.json, tables and figures; with `pdf` also PDF figures."""
         tables = self._tables()
-        heads = {one.name: one.labels for one in [*self.findings(), *self.beside]}
+        # Hidden columns keep their own names, so that no heading is there twice.
+        heads = {
+            one.name: {name: head for name, head in one.labels.items() if name not in one.hidden}
+            for one in [*self.findings(), *self.beside]
+        }
         sheets = {
             name: one.rename(columns=heads[name])
             for name, one in tables.items()
