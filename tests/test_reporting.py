@@ -225,7 +225,9 @@ def test_no_heading_of_the_workbook_is_there_twice() -> None:
     finding = Finding("methods", table, labels=same, hidden=("held_out_vaf",))
     verdict = Verdict(Level.NOTE, "A", "b")
     files = Report("a", "A", verdict, [Section("One", [finding])]).files()
-    sheet = pd.read_excel(io.BytesIO(files["tables.xlsx"]), "methods", header=None)
+    sheet = pd.read_excel(
+        io.BytesIO(files["tables.xlsx"]), "methods", header=None, engine="openpyxl"
+    )
     assert sheet.iloc[0].tolist() == ["VAF (%)", "held_out_vaf"]
 
 
