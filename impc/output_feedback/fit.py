@@ -15,6 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
+from impc.assess.variance_accounted_for import whiteness
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.minimiser import Prior, Rows, Stop, minimise
@@ -38,6 +39,10 @@ if TYPE_CHECKING:
     from impc.output_feedback.observer import Observer
     from impc.output_feedback.unknowns import LikelihoodTerms
 
+# Lags of the whiteness test: 1 s, which shows a missed rhythm; at least this many.
+_LEAST_LAGS = 10
+# p-value below which innovations are not white.
+_WHITE = 0.01
 # Evaluations of the first stage, in which the gain is fixed: with noise SDs far off, the best gain
 # lies on the stability boundary, where 3 of 21 searches ended.
 _FIRST = 10
@@ -102,6 +107,31 @@ class OutputFeedbackFit(Frozen):
     def criterion(self) -> float:
         """Akaike information criterion, 2 count - 2 log L; smaller is better."""
         return 2 * self.count - 2 * self.log_likelihood
+
+    @property
+    def whiteness(self) -> Array:
+        """p-values (p,) of whiteness of the standardised innovations of each output."""
+        trials = self.identified.trials
+        joined = np.concatenate(
+            [one.innovations / np.sqrt(np.einsum("tpp->tp", one.spreads)) for one in trials]
+        )
+        lags = max(_LEAST_LAGS, round(1 / self.problem.plant.dt))
+        return whiteness(joined, min(lags, len(joined) - 1))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Sentences that qualify the result, as those of `Estimate.doubts`."""
+        found = []
+        if not self.converged:
+            found.append("The search did not converge: do not report these gains.")
+        names = zip(self.problem.plant.outputs, self.whiteness, strict=True)
+        left = [name for name, p in names if p < _WHITE]
+        if left:
+            found.append(
+                f"Prediction errors of {' and '.join(left)} are autocorrelated: the model is "
+                "incomplete, and gains may be wrong by more than their intervals show."
+            )
+        return tuple(found)
 
 
 @checked(spread=0, max_evaluations=1, recorder="p", counted=0)

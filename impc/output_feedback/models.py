@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.variance_accounted_for import whiteness
 from impc.checking import replace
 from impc.control.aims import aim_of, window
 from impc.control.closed_loop import prepare_loop
@@ -51,15 +50,12 @@ _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100
 _ASKED, _BESIDE = 250, 60
 # Initial signal-dependent motor noise as a share of the command (typical of isometric force).
 _SHARE = 0.1
-# Lags of the whiteness test: 1 s, which shows a missed rhythm; at least this many.
-_LEAST_LAGS = 10
 # A noise SD counts as identified if its 95 % interval ends within a factor of ten.
 _IDENTIFIED = np.log(10)
 # Correlation of gain and noise from which they can hardly be separated.
 _CONFUSED = 0.9
 # AIC differences below this do not decide (Burnham and Anderson 2002).
 _UNDECIDED = 4.0
-_WHITE = 0.01
 # From simulated subjects (experiments/output_feedback.md).
 _AT_LIMIT = (
     "A limit was reached, so these intervals are approximate: in simulations they contained 80 to "
@@ -139,18 +135,13 @@ class PersonReport(Frozen):
         found, together = [self._compared()], self.confusion
         if len(entries):
             count = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
-            loose = " The search did not converge: do not report these gains." * (not fit.converged)
-            found.append(f"The 95 % CI of {count} of {len(entries)} gains excludes zero.{loose}")
+            found.append(f"The 95 % CI of {count} of {len(entries)} gains excludes zero.")
+        found += fit.doubts
         if self.at_limit:
             found.append(_AT_LIMIT)
         if together >= _CONFUSED:
             how = f"correlation {together:.2f}"
             found.append(f"Gain and noise can hardly be separated here ({how}).")
-        outputs = zip(self.plant.outputs, self.whiteness, strict=True)
-        left = [signal_name(self.plant, name) for name, p in outputs if p < _WHITE]
-        if left:
-            named = " and ".join(left)
-            found.append(f"Residuals of {named} are autocorrelated: the model is incomplete.")
         return found
 
     def _compared(self) -> str:
@@ -247,7 +238,7 @@ def person_report(
             levels=levels,
             entries=entries,
             confusion=intervals.confusion(fit),
-            whiteness=frozen(_white(fit)),
+            whiteness=frozen(fit.whiteness),
             ahead=ahead,
             errors=frozen(prediction_errors(fit, ahead)),
         )
@@ -335,15 +326,6 @@ def persons(problem: Problem, asked: Observer, walk: Array) -> list[tuple[str, P
     if len(bound_rows(problem.bounds, problem.plant).b):
         models.append((f"{models[0][0]}, no limit", problem.without_bounds(), asked))
     return models
-
-
-def _white(fit: OutputFeedbackFit) -> Array:
-    """Whiteness p-values of the standardised innovations of all trials, concatenated."""
-    lags, trials = max(_LEAST_LAGS, round(1 / fit.problem.plant.dt)), fit.identified.trials
-    joined = np.concatenate(
-        [one.innovations / np.sqrt(np.einsum("tpp->tp", one.spreads)) for one in trials]
-    )
-    return whiteness(joined, min(lags, len(joined) - 1))
 
 
 def prediction_errors(fit: OutputFeedbackFit, ahead: tuple[int, ...]) -> Array:

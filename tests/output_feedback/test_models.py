@@ -195,7 +195,7 @@ def test_what_is_said_of_gains_noise_and_limits() -> None:
 
     def said(intervals: list[list[float]], *, loose: bool = False) -> str:
         settled = replace(fit, converged=not loose)
-        return replace(report, entries=np.array(intervals), fit=settled).sentences()[1]
+        return " ".join(replace(report, entries=np.array(intervals), fit=settled).sentences())
 
     both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
     assert "of 2 of 2 gains" in said(both)
@@ -209,9 +209,21 @@ def test_what_is_said_of_gains_noise_and_limits() -> None:
     met = replace(report, fit=replace(fit, identified=replace(terms, trials=limited)))
     assert any("80 to 95 %" in line for line in met.sentences())
     assert met.data()["at_limit"] is True
-    other = replace(report, confusion=0.95, whiteness=frozen([1e-3])).sentences()[-2:]
-    assert other[0] == "Gain and noise can hardly be separated here (correlation 0.95)."
-    assert other[1] == "Residuals of x are autocorrelated: the model is incomplete."
+    other = replace(report, confusion=0.95).sentences()[-1]
+    assert other == "Gain and noise can hardly be separated here (correlation 0.95)."
+
+
+def test_a_model_whose_prediction_errors_are_not_white_is_doubted() -> None:
+    """In Python and on the page."""
+    report, fit = report_and_fit()
+    assert fit.doubts == ()
+    terms = fit.identified
+    summed = [one._replace(innovations=np.cumsum(one.innovations, axis=0)) for one in terms.trials]
+    wrong = replace(fit, identified=replace(terms, trials=summed))
+    (doubt,) = wrong.doubts
+    assert doubt.startswith("Prediction errors of x are autocorrelated: the model is incomplete")
+    assert doubt in replace(report, fit=wrong).sentences()
+    assert "did not converge" in replace(fit, converged=False).doubts[0]
 
 
 def test_the_section_and_result_json_have_the_same_numbers() -> None:
