@@ -36,11 +36,11 @@ def test_a_subject_is_scored_against_its_truth() -> None:
 
 @pytest.mark.full
 def test_on_the_seat_the_gain_is_found_if_least_squares_is_far_off() -> None:
-    """Sensory noise: the least-squares gain is five times as large."""
+    """Sensory noise: the least-squares gain is more than three times as large."""
     who = subject("seat", 2, "sensory", 90.0, 70.0)
     trials, truth = recorded(who, 2), np.array(who.controller.K)
     first = fit(trials.problem)
-    assert np.array(first.gain)[0, 0] > 4 * truth[0, 0]
+    assert np.array(first.gain)[0, 0] > 3 * truth[0, 0]
     found = fit_output_feedback(first, blind(who))
     assert found.converged
     assert found.space.gain == 5
