@@ -34,6 +34,7 @@ class Kind(Generic[F]):
     todo: Sequence[str] = ()  # Steps, in order; one that becomes empty is left out
     forbids: frozenset[str] = frozenset()
     badge: str = ""  # Replaces the usual words of the badge
+    name: str = ""  # For programs that count pages by it
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class Rules(Generic[F]):
             words.claims(self.may),
             words.claims(self.may_not),
             words.fill(worst.badge),
+            worst.name,
         )
 
     def applying(self, facts: F) -> list[Kind[F]]:

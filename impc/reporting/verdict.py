@@ -68,6 +68,7 @@ class Verdict:
     may: Sequence[Claim] = ()
     may_not: Sequence[Claim] = ()
     badge: str = ""  # Replaces the usual words of the badge
+    kind: str = ""  # Name of the leading kind of finding, if it has one
 
     @property
     def words(self) -> str:
@@ -80,6 +81,7 @@ class Verdict:
             "level": self.level.value,
             "headline": self.headline,
             "sentence": self.sentence,
+            "kind": self.kind,
             "alerts": [alert.data() for alert in self.alerts],
             "may_report": [_line(claim) for claim in self.may],
             "may_not_report": [_line(claim) for claim in self.may_not],

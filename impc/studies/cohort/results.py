@@ -19,6 +19,7 @@ from impc.studies.cohort.comparison import (
     outlying,
 )
 from impc.studies.fit.facts import between, with_unit
+from impc.studies.fit.verdict import UNDETERMINED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,8 +34,6 @@ LOGARITHM = "log_cost_weight."
 _LEADING = ("K.", LOGARITHM)
 # Questions about means, in the order of preference.
 _QUESTIONS = ("group", "change", "condition", "visit")
-# Of the headline of a fit that determines no gain (`impc.studies.fit.verdict`).
-_UNCERTAIN = "do not determine its gains"
 #: Corrected p-value of a difference that is found.
 SIGNIFICANT = 0.05
 
@@ -62,8 +61,7 @@ class Cohort:
     def with_warning(self) -> pd.DataFrame:
         """Units with a warning, except that no gain is determined: such a fit counts little."""
         found = self._of(Level.AMBER, Level.RED)
-        uncertain = found["headline"].str.contains(_UNCERTAIN) if len(found) else found.index < 0
-        return found[~uncertain]
+        return found[found["kind"] != UNDETERMINED] if len(found) else found
 
     @property
     def warned(self) -> int:

@@ -54,7 +54,7 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
 
 
 def _unit_row(fit: dict[str, Any]) -> dict[str, Any]:
-    said = {name: fit["verdict"][name] for name in ("level", "headline")}
+    said = {name: fit["verdict"][name] for name in ("level", "headline", "kind")}
     row: dict[str, Any] = {**said, "trials": fit["trials"], "samples": fit["samples"]}
     for name in ASSESSMENTS:
         given = fit[name] if isinstance(fit[name], dict) else {"": fit[name]}

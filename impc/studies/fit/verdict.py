@@ -56,6 +56,8 @@ _MUCH, _COLOURED = 90.0, 1e-3
 _SHORT = 200
 #: Results that a kind may forbid: gains, cost weights, time at the limit.
 GAIN, WEIGHTS, SHARE = "gain", "weights", "share"
+#: Name of the kind in which no gain is determined.
+UNDETERMINED = "undetermined"
 _NO_GAIN = frozenset([GAIN, WEIGHTS])
 _NOTHING = frozenset([GAIN, WEIGHTS, SHARE])
 
@@ -408,6 +410,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
             "uncertain in each person may be known for the group (impc cohort).",
         ),
         _NO_GAIN,
+        name=UNDETERMINED,
     ),
     Kind(
         Level.AMBER,

@@ -60,7 +60,7 @@ def fit_of(seed: int) -> dict[str, Any]:
     return {
         "states": ["position", "position_rate"], "controls": ["force"], "outputs": ["position"],
         "shown_units": [[1.0, "m"]], "words": {"position": "hand position"},
-        "verdict": {"level": "green", "headline": "It fits.", "sentence": "Well."},
+        "verdict": {"level": "green", "headline": "It fits.", "sentence": "Well.", "kind": ""},
         "added": None,
         "units": {"K.force.position": "N/m", "K.force.position_rate": "N s/m"},
         "shown_gains": {

@@ -18,7 +18,7 @@ from impc.reporting.provenance import Provenance
 from impc.studies.fit.facts import unlimited_ratio
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.verdict import fit_verdict
+from impc.studies.fit.verdict import UNDETERMINED, fit_verdict
 from tests.studies.fit.test_verdict import explained
 
 if TYPE_CHECKING:
@@ -87,6 +87,8 @@ def test_the_level_follows_from_the_tables(
     result = made_up(fitted, left_out, alarm=alarm, known=known, rejected=rejected, fell=fell)
     report = fit_report(result, Provenance())
     assert report.verdict.level is _level_of_page(report)
+    if report.verdict.kind == UNDETERMINED:
+        assert not known
     assert isinstance(report.copy, Copy) == (report.verdict.level is not Level.RED)
     if report.verdict.level is Level.AMBER:
         assert report.verdict.alerts
