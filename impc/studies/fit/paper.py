@@ -77,7 +77,7 @@ def _pushed(result: FitResult) -> str:
             sizes.append(
                 f"{signal_name(plant, name)} (up to {with_unit(number(factor * size), unit)})"
             )
-    return f"The person was perturbed by {' and '.join(sizes)}. " if sizes else ""
+    return f"The perturbation was the {' and '.join(sizes)}. " if sizes else ""
 
 
 def _results(result: FitResult, verdict: Verdict) -> list[str]:
