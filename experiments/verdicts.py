@@ -127,7 +127,7 @@ KINDS: dict[str, tuple[Callable[[int], Made], Level, str]] = {
     "weak": (
         lambda seed: subject(seed, size=0.3, noise=0.015, samples=30, settle=0.2),
         Level.AMBER,
-        "pin down",
+        "do not determine",
     ),
 }  # fmt: skip
 
@@ -165,9 +165,9 @@ def main() -> None:
             no = forbidden(one.result)
             if GAIN not in no and one.gain is not None:
                 for truth, (_, row) in zip(one.gain.ravel(), named_gains(one.result), strict=False):
-                    gains += row.interval.identified
+                    gains += row.determined
                     inside += bool(
-                        row.interval.identified and row.interval.low <= truth <= row.interval.high
+                        row.determined and row.interval.low <= truth <= row.interval.high
                     )
             if WEIGHTS not in no and name != "body":
                 found = _true_statements(one.result)

@@ -200,7 +200,7 @@ def _problem(kept: dict[str, Any], plant: Plant | None, family: PlantFamily | No
         raise InputError("plant", "has an unsaved nonlinear body", "pass load(..., plant=...)")
     if plant is None:
         fixed = {name: tuple(saved[name]) for name in _SIGNALS}
-        pairs = {name: tuple(map(tuple, saved[name])) for name in ("units", "words")}
+        pairs = {name: tuple(map(tuple, saved[name])) for name in ("units", "words", "gravity")}
         previewed = {"previewed": tuple(saved["previewed"])}
         plant = _filled(Plant, saved | fixed | pairs | previewed | {"body": None})
         _require_names(plant)
@@ -241,6 +241,9 @@ def _require_names(plant: Plant) -> None:
     for pairs in (plant.units, plant.words):
         if not all(isinstance(text, str) for pair in pairs for text in pair):
             raise ValueError("a unit that is not text")
+    finite_array("gravity", [moment for _, moment in plant.gravity], (len(plant.gravity),))
+    if not {name for name, _ in plant.gravity} <= set(plant.states):
+        raise ValueError("a moment of gravity of no state")
 
 
 def _require_same(plant: Plant, saved: Mapping[str, Any]) -> None:

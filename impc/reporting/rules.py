@@ -79,6 +79,11 @@ class Rules(Generic[F]):
         """The kinds that apply, worst first."""
         return [kind for kind in self.kinds if kind.when(facts)]
 
+    def reason(self, facts: F, result: str) -> str:
+        """Title of the first kind that forbids a result; empty if none does."""
+        found = (kind for kind in self.applying(facts) if result in kind.forbids)
+        return next((_Words(self.words, facts).fill(kind.title) for kind in found), "")
+
     def forbidden(self, facts: F) -> frozenset[str]:
         """Results that the page must not show."""
         return frozenset().union(*(kind.forbids for kind in self.applying(facts)))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import impc
+import plants
 from experiments.coverage import cart, noisy_trial
 from impc.attached_methods import METHODS, PROPERTIES
 from impc.nonlinear.fit import OptimalControlEstimate
@@ -98,6 +99,18 @@ def test_a_saved_estimate_is_the_same(found: impc.Estimate, tmp_path: Path, kind
     assert again.problem.plant.units == found.problem.plant.units
 
 
+def test_the_moments_of_gravity_are_saved(tmp_path: Path) -> None:
+    plant = impc.Plant(plants.seated_balance_plant(), ["command"])
+    assert dict(plant.gravity).keys() == {"theta1", "theta2"}
+    law = impc.Controller(plant, impc.Weights(np.eye(plant.n), 1), impc.Bounds(plant), 3)
+    outputs = law.simulate(0.01 * np.ones(plant.n), steps=30).outputs
+    problem = impc.Problem(plant, impc.Bounds(plant), 3, [impc.Recording(plant, outputs)])
+    found = impc.fit(impc.replace(problem, unknown_start=True), "feedback_gain")
+    again = impc.load(found.save(tmp_path / "found.json"))
+    assert isinstance(again, impc.Estimate)
+    assert again.problem.plant.gravity == plant.gravity
+
+
 def test_a_search_goes_on_from_an_earlier_answer_and_is_silent(
     found: impc.Estimate, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,12 +126,14 @@ def test_a_search_goes_on_from_an_earlier_answer_and_is_silent(
     ("damage", "said"),
     [
         (lambda text: text[:-40], "is not a result file"),
-        (lambda text: text.replace('"schema": 7', '"schema": 3'), "another version"),
+        (lambda text: text.replace('"schema": 8', '"schema": 3'), "another version"),
         (lambda text: text.replace('"status": "settled"', '"status": "odd"'), "is damaged"),
         (lambda text: text.replace('"K": [[', '"K": [["x", '), "K: expected real numbers"),
         (lambda text: text.replace('"K": [[', '"K": [[1.0, '), "K: expected shape"),
         (lambda text: text.replace('"recordings": [{', '"recordings": [7, {'), "is damaged"),
         (lambda text: text.replace('"A": [[', '"A": [[1, '), "is damaged"),
+        (lambda text: text.replace('"gravity": []', '"gravity": [["x", 1.0]]'), "is damaged"),
+        (lambda text: text.replace('"gravity": []', '"gravity": "abc"'), "is damaged"),
     ],
 )
 def test_a_damaged_file_is_one_line(found: impc.Estimate, tmp_path: Path, damage, said) -> None:  # type: ignore[no-untyped-def]

@@ -10,7 +10,7 @@ import numpy as np
 
 from impc.model.plant import UNKNOWN
 from impc.reporting.finding import Level
-from impc.reporting.rendering import number, p_value
+from impc.reporting.rendering import number, p_value, sentence_case
 from impc.studies.cohort.comparison import (
     compare_cohort,
     difference_of,
@@ -191,7 +191,7 @@ class Cohort:
             said = f"the {name} is {amount} {than.format(second)} {first}"
         several = item.condition and self.units["condition"].nunique() > 1
         where = f" ({item.condition})" if several else ""
-        return f"{said[:1].upper()}{said[1:]}{where}."
+        return f"{sentence_case(said)}{where}."
 
     def numbers(self, item: Comparison) -> str:
         """Interval, number of people, SD between them, p-value and effect size."""

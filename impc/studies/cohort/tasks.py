@@ -23,7 +23,6 @@ from impc.assess.printed_gain import follows_command
 from impc.assess.resampling import replicate
 from impc.checking import replace
 from impc.errors import DataError, ImpcError
-from impc.files.checks import FELL
 from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.plant_sources import made_by, plant_source
@@ -128,16 +127,16 @@ def unit_digest(
 def fit_unit(task: FitTask) -> dict[str, Any]:
     """Fit a unit."""
     started = time.perf_counter()
-    problem, settings = unit_problem(task)
+    problem, settings, falls = unit_problem(task)
     with angles_in(task.configuration.report.angles):
-        content = _described(fit_alone(problem, settings))
+        content = _described(replace(fit_alone(problem, settings), falls=falls))
     return _finished(content, started)
 
 
 def replicate_unit(task: FitTask, fit: dict[str, Any], index: int) -> dict[str, Any]:
     """Bootstrap replicate `index` of a unit with the stored `fit`."""
     started = time.perf_counter()
-    problem, settings = unit_problem(task)
+    problem, settings, _ = unit_problem(task)
     if fit["added"]:
         raise DataError(
             "bootstrap", f"the fit has one more unknown ({fit['added']})", "correct the recordings"
@@ -155,8 +154,8 @@ def _finished(content: dict[str, Any], started: float) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=4)
-def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
-    """Inverse problem of a unit; cached."""
+def unit_problem(task: FitTask) -> tuple[Problem, FitSettings, tuple[str, ...]]:
+    """Inverse problem of a unit, its settings, and trials that ended in a fall; cached."""
     settings = fit_settings(task.configuration.fit)
     source = plant_source(task.plant, task.arguments)
     # A worker on another machine, or one that was started earlier, may have other files or code.
@@ -174,9 +173,10 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings]:
     if not read:
         raise fallen[0]
     first, *others = read
-    left = (f"{fall.subject}: {fall.problem}; the trial is left out" for fall in fallen)
+    falls = tuple(f"{fall.subject}: {fall.problem}" for fall in fallen)
+    left = (f"{fall}; the trial is left out" for fall in falls)
     recordings = (replace(first, findings=(*first.findings, *left)), *others)
-    return fit_problem(plant, recordings, settings, family), settings
+    return fit_problem(plant, recordings, settings, family), settings, falls
 
 
 def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
@@ -189,7 +189,7 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
     }
     for name, task in tasks.items():
         try:
-            problem, settings = unit_problem(task)
+            problem, settings, _ = unit_problem(task)
         except ImpcError:  # reported when the unit is fitted
             continue
         alone = replace(settings, profiles=[], horizons=[], unknown_limit=False)
@@ -199,9 +199,7 @@ def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
 
 def _described(result: FitResult) -> dict[str, Any]:
     plant, K, weights = result.fitted.problem.plant, result.fitted.gain, result.fitted.stage_weights
-    fit, estimate, (first, *_) = result.inverse_mpc, result.estimate, result.given.recordings
-    # Named by `unit_problem`.
-    result = replace(result, falls=tuple(line for line in first.findings if FELL in line))
+    fit, estimate = result.inverse_mpc, result.estimate
     family = estimate.problem.family
     known = () if family is None else family.names
     ends = np.array([(one.low, one.high) for one in result.gain_intervals]).T

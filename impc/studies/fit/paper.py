@@ -24,7 +24,7 @@ from impc.studies.fit.facts import (
     with_unit,
 )
 from impc.studies.fit.structures import structure_sentences
-from impc.studies.fit.verdict import GAIN, SHARE, WEIGHTS, forbidden
+from impc.studies.fit.verdict import GAIN, SHARE, WEIGHTS, forbidden, reason
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
@@ -36,7 +36,7 @@ def paper_text(result: FitResult, verdict: Verdict, provenance: Provenance) -> C
     """Methods and results in words; of a red page there are none."""
     if verdict.level is Level.RED:
         return "There is no text to copy: this model does not describe the recordings."
-    return Copy(" ".join(_methods(result, provenance)), " ".join(_results(result, verdict)))
+    return Copy(" ".join(_methods(result, provenance)), " ".join(_results(result)))
 
 
 def _methods(result: FitResult, provenance: Provenance) -> list[str]:
@@ -80,7 +80,7 @@ def _pushed(result: FitResult) -> str:
     return f"The perturbation was the {' and '.join(sizes)}. " if sizes else ""
 
 
-def _results(result: FitResult, verdict: Verdict) -> list[str]:
+def _results(result: FitResult) -> list[str]:
     no, held = forbidden(result), held_out(result)
     left_out = f", and for {shares(result, held)} in left-out trials" if held is not None else ""
     said = [
@@ -93,7 +93,8 @@ def _results(result: FitResult, verdict: Verdict) -> list[str]:
         share, (_, without) = saturation(result), unlimited_ratio(result)
         said.append(f"The command was at its limit for {share:.1f} % of the time.{without}")
     if GAIN in no:
-        return [*said, f"Gains are not reported: {verdict.alerts[0].title.lower()}."]
+        why = reason(result, GAIN)
+        return [*said, f"Gains are not reported: {why[:1].lower()}{why[1:]}."]
     gains = [
         f"{number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})"
         for _, row in named_gains(result)

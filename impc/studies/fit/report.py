@@ -72,6 +72,7 @@ from impc.studies.fit.verdict import (
     fallen_verdict,
     fit_verdict,
     forbidden,
+    little,
 )
 from impc.studies.methods_figure import methods_figure
 from impc.studies.methods_table import methods_finding
@@ -348,7 +349,7 @@ def _response(result: FitResult) -> list[Block]:
 def _checks(result: FitResult, truth: Array | None) -> list[Block]:
     checks = [
         _recordings(result),
-        Check(Level.GREEN if result.usable else Level.RED, "Explained variance",
+        Check(Level.RED if little(result) else Level.GREEN, "Explained variance",
               left_out_text(result)),
         *_limit_check(result),
         _model(result),

@@ -72,12 +72,18 @@ def forbidden(result: FitResult) -> frozenset[str]:
     return _RULES.forbidden(result)
 
 
+def reason(result: FitResult, what: str) -> str:
+    """Title of the first warning that forbids a result; empty if none does."""
+    return _RULES.reason(result, what)
+
+
 def fallen_verdict(falls: tuple[str, ...]) -> Verdict:
     """Verdict if every trial ended in a fall, so that nothing was fitted."""
     return _FALLEN.verdict(falls)
 
 
-def _little(result: FitResult) -> bool:
+def little(result: FitResult) -> bool:
+    """Whether the model does not describe the recordings."""
     found, where = reported_shares(result)
     # Uncertain gains predict short trials badly even if the model is right.
     short = where == "left-out trials" and result.given.recorded_numbers < _SHORT
@@ -246,7 +252,7 @@ _INEXACT = Kind["FitResult"](
 _KINDS: tuple[Kind[FitResult], ...] = (
     Kind(
         Level.RED,
-        _little,
+        little,
         "The model explains less than half of a recorded signal.",
         "It explains {explained} in {where}. Do not interpret the other numbers on this page.",
         "The model does not describe these recordings",
@@ -466,7 +472,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
 
 def _allows(result: FitResult, what: str = "") -> bool:
     """Whether the model describes the recordings, and this result is not forbidden."""
-    return not _little(result) and what not in forbidden(result)
+    return not little(result) and what not in forbidden(result)
 
 
 def _limit_matters(result: FitResult) -> bool:
@@ -474,7 +480,7 @@ def _limit_matters(result: FitResult) -> bool:
 
 
 _MAY: tuple[Line[FitResult], ...] = (
-    Line(_little, "That this model does not explain the movement.",
+    Line(little, "That this model does not explain the movement.",
          "It explains {explained} in {where}."),
     Line(lambda it: _allows(it) and it.weights_test.rejected,
          "A linear feedback follows the movement.",

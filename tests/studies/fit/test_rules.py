@@ -12,7 +12,7 @@ from impc.assess.assessments import MethodFit
 from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.assess.variance_accounted_for import HeldOut, explained_share, vaf
 from impc.checking import replace
-from impc.reporting.document import Copy, Report
+from impc.reporting.document import Check, Checks, Copy, Report
 from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.studies.fit.facts import unlimited_ratio
@@ -70,6 +70,21 @@ def _level_of_page(report: Report) -> Level:
     return Level.AMBER if alarm or doubts or not any(gains["determined"]) else Level.GREEN
 
 
+def _checks(report: Report) -> list[Check]:
+    blocks = [block for section in report.sections for block in section.blocks]
+    return [one for block in blocks if isinstance(block, Checks) for one in block.checks]
+
+
+def test_the_text_for_a_paper_names_the_warning_that_forbids_gains() -> None:
+    """Rejected weights come first and allow gains; the wide intervals do not."""
+    result = made_up(99.0, None, alarm=False, known=False, rejected=True, fell=False)
+    report = fit_report(result, Provenance())
+    assert report.verdict.alerts[0].title == "No cost weights lead to this gain"
+    assert isinstance(report.copy, Copy)
+    said = "Gains are not reported: the recordings are too short, or the perturbation is too weak."
+    assert said in report.copy.results
+
+
 CASES = [
     (fitted, left_out, alarm, known, rejected, fell)
     for (fitted, left_out), (alarm, known, rejected, fell) in itertools.product(
@@ -89,6 +104,8 @@ def test_the_level_follows_from_the_tables(
     assert report.verdict.level is _level_of_page(report)
     if report.verdict.kind == UNDETERMINED:
         assert not known
+    (share,) = (one for one in _checks(report) if one.name == "Explained variance")
+    assert (share.level is Level.RED) == (report.verdict.level is Level.RED)
     assert isinstance(report.copy, Copy) == (report.verdict.level is not Level.RED)
     if report.verdict.level is Level.AMBER:
         assert report.verdict.alerts
