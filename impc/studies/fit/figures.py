@@ -37,6 +37,8 @@ _LAGS = 1.0  # Largest lag of the autocorrelation, s
 # Largest number of signals of each kind; the interactive part shows all.
 _MOST = 3
 _MOST_STATEMENTS = 12
+# Share of the axis below which a range is drawn as a mark.
+_POINT = 0.01
 
 
 def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
@@ -210,7 +212,9 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
         labels.append(sentence_case(label))
         low, high = np.clip(ends[row], -reach, reach)
         colour, width = (BLUE, 7) if item.made else (RECORDED, 5)
-        ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt")
+        ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt",
+                marker="|" if high - low < _POINT * reach else "", markersize=12,
+                markeredgewidth=3)  # fmt: skip
         if narrow:  # label above the bar for lack of space
             ax.text(0, row - 0.22, labels[-1], transform=ax.get_yaxis_transform(), va="bottom",
                     fontsize=10)  # fmt: skip

@@ -209,6 +209,16 @@ def test_bars_are_the_ranges_of_the_comparisons() -> None:
     )
 
 
+def test_a_range_of_one_value_is_drawn() -> None:
+    """With one output the first comparison is the same for all weights with the gain."""
+    result = explained()
+    at = [item.low for item in result.compared if item.high == pytest.approx(item.low)]
+    (ax,) = statements_figure(result, narrow=False).axes
+    marked = [line for line in ax.lines if line.get_marker() == "|"]
+    assert [float(np.asarray(line.get_xdata())[0]) for line in marked] == at
+    assert len(at) == 1
+
+
 @pytest.mark.parametrize("vaf", [40.0, 60.0])
 def test_little_is_called_little(vaf: float) -> None:
     plain = explained()
