@@ -170,7 +170,7 @@ def calls() -> list[Call]:
         *_of_files(),
         (impc.Structure, {"plant": two, "Q": "diagonal", "R": "full", "name": "one"}),
         (impc.expected_intervals, {
-            "problem": v["structured"], "cost_weights": np.zeros(3), "deviation": 0.01, "root": 0.0,
+            **problem, "gain": np.zeros((1, 3)), "deviation": 0.01, "metric": None, "root": 0.0,
         }),
         (v["point"].plan, {"theta": {"price": 1.0}, "x0": [1.0], "solver": "ipopt", "mu": 1e-9}),
         (impc.fit_optimal_control, {

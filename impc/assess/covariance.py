@@ -189,7 +189,7 @@ def gain_covariance(
     """
     at, (m, n) = slopes_at(problem, gain, metric, scale), gain.shape
     on_gain, on_parameters = np.array(at.on_law[:, : m * n]), np.array(at.on_parameters)
-    on_metric = _identified_metric(at.on_law[:, m * n :])
+    on_metric = identified_metric(at.on_law[:, m * n :])
     in_units = at.law.gains.reshape(m * n, m * n).T
     # Project the gain columns on the complement of the others: this gives the block of the inverse
     # of H.
@@ -298,7 +298,7 @@ def by_trial(problem: Problem, rows: Array) -> list[Array]:
     return [part.reshape(len(part) // q, q, *rows.shape[1:]) for part in parts]
 
 
-def _identified_metric(alone: Array) -> Array:
+def identified_metric(alone: Array) -> Array:
     """Orthonormal columns of the identified part of the metric `alone` (r, k)."""
     metric, sizes, _ = np.linalg.svd(alone, full_matrices=False)
     # Unidentified S (inputs that never saturate) leaves rounding of 1e-15.

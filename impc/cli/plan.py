@@ -32,8 +32,8 @@ _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 @click.option(
     "--like",
     type=click.Path(path_type=Path),
-    help="Folder of an `impc fit` result: plant, settings, cost weights and noise of the assumed "
-    "subject. Keys in CONFIG take precedence.",
+    help="Folder of `impc fit`: plant, settings, gain and noise of the assumed subject; or of "
+    "`impc simulate seated-balance`: its gain. Keys in CONFIG take precedence.",
 )
 @out_option("plan", "report.html, result.json, tables and the figures")
 @page_options
@@ -79,7 +79,8 @@ def command(
     recorded = [config.parent / name for name in settings.files]
     perturbation = _perturbation(person.controller.plant, configuration, settings, recorded)
     require_consent(plan_effort(person, settings), yes, _FEWER)
-    used = [*recorded, *([] if like is None else [like / "result.json"])]
+    of_person = [] if like is None else [like / "result.json", like / "truth.json"]
+    used = [*recorded, *filter(Path.exists, of_person)]
     inputs = gather_inputs(used, config, source.name, source.arguments)
     steps = Steps(Cache(out / "plan-in-progress"), inputs.digest)
 
@@ -112,9 +113,11 @@ def _assumed(
     if like is not None:
         configuration, named = filled(configuration, like)
         where = f"--like {like}: plant"
-        return configuration, consented_name(where, named, plant_name, False, "plant", tuple(KNOWN))
+        if named is not None:
+            known = tuple(KNOWN)
+            return configuration, consented_name(where, named, plant_name, False, "plant", known)
     if plant_name is None:
-        raise click.UsageError("Missing option '--plant' or '--like'.")
+        raise click.UsageError("Missing option '--plant'; or give '--like' a folder of impc fit.")
     return configuration, plant_name
 
 
@@ -128,7 +131,7 @@ def _person(
     from impc.studies.fit.asked import asked_plant, fit_bounds  # noqa: PLC0415
     from impc.studies.plan.designs import Person  # noqa: PLC0415
     from impc.studies.plan.settings import (  # noqa: PLC0415
-        assumed_cost_weights,
+        assumed_gain,
         mechanical_stops,
         noise_deviations,
     )
@@ -140,20 +143,16 @@ def _person(
         raise InputError("[plan] perturbed", "names no input of the plant", f"choose from: {known}")
     if "data" in fit.bounded_states.values():
         raise InputError("[fit] bounded_states", 'is "data"', "give numbers: a plan has no data")
-    structure, cost_weights = assumed_cost_weights(plant, settings, fit)
-    bounds = fit_bounds(plant, fit, ())
-    controller = Controller(
+    controller = Controller.from_gain(
         plant,
-        structure.weights(cost_weights),
-        bounds,
+        assumed_gain(plant, settings),
+        fit_bounds(plant, fit, ()),
         fit.horizon,
         terminal_set=fit.terminal_set is True,
     )
     tau = settings.correlation
     return Person(
         controller,
-        structure,
-        cost_weights,
         noise_deviations(plant, settings),
         float(np.exp(-plant.dt / tau)) if tau > 0 else 0.0,
         mechanical_stops(plant, settings, configuration.signals),

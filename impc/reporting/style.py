@@ -6,6 +6,7 @@ meaning depends on colour alone.
 
 from __future__ import annotations
 
+import math
 import re
 from contextlib import contextmanager
 from io import BytesIO
@@ -16,7 +17,7 @@ from markupsafe import Markup, escape
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FixedFormatter, FuncFormatter
+from matplotlib.ticker import FixedFormatter, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from impc.errors import one_line
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.ticker import Formatter
 
 #: Colours of text and axes; of secondary items; of grid lines; of the background.
@@ -46,6 +48,10 @@ _VARIABLES = {
 
 #: Width in inches of a figure over the whole page, next to text, and on a phone.
 WIDE, HALF, PHONE = 11.0, 7.2, 4.0
+
+# Decades of a logarithmic axis below which 1, 2 and 5 are labelled, and below which 1, 2 and 5 are
+# too far apart.
+_DECADES, _NO_DECADE = 1.8, 0.7
 
 # Any: the types of the keys differ between versions of matplotlib.
 _RC: dict[Any, Any] = {
@@ -101,6 +107,17 @@ def strip(ax: Axes, title: str) -> None:
     """Set the title of a panel and draw its zero line."""
     ax.set_title(title, pad=5)
     ax.axhline(0, color=RULE, linewidth=0.8, zorder=0)
+
+
+def plain_log(axis: Axis) -> None:
+    """Label a logarithmic axis whose ends are known with a few plain numbers, none overprinted."""
+    low, high = axis.get_view_interval()
+    decades = math.log10(high / low)
+    subs = (1.0, 2.0, 5.0) if decades < _DECADES else (1.0,)
+    few = decades < _NO_DECADE
+    axis.set_major_locator(MaxNLocator(4) if few else LogLocator(subs=subs, numticks=5))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def drawn(draw: Callable[[bool], Figure], kind: str, *, narrow: bool = False) -> bytes:

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from impc.cli.main import main
+from impc.cli.seat import seat_controller
 from impc.files.formats import write_table
 from impc.files.results import SCHEMA, read_result
 from impc.files.table import make_table
@@ -26,22 +27,21 @@ height = 1.66
 u_max = 6.0
 body = "linear"
 
-[fit.structure]
-Q = "diagonal"
-over = ["theta1", "theta2"]
-
 [plan]
-cost_weights = { theta1 = 6e3, theta2 = 9e3 }
-noise = { theta1 = "0.05 deg", theta2 = "0.05 deg" }
+gain = [GAIN]
+noise = { theta1 = "0.02 deg", theta2 = "0.02 deg" }
 correlation = 0.02
 stops = { theta1 = "12 deg" }
 perturbed = ["perturbation"]
-amplitude = [2, 4]
+amplitude = [3, 6]
 dwell = [0.25]
-duration = 8.0
+duration = 15.0
 trials = 1
 draws = 2
 """
+# The subject of `impc simulate seated-balance`.
+GAIN = seat_controller({"mass": 79.7, "height": 1.66}, 6.0).K.tolist()
+PLAN = PLAN.replace("[GAIN]", json.dumps(GAIN))
 
 
 def run(*arguments: str) -> Result:
@@ -59,8 +59,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("plan")
     done = planned(folder, PLAN)
     assert done.exit_code == 0, done.output
-    assert "One 8-s trial at 4 N m identif" in done.output
-    assert "best of 2 experiments: 4 N m, held for 0.25 s" in done.output
+    assert "One 15-s trial at 6 N m determine" in done.output
+    assert "best of 2 experiments: 6 N m, held for 0.25 s" in done.output
     assert max(map(len, done.output.partition("Open ")[0].splitlines())) <= 100
     return folder
 
@@ -69,33 +69,38 @@ def test_the_page_the_table_and_the_numbers_say_the_same(folder: Path) -> None:
     found = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
     table = pd.read_csv(folder / "out" / "experiments.csv")
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    assert table["amplitude"].tolist() == [2, 4]
-    assert found["best"] == {"amplitude": 4, "dwell": 0.25}
-    errors = table["theta1_standard_error"]
-    kept = found["findings"]["experiments"]["table"]["theta1_standard_error"]
-    assert kept == pytest.approx(list(errors))
-    # Twice the torque halves the error by noise, not the error by the uncertain body.
-    assert errors[0] / 2 < errors[1] < errors[0]
-    weights = pd.read_csv(folder / "out" / "cost_weights.csv")
-    assert np.all(weights["with_an_exact_body"] < weights["standard_error_of_the_logarithm"])
+    assert table["amplitude"].tolist() == [3, 6]
+    assert found["best"] == {"amplitude": 6, "dwell": 0.25}
+    errors = table["theta1_percent"].tolist()
+    kept = found["findings"]["experiments"]["table"]["theta1_percent"]
+    # Infinite in CSV, null in JSON.
+    assert [value if value is not None else np.inf for value in kept] == pytest.approx(errors)
+    assert errors[0] == np.inf
+    assert 5 < errors[1] < 15
+    gains = pd.read_csv(folder / "out" / "gains.csv")
+    assert np.all(gains["with_an_exact_body_percent"] < gains["standard_error_percent"])
+    assert found["K"] == GAIN
+    per_degree = np.radians(GAIN[0][0])
+    assert gains["assumed"][0] == pytest.approx(per_degree)
+    assert gains["gain"].tolist() == ["seat tilt", "trunk tilt", "seat velocity", "trunk velocity"]
     body = pd.read_csv(folder / "out" / "body.csv").set_index("parameter")
     assert body.loc["tau_m", "stated_percent"] == pytest.approx(25)
     assert found["findings"]["body"]["table"]["theta1_narrower_percent"] == pytest.approx(
         list(body["theta1_narrower_percent"])
     )
-    assert "table of the body" in " ".join(found["verdict"]["alerts"][0]["todo"])
     assert list(body.index) == found["findings"]["body"]["table"]["parameter"]
     text = html.unescape(re.sub("<[^>]*>", "", page)).replace("\u00a0", " ")
     assert found["verdict"]["headline"] in text
-    assert "simulated with one 8-s trial at 4 N m." in text  # units keep their case
-    assert found["verdict"]["alerts"][0]["title"].endswith("too wide")
+    assert "simulated with one 15-s trial at 6 N m." in text  # units keep their case
+    assert found["verdict"]["level"] == "green"
     assert read_result(folder / "out").content["best"] == found["best"]
     assert (folder / "out" / "figures" / "trials.svg").stat().st_size > 5_000
-    highest = table[["theta1_high", "theta2_high"]].max(axis=1)
-    np.testing.assert_allclose(table["widest_interval_percent"], 100 * (highest - 1))
+    each = table[["theta1_percent", "theta2_percent", "theta1_rate_percent", "theta2_rate_percent"]]
+    np.testing.assert_allclose(table["widest_interval_percent"], each.max(axis=1))
 
 
 EXACT = PLAN.replace("[fit]", "[plant.uncertainty]\nall = 0\n\n[fit]", 1)
+EXACT = EXACT.replace("[3, 6]", "[1, 2]").replace("0.02 deg", "1e-5 deg")
 
 
 def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
@@ -104,31 +109,30 @@ def test_a_body_that_is_exact_is_said_to_be(tmp_path: Path) -> None:
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Taken as exact" in page
     # Twice the torque without any bound: half the standard error.
-    errors = pd.read_csv(tmp_path / "out" / "experiments.csv")["theta1_standard_error"]
+    errors = pd.read_csv(tmp_path / "out" / "experiments.csv")["theta1_percent"]
     assert errors[1] == pytest.approx(errors[0] / 2, rel=1e-6)
     assert not (tmp_path / "out" / "body.csv").exists()
 
 
-def test_an_interval_without_an_upper_end_is_infinite_not_a_large_number(tmp_path: Path) -> None:
-    done = planned(tmp_path, PLAN.replace("0.05 deg", "100000 deg").replace("[2, 4]", "[2]"))
+def test_an_interval_without_an_end_is_infinite_not_a_large_number(tmp_path: Path) -> None:
+    done = planned(tmp_path, PLAN.replace("0.02 deg", "100000 deg").replace("[3, 6]", "[2]"))
     assert done.exit_code == 0, done.output
     assert "seat tilt: not determined" in " ".join(done.output.split())
     found = json.loads((tmp_path / "out" / "result.json").read_text("utf-8"))["findings"]
     (row,) = pd.read_csv(tmp_path / "out" / "experiments.csv").to_dict("records")
-    assert found["experiments"]["table"]["theta1_high"] == [None]
-    assert row["theta1_low"] == 0
-    assert row["theta1_high"] == np.inf
+    assert found["experiments"]["table"]["theta1_percent"] == [None]
+    assert row["theta1_percent"] == np.inf
 
 
 def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
-    time = np.arange(800) / 100
+    time = np.arange(1500) / 100
     push = np.where(np.floor(time * 4) % 3 == 0, 2.0, -1.0)
     write_table(folder / "push.csv", make_table("push", {"time": time, "motor": push}))
     signals = (
         '\n[recording]\ntime = "time"\n[signals.perturbation]\ncolumn = "motor"\nunit = "N*m"\n'
     )
     text = PLAN.replace("dwell = [0.25]", 'files = ["push.csv"]').replace(
-        "amplitude = [2, 4]", "amplitude = [1, 2]"
+        "amplitude = [3, 6]", "amplitude = [1, 2]"
     )
     done = planned(folder, text + signals, "file")
     assert done.exit_code == 0, done.output
@@ -143,12 +147,11 @@ def test_a_perturbation_from_a_file_is_scaled(folder: Path) -> None:
     ("change", "message"),
     [
         (('perturbed = ["perturbation"]', ""), "[plan] perturbed: names no input of the plant"),
-        (("amplitude = [2, 4]", "amplitude = [90]"), "falls in at least 100 % of the trials"),
-        (('"0.05 deg", theta2', '"0.05 kg", theta2'), "noise theta1: is in kg"),
-        (('"0.05 deg", theta2', '"deg", theta2'), "noise theta1: got deg"),
-        (("theta1 = 6e3, ", ""), "[plan] cost_weights: lacks 'theta1'"),
-        (("theta1 = 6e3", "theta1 = 0"), "cost_weights theta1: got 0"),
-        (("theta1 = 6e3", "angle = 1, theta1 = 6e3"), "cost_weights angle: is not a feature"),
+        (("amplitude = [3, 6]", "amplitude = [90]"), "falls in at least 100 % of the trials"),
+        (('"0.02 deg", theta2', '"0.05 kg", theta2'), "noise theta1: is in kg"),
+        (('"0.02 deg", theta2', '"deg", theta2'), "noise theta1: got deg"),
+        (("gain = [[", "gain = [[1.0, "), f"[plan] gain: has rows of {len(GAIN[0]) + 1} numbers"),
+        (("gain = [[", "gain = [[nan, 1.0], ["), "[plan] gain"),
         (("u_max = 6.0", 'bounded_states = { theta1 = "data" }'), 'bounded_states: is "data"'),
         (("[plan]", "[plann]"), "plann: is not known"),
     ],
@@ -167,13 +170,9 @@ FITTED = {
     "schema": SCHEMA, "command": "impc fit", "made": "", "versions": {}, "files": [],
     "sha256": None, "outputs": ["theta1", "theta2"],
     "plant": {"name": "plants:seated_balance_for", "arguments": {"mass": 70.0, "height": 1.7}},
-    "settings": {"u_max": 6.0, "horizon": 20, "body": "linear", "observer": None,
-                 "structure": {"Q": "diagonal", "over": ["theta1", "theta2"]}},
+    "settings": {"u_max": 6.0, "horizon": 20, "body": "linear", "observer": None},
     "trials": [{"rms_residual": [1e-3, 2e-3]}, {"rms_residual": [1e-3, 4e-3]}],
-    "findings": {
-        "structure_cost_weights": {"table": {"feature": ["theta1", "theta2"],
-                                             "value": [5e3, 7e3]}},
-    },
+    "K": GAIN,
 }  # fmt: skip
 LIKE = """
 [plan]
@@ -198,20 +197,37 @@ def test_a_person_like_the_one_of_a_fit(tmp_path: Path) -> None:
     done = planned_like(tmp_path, FITTED)
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
-    assert found["presumed"] == pytest.approx({"theta1": 5e3, "theta2": 7e3})
+    assert found["K"] == GAIN
     page = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     assert "seat tilt 0.0573°, trunk tilt 0.181°" in page  # roots of mean squares, in degrees
-    own = LIKE.replace("[plan]", "[plan]\ncost_weights = { theta1 = 1e3, theta2 = 2e3 }")
+    other = [[1.1 * value for value in GAIN[0]]]
+    own = LIKE.replace("[plan]", f"[plan]\ngain = {json.dumps(other)}")
     assert planned_like(tmp_path, FITTED, own).exit_code == 0
     found = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
-    assert found["presumed"] == pytest.approx({"theta1": 1e3, "theta2": 2e3})
+    assert found["K"] == other
+
+
+def test_a_person_like_a_simulated_one(tmp_path: Path) -> None:
+    out, text = (
+        str(tmp_path / "person"),
+        LIKE + 'noise = { theta1 = "0.1 deg", theta2 = "0.1 deg" }',
+    )
+    assert run("simulate", "seated-balance", "--out", out, "--trials", "1", "--duration", "2",
+               "--formats", "csv", "--torque-limit", "5").exit_code == 0  # fmt: skip
+    (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    ends = ("--plant", "seated-balance", "--like", out, "--out", str(tmp_path / "out"))
+    done = run("plan", str(tmp_path / "plan.toml"), *ends)
+    assert done.exit_code == 0, done.output
+    found = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert found["K"] == json.loads((tmp_path / "person" / "truth.json").read_text("utf-8"))["K"]
+    assert "5 N m" in (tmp_path / "out" / "report.html").read_text("utf-8").replace("\u00a0", " ")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"findings": {}}, "has no cost weights of named features"),
-        ({"trials": 1}, "is not a result of impc fit"),
+        ({"K": None}, "[plan] gain"),
+        ({"trials": 1}, "has no subject"),
         ({"plant": {"name": "os:getcwd", "arguments": {}}}, "names code that would be run"),
     ],
 )

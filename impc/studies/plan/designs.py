@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.expected import Expectation, expected_intervals
+from impc.assess.printed_gain import follows_command
 from impc.assess.variance_accounted_for import saturated_share
 from impc.control.closed_loop import simulate
 from impc.control.simulation import scenario
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from impc.control.controller import Controller
+    from impc.model.plant import Plant
     from impc.model.plant_family import PlantFamily
-    from impc.model.structure import Structure
 
 
 #: (amplitude, hold time, number of the draw) -> disturbance (samples, d).
@@ -43,8 +44,6 @@ class Person(Frozen):
     """Assumed subject and recording noise."""
 
     controller: Controller
-    structure: Structure  # Structure of the weights
-    cost_weights: Array  # Unknowns of the structure (count,), logarithms
     deviation: Array  # SD of the recording noise (p,), in the units of the outputs
     root: float  # Correlation of the noise between neighbouring samples
     stops: Array  # Largest magnitude of each output (p,); infinite without a stop
@@ -71,7 +70,7 @@ class Outcome(Frozen):
     vaf: Array  # VAF of the true controller with recording noise, % (p,)
     # Noise-free recordings of the planned number of trials; None if too many trials end in a fall
     problem: Problem | None
-    expected: Expectation | None  # Expected intervals
+    expected: Expectation | None  # Expected standard errors
 
 
 def designs(amplitudes: Sequence[float], dwells: Sequence[float]) -> tuple[Design, ...]:
@@ -83,7 +82,8 @@ def try_design(
     person: Person, design: Design, perturbation: Perturbation, *, trials: int, draws: int
 ) -> Outcome:
     """Simulate one experiment and compute the expected intervals."""
-    plant, limits = person.controller.plant, person.controller.bounds
+    controller = person.controller
+    plant, limits = controller.plant, controller.bounds
     numbers = range(max(draws, trials))
     tried = [_held(person, perturbation(design.amplitude, design.dwell, k)) for k in numbers]
     kept = [trial for trial in tried if trial is not None]
@@ -103,7 +103,11 @@ def try_design(
         frozen(100 * power / (power + person.deviation**2)),
         problem,
         expected_intervals(
-            problem, np.array(person.cost_weights), np.array(person.deviation), root=person.root
+            problem,
+            controller.K,
+            np.array(person.deviation),
+            metric=controller.S,
+            root=person.root,
         ),
     )
 
@@ -134,14 +138,31 @@ def _problem_of(person: Person, recordings: Sequence[Recording]) -> Problem:
         terminal_set=controller.terminal is not None,
         unknown_start=True,
         family=person.family,
-        structure=person.structure,
     )
 
 
-def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome]:
-    """A-optimal and D-optimal experiment among those with few enough falls."""
+def gain_places(plant: Plant) -> BoolArray:
+    """Mask of the entries of a gain (m, n) whose single values have a meaning."""
+    inner = follows_command(plant)
+    return np.broadcast_to(~inner | np.all(inner), (plant.m, plant.n))
+
+
+def relative_errors(person: Person, deviations: Array) -> Array:
+    """Standard errors (..., m, n) of the gains that a plan shows, relative to them (..., k)."""
+    shown, K = gain_places(person.controller.plant), np.array(person.controller.K)
+    own = np.abs(K[shown])
+    unknown = np.full(deviations[..., shown].shape, np.inf)
+    return np.asarray(np.divide(deviations[..., shown], own, out=unknown, where=own > 0))
+
+
+def best_of(person: Person, outcomes: Sequence[Outcome], falls: float) -> Outcome:
+    """Experiment with the smallest mean variance of the gains, among those with few enough falls.
+
+    Variances are relative to the gain and, for a mean that exists if nothing is known of a gain,
+    those after a prior with an SD of the gain's size.
+    """
     held = [
-        (item, item.expected)
+        (_score(relative_errors(person, np.array(item.expected.gain.entries))), item)
         for item in outcomes
         if item.expected is not None and item.falls <= falls
     ]
@@ -153,7 +174,8 @@ def best_of(outcomes: Sequence[Outcome], falls: float) -> tuple[Outcome, Outcome
             "the trials",
             "reduce amplitude, or increase u_max or the allowed share falls",
         )
-    return (
-        min(held, key=lambda pair: pair[1].mean_variance)[0],
-        min(held, key=lambda pair: pair[1].log_determinant)[0],
-    )
+    return min(held, key=lambda pair: pair[0])[1]
+
+
+def _score(errors: Array) -> float:
+    return float(np.mean(1 / (1 + np.maximum(errors, 1e-100) ** -2)))

@@ -1,4 +1,4 @@
-"""Assumed subject of a plan from the results of a fit: `impc plan --like`."""
+"""Assumed subject of a plan from a fit or a simulated subject: `impc plan --like`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import msgspec
 import numpy as np
 
 from impc.errors import InputError
+from impc.files.configuration import read_configuration
+from impc.files.disk import truth_beside
 from impc.files.results import read_result
 
 if TYPE_CHECKING:
@@ -17,35 +19,33 @@ if TYPE_CHECKING:
     from impc.files.configuration import Configuration
 
 
-def filled(configuration: Configuration, folder: Path) -> tuple[Configuration, str]:
-    """Complete a configuration by the fit in a `folder`; also return the name of the plant.
+def filled(configuration: Configuration, folder: Path) -> tuple[Configuration, str | None]:
+    """Complete a configuration by the subject in a `folder`; also return the name of its plant.
 
-    The noise is the RMS of the residuals; the cost weights are those of the fit's [fit.structure].
+    A fit gives plant, settings, gain, and the RMS of its residuals as noise; a simulated subject
+    the gain and its settings.
     """
-    where, plan = f"--like {os.fspath(folder)}", configuration.plan
-    found = read_result(folder).content
+    where, truth = f"--like {os.fspath(folder)}", truth_beside(folder)
     own: dict[str, Any] = {}
+    plant: str | None = None
     try:
-        named = found["findings"].get("structure_cost_weights")
-        rms = [np.square(trial["rms_residual"]) for trial in found["trials"]]
-        own["noise"] = dict(
-            zip(found["outputs"], np.sqrt(np.mean(rms, axis=0)).tolist(), strict=True)
-        )
-        if named is not None:
-            table = named["table"]
-            own["cost_weights"] = dict(zip(table["feature"], table["value"], strict=True))
-        settings = {name: one for name, one in found["settings"].items() if one is not None}
-        plant, arguments = str(found["plant"]["name"]), dict(found["plant"]["arguments"])
+        if truth:
+            own["gain"], beside = truth["K"], read_configuration(folder / "subject.toml")
+            arguments, settings = beside.plant, beside.fit
+        else:
+            found = read_result(folder).content
+            rms = [np.square(trial["rms_residual"]) for trial in found["trials"]]
+            noise = np.sqrt(np.mean(rms, axis=0)).tolist()
+            own |= {"noise": dict(zip(found["outputs"], noise, strict=True)), "gain": found["K"]}
+            settings = {name: one for name, one in found["settings"].items() if one is not None}
+            plant, arguments = str(found["plant"]["name"]), dict(found["plant"]["arguments"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        remedy = "pass an output folder of impc fit"
-        raise InputError(where, f"is not a result of impc fit ({error})", remedy) from None
-    if "cost_weights" not in own | plan:
-        remedy = "fit with a diagonal [fit.structure], or set [plan] cost_weights"
-        raise InputError(where, "has no cost weights of named features", remedy)
+        remedy = "pass an output folder of impc fit, or of impc simulate seated-balance"
+        raise InputError(where, f"has no subject ({error})", remedy) from None
     changed = msgspec.structs.replace(
         configuration,
         plant=configuration.plant or arguments,
         fit={**settings, **configuration.fit},
-        plan={**own, **plan},
+        plan={**own, **configuration.plan},
     )
     return changed, plant

@@ -9,23 +9,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import NullLocator
 
 from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import Block, Checks, Report, Section, Terms
-from impc.reporting.finding import Finding, Picture
-from impc.reporting.shown_units import shown_unit, signal_name
-from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, PHONE, RULE, new_figure
+from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.shown_units import shown_unit
+from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, PHONE, RULE, new_figure, plain_log
+from impc.studies.fit.facts import one_of
+from impc.studies.plan.designs import gain_places, relative_errors
 from impc.studies.plan.sentences import (
     expected,
+    gain_names,
+    halves,
     listed,
     plan_checks,
     plan_copy,
     plan_keys,
     plan_verdict,
+    shown_gains,
     stated_as,
     target,
-    weight_names,
     widths,
 )
 from impc.studies.plan.study import spread
@@ -38,9 +42,9 @@ if TYPE_CHECKING:
 
 _TRIALS = Picture(
     "trials",
-    "Width of the interval of each cost weight over the number of trials, and the target",
-    "How far an estimate may be from the truth (95 % interval, approximation). Lower is better. "
-    "Dashed: difference to be detected.",
+    "Width of the interval of each gain over the number of trials, and the target",
+    "How far an estimate may be from the truth (95 % interval). Lower is better; "
+    "without a point: not determined. Dashed: difference to be detected.",
 )
 _LINES = ((BLUE, "o", "-"), (GREEN, "s", "--"), (INK, "^", ":"), (MUTED, "D", "-."))
 # Height of a line of text relative to the axis; largest width that is drawn, %.
@@ -55,7 +59,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
         "plan of an experiment",
         plan_verdict(plan),
         [
-            Section("Cost weights", [_cost_weights(plan), *_body(plan)]),
+            Section("Gains", [_gains(plan), *_body(plan)]),
             Section("Experiments", [_experiments(plan)]),
             Section("Groups", [_groups(plan)]),
             Section("Assumed person", [_person(plan)]),
@@ -77,20 +81,19 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
 
 
 def _trials_figure(plan: Plan, narrow: bool) -> Figure:
-    """Longer side of each interval over the number of trials."""
+    """Half width of each interval over the number of trials."""
     figure = new_figure(PHONE if narrow else HALF, 3.6)
     ax = figure.subplots()
     counts, sides = widths(plan)
-    with np.errstate(over="ignore"):
-        shares = np.clip(100 * np.expm1(sides), 1e-3, None)
+    shares = np.clip(100 * sides, 1e-3, None)
     shares[shares > _MOST] = np.nan
-    aim, planned = 100 * math.expm1(target(plan)), plan.settings.trials
+    aim, planned = 100 * target(plan), plan.settings.trials
     known = [*shares[np.isfinite(shares)], aim]
     low, high = math.log(min(known) / 1.3), math.log(max(known) * 1.4)
     styles, least = list(itertools.islice(itertools.cycle(_LINES), len(shares.T))), -1.0
     for values, (color, marker, line) in zip(shares.T, styles, strict=True):
         ax.plot(counts, values, color=color, marker=marker, linestyle=line)
-    names = weight_names(plan)
+    names = gain_names(plan)
     for k in np.argsort(shares[-1])[: np.count_nonzero(np.isfinite(shares[-1]))]:
         # Names at the right ends of the curves, without overlap.
         least = max((math.log(shares[-1, k]) - low) / (high - low), least + _LINE)
@@ -100,123 +103,125 @@ def _trials_figure(plan: Plan, narrow: bool) -> Figure:
     ax.axhline(aim, color=INK, linewidth=1, linestyle=(0, (4, 3)))
     ax.annotate(f"target {aim:g} %", (counts[0], aim), (0, 4), textcoords="offset points")
     ax.axvline(planned, color=RULE, zorder=0)
-    ax.annotate("planned", (planned, math.exp(high)), (4, -12), textcoords="offset points",
+    ax.annotate("planned", (planned, math.exp(low)), (4, 5), textcoords="offset points",
                 color=MUTED)  # fmt: skip
     ax.set_xscale("log")
     ax.set_xticks(counts, [f"{count:g}" for count in counts], minor=False)
-    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.xaxis.set_minor_locator(NullLocator())
     ax.set_yscale("log")
     ax.set_ylim(math.exp(low), math.exp(high))
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.set_title("95 % interval of a cost weight, up to \u00b1 (%)")
+    plain_log(ax.yaxis)
+    ax.set_title("95 % interval of a gain, \u00b1 (%)")
     ax.set_xlabel("Trials of one person (count)")
     return figure
 
 
 def _experiments(plan: Plan) -> Finding:
-    """Table of experiments with expected 95 % intervals relative to the cost weights."""
-    plant, names, rows = plan.person.controller.plant, plan.person.structure.unknowns, []
-    marks = {"A-optimal": plan.best, "D-optimal": plan.sharpest}
-    for item in plan.outcomes:
-        ends, widest = np.full((len(names), 3), np.nan), math.nan
-        if item.expected is not None:
-            sides = [(one.low - one.value, one.high - one.value) for one in item.expected.intervals]
-            ends = np.column_stack([np.exp(sides), item.expected.deviations])
-            first_order = TWO_SIDED * ends[:, 2:]
-            longer = np.where(np.isfinite(sides), np.abs(sides), first_order)
-            with np.errstate(over="ignore"):
-                widest = float(100 * np.expm1(np.max(longer)))
-        row: dict[str, Any] = {
-            "amplitude": float(item.design.amplitude),
-            "dwell": float(item.design.dwell),
-            "widest_interval_percent": widest,
-            "falls_percent": 100 * float(item.falls),
-            "at_the_limit_percent": 100 * float(item.at_limit),
-            "smallest_vaf_percent": float(np.min(item.vaf)),
-            "best": ", ".join(word for word, one in marks.items() if item is one),
-        }
-        for name, values in zip(names, ends, strict=True):
-            heads = (f"{name}_{end}" for end in ("low", "high", "standard_error"))
-            row |= dict(zip(heads, map(float, values), strict=True))
-        rows.append(row)
+    """Table of experiments with expected 95 % intervals relative to the gains."""
+    plant, shown = plan.person.controller.plant, shown_gains(plan)
+    unknown = np.full(np.shape(plan.person.controller.K), np.nan)
+    sides = 100 * TWO_SIDED * np.array([
+        relative_errors(plan.person, unknown if item.expected is None else item.expected.deviations)
+        for item in plan.outcomes
+    ])  # fmt: skip
+    table = table_of(
+        zip(plan.outcomes, sides, strict=True),
+        {
+            "amplitude": lambda row: float(row[0].design.amplitude),
+            "dwell": lambda row: float(row[0].design.dwell),
+            "widest_interval_percent": lambda row: float(np.max(row[1])),
+            "falls_percent": lambda row: 100 * float(row[0].falls),
+            "at_the_limit_percent": lambda row: 100 * float(row[0].at_limit),
+            "smallest_vaf_percent": lambda row: float(np.min(row[0].vaf)),
+            "selected": lambda row: row[0] is plan.best,
+        },
+    )
+    each = [f"{one.key}_percent" for one in shown]
+    table[each] = sides
     unit = shown_unit(plant, plant.disturbances[0])[1]
     return Finding(
         "experiments",
-        pd.DataFrame(rows),
-        "Widest interval: how far an estimate may be from the truth; an approximation if the "
-        "interval has no end. A-optimal: smallest mean variance (selected). D-optimal: smallest "
-        "joint confidence region.",
+        table,
+        "Widest interval: how far an estimate of a gain may be from the truth. Selected: smallest "
+        "mean variance of the gains.",
         digits=3,
         labels={
             "amplitude": "Factor" if plan.settings.files else f"Amplitude ({unit})",
             "dwell": "Held for (s)",
+            "widest_interval_percent": "Widest interval, \u00b1 (%)",
             "smallest_vaf_percent": "Attainable VAF (%)",
         },
-        hidden=list(rows[0])[7:],
+        hidden=each,
     )
 
 
-def _cost_weights(plan: Plan) -> Finding:
-    found, person, fits = expected(plan), plan.person, plan.simulated
+def _gains(plan: Plan) -> Finding:
+    """Table of the assumed gains with their expected intervals, in shown units."""
+    found, fits, rows = expected(plan), plan.simulated, shown_gains(plan)
+    plant, K = plan.person.controller.plant, np.array(plan.person.controller.K)
+    commands = [shown_unit(plant, one.control) for one in rows]
+    states = [shown_unit(plant, one.state) for one in rows]
+    scales = [of[0] / per[0] for of, per in zip(commands, states, strict=True)]
     table = pd.DataFrame(
         {
-            "cost_weight": weight_names(plan),
-            "feature": person.structure.unknowns,
-            "assumed": np.exp(person.cost_weights),
-            "low": [math.exp(item.low) for item in found.intervals],
-            "high": [math.exp(item.high) for item in found.intervals],
-            "interval": [stated_as(item) for item in found.intervals],
-            "standard_error_of_the_logarithm": np.array(found.deviations),
+            "gain": gain_names(plan),
+            "for_every": [one_of(unit) for _, unit in states],
+            "assumed": K[gain_places(plant)] * scales,
+            "unit": [unit for _, unit in commands],
+            "interval": list(map(stated_as, halves(plan).tolist())),
+            "standard_error_percent": 100 * relative_errors(plan.person, found.deviations),
         }
     )
-    if fits is not None and len(fits.cost_weights):
-        table["in_simulated_fits"] = spread(fits.cost_weights)
-    hidden = ["feature", "standard_error_of_the_logarithm"]
-    if found.body is not None:
-        own = {"with_an_exact_body": found.body.exact,
-               "with_ten_times_the_trials": found.body.tenfold,
-               "with_any_number_of_trials": found.body.floor}  # fmt: skip
-        table = table.assign(**{name: np.array(values) for name, values in own.items()})
-        hidden += list(own)
+    hidden = ["standard_error_percent"]
+    if fits is not None and len(fits.gains):
+        scatter = relative_errors(plan.person, spread(fits.gains))
+        table["scatter_in_simulated_fits_percent"] = 100 * scatter
+    if found.exact is not None:
+        for name, errors in (
+            ("an_exact_body", found.exact),
+            ("ten_times_the_trials", found.by_trials[-1]),
+        ):
+            table[f"with_{name}_percent"] = 100 * relative_errors(plan.person, np.array(errors))
+            hidden.append(f"with_{name}_percent")
     return Finding(
-        "cost_weights",
+        "gains",
         table,
-        "Expected 95 % intervals in the best experiment. The cost weight of "
-        f"{signal_name(person.controller.plant, person.controller.plant.controls[0])} is 1.",
+        "Opposing command for a unit of each state, with the expected 95 % interval in the best "
+        "experiment.",
         digits=3,
-        labels={
-            "interval": "Relative to assumed",
-            "in_simulated_fits": "Scatter in simulated fits (log)",
-        },
+        labels={"gain": "Gain on", "interval": "95 % interval"},
         hidden=hidden,
     )
 
 
 def _body(plan: Plan) -> list[Block]:
     """Table of the benefit of measuring body parameters, most useful first."""
-    found, problem = expected(plan), plan.best.problem
-    if found.body is None or problem is None:
+    found, problem, person = expected(plan), plan.best.problem, plan.person
+    if found.exact is None or problem is None or problem.family is None:
         return []
-    known, names = np.isfinite(found.deviations), plan.person.structure.unknowns
-    exact, tenfold = (
-        100 * float(np.mean(found.narrower(one)[known])) if np.any(known) else 0.0
-        for one in (found.body.exact, found.body.tenfold)
+    now, exact, tenfold = (
+        relative_errors(person, np.array(errors))
+        for errors in (found.deviations, found.exact, found.by_trials[-1])
     )
-    shares = np.round(100 * found.narrower(found.body.measured), 1) + 0.0
-    heads = [f"{name}_narrower_percent" for name in names]
-    table = pd.DataFrame(shares, columns=heads)
-    table.insert(0, "parameter", found.body.names)
+    known = np.isfinite(now)
+    shares = [
+        100 * float(np.mean(1 - other[known] / now[known])) if np.any(known) else 0.0
+        for other in (exact, tenfold)
+    ]
+    plant = person.controller.plant
+    each = np.round(100 * found.narrower[gain_places(plant)].T, 1) + 0.0
+    heads = [f"{one.key}_narrower_percent" for one in shown_gains(plan)]
+    table = pd.DataFrame(each, columns=heads)
+    table.insert(0, "parameter", np.array(problem.parameter_names)[problem.stated])
     table.insert(1, "stated_percent", 100 * problem.parameter_units[problem.stated])
-    words = (f"{name} (%)" for name in weight_names(plan))
+    words = (f"{name} (%)" for name in gain_names(plan))
     return [
         Finding(
             "body",
-            table.iloc[np.argsort(-np.nanmean(shares, axis=1), kind="stable")],
+            table.iloc[np.argsort(-np.nanmean(each, axis=1), kind="stable")],
             "Body: reduction of each interval if this parameter were known exactly. With an "
-            f"exactly known body the intervals would be {exact:.0f} % narrower on average, with "
-            f"ten times as many trials {tenfold:.0f} %.",
+            f"exactly known body the intervals would be {shares[0]:.0f} % narrower on average, "
+            f"with ten times as many trials {shares[1]:.0f} %.",
             digits=2,
             folded="Benefit of measuring each parameter of the body",
             labels={"stated_percent": "Stated (%)", **dict(zip(heads, words, strict=True))},
@@ -228,11 +233,10 @@ def _groups(plan: Plan) -> Finding:
     settings = plan.settings
     powers = [f"power_with_{size}_a_group_percent" for size in settings.groups]
     rows = [
-        (name, item.feature, item.deviation, *(100 * np.array(item.powers)), item.needed)
-        for item, name in zip(plan.groups, weight_names(plan), strict=True)
+        (name, 100 * item.deviation, *(100 * np.array(item.powers)), item.needed)
+        for item, name in zip(plan.groups, gain_names(plan), strict=True)
     ]
-    heads = ["cost_weight", "feature", "standard_deviation_within_a_group", *powers,
-             "persons_a_group_for_80_percent"]  # fmt: skip
+    heads = ["gain", "deviation_in_a_group_percent", *powers, "persons_a_group_for_80_percent"]
     sizes = zip(powers, settings.groups, strict=True)
     return Finding(
         "groups",
@@ -241,11 +245,11 @@ def _groups(plan: Plan) -> Finding:
         f"persons differ by {settings.between:g} % (SD; t-test at 5 %).",
         digits=3,
         labels={
-            heads[2]: "SD within a group (log)",
+            "gain": "Gain on",
+            heads[1]: "SD in a group (%)",
             heads[-1]: "Persons per group for 80 %",
             **{key: f"{size} per group (%)" for key, size in sizes},
         },
-        hidden=["feature"],
     )
 
 
@@ -266,14 +270,14 @@ def _person(plan: Plan) -> Terms:
 
 def _data(plan: Plan) -> dict[str, Any]:
     person, found, fits = plan.person, expected(plan), plan.simulated
-    names = person.structure.unknowns
+    simulated = None
+    if fits is not None:
+        inside = fits.inside(person, found)
+        simulated = {"fits": len(fits.gains), "failed": fits.failed, "inside": inside}
     return {
         "best": asdict(plan.best.design),
-        "sharpest": asdict(plan.sharpest.design),
-        "presumed": dict(zip(names, np.exp(person.cost_weights), strict=True)),
-        "gain": {"presumed": person.controller.K, "deviation": found.gain.entries},
+        "K": person.controller.K,
+        "standard_errors": found.deviations,
         "limit_deviation": found.limits,
-        "simulated": None
-        if fits is None
-        else {"fits": len(fits.cost_weights), "failed": fits.failed, "inside": fits.inside(found)},
+        "simulated": simulated,
     }

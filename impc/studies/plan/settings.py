@@ -12,7 +12,6 @@ from msgspec import Meta
 from impc.errors import InputError, brief
 from impc.files.units import si_unit
 from impc.model.plant import UNKNOWN
-from impc.model.structure import Structure
 from impc.studies.fit.settings import read_settings
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.configuration import SignalTable
     from impc.model.plant import Plant
-    from impc.studies.fit.settings import FitSettings
 
 # Wide limits that only exclude numerical overflow.
 Amplitude = Annotated[float, Meta(ge=1e-100, le=1e100)]
@@ -38,9 +36,9 @@ class PlanSettings:
 
     Attributes
     ----------
-    cost_weights : dict of str to float
-        Assumed cost weight of each feature of [fit.structure], relative to that of the first input.
-        Without [fit.structure] the keys are the features.
+    gain : list of list of float
+        Gain K of the assumed subject, u = -K x, in the units of the plant: a row for each input, in
+        it a number for each state. `--like` takes it from a fit or a simulated subject.
     noise : dict of str to float or str
         Standard deviation of the recording noise of each output: a number in the plant's unit, or a
         text with a unit such as "0.1 deg".
@@ -69,9 +67,9 @@ class PlanSettings:
     groups : list of int
         Numbers of subjects per group for which the power of a comparison is computed.
     difference : float
-        Difference of a cost weight, between groups or in one subject, that is to be detected, %.
+        Difference of a gain, between groups or in one subject, that is to be detected, %.
     between : float
-        Standard deviation of the logarithm of a cost weight within a group, %.
+        Standard deviation of a gain within a group, %.
     fits : int
         Number of fits to simulated recordings of the best experiment, to check the expected
         intervals: 0 (none) or at least 20.
@@ -79,7 +77,7 @@ class PlanSettings:
         Seed of all random numbers.
     """
 
-    cost_weights: dict[str, float]
+    gain: list[list[float]]
     noise: dict[str, float | str]
     correlation: Annotated[float, Meta(ge=0, le=100)] = 0.0
     stops: dict[str, float | str] = field(default_factory=dict)
@@ -106,32 +104,16 @@ def plan_settings(table: Mapping[str, Any]) -> PlanSettings:
     return settings
 
 
-def assumed_cost_weights(
-    plant: Plant, settings: PlanSettings, fit: FitSettings
-) -> tuple[Structure, Array]:
-    """Structure of the assumed subject's weights, and its unknowns (count,)."""
-    given = settings.cost_weights
-    item = fit.structure
-    if item is None:
-        structure = Structure(plant, list(given))
-    else:
-        structure = Structure(plant, item.Q, item.R, over=item.over, name=item.name)
-    if structure.coupled or structure.input_coupled:
-        raise InputError("[fit.structure]", "has cross terms", "plan with a diagonal structure")
-    for name in structure.unknowns:
-        if name not in given:
-            raise InputError(
-                "[plan] cost_weights", f"lacks {name!r}", "give a cost weight for each feature"
-            )
-    for name, cost_weight in given.items():
-        if name not in structure.unknowns:
-            known = ", ".join(structure.unknowns)
-            raise InputError(f"[plan] cost_weights {name}", "is not a feature", f"use: {known}")
-        if not 1e-100 < cost_weight < 1e100:
-            raise InputError(
-                f"[plan] cost_weights {name}", f"got {cost_weight:g}", "give a positive number"
-            )
-    return structure, np.log([given[name] for name in structure.unknowns])
+def assumed_gain(plant: Plant, settings: PlanSettings) -> Array:
+    """Gain (m, n) of the assumed subject, checked against the plant."""
+    rows = list(map(len, settings.gain))
+    if rows != [plant.n] * plant.m:
+        raise InputError(
+            "[plan] gain",
+            f"has rows of {', '.join(map(str, rows)) or 'no'} numbers",
+            f"give {plant.m} of {plant.n}, for {', '.join(plant.states)}",
+        )
+    return np.array(settings.gain)
 
 
 def noise_deviations(plant: Plant, settings: PlanSettings) -> Array:

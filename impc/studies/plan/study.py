@@ -1,7 +1,7 @@
 """Compute a plan: experiments, the best one, power of comparisons, simulated fits.
 
-Fits to simulated recordings check the expected intervals. They start at the true weights and use
-the full nonlinear search: they show the scatter of the best solution, not whether a search from the
+Fits to simulated recordings check the expected intervals. They start at the true gain and use the
+full nonlinear search: they show the scatter of the best solution, not whether a search from the
 default start finds it (docs/howto/plan.md).
 """
 
@@ -21,11 +21,10 @@ from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.checking import replace
 from impc.errors import ImpcError, SolverError
+from impc.inverse.problem import simulated
 from impc.inverse.refit import refit
-from impc.inverse.residuals import verify_hard
-from impc.inverse.structured import search_from, structured_estimate
 from impc.studies.effort import SECONDS_A_SAMPLE, Effort
-from impc.studies.plan.designs import Design, Outcome, best_of, designs, try_design
+from impc.studies.plan.designs import Design, Outcome, best_of, designs, relative_errors, try_design
 
 if TYPE_CHECKING:
     from impc.assess.expected import Expectation
@@ -42,11 +41,9 @@ _A_FIT = 40
 
 @dataclass(frozen=True)
 class GroupPower(Frozen):
-    """Power of a comparison of two groups by one cost weight."""
+    """Power of a comparison of two groups by one gain."""
 
-    feature: str  # Feature of the cost weight
-    # SD of the logarithm of estimates within a group, between persons and by estimation (from the
-    # interval); infinite if the interval has no end
+    # SD of estimates within a group relative to the gain, between persons and by estimation
     deviation: float
     powers: Array  # Power of a t-test at 5 % for each group size (g,)
     needed: float  # Persons per group for a power of 80 %; infinite above a million
@@ -59,9 +56,8 @@ class Plan(Frozen):
     person: Person
     settings: PlanSettings
     outcomes: tuple[Outcome, ...]  # One per experiment, in the order of `designs`
-    best: Outcome  # Smallest mean variance of the logarithms of cost weights (A-optimal)
-    sharpest: Outcome  # Smallest determinant of their covariance (D-optimal)
-    groups: tuple[GroupPower, ...]  # For the best experiment, one per cost weight
+    best: Outcome  # Smallest mean variance of the gains (A-optimal)
+    groups: tuple[GroupPower, ...]  # For the best experiment, one per gain that is shown
     simulated: SimulatedFits | None  # For the best experiment
 
 
@@ -88,12 +84,10 @@ def make_plan(
             try_design(person, design, perturbation, trials=settings.trials, draws=settings.draws)
         )
         done(f"amplitude {design.amplitude:g}")
-    best, sharpest = best_of(outcomes, settings.falls / 100)
-    fits = None
+    best, fits = best_of(person, outcomes, settings.falls / 100), None
     if settings.fits and best.problem is not None:
         fits = simulated_fits(person, best.problem, settings.fits, settings.seed, done, remember)
-    groups = group_powers(person, best, settings)
-    return Plan(person, settings, tuple(outcomes), best, sharpest, groups, fits)
+    return Plan(person, settings, tuple(outcomes), best, group_powers(person, best, settings), fits)
 
 
 def group_powers(
@@ -104,17 +98,16 @@ def group_powers(
         return ()
     from statsmodels.stats.power import TTestIndPower  # noqa: PLC0415  # a second to load
 
-    test, apart = TTestIndPower(), math.log1p(settings.difference / 100)
-    found = []
-    for name, own in zip(person.structure.unknowns, outcome.expected.intervals, strict=True):
-        deviation = math.hypot((own.high - own.low) / (2 * TWO_SIDED), settings.between / 100)
+    test, found = TTestIndPower(), []
+    for error in relative_errors(person, outcome.expected.deviations).tolist():
+        deviation = math.hypot(error, settings.between / 100)
         if not math.isfinite(deviation) or deviation == 0:
             nothing = frozen(np.full(len(settings.groups), _SIZE))
-            found.append(GroupPower(name, deviation, nothing, math.inf))
+            found.append(GroupPower(deviation, nothing, math.inf))
             continue
-        effect = apart / deviation
+        effect = settings.difference / 100 / deviation
         powers = [float(test.power(effect, size, _SIZE)) for size in settings.groups]
-        found.append(GroupPower(name, deviation, frozen(powers), _needed(test, effect)))
+        found.append(GroupPower(deviation, frozen(powers), _needed(test, effect)))
     return tuple(found)
 
 
@@ -154,28 +147,25 @@ _FORGOTTEN = 14.0
 class SimulatedFits(Frozen):
     """Results of the fits to simulated recordings."""
 
-    cost_weights: Array  # Unknowns (fits, count); minus infinity for a cost weight of zero
-    gains: Array  # Gains fitted without a structure (fits, m, n)
+    gains: Array  # (fits, m, n)
     failed: int  # Number of fits without a solution, including simulations with a fall
 
-    def inside(self, expected: Expectation) -> Array:
-        """Share of the fits whose unknowns are inside the expected intervals (count,)."""
-        ends = np.array([[item.low, item.high] for item in expected.intervals])
-        held = (self.cost_weights >= ends[:, 0]) & (self.cost_weights <= ends[:, 1])
-        return np.asarray(np.mean(held, axis=0))
+    def inside(self, person: Person, expected: Expectation) -> Array:
+        """Share of the fits whose gains are inside the expected intervals (m, n)."""
+        apart = np.abs(self.gains - np.array(person.controller.K))
+        return np.asarray(np.mean(apart <= TWO_SIDED * expected.deviations, axis=0))
 
 
 def spread(values: Array) -> Array:
-    """Half the range (k,) of the middle 68 % of values (fits, k): a robust SD."""
+    """Half the range (...) of the middle 68 % of values (fits, ...): a robust SD."""
     low, high = np.percentile(values, (15.866, 84.134), axis=0, method="inverted_cdf")
     return np.asarray((high - low) / 2)
 
 
 @dataclass(frozen=True)
 class OneFit(Frozen):
-    """Result of one simulated fit; both arrays are empty if it failed."""
+    """Gain of one simulated fit (m, n); empty if it failed."""
 
-    cost_weights: Array
     gain: Array
 
 
@@ -192,36 +182,29 @@ def simulated_fits(
     remember: RememberFit = lambda _, compute: compute(),
 ) -> SimulatedFits:
     """Fit recordings of one experiment `count` times, each with new noise."""
-    truth = np.array(person.cost_weights)
+    K, S = np.array(person.controller.K), np.array(person.controller.S)
 
     def fit(number: int) -> OneFit:
         try:
             noisy = _measured(person, problem, np.random.default_rng([seed, number]))
-            end = search_from(noisy, person.structure, truth)
-            fitted = structured_estimate(noisy, person.structure, end)
-            gain = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)).K
+            return OneFit(frozen(refit(noisy, K, S).K))
         except ImpcError:  # counted as failed
-            return OneFit(frozen([]), frozen([]))
-        return OneFit(frozen(end.cost_weights), frozen(gain))
+            return OneFit(frozen([]))
 
     found = []
     for number in range(count):
         found.append(remember(f"fit {number + 1}", functools.partial(fit, number)))
         done(f"fit {number + 1}")
-    ended = [one for one in found if len(one.cost_weights)]
-    return SimulatedFits(
-        frozen(np.reshape([one.cost_weights for one in ended], (-1, len(truth)))),
-        frozen(np.reshape([one.gain for one in ended], (-1, *person.controller.K.shape))),
-        count - len(ended),
-    )
+    gains = [one.gain for one in found if len(one.gain)]
+    return SimulatedFits(frozen(np.reshape(gains, (-1, *K.shape))), count - len(gains))
 
 
 def _measured(person: Person, problem: Problem, rng: np.random.Generator) -> Problem:
-    """Noisy recordings with the assumed weights, in a body drawn from its stated uncertainty."""
+    """Noisy recordings with the assumed gain, in a body drawn from its stated uncertainty."""
     unknown = np.where(problem.stated, problem.parameter_units, 0.0)
-    drawn = problem.at(problem.starts, unknown * rng.standard_normal(len(unknown)))
-    weights, trials = person.structure.weights(person.cost_weights), []
-    for trial, run in zip(problem.recordings, verify_hard(drawn, weights), strict=True):
+    drawn, trials = problem.at(problem.starts, unknown * rng.standard_normal(len(unknown))), []
+    runs = simulated(drawn, np.array(person.controller.K), np.array(person.controller.S))
+    for trial, run in zip(problem.recordings, runs, strict=True):
         if not run.complete:
             raise SolverError("simulation", "the simulated subject falls", "reduce amplitude")
         noise = recorded_noise(person, trial.samples, rng)
