@@ -1,6 +1,6 @@
 """Compute a plan: experiments, the best one, power of comparisons, simulated fits.
 
-Fits to simulated recordings check the expected intervals. They start at the true gain and use the
+Fits to simulated recordings check the expected intervals. They start at the truth and use the
 full nonlinear search: they show the scatter of the best solution, not whether a search from the
 default start finds it (docs/howto/plan.md).
 """
@@ -202,14 +202,16 @@ def simulated_fits(
 def _measured(person: Person, problem: Problem, rng: np.random.Generator) -> Problem:
     """Noisy recordings with the assumed gain, in a body drawn from its stated uncertainty."""
     unknown = np.where(problem.stated, problem.parameter_units, 0.0)
-    drawn, trials = problem.at(problem.starts, unknown * rng.standard_normal(len(unknown))), []
+    moved, trials = unknown * rng.standard_normal(len(unknown)), []
+    drawn = problem.at(problem.starts, moved)
     runs = simulated(drawn, np.array(person.controller.K), np.array(person.controller.S))
     for trial, run in zip(problem.recordings, runs, strict=True):
         if not run.complete:
             raise SolverError("simulation", "the simulated subject falls", "reduce amplitude")
         noise = recorded_noise(person, trial.samples, rng)
         trials.append(replace(trial, outputs=run.x @ drawn.plant.C.T + noise))
-    return replace(problem, recordings=trials, output_scale=person.deviation)
+    noisy = replace(problem, recordings=trials, output_scale=person.deviation)
+    return noisy.at(noisy.starts, moved)
 
 
 def recorded_noise(person: Person, samples: int, rng: np.random.Generator) -> Array:

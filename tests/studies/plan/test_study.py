@@ -38,7 +38,14 @@ from impc.studies.plan.settings import (
     noise_deviations,
     plan_settings,
 )
-from impc.studies.plan.study import make_plan, recorded_noise, simulated_fits, spread, steps_of
+from impc.studies.plan.study import (
+    SimulatedFits,
+    make_plan,
+    recorded_noise,
+    simulated_fits,
+    spread,
+    steps_of,
+)
 
 GAIN = [[2.0, 2.0]]
 SETTINGS = PlanSettings(
@@ -202,6 +209,14 @@ def test_fits_scatter_as_foreseen() -> None:
     gains = np.std(fits.gains, axis=0) / identified.expected.deviations
     assert np.all((gains > 0.65) & (gains < 1.35)), gains
     assert np.all(fits.inside(someone, identified.expected) > 0.8)
+
+
+def test_fits_outside_the_intervals_make_a_plan_doubtful() -> None:
+    one = replace(SETTINGS, amplitude=[0.8], dwell=[2.0])
+    plan = make_plan(person(), one, perturbation)
+    for factor, words in ((1.0, "Enough"), (2.0, "Doubtful")):
+        fits = SimulatedFits(np.tile(factor * np.array(GAIN), (20, 1, 1)), 0)
+        assert plan_verdict(replace(plan, simulated=fits)).words == words
 
 
 def test_noise_has_the_deviation_and_the_colour_that_were_asked_for() -> None:
