@@ -231,10 +231,16 @@ def _set_of_gain(
         # Rough solutions suffice: only the extent of the set is needed.
         found = weights_set(gain_fibre(plant, solution.K, own), _RATIO, rough=True)
         ranges = linear_ranges(found, penalised, tolerance=_ROUGH)
-        most = linear_maxima(found, against, tolerance=_ROUGH) if len(against) else ()
+        # A member found on the way that breaks a statement decides it without a program.
+        ends = [end.weights.block for one in ranges for end in (one.least, one.most)]
+        seen = np.tensordot(against, [*ends, found.least.weights.block], ([1, 2], [1, 2]))
+        unbroken = np.flatnonzero(np.all(seen < 0, axis=1))
+        most = linear_maxima(found, against[unbroken], tolerance=_ROUGH) if len(unbroken) else ()
     except (WeightsError, SolverError):
         return DrawnSet(((0.0, np.inf),) * len(states), (False,) * len(statements))
-    holding = iter([end.value < 0 for end in most])
+    kept = np.zeros(len(against), dtype=bool)
+    kept[unbroken] = [end.value < 0 for end in most]
+    holding = iter(kept.tolist())
     agrees = tuple(item.holds is not None and next(holding) for item in statements)
     return DrawnSet(tuple((one.low, one.high) for one in ranges), agrees)
 

@@ -121,7 +121,7 @@ def csv_bytes(table: pd.DataFrame) -> bytes:
 
 
 #: Largest table (cells) in the workbook; larger ones, slow to write, are CSV only.
-MOST_CELLS = 200_000
+MOST_CELLS = 20_000
 
 
 def _shown(column: str, value: Any, digits: int) -> str:
