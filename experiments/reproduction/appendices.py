@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-import casadi as ca
 import numpy as np
 
 import plants
@@ -15,15 +14,16 @@ from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information, largest_subsets
 from impc.studies.selection.lasso import lasso_of_size
-from impc.studies.selection.linear import Discrete, sampled
+from impc.studies.selection.linear import sampler
 from impc.studies.selection.model import Trial, normalised, sensitivity
 
 if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.selection.fisher import Information
+    from impc.studies.selection.linear import Discrete
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["appendix_entries", "discretised", "kronecker_sensitivity"]
+__all__ = ["appendix_entries", "kronecker_sensitivity"]
 
 _DRAWS = 200
 
@@ -33,20 +33,6 @@ def appendix_entries() -> list[Entry]:
     subject = mean_subject()
     information = fisher_information(*subject)
     return [*_information(*subject, information), *_lasso(*subject), *_selection(information)]
-
-
-def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
-    """Sample a model at one point.
-
-    `theta` (k,); `dt` in s.
-    """
-    A, B, C = (item.full() for item in matrices(theta))
-    symbol = ca.SX.sym("theta", len(theta))
-    parts = matrices(symbol)
-    derivative = ca.Function(
-        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
-    )
-    return sampled((A, B, C), [item.full() for item in derivative(theta)], dt)
 
 
 def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
@@ -70,7 +56,7 @@ def _information(
     model: ParametricModel, theta: Array, trials: list[Trial], information: Information
 ) -> list[Entry]:
     outputs, exact = sensitivity(model, theta, trials[0].input)
-    linear = discretised(plants.head_neck_matrices(), theta, 1 / 60)
+    linear = sampler(plants.head_neck_matrices(), 1 / 60)(theta, np.arange(model.size))
     recursion = kronecker_sensitivity(linear, trials[0].input) * model.gain
     kronecker = float(np.max(np.abs(recursion - exact)) / np.max(np.abs(exact)))
     _, differences = sensitivity(replace(model, jacobian=None), theta, trials[0].input)
@@ -81,7 +67,7 @@ def _information(
         Entry(
             "(A.1)",
             "Discrete state space with white measurement noise.",
-            ("impc.studies.selection.linear:sampled",),
+            ("impc.studies.selection.linear:sampler",),
             f"{linear.A.shape[0]} states, sampled exactly; {len(outputs)} samples a trial.",
             Verdict.REPRODUCED,
         ),
@@ -139,9 +125,9 @@ def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]
             "Table C.1",
             "Change lambda until the wanted number of parameters is farther than .005 from its"
             " typical value; bounded Nelder and Mead.",
-            ("impc.studies.selection.lasso:table_c1",),
-            "Run by `nelder_mead = true` and by `python -m experiments.selection_claims"
-            " --nelder-mead`: experiments/reliability_selection.md.",
+            ("experiments.selection_claims:table_c1",),
+            "Run by `python -m experiments.selection_claims --nelder-mead`:"
+            " experiments/reliability_selection.md.",
             Verdict.IN_KIND,
             "The rule by which lambda changes is lost.",
         ),

@@ -55,7 +55,7 @@ class Facts:
         self.people, self.visits = len(result.subjects), len(result.visits)
         self.sways = [item for item in cases if item.measure == "rms"]
         self.good = [item for item in cases if item.icc.low >= GOOD]
-        self.poor = [item for item in cases if item not in self.good]
+        self.poor = [item for item in cases if not item.icc.low >= GOOD]
         self.cases, self.bad = len(cases), len(self.poor)
         self.reliable = sum(item.icc.low >= GOOD for item in self.sways)
         # Whether an interval reaches the band good, so that more people may show it

@@ -61,19 +61,12 @@ class KeyParameters(Frozen):
     estimates: Array
 
 
-@dataclass(frozen=True)
-class Refits:
-    """Fits of several subsets to one subject and visit."""
-
-    fits: tuple[Estimate, ...]  # One per subset
-
-
 def refit_subsets(
     model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
-) -> Refits:
+) -> tuple[Estimate, ...]:
     """Fit each of the `subsets`, the other parameters fixed at their typical values."""
     typical = np.array(model.typical)
-    return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
+    return tuple(estimate(model, trials, subset, typical) for subset in subsets)
 
 
 def key_parameters(
@@ -93,10 +86,12 @@ def key_parameters(
     informations = [np.asarray(item.information.F) for item in nominal.values()]
     selection = largest_subsets(informations, bound, settings.least)
     subsets = selection.subsets[:most]
-    refits = run(refit_subsets, Refits, {name: (trials[name], subsets) for name in trials})
+    refits = run(
+        refit_subsets, tuple[Estimate, ...], {name: (trials[name], subsets) for name in trials}
+    )
     candidates = []
     for place, subset in enumerate(subsets):
-        fits = [item.fits[place] for item in refits.values()]
+        fits = [item[place] for item in refits.values()]
         vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
         tables = [between_visits(table) for table in _by_visit(recorded, fits, subset)]
         # (5.6): minimum over the subset; NaN without several subjects and visits.
@@ -112,7 +107,7 @@ def key_parameters(
         key=lambda item: (not item.kept, -item.diversity, -np.nan_to_num(item.reliability))
     )
     chosen = candidates[0].subset if candidates and candidates[0].kept else ()
-    alone = [item.fits[subsets.index(chosen)] for item in refits.values()] if chosen else []
+    alone = [item[subsets.index(chosen)] for item in refits.values()] if chosen else []
     return KeyParameters(
         selection,
         sweep(informations, settings.bounds, settings.least),
