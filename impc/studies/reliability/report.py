@@ -8,14 +8,12 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.several_tests import holm
-from impc.errors import DataError
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, probability, sentence_case
 from impc.reporting.verdict import Key
 from impc.studies.reliability.analysis import MEASURES
-from impc.studies.reliability.anova import learning_trend
 from impc.studies.reliability.figures import reliability_figures
 from impc.studies.reliability.verdict import (
     RULES,
@@ -67,10 +65,6 @@ _VISITS = (
     "Mean and SD over n people; analysis of variance over visits, uncorrected and with the "
     "Greenhouse-Geisser correction; change per visit with its 95 % CI."
 )
-_CONDITIONS = (
-    "Sway in each condition minus that in the first, means over visits; paired t-test over "
-    "people with 95 % CI; the second p is corrected over all rows by Holm's method."
-)
 _CMC = (
     "Coefficient of multiple correlation of the responses within and between visits (1: "
     "identical curves), mean and SD over people; undefined: number of undefined coefficients."
@@ -91,7 +85,6 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         "{low} to {high} Hz".format(**ends)
     )
     sections: dict[str, list[Block]] = {
-        "Conditions": [tables["conditions"]] if len(result.conditions) > 1 else [],
         "Response to the perturbation": [_RESPONSES, tables["cmc"]],
         "Visits": [tables[f"visits-{measure}"] for measure in MEASURES],
         "Checks": [Checks(_checks(result, facts))],
@@ -109,7 +102,7 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         sections = {"ICC": own, "Change of one person": [_BLAND_ALTMAN], **sections}
     return Report(
         "impc reliability", "reliability report", RULES.verdict(facts),
-        [Section(title, blocks) for title, blocks in sections.items() if blocks],
+        [Section(title, blocks) for title, blocks in sections.items()],
         meta=("Reliability", f"{people} people", f"{visits} visits", ", ".join(result.conditions)),
         hero=_HERO if sways else None,
         keys=keys,
@@ -155,7 +148,7 @@ def _checks(result: Reliability, facts: Facts) -> list[Check]:
 
 def reliability_findings(result: Reliability) -> dict[str, Finding]:
     """All findings by name."""
-    found = [_correlations(result.cmc), _conditions(result)]
+    found = [_correlations(result.cmc)]
     for measure in MEASURES:
         own = [item for item in result.measures if item.measure == measure]
         own.sort(key=lambda item: [one.output for one in result.measures].index(item.output))
@@ -210,31 +203,6 @@ def _visits(measure: str, own: Sequence[MeasureResult], visits: Sequence[str]) -
     labels = {f"sd_visit_{visit}": f"SD visit {visit}" for visit in visits}
     labels |= {"p_greenhouse_geisser": "p (Greenhouse-Geisser)", "p_change": "p (change)"}
     return _table(f"visits-{measure}", rows, _VISITS, f"All visits: {MEASURES[measure]}", **labels)
-
-
-def _conditions(result: Reliability) -> Finding:
-    """Paired comparison of all conditions with the first, means over visits."""
-    rows: list[dict[str, Any]] = []
-    first: dict[str, Array] = {}
-    sways = [item for item in result.measures if item.measure == "rms"]
-    for item in sways:
-        own = pd.DataFrame(item.scores).mean(axis=1).to_numpy(float)
-        if first.setdefault(item.output, own) is own:
-            continue
-        try:
-            change, low, high, p = learning_trend(np.column_stack([first[item.output], own]))
-        except DataError:
-            change, low, high, p = (np.nan,) * 4
-        mean, sd, count = _spread(own)
-        rows.append(_row(
-            item, mean=mean, sd=sd, difference=change, low=low, high=high, unit=item.unit,
-            people=count, against=result.conditions[0], p=p,
-        ))  # fmt: skip
-    rows.sort(key=lambda row: list(first).index(row["output"]))
-    for row, corrected in zip(rows, holm(np.array([row["p"] for row in rows])), strict=True):
-        row["p_holm"] = float(corrected)
-    labels = {"p_holm": "p, corrected", "sd": "SD", "people": "n (people)"}
-    return _table("conditions", rows, _CONDITIONS, **labels)
 
 
 def _correlations(items: Sequence[CmcResult]) -> Finding:

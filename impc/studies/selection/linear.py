@@ -12,7 +12,7 @@ B, which CasADi computes; with X_i = dx / dtheta_i
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -25,66 +25,46 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-class Discrete(NamedTuple):
-    """Sampled matrices and their derivatives; the first axis is the parameter."""
-
-    A: Array  # (n, n)
-    B: Array  # (n, d)
-    C: Array  # (p, n)
-    dA: Array  # (k, n, n)
-    dB: Array  # (k, n, d)
-    dC: Array  # (k, p, n)
-
-
-def sampler(matrices: ca.Function, dt: float) -> Callable[[Array, IntArray], Discrete]:
-    """Function of theta (k,) and the parameters of the derivatives; `dt` in s."""
-    symbol = ca.SX.sym("theta", matrices.size1_in(0))
-    jacobians = [ca.jacobian(ca.vec(part), symbol) for part in matrices(symbol)]
-    derivative = ca.Function("derivative", [symbol], jacobians)
-
-    def sample(theta: Array, free: IntArray) -> Discrete:
-        A, B, C = (item.full() for item in matrices(theta))
-        dA, dB, dC = (
-            # CasADi stacks columns; the first axis becomes the parameter.
-            item.full()[:, free].T.reshape(len(free), *part.T.shape).transpose(0, 2, 1)
-            for item, part in zip(derivative(theta), (A, B, C), strict=True)
-        )
-        joined = _joined(A, B) * dt
-        along = np.array([_joined(*pair) * dt for pair in zip(dA, dB, strict=True)])
-        exponential, change = _exponentials(joined, along.reshape(len(free), *joined.shape))
-        n = len(A)
-        parts = (
-            exponential[:n, :n],
-            exponential[:n, n:],
-            C,
-            change[:, :n, :n],
-            change[:, :n, n:],
-            dC,
-        )
-        return Discrete(*map(np.ascontiguousarray, parts))
-
-    return sample
-
-
 def linear_functions(
     matrices: ca.Function, dt: float
 ) -> tuple[
     Callable[[Array, Array], Array], Callable[[Array, Array, IntArray], tuple[Array, Array]]
 ]:
     """Functions `simulate` and `jacobian` of a `ParametricModel` from rest; `dt` in s."""
-    sample = sampler(matrices, dt)
+    symbol = ca.SX.sym("theta", matrices.size1_in(0))
+    jacobians = [ca.jacobian(ca.vec(part), symbol) for part in matrices(symbol)]
+    derivative = ca.Function("derivative", [symbol], jacobians)
 
     def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
-        found = sample(theta, free)
-        x, X = _with_derivatives(found.A, found.B, found.dA, found.dB, np.ascontiguousarray(given))
-        on_state = np.einsum("pn,skn->spk", found.C, X)
-        on_output = np.einsum("kpn,sn->spk", found.dC, x)
-        return np.asarray(x @ found.C.T), np.asarray(on_state + on_output)
+        A, B, C = (item.full() for item in matrices(theta))
+        dA, dB, dC = (
+            # CasADi stacks columns; the first axis becomes the parameter.
+            item.full()[:, free].T.reshape(len(free), *part.T.shape).transpose(0, 2, 1)
+            for item, part in zip(derivative(theta), (A, B, C), strict=True)
+        )
+        exponential, change = _exponentials(_joined(A, B) * dt, _joined(dA, dB) * dt)
+        n = len(A)
+        parts = (
+            exponential[:n, :n],
+            exponential[:n, n:],
+            change[:, :n, :n],
+            change[:, :n, n:],
+            given,
+        )
+        x, X = _with_derivatives(*map(np.ascontiguousarray, parts))
+        on_state, on_output = np.einsum("pn,skn->spk", C, X), np.einsum("kpn,sn->spk", dC, x)
+        return np.asarray(x @ C.T), np.asarray(on_state + on_output)
 
     def simulate(theta: Array, given: Array) -> Array:
         return jacobian(theta, given, np.zeros(0, dtype=np.int64))[0]
 
     return simulate, jacobian
+
+
+def _joined(A: Array, B: Array) -> Array:
+    """[A B; 0 0], with the leading axes of A and B."""
+    wide = np.concatenate([A, B], axis=-1)
+    return np.pad(wide, [(0, 0)] * (wide.ndim - 2) + [(0, B.shape[-1]), (0, 0)])
 
 
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
@@ -101,10 +81,6 @@ def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
     found = np.asarray(scipy.linalg.expm(blocks))
     first = found[0, :size, :size] if count else np.asarray(scipy.linalg.expm(M))
     return first, found[:, :size, size:] * length
-
-
-def _joined(A: Array, B: Array) -> Array:
-    return np.pad(np.hstack([A, B]), ((0, B.shape[1]), (0, 0)))
 
 
 @njit(cache=True, nogil=True)
