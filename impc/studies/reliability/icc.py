@@ -135,8 +135,6 @@ def measurement_error(scores: ArrayLike) -> MeasurementError:
 def complete_rows(scores: ArrayLike) -> tuple[Array, int]:
     """Scores of the subjects with all occasions, and the number of the others."""
     table = np.asarray(scores, dtype=np.float64)
-    if table.ndim != 2:
-        raise DataError("scores", f"got {table.ndim} dimensions", "pass (subjects, occasions)")
     if table.shape[1] < 2:
         raise DataError("scores", f"got {table.shape[1]} occasion", "give at least 2")
     kept = table[np.all(np.isfinite(table), axis=1)]

@@ -92,7 +92,8 @@ def parametric_model(
     """Check and freeze a model; `low`, `high`, `typical`, `deviation` (k,)."""
     count = len(names)
     spread = [(most - least) / 4 for least, most in zip(low, high, strict=False)]
-    sized = {"low": low, "high": high, "typical": typical, "deviation": deviation or spread}
+    spread = spread if deviation is None else [float(value) for value in deviation]
+    sized = {"low": low, "high": high, "typical": typical, "deviation": spread}
     for name, values in sized.items():
         if len(values) != count:
             raise InputError(name, f"has {len(values)} values", f"give {count}, one per parameter")
@@ -105,9 +106,11 @@ def parametric_model(
             )
         if not 0 <= sd < np.inf:
             raise InputError(f"parameter {name}", f"deviation {sd:g}", "give 0 or more")
-    groups, measured, words = (tuple(one or [""] * count) for one in (pathways, units, meanings))
+    groups, measured, words = (
+        ("",) * count if one is None else tuple(one) for one in (pathways, units, meanings)
+    )
     return ParametricModel(
-        tuple(names), frozen(low), frozen(high), frozen(typical), frozen(sized["deviation"]),
+        tuple(names), frozen(low), frozen(high), frozen(typical), frozen(spread),
         groups, measured, simulate, jacobian, words,
     )  # fmt: skip
 

@@ -18,26 +18,16 @@ from impc.studies.selection.analysis import bootstrap_subset, draw_single
 from impc.studies.selection.estimation import estimate
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.lasso import _box_lasso, proximal_lasso
-from impc.studies.selection.model import ParametricModel, Trial, normalised, parametric_model
+from impc.studies.selection.model import Trial
 from impc.studies.selection.settings import SelectSettings
 from tests.studies.selection.dosing import blood_model, in_turn
-from tests.studies.selection.heads import head_model
+from tests.studies.selection.heads import line_model
 
 SEED = 2
-MODEL = head_model()
 
 
 def run(*arguments: str) -> Result:
     return CliRunner().invoke(main, list(arguments))
-
-
-def line_model() -> ParametricModel:
-    """y = a u1 + b u2 + c u3: closed-form least squares and LASSO."""
-
-    def simulate(p: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.asarray(u @ p)[:, None]
-
-    return parametric_model(["a", "b", "c"], [-5] * 3, [5] * 3, [0.0, 0.0, 0.0], simulate)
 
 
 def line_trial(noise: float) -> Trial:
@@ -59,8 +49,7 @@ def test_bootstrap_of_a_line_is_its_covariance() -> None:
 
 
 def test_blocks_widen_intervals_of_coloured_residuals() -> None:
-    model, trial = line_model(), line_trial(0.0)
-    rng = np.random.default_rng(SEED)
+    model, rng = line_model(), np.random.default_rng(SEED)
     slow = np.repeat(rng.standard_normal(40), 10)[:, None]
     drive = np.repeat(rng.standard_normal((40, 3)), 10, axis=0)
     trial = Trial(drive, (drive @ [2.0, 0.0, -1.0])[:, None] + 0.5 * slow)
@@ -82,7 +71,7 @@ def test_lasso_of_a_line_is_soft_thresholding() -> None:
     t, _ = proximal_lasso(model, [trial], weight)
     expected = np.sign([2, 0.1, -1]) * np.maximum(np.abs([2, 0.1, -1]) - 0.5 / 2, 0) / 5
     np.testing.assert_allclose(t, expected, atol=1e-8)
-    assert t[1] == normalised(model, np.array(model.typical))[1]
+    assert t[1] == 0  # exactly typical
 
 
 def test_nelder_mead_finds_the_same_objective() -> None:
@@ -97,10 +86,7 @@ def test_nelder_mead_finds_the_same_objective() -> None:
 def test_key_parameters_of_a_line() -> None:
     """Six subjects, two visits: a and c differ between subjects, b is noise; a, c are reliable."""
     rng = np.random.default_rng(SEED)
-    base = line_model()
-    model = parametric_model(
-        ["a", "b", "c"], [-5] * 3, [5] * 3, [0, 0, 0], base.simulate, pathways=["x", "x", "y"]
-    )
+    model = line_model(pathways=["x", "x", "y"])
     recorded = {}
     for subject in range(6):
         own = np.array([rng.normal(0, 1), 0.0, rng.normal(0, 1)])
@@ -216,19 +202,16 @@ def test_a_model_from_another_field(tmp_path: Path) -> None:
 def test_faults_are_one_line(tmp_path: Path) -> None:
     study = blood_study(tmp_path, 1, 1)
     text = study.read_text()
+    before, wrong = "bound = 0.05\nsize = 2\nreplicates = 40", (
+        "replicates = 0", "replicates = 1", "replicates = 9223372036854775807", "starts = 0",
+        "seed = -1", "bounds = []", "bounds = [nan]", "bound = -1.0",
+    )  # fmt: skip
     for old, new, match in (
         ('model = "tests.studies.selection.dosing:blood_model"', "", "study.model"),
         ("dosing:blood_model", "dosing:nothing", "nothing"),
         ("bound = 0.05", "bond = 0.05", "is not a setting"),
-        ("replicates = 40", "draw = 'x'", "give single or block"),
-        ("replicates = 40", "replicates = 0", "[select] replicates"),
-        ("replicates = 40", "replicates = 1", "[select] replicates"),
-        ("replicates = 40", "replicates = 9223372036854775807", "[select] replicates"),
-        ("replicates = 40", "starts = 0", "[select] starts"),
-        ("replicates = 40", "seed = -1", "[select] seed"),
-        ("replicates = 40", "bounds = []", "[select] bounds"),
-        ("replicates = 40", "bounds = [nan]", "[select] bound"),
-        ("bound = 0.05", "bound = -1.0", "[select] bound"),
+        ("bound = 0.05", "draw = 'x'", "give single or block"),
+        *((before, one, f"[select] {one.split()[0]}") for one in wrong),
     ):
         study.write_text(text.replace(old, new))
         done = run("select", str(study), "--allow-model", "--out", str(tmp_path / "out"))
