@@ -180,8 +180,6 @@ def _f_limits(squares: MeanSquares) -> tuple[float, float]:
     a = k * rho / (n * (1 - rho))
     b = 1 + k * rho * (n - 1) / (n * (1 - rho))
     spread = (a * c) ** 2 / (k - 1) + (b * e) ** 2 / ((n - 1) * (k - 1))
-    if spread == 0:
-        return 1.0, 1.0
     freedom = (a * c + b * e) ** 2 / spread
     lower = scipy.stats.f.ppf(tail, n - 1, freedom)
     upper = scipy.stats.f.ppf(tail, freedom, n - 1)
