@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impc.errors import DataError
 from impc.reporting.document import Checks, Copy, Report
 from impc.reporting.rendering import number
 from impc.studies.selection.analysis import select_study
@@ -94,7 +95,6 @@ def keyed(spread: float, people: int) -> Report:
     ("spread", "people", "badge", "headline"),
     [
         (0.3, 3, "Undecided", "3 people and 2 visits do not show"),
-        (0.1, 1, "Check before reporting", "No subset of parameters is shown to be repeatable"),
         (3.0, 30, "Check before reporting", "No subset of parameters is shown to be repeatable"),
         (0.02, 30, "Check before reporting", "2 of 3 parameters are key parameters"),
     ],
@@ -110,10 +110,13 @@ def test_the_interval_of_an_icc_decides_not_the_icc(
     best: Any = table.iloc[0]
     assert best["kept"] == (best["least_icc_low"] >= 0.6)
     assert isinstance(report.copy, Copy)
-    one = people == 1  # no ICC
-    said = "no ICC could be" if one else f"ICC of at least {number(best['least_icc'])}"
-    assert said in report.copy.results
+    assert f"ICC of at least {number(best['least_icc'])}" in report.copy.results
     if people == 3:
         assert best["least_icc"] > 0.75
         assert verdict.may == []
     assert any("impc select" in one for one in report.sections[1].blocks if isinstance(one, str))
+
+
+def test_one_person_has_no_key_parameters() -> None:
+    with pytest.raises(DataError, match="1 subjects with all visits, and 2 visits"):
+        keyed(0.1, 1)
