@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.control.named_solver import silent
+from impc.control.named_solver import require_solver, silent
 from impc.studies.selection.estimation import Estimate, estimate, residuals
 from impc.studies.selection.model import normalised, physical, stacked
 
@@ -109,8 +109,9 @@ def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> A
     both = np.hstack([np.eye(len(t)), -np.eye(len(t))])
     square = ca.DM(both.T @ H @ both)
     options: dict[str, Any] = {"printLevel": "none", "error_on_fail": False}
+    solver_name = require_solver("qpoases")
     with silent():
-        solver = ca.conic("lasso", "qpoases", {"h": square.sparsity()}, options)
+        solver = ca.conic("lasso", solver_name, {"h": square.sparsity()}, options)
         found = solver(
             h=square, g=both.T @ (g + H @ (typical - t)) + weight,
             lbx=0, ubx=np.concatenate([1 - typical, 1 + typical]),
