@@ -15,8 +15,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.optimize
 
 import plants
+from impc.arrays import percentiles
 from impc.studies.selection.analysis import bootstrap_subset
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import (
@@ -26,11 +28,13 @@ from impc.studies.selection.fisher import (
     subset_variances,
     sweep,
 )
-from impc.studies.selection.lasso import lasso_of_size, table_c1
-from impc.studies.selection.model import Trial
+from impc.studies.selection.lasso import lasso_objective, lasso_of_size
+from impc.studies.selection.model import Trial, normalised
 from impc.studies.selection.model_source import model_source
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from impc.arrays import Array
     from impc.studies.selection.fisher import Information
     from impc.studies.selection.model import ParametricModel
@@ -43,6 +47,8 @@ __all__ = [
     "mean_subject",
     "nominal_information",
     "reduced_widths",
+    "search_times",
+    "table_c1",
 ]
 
 #: The five parameters that the dissertation's Fisher information selects.
@@ -89,7 +95,8 @@ def bootstrap_widths(shortest: float, longest: float, replicates: int) -> tuple[
             noise = np.sqrt((1 / vaf - 1) * np.mean(head**2))
             trials.append(Trial(reference, head + noise * rng.standard_normal(head.shape)))
         fit = estimate(model, trials, free, nominal)
-        widths.append(bootstrap_subset(model, trials, fit, replicates, subject).width)
+        drawn = bootstrap_subset(model, trials, fit, replicates, subject)
+        widths.append(np.ptp(percentiles(drawn, 0.95), axis=0))
     mean, spread = np.mean(widths, axis=0), np.std(widths, axis=0, ddof=1)
     return tuple(
         Width(name, float(a), float(b), *quoted)
@@ -133,7 +140,9 @@ def reduced_widths(replicates: int) -> dict[str, Array]:
     for label, names in (("all twelve", model.names), ("FIM", FIM_SUBSET), ("LASSO", _LASSO)):
         free = free_indices(model, names)
         fit = estimate(model, trials, free, theta)
-        widths = bootstrap_subset(model, trials, fit, replicates, 0).width
+        widths = np.ptp(
+            percentiles(bootstrap_subset(model, trials, fit, replicates, 0), 0.95), axis=0
+        )
         found[label] = widths[[free.index(index) for index in shown]]
     return found
 
@@ -158,19 +167,52 @@ def _print_reduction(replicates: int) -> None:
         print(f"  here, {label:6}  {', '.join(f'{item:.0f}' for item in shares)} %")
 
 
-def _print_times(nelder_mead: bool) -> None:
+def table_c1(
+    model: ParametricModel, trials: Sequence[Trial], count: int, *, solves: int = 12
+) -> tuple[tuple[int, ...], float, float]:
+    """Table C.1: Nelder-Mead, lambda adjusted until `count` parameters exceed the threshold.
+
+    Returns the selected parameters, lambda, and (C.5). The dissertation does not give the rule for
+    lambda: it is multiplied by 2 if too many parameters moved, divided by 2 if too few; the
+    factor's logarithm is halved if the direction changes. At most `solves` problems are solved.
+    """
+    typical = normalised(model, np.asarray(model.typical))
+    weight, factor, before = 0.13, 2.0, 0
+    for number in range(1, solves + 1):
+
+        def value(u: Array, weight: float = weight) -> float:
+            return lasso_objective(model, trials, np.sin(u), weight)
+
+        found = scipy.optimize.minimize(
+            value, np.arcsin(np.clip(typical, -1, 1)), method="Nelder-Mead",
+            options={"maxfev": 200 * len(typical)},
+        )  # fmt: skip
+        moved = np.flatnonzero(np.abs(np.sin(found.x) - typical) > 0.005)
+        if len(moved) == count or number == solves:
+            break
+        direction = 1 if len(moved) > count else -1
+        if before and direction != before:
+            factor = float(np.sqrt(factor))
+        weight, before = weight * factor**direction, direction
+    return tuple(moved.tolist()), weight, float(found.fun)
+
+
+def search_times(*, nelder_mead: bool) -> dict[str, tuple[float, tuple[int, ...]]]:
+    """LASSO by each method for the mean subject: run time over that of the FIM, and selection."""
     model, theta, trials = mean_subject()
     started = time.perf_counter()
     sweep([fisher_information(model, theta, trials).F], [0.05 + 0.1 * k for k in range(10)])
     fim = time.perf_counter() - started
-    print(f"\nseconds of information and sweep: {fim:.3f}; over that, for one subject")
-    searches = {"proximal": lasso_of_size} | ({"Table C.1": table_c1} if nelder_mead else {})
+    searches: dict[str, Callable[[], tuple[int, ...]]]
+    searches = {"proximal": lambda: lasso_of_size(model, trials, 5).selected}
+    if nelder_mead:
+        searches["Table C.1"] = lambda: table_c1(model, trials, 5)[0]
+    found = {}
     for label, search in searches.items():
         started = time.perf_counter()
-        found = search(model, trials, 5)
-        seconds = time.perf_counter() - started
-        names = ", ".join(model.names[index] for index in found.selected)
-        print(f"  LASSO, {label}: {seconds:.1f} s, {seconds / fim:.0f} times; {names}")
+        selected = search()
+        found[label] = (time.perf_counter() - started) / fim, selected
+    return found
 
 
 def main() -> None:
@@ -188,8 +230,10 @@ def main() -> None:
                 f"{item.quoted:g} ± {item.deviation:g}   {'inside' if inside else 'outside'}"
             )
     _print_reduction(given.replicates)
-    _print_times(given.nelder_mead)
     model, found = nominal_information()
+    for label, (times, selected) in search_times(nelder_mead=given.nelder_mead).items():
+        names = ", ".join(model.names[index] for index in selected)
+        print(f"\nLASSO, {label}: {times:.0f} times as long as information and sweep; {names}")
     print(f"\nnominal column: rank {found.rank} of 12")
     for bound in (0.05, 0.15, 0.35, 0.95):
         selection = largest_subsets([found.F], bound)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 
 import plants
 from experiments.reproduction.entry import Entry, Verdict, agrees
@@ -15,7 +16,6 @@ from impc.checking import replace
 from impc.studies.selection.estimation import estimate, free_indices
 from impc.studies.selection.fisher import fisher_information, largest_subsets
 from impc.studies.selection.lasso import lasso_of_size
-from impc.studies.selection.linear import Discrete, sampled
 from impc.studies.selection.model import Trial, normalised, sensitivity
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from impc.studies.selection.fisher import Information
     from impc.studies.selection.model import ParametricModel
 
-__all__ = ["appendix_entries", "discretised", "kronecker_sensitivity"]
+__all__ = ["appendix_entries", "kronecker_sensitivity"]
 
 _DRAWS = 200
 
@@ -35,34 +35,38 @@ def appendix_entries() -> list[Entry]:
     return [*_information(*subject, information), *_lasso(*subject), *_selection(information)]
 
 
-def discretised(matrices: ca.Function, theta: Array, dt: float) -> Discrete:
-    """Sample a model at one point.
-
-    `theta` (k,); `dt` in s.
-    """
-    A, B, C = (item.full() for item in matrices(theta))
-    symbol = ca.SX.sym("theta", len(theta))
-    parts = matrices(symbol)
-    derivative = ca.Function(
-        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
-    )
-    return sampled((A, B, C), [item.full() for item in derivative(theta)], dt)
-
-
-def kronecker_sensitivity(found: Discrete, given: Array) -> Array:
+def kronecker_sensitivity(matrices: ca.Function, theta: Array, dt: float, given: Array) -> Array:
     """(A.3) with Kronecker products: derivative of the outputs (samples, p, k); slow.
 
-    `given` (samples, d).
+    `theta` (k,), `dt` in s, `given` (samples, d).
     """
-    k, n, d = len(found.dA), found.A.shape[0], found.B.shape[1]
-    dA, dB, dC = (np.hstack(list(item)) for item in (found.dA, found.dB, found.dC))
-    x, X = np.zeros((n, 1)), np.zeros((n, k))
-    eye = np.eye(k)
-    rows = np.empty((len(given), found.C.shape[0], k))
+    symbol = ca.SX.sym("theta", len(theta))
+    slopes = ca.Function(
+        "slopes", [symbol], [ca.jacobian(part, symbol) for part in matrices(symbol)]
+    )
+    A, B, C = (item.full() for item in matrices(theta))
+    n, d = B.shape
+    M = np.zeros((n + d, n + d))
+    M[:n] = np.hstack([A, B]) * dt
+    Ad, Bd = np.split(scipy.linalg.expm(M)[:n], [n], axis=1)
+    found: list[list[Array]] = [[], [], []]
+    for columns in zip(*(item.full().T for item in slopes(theta)), strict=True):
+        parts = [
+            one.reshape(of.shape, order="F") for one, of in zip(columns, (A, B, C), strict=True)
+        ]
+        L = np.zeros_like(M)
+        L[:n] = np.hstack(parts[:2]) * dt
+        change = np.real(scipy.linalg.expm_frechet(M, L)[1])
+        for item, one in zip(found, (change[:n, :n], change[:n, n:], parts[2]), strict=True):
+            item.append(one)
+    dA, dB, dC = map(np.hstack, found)
+    x, X = np.zeros((n, 1)), np.zeros((n, len(theta)))
+    eye = np.eye(len(theta))
+    rows = np.empty((len(given), len(C), len(theta)))
     for sample, r in enumerate(np.asarray(given).reshape(len(given), d, 1)):
-        rows[sample] = dC @ np.kron(eye, x) + found.C @ X
-        X = dA @ np.kron(eye, x) + found.A @ X + dB @ np.kron(eye, r)
-        x = found.A @ x + found.B @ r
+        rows[sample] = dC @ np.kron(eye, x) + C @ X
+        X = dA @ np.kron(eye, x) + Ad @ X + dB @ np.kron(eye, r)
+        x = Ad @ x + Bd @ r
     return rows
 
 
@@ -70,8 +74,8 @@ def _information(
     model: ParametricModel, theta: Array, trials: list[Trial], information: Information
 ) -> list[Entry]:
     outputs, exact = sensitivity(model, theta, trials[0].input)
-    linear = discretised(plants.head_neck_matrices(), theta, 1 / 60)
-    recursion = kronecker_sensitivity(linear, trials[0].input) * model.gain
+    matrices = plants.head_neck_matrices()
+    recursion = kronecker_sensitivity(matrices, theta, 1 / 60, trials[0].input) * model.gain
     kronecker = float(np.max(np.abs(recursion - exact)) / np.max(np.abs(exact)))
     _, differences = sensitivity(replace(model, jacobian=None), theta, trials[0].input)
     difference = float(np.max(np.abs(differences - exact)) / np.max(np.abs(exact)))
@@ -81,8 +85,8 @@ def _information(
         Entry(
             "(A.1)",
             "Discrete state space with white measurement noise.",
-            ("impc.studies.selection.linear:sampled",),
-            f"{linear.A.shape[0]} states, sampled exactly; {len(outputs)} samples a trial.",
+            ("impc.studies.selection.linear:linear_functions",),
+            f"{matrices.size1_out(0)} states, sampled exactly; {len(outputs)} samples a trial.",
             Verdict.REPRODUCED,
         ),
         Entry(
@@ -139,9 +143,9 @@ def _lasso(model: ParametricModel, _: Array, trials: list[Trial]) -> list[Entry]
             "Table C.1",
             "Change lambda until the wanted number of parameters is farther than .005 from its"
             " typical value; bounded Nelder and Mead.",
-            ("impc.studies.selection.lasso:table_c1",),
-            "Run by `nelder_mead = true` and by `python -m experiments.selection_claims"
-            " --nelder-mead`: experiments/reliability_selection.md.",
+            ("experiments.selection_claims:table_c1",),
+            "Run by `python -m experiments.selection_claims --nelder-mead`:"
+            " experiments/reliability_selection.md.",
             Verdict.IN_KIND,
             "The rule by which lambda changes is lost.",
         ),

@@ -80,10 +80,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
         Entry(
             "Table 2.4",
             "CMC of the transfer functions within and between visits.",
-            (
-                "impc.studies.reliability.analysis:cmc_within",
-                "impc.studies.reliability.analysis:cmc_between",
-            ),
+            ("impc.studies.reliability.analysis:cmc",),
             f"Within {within[0]:.3f} to {within[1]:.3f}, between {between[0]:.3f} to"
             f" {between[1]:.3f}.",
             kind(min(within[0], between[0]) > _EXCELLENT),

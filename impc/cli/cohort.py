@@ -183,15 +183,15 @@ def reliability_command(
     require_distinct([file for unit in study.units for file in unit.files])
     source = named_plant(study_file, study, plant_name, allowed)
     units = [replace(unit, files=unit.files[-last:]) for unit in study.units]
-    trials = _trials_of(units, study.configuration, source)
+    with angles_in(study.configuration.report.angles):
+        trials = _trials_of(units, study.configuration, source)
     inputs = gather_inputs(
         {unit.name: unit.files for unit in units}, study_file, source.name, source.arguments
     )
     result = analyse(trials)
     line = f"impc reliability {study_file.name} --plant {source.name} --last {last}"
-    with angles_in(study.configuration.report.angles):
-        report = reliability_report(trials, result, line, inputs)
-        written = write_files(out, report.files(pdf=pdf))
+    report = reliability_report(trials, result, line, inputs)
+    written = write_files(out, report.files(pdf=pdf))
     click.echo(f"{report.verdict.text()}\n")
     for item in report.findings():
         if item.name.startswith("icc-"):
@@ -205,15 +205,18 @@ def reliability_command(
 def _trials_of(units: Sequence[Unit], configuration: Configuration, source: PlantSource) -> Trials:
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
     from impc.files.reading import read_recordings, require_whole  # noqa: PLC0415
-    from impc.reporting.shown_units import signal_name  # noqa: PLC0415
+    from impc.reporting.shown_units import shown_angle, signal_name  # noqa: PLC0415
     from impc.studies.reliability.analysis import Trials  # noqa: PLC0415
 
     cells = {}
+    factor, shown = shown_angle()
     recorded = configuration.recorded
     plant = make_plant(source, recorded)
     for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
         found = read_recordings(unit.files, configuration, plant)
         require_whole(found, "reliability")
-        cells[unit.subject, unit.visit, unit.condition] = found
+        cells[unit.subject, unit.visit, unit.condition] = [
+            (item.disturbance[:, 0], factor * item.outputs) for item in found
+        ]
     words = {name: signal_name(plant, name) for name in plant.outputs}
-    return Trials(tuple(plant.outputs), 1 / plant.dt, cells, words)
+    return Trials(words, shown, 1 / plant.dt, cells)

@@ -35,10 +35,10 @@ _SLOWER = {"compiled": 1.0, "daqp": 18.0, "qpoases": 24.0, "ipopt": 225.0}
 _A_TRIAL = 1e-3
 # Number of simulations of all trials in a fit, a bootstrap replicate and a profile.
 _FIT, _REPLICATE, _PROFILE = 300, 40, 1000
-# Evaluations with derivatives of a fit from a distant start, of a fit from a close start, of a
-# LASSO with refit, and of Table C.1. Counts on the drug: 7, 5, 74; on the head, whose twelve
-# parameters are poorly determined: 200, 17, 23.
-_START, _REFIT, _LASSO, _TABLE = 30, 9, 100, 4000
+# Evaluations with derivatives of a fit from a distant start, of a fit from a close start, and of a
+# LASSO with refit. Counts on the drug: 7, 5, 74; on the head, whose twelve parameters are poorly
+# determined: 200, 17, 23.
+_START, _REFIT, _LASSO = 30, 9, 100
 # Arrays of the size of the derivative in a fit; parallel fits in a bootstrap.
 _COPIES, _THREADS = 6, 2
 
@@ -83,8 +83,7 @@ def fit_effort(problem: Problem, settings: FitSettings) -> Effort:
 
 def select_evaluations(settings: SelectSettings) -> int:
     """Evaluations of the model with derivative for one subject of `impc select`."""
-    table = _TABLE if settings.nelder_mead else 0
-    return _START * (settings.starts + 1) + _REFIT * settings.replicates + _LASSO + table
+    return _START * (settings.starts + 1) + _REFIT * settings.replicates + _LASSO
 
 
 def key_evaluations(settings: SelectSettings, most: int = 20) -> int:

@@ -18,66 +18,63 @@ negative, the CMC is NaN: curves differ more between trials than between frequen
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.errors import DataError
-from impc.studies.reliability.anova import (
-    learning_trend,
-    variance_components,
-    visit_anova,
-)
-from impc.studies.reliability.icc import icc, measurement_error
-from impc.studies.reliability.measures import (
-    band_energy,
-    passband,
-    rms,
-    transfer_function,
-)
+from impc.studies.reliability.anova import Anova, Trend, learning_trend, visit_anova
+from impc.studies.reliability.icc import Icc, MeasurementError, icc, measurement_error
+from impc.studies.reliability.measures import band_energy, passband, rms, transfer_function
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
-    from impc.model.recordings import Recording
-    from impc.studies.reliability.anova import Anova, Trend, VarianceComponent
-    from impc.studies.reliability.icc import Icc, MeasurementError
     from impc.studies.reliability.measures import ComplexArray, Passband, TransferFunction
 
 #: Name of a measure -> description.
 MEASURES = {"rms": "sway (RMS about upright)", "energy": "energy in the band"}
+_NONE = float("nan")
 
 
 @dataclass(frozen=True)
 class Trials:
     """Recordings of a study."""
 
-    outputs: tuple[str, ...]  # Names, in the order of the recordings' columns
+    outputs: Mapping[str, str]  # Names of the outputs, in order -> names in words
+    unit: str  # Of the outputs
     rate: float  # Samples per second
-    # (subject, visit, condition) -> the trials analysed, in order
-    cells: Mapping[tuple[str, str, str], tuple[Recording, ...]]
-    words: Mapping[str, str] = field(default_factory=dict)  # Names of the outputs in words
+    # (subject, visit, condition) -> torque (samples,) and outputs (samples, p) of each trial
+    cells: Mapping[tuple[str, str, str], Sequence[tuple[Array, Array]]]
 
 
 @dataclass(frozen=True)
 class MeasureResult:
-    """One measure of one output in one condition."""
+    """One measure of one output in one condition; NaN where a result is missing."""
 
     measure: str  # One of `MEASURES`
     output: str
+    signal: str  # The output in words
     condition: str
-    # (subjects, visits), NaN if missing, in the output's unit (squared for energy)
-    scores: Array
-    icc: Icc | None = None  # ICC(A,k) between visits with the generalised interval
-    # SEM and minimal detectable change (95 %) of the score of one visit, in its unit
-    error: MeasurementError | None = None
-    anova: Anova | None = None
-    trend: Trend | None = None  # Change from visit to visit (learning)
-    # Variance of subjects, visits and trials; empty if there are too few trials
-    components: tuple[VarianceComponent, ...] = ()
-    notes: tuple[str, ...] = ()  # Reasons for missing results
+    unit: str  # Of the scores: the output's, squared for energy
+    scores: Array  # (subjects, visits), NaN if missing
+    # ICC(A,k) between visits with the generalised interval, and with that of McGraw and Wong
+    icc: Icc
+    icc_f: Icc
+    error: MeasurementError  # SEM and minimal detectable change (95 %) of the score of one visit
+    anova: Anova
+    trend: Trend  # Change from visit to visit (learning)
+    notes: tuple[str, ...]  # Reasons for missing results
+
+    @property
+    def name(self) -> str:
+        """Name in words; the RMS of a tilt is called sway."""
+        if self.measure == "energy":
+            return f"band energy of {self.signal}"
+        tilt = self.signal.removesuffix(" tilt")
+        return f"RMS of {self.signal}" if tilt == self.signal else f"{tilt} sway"
 
 
 @dataclass(frozen=True)
@@ -85,6 +82,7 @@ class CmcResult:
     """Coefficients of multiple correlation of one output in one condition, by subject."""
 
     output: str
+    signal: str  # The output in words
     condition: str
     within: Array  # (subjects,), NaN if undefined
     between: Array
@@ -98,13 +96,19 @@ class Reliability:
     subjects: tuple[str, ...]  # Names, in the order of the study
     visits: tuple[str, ...]
     conditions: tuple[str, ...]
-    outputs: tuple[str, ...]
     band: Passband  # Passband of the input
     measures: tuple[MeasureResult, ...]
     cmc: tuple[CmcResult, ...]
     # (subject, visit, condition) -> transfer function, mean over trials
     responses: Mapping[tuple[str, str, str], TransferFunction]
     notes: tuple[str, ...]  # Notes on the whole study
+
+    @property
+    def known(self) -> list[MeasureResult]:
+        """Measures with an ICC, RMS first, sorted by signal."""
+        signals = [item.output for item in self.measures]
+        found = [item for item in self.measures if item.icc.subjects]
+        return sorted(found, key=lambda it: (it.measure != "rms", signals.index(it.output)))
 
 
 def analyse(trials: Trials) -> Reliability:
@@ -115,68 +119,67 @@ def analyse(trials: Trials) -> Reliability:
     subjects, visits, conditions = (
         tuple(dict.fromkeys(one)) for one in zip(*trials.cells, strict=True)
     )
-    lengths = [item.samples for cell in trials.cells.values() for item in cell]
+    lengths = [len(torque) for cell in trials.cells.values() for torque, _ in cell]
     samples, rate = min(lengths), trials.rate
     notes = []
     if max(lengths) > samples:
         notes.append(f"Trials have {samples} to {max(lengths)} samples; all were cut to {samples}.")
-    inputs = {
-        key: [item.disturbance[:samples, 0] for item in cell] for key, cell in trials.cells.items()
+    # Of each cell: inputs (trials, samples) and outputs (trials, samples, p).
+    cells = {
+        key: (
+            np.stack([torque[:samples] for torque, _ in cell]),
+            np.stack([outputs[:samples] for _, outputs in cell]),
+        )
+        for key, cell in trials.cells.items()
     }
-    outputs = {key: [item.outputs[:samples] for item in cell] for key, cell in trials.cells.items()}
-    band = passband(next(iter(inputs.values()))[0], rate)
-    responses = {
-        key: transfer_function(inputs[key], outputs[key], rate, band) for key in trials.cells
-    }
-    # For each trial: scores by measure (p,), and its transfer function (frequencies, p).
-    scores: dict[str, dict[tuple[str, str, str], list[Array]]] = {
-        "rms": {key: [rms(item) for item in cell] for key, cell in outputs.items()},
+    band = passband(next(iter(cells.values()))[0][0], rate)
+    # Of each trial: scores by measure (trials, p), and transfer function (trials, frequencies, p).
+    scores = {
+        "rms": {key: rms(outputs) for key, (_, outputs) in cells.items()},
         "energy": {
-            key: [band_energy(item, rate, band.low, band.high) for item in cell]
-            for key, cell in outputs.items()
+            key: band_energy(outputs, rate, band.low, band.high)
+            for key, (_, outputs) in cells.items()
         },
     }
     curves = {
-        key: [
-            transfer_function([one], [other], rate, band).response
-            for one, other in zip(inputs[key], outputs[key], strict=True)
-        ]
-        for key in trials.cells
-    }
+        key: np.stack([
+            transfer_function(one[None], other[None], rate, band).response
+            for one, other in zip(*cell, strict=True)
+        ])
+        for key, cell in cells.items()
+    }  # fmt: skip
     measures, cmc = [], []
     for condition in conditions:
         keys = [[(subject, visit, condition) for visit in visits] for subject in subjects]
-        for place, output in enumerate(trials.outputs):
+        for place, (output, signal) in enumerate(trials.outputs.items()):
+            named = output, signal, condition
             for name, found in scores.items():
                 table = [
-                    [[float(one[place]) for one in found.get(key, ())] for key in row]
+                    [np.mean(found[key][:, place]) if key in found else _NONE for key in row]
                     for row in keys
                 ]
-                measures.append(_measure(name, output, condition, table))
-            own = [
-                [[one[:, place] for one in curves[key]] for key in row if key in curves]
-                for row in keys
-            ]
-            cmc.append(_cmc(output, condition, own))
+                unit = trials.unit if name == "rms" else f"{trials.unit}²"
+                measures.append(measured(name, *named, unit, np.array(table)))
+            own = [[curves[key][..., place] for key in row if key in curves] for row in keys]
+            cmc.append(_cmc(*named, own))
+    responses = {key: transfer_function(*cell, rate, band) for key, cell in cells.items()}
     return Reliability(
-        subjects, visits, conditions, trials.outputs, band, tuple(measures), tuple(cmc), responses,
-        tuple(notes),
-    )  # fmt: skip
+        subjects, visits, conditions, band, tuple(measures), tuple(cmc), responses, tuple(notes)
+    )
 
 
-def _measure(
-    measure: str,
-    output: str,
-    condition: str,
-    table: list[list[list[float]]],
+def measured(
+    measure: str, output: str, signal: str, condition: str, unit: str, scores: Array
 ) -> MeasureResult:
-    """Analyse the scores of all trials, by subject and visit; an empty list is a missing cell."""
-    scores = np.array([[np.mean(cell) if cell else np.nan for cell in row] for row in table])
-    found: dict[str, Any] = {}
+    """Analyse the scores (subjects, visits); NaN is a missing visit."""
+    none = Icc(_NONE, _NONE, _NONE, 0, 0)
+    found: dict[str, Any] = {"icc": none, "icc_f": none, "error": MeasurementError(_NONE, _NONE)}
+    found |= {"anova": Anova(_NONE, _NONE, _NONE), "trend": Trend(_NONE, _NONE, _NONE, _NONE)}
     notes: list[str] = []
     try:
         found |= {
             "icc": icc(scores, "A,k", method="generalised"),
+            "icc_f": icc(scores, "A,k"),
             "error": measurement_error(scores),
         }
         if found["icc"].left_out:
@@ -185,54 +188,28 @@ def _measure(
         found["trend"] = learning_trend(scores)
     except DataError as error:
         notes.append(str(error))
-    complete = [row for row in table if all(row)]
-    try:
-        if not complete:
-            raise DataError("scores", "no subject has all visits", "record all visits")
-        fewest = min(len(cell) for row in complete for cell in row)
-        even = np.array([[cell[-fewest:] for cell in row] for row in complete])
-        found["components"] = variance_components(even)
-    except DataError as error:
-        notes.append(f"variance components: {error}")
-    return MeasureResult(measure, output, condition, scores, **found, notes=tuple(notes))
+    return MeasureResult(
+        measure, output, signal, condition, unit, scores, **found, notes=tuple(notes)
+    )
 
 
-def _cmc(output: str, condition: str, subjects: list[list[list[ComplexArray]]]) -> CmcResult:
-    """CMC of the curves (frequencies,) of all trials, by subject and visit."""
+def _cmc(output: str, signal: str, condition: str, subjects: list[list[ComplexArray]]) -> CmcResult:
+    """CMC of the curves (trials, frequencies), by subject and visit."""
     found, undefined = np.full((2, len(subjects)), np.nan), 0
     for place, visits in enumerate(subjects):
-        fewest = min((len(trials) for trials in visits), default=0)
-        if not fewest:
-            continue
-        curves = np.array([trials[-fewest:] for trials in visits])
-        for row, make, count in ((0, cmc_within, fewest), (1, cmc_between, len(visits))):
+        fewest = min(map(len, visits), default=0)
+        for row, over, count in ((0, (1,), fewest), (1, (0, 1), len(visits))):
             if count > 1:
-                found[row, place] = make(curves)
+                found[row, place] = cmc(np.array([one[-fewest:] for one in visits]), over)
                 undefined += int(np.isnan(found[row, place]))
-    return CmcResult(output, condition, found[0], found[1], undefined)
+    return CmcResult(output, signal, condition, found[0], found[1], undefined)
 
 
-def cmc_within(curves: ComplexArray) -> float:
-    """CMC within visits; curves (visits, trials, frequencies)."""
-    M, N, T = curves.shape
-    if N < 2 or T < 2:
-        raise DataError("curves", f"got {N} trials, {T} frequencies", "give at least 2 of each")
-    own = np.sum(np.abs(curves - curves.mean(axis=1, keepdims=True)) ** 2)
-    all_of_visit = np.sum(np.abs(curves - curves.mean(axis=(1, 2), keepdims=True)) ** 2)
-    return _root(own / (M * T * (N - 1)), all_of_visit, M * (N * T - 1))
-
-
-def cmc_between(curves: ComplexArray) -> float:
-    """CMC between visits; curves (visits, trials, frequencies)."""
-    M, N, T = curves.shape
-    if M < 2 or T < 2:
-        raise DataError("curves", f"got {M} visits, {T} frequencies", "give at least 2 of each")
-    own = np.sum(np.abs(curves - curves.mean(axis=(0, 1), keepdims=True)) ** 2)
-    everything = np.sum(np.abs(curves - curves.mean()) ** 2)
-    return _root(own / (T * (M * N - 1)), everything, M * N * T - 1)
-
-
-def _root(own: float, squares: float, freedom: int) -> float:
-    """Root of 1 minus the share of `own` in the mean square; NaN if negative."""
-    share = 1 - own * freedom / squares if squares else -1.0
+def cmc(curves: ComplexArray, over: tuple[int, ...]) -> float:
+    """CMC of curves (visits, trials, frequencies): over (1,) within visits, (0, 1) between."""
+    own, everything = (
+        np.sum(np.abs(curves - mean) ** 2) / (curves.size - mean.size)
+        for mean in (curves.mean(axis=axes, keepdims=True) for axes in (over, (*over, 2)))
+    )
+    share = 1 - own / everything if everything else -1.0
     return float(np.sqrt(share)) if share >= 0 else float("nan")

@@ -10,7 +10,6 @@ import numpy as np
 import scipy.signal
 
 from impc.reporting.rendering import sentence_case
-from impc.reporting.shown_units import shown_angle
 from impc.reporting.style import (
     BLUE,
     FORBIDDEN,
@@ -25,11 +24,9 @@ from impc.reporting.style import (
     new_figure,
     strip,
 )
-from impc.studies.reliability.verdict import BANDS, known, measure_name, shown_score, word_of
+from impc.studies.reliability.verdict import BANDS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from matplotlib.figure import Figure
 
     from impc.reporting.document import Draw
@@ -48,18 +45,18 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
         "transfer-visits": partial(_responses, trials, result, visits),
         "transfer-subjects": partial(_responses, trials, result, people),
     }
-    if known(result):
-        found["icc"] = partial(_icc, result, trials.words)
-        found["bland-altman"] = partial(_bland_altman, result, trials.words)
+    if result.known:
+        found["icc"] = partial(_icc, result)
+        found["bland-altman"] = partial(_bland_altman, result)
     return found
 
 
-def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
+def _icc(result: Reliability, narrow: bool) -> Figure:
     """All ICCs with their intervals over the bands from poor to excellent."""
-    items = [item for item in known(result) if item.measure == "rms" or not narrow]
+    items = [item for item in result.known if item.measure == "rms" or not narrow]
     figure = new_figure(PHONE if narrow else HALF, 0.9 + 0.29 * len(items))
     ax, labels, name = figure.subplots(), [], ""
-    least = -0.5 if min(item.icc.low for item in items if item.icc) < 0 else 0.0
+    least = -0.5 if min(item.icc.low for item in items) < 0 else 0.0
     ends = [least, *(most for most, _ in BANDS[:-1]), 1.0]
     for place, (low, high) in enumerate(pairwise(ends)):
         if place % 2 == 0:
@@ -67,12 +64,11 @@ def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
         ax.text((max(low, 0.0) + high) / 2, -0.9, BANDS[place][1], ha="center", color=MUTED,
                 fontsize=8.5 if narrow else 10)  # fmt: skip
     for at, item in enumerate(items):
-        assert item.icc is not None
         color, marker = (BLUE, "o") if item.measure == "rms" else (MUTED, "s")
         value, low, high = np.clip(item.icc[:3], least, 1.0)
         ax.plot([low, high], [at, at], color=color, linewidth=1.8)
         ax.plot(value, at, marker, color=color)
-        before, name = name, measure_name(item, words)
+        before, name = name, item.name
         labels.append(item.condition if name == before else f"{name}, {item.condition}".strip(", "))
     ax.set_yticks(range(len(labels)), labels)
     ax.set(ylim=(len(items) - 0.4, -1.3), xlim=(least, 1.0))
@@ -82,9 +78,9 @@ def _icc(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
     return figure
 
 
-def _bland_altman(result: Reliability, words: Mapping[str, str], narrow: bool) -> Figure:
+def _bland_altman(result: Reliability, narrow: bool) -> Figure:
     """Difference of last and first visit over their mean, one dot per person."""
-    items = [item for item in known(result) if item.measure == "rms"]
+    items = [item for item in result.known if item.measure == "rms"]
     columns = 2 if narrow else max(len(result.conditions), 2)
     rows = -(-len(items) // columns)
     figure = new_figure(PHONE if narrow else WIDE, 0.5 + 1.7 * rows)
@@ -92,27 +88,25 @@ def _bland_altman(result: Reliability, words: Mapping[str, str], narrow: bool) -
     for ax in axes[len(items) :]:
         ax.set_visible(False)
     for ax, item in zip(axes, items, strict=False):
-        factor, unit = shown_score(item)
-        first, last = factor * item.scores[:, 0], factor * item.scores[:, -1]
+        first, last = item.scores[:, 0], item.scores[:, -1]
         mean, reach = float(np.nanmean(last - first)), 1.96 * np.nanstd(last - first, ddof=1)
-        strip(ax, f"{measure_name(item, words)}, {item.condition} ({unit})")
+        strip(ax, f"{item.name}, {item.condition} ({item.unit})")
         ax.axhspan(mean - reach, mean + reach, color=RULE, alpha=0.6, linewidth=0, zorder=0)
         ax.axhline(mean, color=INK, linewidth=1.0)
         ax.plot((first + last) / 2, last - first, "o", color=BLUE, markersize=4)
-        ax.set_xlabel(f"Mean of both visits ({unit})")
+        ax.set_xlabel(f"Mean of both visits ({item.unit})")
     return figure
 
 
 def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
     """Perturbation and outputs of one trial over time, and their power spectra."""
-    trial = next(iter(trials.cells.values()))[0]
-    factor, angle = shown_angle()
-    signals = [("perturbation torque", trial.disturbance[:, 0], "N m")]
-    for name, values in zip(trials.outputs, trial.outputs.T, strict=True):
-        signals.append((word_of(name, trials.words), factor * values, angle))
+    torque, outputs = next(iter(trials.cells.values()))[0]
+    signals = [("perturbation torque", torque, "N m")]
+    for name, values in zip(trials.outputs.values(), outputs.T, strict=True):
+        signals.append((name, values, trials.unit))
     figure = new_figure(WIDE, 0.5 + 1.5 * len(signals))
     axes = figure.subplots(len(signals), 2, squeeze=False, sharex="col")
-    time = np.arange(trial.samples) / trials.rate
+    time = np.arange(len(torque)) / trials.rate
     for (left, right), (name, values, unit) in zip(axes, signals, strict=True):
         strip(left, f"{sentence_case(name)} ({unit})")
         left.plot(time, values, color=BLUE, linewidth=1.0)
@@ -130,26 +124,24 @@ def _responses(
     trials: Trials, result: Reliability, cells: dict[str, tuple[str, str, str]], narrow: bool
 ) -> Figure:
     """Magnitude and phase of the averaged responses of up to four cells."""
-    outputs = result.outputs[: 1 if narrow else None]
+    outputs = list(trials.outputs.values())[: 1 if narrow else None]
     figure = new_figure(PHONE if narrow else WIDE, 3.4)
     axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False)
-    factor, unit = shown_angle()
     for (color, line), (label, key) in zip(_LINES, cells.items(), strict=False):
         found = result.responses.get(key)
         if found is None:
             continue
         style: Any = {"color": color, "linestyle": line, "label": label}
         for index, (above, below) in enumerate(axes.T):
-            response, seen = factor * found.response[:, index], found.coherence[:, index]
+            response, seen = found.response[:, index], found.coherence[:, index]
             # Phase only above the coherence that chance alone reaches in 5 %.
             clear = seen >= 1 - 0.05 ** (1 / max(len(trials.cells[key]) - 1, 1e-9))
             phase = np.full(len(response), np.nan)
             phase[clear] = np.degrees(np.unwrap(np.angle(response[clear])))
             above.loglog(found.frequency, np.abs(response), **style)
             below.semilogx(found.frequency, phase, **style)
-    for (above, below), output in zip(axes.T, outputs, strict=True):
-        name = word_of(output, trials.words)
-        above.set_title(f"{sentence_case(name)}, magnitude ({unit}/(N m))")
+    for (above, below), name in zip(axes.T, outputs, strict=True):
+        above.set_title(f"{sentence_case(name)}, magnitude ({trials.unit}/(N m))")
         below.set_title("Phase (°)")
         below.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend(loc="lower left")

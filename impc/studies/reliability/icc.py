@@ -35,7 +35,7 @@ import numpy as np
 import scipy.stats
 
 from impc.arrays import Array, frozen, percentiles
-from impc.errors import DataError, InputError
+from impc.errors import DataError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -46,8 +46,6 @@ _ALIKE = 1e-24  # Relative size of mean squares that is rounding error
 _LEVEL = 0.95
 #: ICC of a single score, or of the mean over all occasions.
 Form = Literal["A,1", "A,k"]
-FORMS: tuple[Form, ...] = ("A,1", "A,k")
-
 #: Interval: McGraw and Wong's F, or the generalised one.
 Method = Literal["F", "generalised"]
 # Draws of a generalised interval: its ends then vary by 1 % of its width between seeds.
@@ -87,8 +85,6 @@ class MeasurementError(NamedTuple):
 
 def icc(scores: ArrayLike, form: Form = "A,k", method: Method = "F") -> Icc:
     """Intraclass correlation of `scores` (subjects, occasions)."""
-    if form not in FORMS:
-        raise InputError(f"ICC form {form!r}", "is not a form of agreement", "use 'A,1' or 'A,k'")
     complete, left_out = complete_rows(scores)
     squares = mean_squares(complete)
     value = _estimate(squares, form)
@@ -139,8 +135,6 @@ def measurement_error(scores: ArrayLike) -> MeasurementError:
 def complete_rows(scores: ArrayLike) -> tuple[Array, int]:
     """Scores of the subjects with all occasions, and the number of the others."""
     table = np.asarray(scores, dtype=np.float64)
-    if table.ndim != 2:
-        raise DataError("scores", f"got {table.ndim} dimensions", "pass (subjects, occasions)")
     if table.shape[1] < 2:
         raise DataError("scores", f"got {table.shape[1]} occasion", "give at least 2")
     kept = table[np.all(np.isfinite(table), axis=1)]
@@ -186,8 +180,6 @@ def _f_limits(squares: MeanSquares) -> tuple[float, float]:
     a = k * rho / (n * (1 - rho))
     b = 1 + k * rho * (n - 1) / (n * (1 - rho))
     spread = (a * c) ** 2 / (k - 1) + (b * e) ** 2 / ((n - 1) * (k - 1))
-    if spread == 0:
-        return 1.0, 1.0
     freedom = (a * c + b * e) ** 2 / spread
     lower = scipy.stats.f.ppf(tail, n - 1, freedom)
     upper = scipy.stats.f.ppf(tail, freedom, n - 1)

@@ -21,7 +21,6 @@ the seat is exogenous. If all trials have the same input, H1 is the mean of thei
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.ndimage
@@ -30,14 +29,13 @@ import scipy.signal
 from impc.arrays import Array, IntArray
 from impc.errors import DataError
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 # Power below this share of the peak is attributed to rounding and leakage.
 _NOTHING = 1e-6
 # Largest share of excited frequencies in a line spectrum; odd harmonics are half of all.
 _MOST_LINES = 0.6
 _NEIGHBOURS = 7
+#: An array of complex numbers.
+ComplexArray = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,8 @@ class Passband:
 
 
 def rms(outputs: Array) -> Array:
-    """Root mean square about zero (upright) of each output (p,); outputs (samples, p)."""
-    return np.asarray(np.sqrt(np.mean(np.asarray(outputs) ** 2, axis=0)))
+    """Root mean square about zero (upright); outputs (..., samples, p) to (..., p)."""
+    return np.asarray(np.sqrt(np.mean(np.asarray(outputs) ** 2, axis=-2)))
 
 
 def passband(signal: Array, rate: float) -> Passband:
@@ -60,7 +58,7 @@ def passband(signal: Array, rate: float) -> Passband:
     frequency, power = scipy.signal.periodogram(signal, rate, detrend=False)
     power[0] = 0.0
     peak = float(power.max(initial=0.0))
-    if peak <= 1e-24 * max(float(np.mean(np.asarray(signal) ** 2)), 1e-300) or peak == 0:
+    if not peak > 1e-24 * float(np.mean(np.asarray(signal) ** 2)):
         raise DataError("input", "is constant: its passband is empty", "check its column")
     excited = np.flatnonzero(power > _NOTHING * peak)
     if len(excited) > _MOST_LINES * len(power):  # not a line spectrum
@@ -68,28 +66,18 @@ def passband(signal: Array, rate: float) -> Passband:
         peak = float(power.max())
     above = power[excited] > 0.03 * peak
     runs = np.split(np.arange(len(excited)), np.flatnonzero(np.diff(above.astype(int))) + 1)
-    inside = [run for run in runs if above[run[0]]]
-    best = max(inside, key=lambda run: int(excited[run[-1]] - excited[run[0]]))
-    found = excited[best]
-    return Passband(float(frequency[found[0]]), float(frequency[found[-1]]), found)
+    inside = [excited[run] for run in runs if above[run[0]]]
+    best = max(inside, key=lambda run: int(run[-1] - run[0]))
+    return Passband(float(frequency[best[0]]), float(frequency[best[-1]]), best)
 
 
 def band_energy(outputs: Array, rate: float, low: float, high: float) -> Array:
-    """Band energy (2.1) of outputs (samples, p) sampled at `rate` in Hz: (p,)."""
-    frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=0)
+    """Band energy (2.1); outputs (..., samples, p) sampled at `rate` in Hz to (..., p)."""
+    frequency, power = scipy.signal.periodogram(outputs, rate, detrend=False, axis=-2)
     step = float(frequency[1] - frequency[0])
     rounding = 1e-6 * step
     inside = (frequency >= low - rounding) & (frequency <= high + rounding)
-    if not np.any(inside):
-        raise DataError(
-            "passband", f"{low:g} to {high:g} Hz contains no frequency of the trial",
-            "use longer trials",
-        )  # fmt: skip
-    return np.asarray(step * np.sum(power[inside], axis=0))
-
-
-#: An array of complex numbers.
-ComplexArray = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
+    return np.asarray(step * np.sum(power[..., inside, :], axis=-2))
 
 
 @dataclass(frozen=True)
@@ -102,26 +90,14 @@ class TransferFunction:
 
 
 def transfer_function(
-    inputs: Sequence[Array], outputs: Sequence[Array], rate: float, band: Passband
+    inputs: Array, outputs: Array, rate: float, band: Passband
 ) -> TransferFunction:
-    """Estimate from trials of equal length: inputs (samples,), outputs (samples, p)."""
-    if not inputs:
-        raise DataError("transfer function", "the list of trials is empty", "pass at least one")
-    lengths = {len(item) for item in (*inputs, *outputs)}
-    if len(lengths) > 1:
-        raise DataError(
-            "trials", f"have {', '.join(map(str, sorted(lengths)))} samples", "cut to equal length"
-        )
-    (samples,) = lengths
-    chosen = band.excited
-    if chosen[-1] > samples // 2:
-        raise DataError(
-            "trials", "are shorter than the input of the passband", "cut to equal length"
-        )
-    U = np.array([np.fft.rfft(item)[chosen] for item in inputs])
-    Y = np.array([np.fft.rfft(item, axis=0)[chosen] for item in outputs])
-    power = np.sum(np.abs(U) ** 2, axis=0)[:, None]
-    cross = np.sum(Y * np.conj(U)[..., None], axis=0)
+    """Estimate from `inputs` (trials, samples) and `outputs` (trials, samples, p)."""
+    U = np.fft.rfft(inputs)[:, band.excited, None]
+    Y = np.fft.rfft(outputs, axis=1)[:, band.excited]
+    power = np.sum(np.abs(U) ** 2, axis=0)
+    cross = np.sum(Y * np.conj(U), axis=0)
     total = power * np.sum(np.abs(Y) ** 2, axis=0)
     coherence = np.divide(np.abs(cross) ** 2, total, out=np.zeros(total.shape), where=total > 0)
-    return TransferFunction(np.asarray(chosen * (rate / samples)), cross / power, coherence)
+    frequency = np.asarray(band.excited * (rate / np.shape(inputs)[1]))
+    return TransferFunction(frequency, cross / power, coherence)

@@ -8,26 +8,20 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.several_tests import holm
-from impc.errors import DataError
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, probability, sentence_case
 from impc.reporting.verdict import Key
 from impc.studies.reliability.analysis import MEASURES
-from impc.studies.reliability.anova import learning_trend
 from impc.studies.reliability.figures import reliability_figures
-from impc.studies.reliability.icc import complete_rows, icc
 from impc.studies.reliability.verdict import (
+    RULES,
+    Facts,
     change_text,
     icc_text,
     interval_band,
-    known,
     lowest,
-    measure_name,
-    reliability_verdict,
-    shown_score,
-    word_of,
 )
 
 if TYPE_CHECKING:
@@ -36,7 +30,7 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.digests import Inputs
     from impc.reporting.document import Block
-    from impc.studies.reliability.analysis import MeasureResult, Reliability, Trials
+    from impc.studies.reliability.analysis import CmcResult, MeasureResult, Reliability, Trials
 
 _HERO = Picture(
     "icc", "ICC of every measure with its interval, over bands from poor to excellent",
@@ -61,14 +55,27 @@ _METHODS = (
     "the generalised 95 % interval of Tian and Cappelleri (2004). The smallest detectable change "
     "(95 %) refers to single visits and uses Student's t distribution."
 )
+_ICC = (
+    "ICC(A,k), agreement of the mean over visits, with two 95 % intervals: generalised (Tian "
+    "and Cappelleri 2004), used on this page, and F (McGraw and Wong 1996), too narrow for few "
+    "and different visits. Mean and SD: over people, of the mean over visits. SEM and smallest "
+    "detectable change refer to a single visit."
+)
+_VISITS = (
+    "Mean and SD over n people; analysis of variance over visits, uncorrected and with the "
+    "Greenhouse-Geisser correction; change per visit with its 95 % CI."
+)
+_CMC = (
+    "Coefficient of multiple correlation of the responses within and between visits (1: "
+    "identical curves), mean and SD over people; undefined: number of undefined coefficients."
+)
 
 
 def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
     """Report of `impc reliability`."""
-    words, tables, band = trials.words, reliability_findings(trials, result), result.band
-    people, visits = len(result.subjects), len(result.visits)
+    tables, band, facts = reliability_findings(result), result.band, Facts(result)
+    people, visits, sways = facts.people, facts.visits, facts.sways
     size = f"{people} × {visits} × {max(map(len, trials.cells.values()))}"
-    sways = [item for item in known(result) if item.measure == "rms"]
     keys = [Key(size, "", "people × visits × trials")]
     copied: Copy | str = "There is no text to copy: no ICC could be computed."
     provenance = Provenance(command=command, inputs=inputs)
@@ -78,60 +85,58 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
         "{low} to {high} Hz".format(**ends)
     )
     sections: dict[str, list[Block]] = {
-        "Conditions": [tables["conditions"]] if len(result.conditions) > 1 else [],
         "Response to the perturbation": [_RESPONSES, tables["cmc"]],
-        "Visits": [one for name, one in tables.items()
-                   if name.startswith(("visits", "components")) and one.rows],
-        "Checks": [Checks(_checks(result, words))],
+        "Visits": [tables[f"visits-{measure}"] for measure in MEASURES],
+        "Checks": [Checks(_checks(result, facts))],
         "Provenance": [Terms([("Recordings", recordings), *provenance.terms])],
-    }  # fmt: skip
+    }
     if sways:
-        keys = [*_keys(sways, words), *keys]
+        keys = [*_keys(sways), *keys]
         results = "; ".join(
-            f"{measure_name(item, words)} {item.condition}: {icc_text(item)}, smallest detectable "
-            f"change {change_text(item)}"
+            f"{item.name} {item.condition}: {icc_text(item)}, smallest detectable change "
+            f"{change_text(item)}"
             for item in sways
         )
         copied = Copy(_METHODS.format(size=size, **ends), f"{sentence_case(results)}.")
         own: list[Block] = [tables["icc-rms"], tables["icc-energy"]]
         sections = {"ICC": own, "Change of one person": [_BLAND_ALTMAN], **sections}
     return Report(
-        "impc reliability", "reliability report", reliability_verdict(result, words),
-        [Section(title, blocks) for title, blocks in sections.items() if blocks],
+        "impc reliability", "reliability report", RULES.verdict(facts),
+        [Section(title, blocks) for title, blocks in sections.items()],
         meta=("Reliability", f"{people} people", f"{visits} visits", ", ".join(result.conditions)),
         hero=_HERO if sways else None,
         keys=keys,
         figures=reliability_figures(trials, result),
         copy=copied,
-        beside=[] if sways else [one for name, one in tables.items() if name[:4] == "icc-"],
+        beside=[] if sways else [tables["icc-rms"], tables["icc-energy"]],
         data={"passband": {"low": band.low, "high": band.high}, "notes": result.notes},
         provenance=provenance,
     )  # fmt: skip
 
 
-def _keys(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Key]:
+def _keys(sways: Sequence[MeasureResult]) -> list[Key]:
     """Key numbers: lowest ICC, and smallest detectable change of a person."""
     least = lowest(sways)
     value, _, interval = icc_text(least).removeprefix("ICC ").partition(" ")
     change, _, unit = change_text(sways[0]).partition(" ")
     return [
-        Key(value, "ICC", f"lowest: {measure_name(least, words)}, {least.condition}",
+        Key(value, "ICC", f"lowest: {least.name}, {least.condition}",
             f"{interval.strip('()')}; ICC(A,k), generalised interval"),
         Key(change, unit, "smallest detectable change of one person",
-            f"{measure_name(sways[0], words)}, {sways[0].condition}"),
+            f"{sways[0].name}, {sways[0].condition}"),
     ]  # fmt: skip
 
 
-def _checks(result: Reliability, words: Mapping[str, str]) -> list[Check]:
+def _checks(result: Reliability, facts: Facts) -> list[Check]:
     """Checks of completeness and learning."""
     notes = dict.fromkeys(note for item in result.measures for note in item.notes)
     lacking = "; ".join([*notes, *result.notes])
     found = [Check(Level.AMBER if lacking else Level.GREEN, "Complete",
                    f"{lacking or 'All people have all visits and trials'}.")]  # fmt: skip
-    tests = [item for item in known(result) if item.measure == "rms" and item.trend is not None]
+    tests = [item for item in facts.sways if np.isfinite(item.trend.p)]
     if tests:
-        p = holm(np.array([item.trend.p for item in tests if item.trend]))
-        changed = [f"{measure_name(item, words)}, {item.condition}"
+        p = holm(np.array([item.trend.p for item in tests]))
+        changed = [f"{item.name}, {item.condition}"
                    for item, one in zip(tests, p, strict=True) if one <= 0.05]  # fmt: skip
         said = f"No change of sway over the visits was found ({probability(min(p))} or more, "
         said += "corrected by Holm's method)."
@@ -141,142 +146,81 @@ def _checks(result: Reliability, words: Mapping[str, str]) -> list[Check]:
     return found
 
 
-def reliability_findings(trials: Trials, result: Reliability) -> dict[str, Finding]:
+def reliability_findings(result: Reliability) -> dict[str, Finding]:
     """All findings by name."""
-    words = trials.words
-    found = [_correlations(result, words), _conditions(result, words)]
+    found = [_correlations(result.cmc)]
     for measure in MEASURES:
         own = [item for item in result.measures if item.measure == measure]
-        own.sort(key=lambda item: result.outputs.index(item.output))
-        found += [_icc(measure, own, words), _visits(measure, own, words, result.visits),
-                  _components(measure, own, words)]  # fmt: skip
+        own.sort(key=lambda item: [one.output for one in result.measures].index(item.output))
+        found += [_icc(measure, own), _visits(measure, own, result.visits)]
     return {item.name: item for item in found}
 
 
 def _table(
     name: str, rows: Sequence[Mapping[str, Any]], caption: str, folded: str = "", **labels: str
 ) -> Finding:
-    """Finding whose names of outputs and empty notes are in the files only."""
-    table = pd.DataFrame(rows)
-    hidden = ["output", *(["notes"] if "notes" in table and not table["notes"].any() else [])]
+    """Finding without empty columns; names of outputs and empty notes are in the files only."""
+    table = pd.DataFrame(rows).dropna(axis=1, how="all")
+    hidden = ["output"] + ["notes"] * ("notes" in table and not table["notes"].any())
     return Finding(name, table, caption, folded=folded, digits=3, labels=labels, hidden=hidden)
 
 
-def _row(item: MeasureResult, words: Mapping[str, str], **shown: float) -> dict[str, Any]:
-    """Common columns of a row, and numbers in the shown unit of the score."""
-    factor, unit = shown_score(item)
-    row = {"measure": measure_name(item, words), "output": item.output}
-    scaled: dict[str, Any] = {name: factor * value for name, value in shown.items()}
-    return row | {"condition": item.condition} | (scaled | {"unit": unit} if shown else {})
+def _row(item: MeasureResult, **columns: Any) -> dict[str, Any]:
+    named = {"measure": item.name, "output": item.output, "condition": item.condition}
+    return named | columns
 
 
-def _icc(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -> Finding:
+def _icc(measure: str, own: Sequence[MeasureResult]) -> Finding:
     rows = []
     for item in own:
-        row = _row(item, words)
-        if item.icc is not None and item.error is not None:
-            (value, low, high, people, _), other = item.icc, icc(item.scores, "A,k")
-            row |= {"icc": value, "low": low, "high": high, "low_f": other.low}
-            row |= {"high_f": other.high, "reliability": interval_band(low, high)}
-            mean, sd, _ = _mean_sd(np.mean(complete_rows(item.scores)[0], axis=1))
-            row |= _row(item, words, mean=mean, sd=sd, sem=item.error.sem, mdc=item.error.mdc)
-            row |= {"people": people}
-        rows.append(row | {"notes": "; ".join(item.notes)})
-    caption = (
-        "ICC(A,k), agreement of the mean over visits, with two 95 % intervals: generalised (Tian "
-        "and Cappelleri 2004), used on this page, and F (McGraw and Wong 1996), too narrow for few "
-        "and different visits. Mean and SD: over people, of the mean over visits. SEM and smallest "
-        "detectable change refer to a single visit."
-    )
+        value, low, high, people, _ = item.icc
+        mean, sd, _ = _spread(item.scores.mean(axis=1))
+        rows.append(_row(
+            item, icc=value, low=low, high=high, low_f=item.icc_f.low, high_f=item.icc_f.high,
+            reliability=interval_band(low, high) if people else None, mean=mean, sd=sd,
+            sem=item.error.sem, mdc=item.error.mdc, unit=item.unit, people=people,
+            notes="; ".join(item.notes),
+        ))  # fmt: skip
     labels = {"low": "Low (generalised)", "high": "High (generalised)", "low_f": "Low (F)"}
     labels |= {"icc": "ICC", "high_f": "High (F)", "sem": "SEM", "sd": "SD", "people": "n (people)"}
     folded = "" if measure == "rms" else "ICC of the band energy"
     mdc = "Smallest detectable change"
-    return _table(f"icc-{measure}", rows, caption, folded, mdc=mdc, **labels)
+    return _table(f"icc-{measure}", rows, _ICC, folded, mdc=mdc, **labels)
 
 
-def _visits(
-    measure: str, own: Sequence[MeasureResult], words: Mapping[str, str], visits: Sequence[str]
-) -> Finding:
+def _visits(measure: str, own: Sequence[MeasureResult], visits: Sequence[str]) -> Finding:
     rows = []
     for item in own:
-        spread: dict[str, float] = {}
-        counts: dict[str, int] = {}
+        row = _row(item)
         for visit, column in zip(visits, item.scores.T, strict=True):
-            mean, sd, counts[f"n_visit_{visit}"] = _mean_sd(column)
-            spread |= {f"mean_visit_{visit}": mean, f"sd_visit_{visit}": sd}
-        row = _row(item, words, **spread) | counts
-        if item.anova is not None:
-            row |= {"F": item.anova.F, "p": item.anova.p}
-            row |= {"p_greenhouse_geisser": item.anova.p_corrected}
-        if item.trend is not None:
-            slope, low, high, p = item.trend
-            row |= _row(item, words, change_per_visit=slope, low=low, high=high) | {"p_change": p}
-        rows.append(row)
-    caption = (
-        "Mean and SD over n people; analysis of variance over visits, uncorrected and with the "
-        "Greenhouse-Geisser correction; change per visit with its 95 % CI."
-    )
+            names = f"mean_visit_{visit}", f"sd_visit_{visit}", f"n_visit_{visit}"
+            row |= dict(zip(names, _spread(column), strict=True))
+        (F, p, corrected), (slope, low, high, p_change) = item.anova, item.trend
+        rows.append(row | {
+            "unit": item.unit, "F": F, "p": p, "p_greenhouse_geisser": corrected,
+            "change_per_visit": slope, "low": low, "high": high, "p_change": p_change,
+        })  # fmt: skip
     labels = {f"sd_visit_{visit}": f"SD visit {visit}" for visit in visits}
     labels |= {"p_greenhouse_geisser": "p (Greenhouse-Geisser)", "p_change": "p (change)"}
-    return _table(f"visits-{measure}", rows, caption, f"All visits: {MEASURES[measure]}", **labels)
+    return _table(f"visits-{measure}", rows, _VISITS, f"All visits: {MEASURES[measure]}", **labels)
 
 
-def _conditions(result: Reliability, words: Mapping[str, str]) -> Finding:
-    """Paired comparison of all conditions with the first, means over visits."""
-    rows, first = [], result.conditions[0]
-    for output in result.outputs:
-        items = [one for one in result.measures if (one.measure, one.output) == ("rms", output)]
-        means = [pd.DataFrame(one.scores).mean(axis=1).to_numpy(float) for one in items]
-        for item, own in zip(items[1:], means[1:], strict=True):
-            try:
-                change, low, high, p = learning_trend(np.column_stack([means[0], own]))
-            except DataError:
-                change, low, high, p = (np.nan,) * 4
-            mean, sd, count = _mean_sd(own)
-            row = _row(item, words, mean=mean, sd=sd, difference=change, low=low, high=high)
-            rows.append(row | {"people": count, "against": first, "p": p})
-    for row, corrected in zip(rows, holm(np.array([row["p"] for row in rows])), strict=True):
-        row["p_holm"] = float(corrected)
-    caption = (
-        "Sway in each condition minus that in the first, means over visits; paired t-test over "
-        "people with 95 % CI; the second p is corrected over all rows by Holm's method."
-    )
-    return _table("conditions", rows, caption, p_holm="p, corrected", sd="SD", people="n (people)")
-
-
-def _components(measure: str, own: Sequence[MeasureResult], words: Mapping[str, str]) -> Finding:
+def _correlations(items: Sequence[CmcResult]) -> Finding:
     rows = []
-    for item in own:
-        factor, unit = shown_score(item)
-        for name, *values in item.components:
-            value, low, high = factor**2 * np.array(values)
-            numbers = {"value": value, "low": low, "high": high, "unit": f"({unit})²"}
-            rows.append(_row(item, words) | {"variance_of": f"{name}s", **numbers})
-    caption = "Variance of people, visits and trials, with 95 % CI."
-    return _table(f"components-{measure}", rows, caption, f"Components: {MEASURES[measure]}")
-
-
-def _correlations(result: Reliability, words: Mapping[str, str]) -> Finding:
-    rows: list[dict[str, Any]] = []
-    for item in result.cmc:
-        within, sd_within, _ = _mean_sd(item.within)
-        between, sd_between, count = _mean_sd(item.between)
+    for item in items:
+        (within, sd_within, _), (between, sd_between, count) = map(
+            _spread, (item.within, item.between)
+        )
         rows.append({
-            "signal": word_of(item.output, words), "output": item.output,
-            "condition": item.condition, "within_visits": within, "sd_within": sd_within,
-            "between_visits": between, "sd_between": sd_between, "people": count,
-            "undefined": item.undefined,
+            "signal": item.signal, "output": item.output, "condition": item.condition,
+            "within_visits": within, "sd_within": sd_within, "between_visits": between,
+            "sd_between": sd_between, "people": count, "undefined": item.undefined,
         })  # fmt: skip
-    caption = (
-        "Coefficient of multiple correlation of the responses within and between visits (1: "
-        "identical curves), mean and SD over people; undefined: number of undefined coefficients."
-    )
     labels = {"people": "n (people)", "sd_within": "SD within", "sd_between": "SD between"}
-    return _table("cmc", rows, caption, "Agreement of the responses in numbers", **labels)
+    return _table("cmc", rows, _CMC, "Agreement of the responses in numbers", **labels)
 
 
-def _mean_sd(values: Array) -> tuple[float, float, int]:
+def _spread(values: Array) -> tuple[float, float, int]:
     """Mean, SD and number of the values that are not missing."""
     scores = pd.Series(values)
     return float(scores.mean()), float(scores.std()), int(scores.count())

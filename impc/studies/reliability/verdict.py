@@ -15,12 +15,11 @@ import numpy as np
 from impc.reporting.finding import Level
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.shown_units import shown_angle
-from impc.reporting.verdict import Claim, Verdict
+from impc.reporting.verdict import Claim
 from impc.studies.reliability.icc import GOOD
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from impc.studies.reliability.analysis import MeasureResult, Reliability
 
@@ -37,70 +36,37 @@ def interval_band(low: float, high: float) -> str:
     return first if first == last else f"{first} to {last}"
 
 
-def shown_score(item: MeasureResult) -> tuple[float, str]:
-    """Factor to the shown unit of a score, and that unit."""
-    factor, unit = shown_angle()
-    return (factor, unit) if item.measure == "rms" else (factor**2, f"{unit}²")
-
-
-def word_of(output: str, words: Mapping[str, str]) -> str:
-    """Name of an output in words."""
-    return words.get(output, output.replace("_", " "))
-
-
-def measure_name(item: MeasureResult, words: Mapping[str, str]) -> str:
-    """Name of a measure of a signal; the RMS of a tilt is called sway."""
-    signal = word_of(item.output, words)
-    if item.measure == "energy":
-        return f"band energy of {signal}"
-    return f"{signal[:-5]} sway" if signal.endswith(" tilt") else f"RMS of {signal}"
-
-
 def icc_text(item: MeasureResult) -> str:
     """ICC with its interval."""
-    assert item.icc is not None
     value, low, high = (f"{end:.2f}".replace("-", "\u2212") for end in item.icc[:3])
     return f"ICC {value} (95 % CI {low} to {high})"
 
 
 def change_text(item: MeasureResult) -> str:
-    """Smallest detectable change of a person in the shown unit."""
-    factor, unit = shown_score(item)
-    return "-" if item.error is None else f"{number(factor * item.error.mdc)} {unit}"
+    """Smallest detectable change of a person."""
+    return f"{number(item.error.mdc)} {item.unit}"
 
 
-def known(result: Reliability) -> list[MeasureResult]:
-    """Measures with an ICC, RMS first, sorted by signal."""
-    found = [item for item in result.measures if item.icc is not None]
-    order = result.outputs.index
-    return sorted(found, key=lambda item: (item.measure != "rms", order(item.output)))
-
-
-class _Facts:
+class Facts:
     """Cases with an ICC, by whether their intervals reach the band good."""
 
-    def __init__(self, result: Reliability, words: Mapping[str, str]) -> None:
-        cases = known(result)
-        self.words, self.people, self.visits = words, len(result.subjects), len(result.visits)
+    def __init__(self, result: Reliability) -> None:
+        cases = result.known
+        self.people, self.visits = len(result.subjects), len(result.visits)
         self.sways = [item for item in cases if item.measure == "rms"]
-        self.good = [item for item in cases if _reaches(item)]
-        self.poor = [item for item in cases if not _reaches(item)]
+        self.good = [item for item in cases if item.icc.low >= GOOD]
+        self.poor = [item for item in cases if not item.icc.low >= GOOD]
         self.cases, self.bad = len(cases), len(self.poor)
-        self.reliable = sum(map(_reaches, self.sways))
+        self.reliable = sum(item.icc.low >= GOOD for item in self.sways)
         # Whether an interval reaches the band good, so that more people may show it
-        self.hopeful = any(_reaches(item, low=False) for item in self.sways)
+        self.hopeful = any(item.icc.high >= GOOD for item in self.sways)
         self.lowest = ""
         if self.sways:
             least = lowest(self.sways)
-            self.lowest = f"{icc_text(least)}, {measure_name(least, words)}, {least.condition}"
+            self.lowest = f"{icc_text(least)}, {least.name}, {least.condition}"
 
 
-def _reaches(item: MeasureResult, *, low: bool = True) -> bool:
-    """Whether the lower or the upper end of its interval is good or better."""
-    return item.icc is not None and (item.icc.low if low else item.icc.high) >= GOOD
-
-
-_EACH = Kind[_Facts](
+_EACH = Kind[Facts](
     Level.GREEN, always, "{each}",
     "A measure is called reliable if the 95 % CI of its ICC begins at 0.60 or above. Lowest: "
     "{lowest}.",
@@ -115,9 +81,9 @@ _PART = replace(
     todo=("Measure more people, or the same people at more visits.",
           "Average over more trials or visits before you compare people."),
 )  # fmt: skip
-RULES = Rules[_Facts](
+RULES = Rules[Facts](
     {name: attrgetter(name) for name in ("lowest", "bad", "cases", "people", "visits")}
-    | {"each": lambda it: _headline(it.sways, it.words)},
+    | {"each": lambda it: _headline(it.sways)},
     kinds=(
         Kind(
             Level.AMBER, lambda it: not it.sways,
@@ -138,9 +104,9 @@ RULES = Rules[_Facts](
         _PART,
         _EACH,
     ),
-    may=(lambda it: _claims(it.good, it.words),),
+    may=(lambda it: _claims(it.good),),
     may_not=(
-        lambda it: _claims(it.poor, it.words),
+        lambda it: _claims(it.poor),
         Line(lambda it: it.sways,
              "That the test is reliable for other people, tasks or times between visits.",
              "An ICC is lower in people who differ less from each other."),
@@ -148,39 +114,30 @@ RULES = Rules[_Facts](
 )  # fmt: skip
 
 
-def reliability_verdict(result: Reliability, words: Mapping[str, str]) -> Verdict:
-    """Verdict of a reliability study."""
-    return RULES.verdict(_Facts(result, words))
-
-
 def lowest(items: Sequence[MeasureResult]) -> MeasureResult:
     """Measure whose interval begins lowest."""
-    return min(items, key=lambda item: np.nan_to_num(item.icc.low if item.icc else 1, nan=-np.inf))
+    return min(items, key=lambda item: np.nan_to_num(item.icc.low, nan=-np.inf))
 
 
-def _by_name(
-    items: Sequence[MeasureResult], words: Mapping[str, str]
-) -> dict[str, list[MeasureResult]]:
-    found: dict[str, list[MeasureResult]] = {}
-    for item in items:
-        found.setdefault(measure_name(item, words), []).append(item)
-    return found
+def _by_name(items: Sequence[MeasureResult]) -> dict[str, list[MeasureResult]]:
+    names = dict.fromkeys(item.name for item in items)
+    return {name: [item for item in items if item.name == name] for name in names}
 
 
-def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
+def _headline(sways: Sequence[MeasureResult]) -> str:
     """Headline: reliable signals and conditions first."""
     parts: dict[str, list[str]] = {}
-    for name, own in _by_name(sways, words).items():
-        good = [item.condition for item in own if _reaches(item)]
-        where = f" in {' and '.join(good)}"
+    for name, own in _by_name(sways).items():
+        good = [item.condition for item in own if item.icc.low >= GOOD]
+        what = "not reliable"
+        if good:
+            what = f"reliable in {' and '.join(good)}"
+        elif any(item.icc.high >= GOOD for item in own):
+            what = "not shown to be reliable"
         if len(good) == len(own):
-            where = f" in {_COUNTS.get(len(own), 'all')} conditions" if len(own) > 1 else ""
-        no = (
-            "not shown to be reliable"
-            if any(_reaches(item, low=False) for item in own)
-            else "not reliable"
-        )
-        parts.setdefault(f"reliable{where}" if good else no, []).append(name)
+            every = f" in {_COUNTS.get(len(own), 'all')} conditions"
+            what = f"reliable{every if len(own) > 1 else ''}"
+        parts.setdefault(what, []).append(name)
     said = "; ".join(
         f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'} {what}"
         for what, names in sorted(parts.items(), key=lambda item: item[0][:3] == "not")
@@ -188,10 +145,10 @@ def _headline(sways: Sequence[MeasureResult], words: Mapping[str, str]) -> str:
     return f"{sentence_case(said)}."
 
 
-def _claims(items: Sequence[MeasureResult], words: Mapping[str, str]) -> list[Claim]:
+def _claims(items: Sequence[MeasureResult]) -> list[Claim]:
     """One claim per measure, with its conditions and ICC."""
     found = []
-    for name, own in _by_name(items, words).items():
+    for name, own in _by_name(items).items():
         named = [item.condition for item in own if item.condition]
         where = " and ".join(", ".join(part) for part in (named[:-1], named[-1:]) if part)
         each = "; ".join(f"{item.condition} {icc_text(item)}".strip() for item in own)

@@ -49,7 +49,6 @@ class Estimate(Frozen):
     free: tuple[int, ...]  # Indices of the fitted parameters
     misfit: float  # Sum of squares, including the prior
     vaf: Array  # VAF (4.4) over all trials (p,), %
-    at_bound: tuple[int, ...]  # Free parameters that end at a bound
 
 
 def free_indices(model: ParametricModel, names: Sequence[str]) -> tuple[int, ...]:
@@ -98,9 +97,8 @@ def estimate(
     full = base.copy()
     full[chosen] = found.x
     theta = physical(model, full)
-    stuck = tuple(chosen[np.abs(found.x) > 1 - 1e-6].tolist())
     vaf, misfit = frozen(pooled_vaf(model, theta, trials)), 2 * float(found.cost)
-    return Estimate(frozen(theta), tuple(chosen.tolist()), misfit, vaf, stuck)
+    return Estimate(frozen(theta), tuple(chosen.tolist()), misfit, vaf)
 
 
 def multi_start(

@@ -17,7 +17,6 @@ grown by one parameter at a time from feasible sets, with the same result as exh
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,7 +27,7 @@ from impc.errors import InputError
 from impc.studies.selection.model import stacked
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from impc.studies.selection.model import ParametricModel, Trial
 
@@ -60,31 +59,25 @@ def fisher_information(
     return Information(frozen(table.T @ table / sigma2), frozen(theta), float(sigma2), rank)
 
 
-def common_scaling(model: ParametricModel, found: Information, names: Sequence[str]) -> float:
-    """Change of the outputs if `names` are scaled by e together, in SDs of the noise."""
-    moved = np.isin(model.names, names) * np.asarray(found.theta) / model.gain
-    return math.sqrt(max(float(moved @ np.asarray(found.F) @ moved), 0.0))
-
-
 def unseen_scalings(model: ParametricModel, found: Information) -> tuple[tuple[str, ...], ...]:
-    """Sets of parameters whose common scaling changes the outputs by at most the noise SD.
+    """Sets of parameters whose common scaling by e changes the outputs by at most the noise SD.
 
     Only parameters whose units begin alike form a set, for example N m/rad and N m s/rad.
     """
     kinds: dict[str, list[str]] = {}
     for name, unit in zip(model.names, model.units, strict=True):
         kinds.setdefault(unit.split("/")[0].split(" s")[0], []).append(name)
-    return tuple(
-        tuple(names)
-        for kind, names in kinds.items()
-        if kind and len(names) > 1 and common_scaling(model, found, names) <= 1
-    )
+    unseen = []
+    for kind, names in kinds.items():
+        moved = np.isin(model.names, names) * np.asarray(found.theta) / model.gain
+        if kind and len(names) > 1 and moved @ np.asarray(found.F) @ moved <= 1:
+            unseen.append(tuple(names))
+    return tuple(unseen)
 
 
 _EPS = float(np.finfo(np.float64).eps)
-# Largest number of subsets of one size (about a minute), and number in memory (0.1 GB for ten
-# parameters).
-_MOST, _AT_ONCE = 1_000_000, 50_000
+# Largest number of subsets of one size (0.2 GB for ten parameters).
+_MOST = 100_000
 
 
 @dataclass(frozen=True)
@@ -127,37 +120,31 @@ def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[i
 
 def largest_subsets(informations: Sequence[Array], bound: float, least: int = 2) -> Selection:
     """Largest feasible subsets for `informations` (k, k)."""
-    if not informations or not bound > 0:
-        raise InputError("selection", "needs an information and a positive bound", "pass both")
     count = len(informations[0])
-    level = [(index,) for index in range(count)]
-    kept = _feasible(informations, level, bound)
-    best = kept
-    while kept:
-        best = kept
-        known = [subset for subset, _ in kept]
-        grown = list(itertools.islice(_grown(known, count), _MOST + 1))
-        if len(grown) > _MOST:
+    tried: list[tuple[int, ...]] = [(index,) for index in range(count)]
+    best: dict[tuple[int, ...], float] = {}
+    while tried:
+        if len(tried) > _MOST:
             raise InputError(
                 "selection", f"more than {_MOST} subsets keep a variance of {bound:g}",
                 "lower bound and bounds in [select]",
             )  # fmt: skip
-        kept = _feasible(informations, grown, bound) if grown else []
-    return _selected(bound, best if best and len(best[0][0]) >= least else [])
+        variances = subset_variances(informations, tried).tolist()
+        kept = {one: size for one, size in zip(tried, variances, strict=True) if size <= bound}
+        best = kept or best
+        tried = list(itertools.islice(_grown(kept, count), _MOST + 1))
+    ordered = sorted(best, key=lambda one: best[one])
+    if not ordered or len(ordered[0]) < least:
+        return Selection(bound, (), ())
+    return Selection(bound, tuple(ordered), tuple(best[one] for one in ordered))
 
 
-def _selected(bound: float, feasible: list[tuple[tuple[int, ...], float]]) -> Selection:
-    ordered = sorted(feasible, key=lambda item: item[1])
-    return Selection(bound, tuple(item[0] for item in ordered), tuple(item[1] for item in ordered))
-
-
-def _grown(known: Sequence[tuple[int, ...]], count: int) -> Iterator[tuple[int, ...]]:
+def _grown(known: Collection[tuple[int, ...]], count: int) -> Iterator[tuple[int, ...]]:
     """Subsets with one more parameter, all of whose subsets are among the known ones."""
-    among = set(known)
     for subset in known:
         for index in range(subset[-1] + 1, count):
             parts = ((*subset[:place], *subset[place + 1 :], index) for place in range(len(subset)))
-            if all(part in among for part in parts):
+            if all(part in known for part in parts):
                 yield (*subset, index)
 
 
@@ -166,12 +153,3 @@ def sweep(
 ) -> tuple[Selection, ...]:
     """`largest_subsets` for several bounds."""
     return tuple(largest_subsets(informations, bound, least) for bound in bounds)
-
-
-def _feasible(
-    informations: Sequence[Array], subsets: Sequence[tuple[int, ...]], bound: float
-) -> list[tuple[tuple[int, ...], float]]:
-    parts = [subsets[at : at + _AT_ONCE] for at in range(0, len(subsets), _AT_ONCE)]
-    variances = np.concatenate([subset_variances(informations, part) for part in parts])
-    kept = np.flatnonzero(variances <= bound).tolist()
-    return [(subsets[place], float(variances[place])) for place in kept]

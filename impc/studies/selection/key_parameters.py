@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
+from impc.errors import DataError
 from impc.studies.reliability.icc import GOOD, icc
 from impc.studies.selection.analysis import Nominal, fit_nominal
 from impc.studies.selection.estimation import Estimate, estimate
@@ -25,7 +26,6 @@ from impc.studies.selection.fisher import largest_subsets, sweep
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from impc.studies.reliability.icc import Icc
     from impc.studies.selection.fisher import Selection
     from impc.studies.selection.model import ParametricModel, Trial
     from impc.studies.selection.model_source import Runner
@@ -61,19 +61,12 @@ class KeyParameters(Frozen):
     estimates: Array
 
 
-@dataclass(frozen=True)
-class Refits:
-    """Fits of several subsets to one subject and visit."""
-
-    fits: tuple[Estimate, ...]  # One per subset
-
-
 def refit_subsets(
     model: ParametricModel, trials: Sequence[Trial], subsets: tuple[tuple[int, ...], ...]
-) -> Refits:
+) -> tuple[Estimate, ...]:
     """Fit each of the `subsets`, the other parameters fixed at their typical values."""
     typical = np.array(model.typical)
-    return Refits(tuple(estimate(model, trials, subset, typical) for subset in subsets))
+    return tuple(estimate(model, trials, subset, typical) for subset in subsets)
 
 
 def key_parameters(
@@ -88,21 +81,27 @@ def key_parameters(
     most: int = 20,
 ) -> KeyParameters:
     """Select key parameters of a study; `recorded` by (subject, visit)."""
+    subjects, visits = (tuple(dict.fromkeys(one)) for one in zip(*recorded, strict=True))
+    whole = sum(all((one, visit) in recorded for visit in visits) for one in subjects)
+    if min(whole, len(visits)) < 2:
+        found = f"has {whole} subjects with all visits, and {len(visits)} visits"
+        raise DataError("study", found, "record at least 2 of each")
     trials = {" visit ".join(filter(None, key)): tuple(item) for key, item in recorded.items()}
     nominal = run(fit_nominal, Nominal, {name: (trials[name], settings) for name in trials})
     informations = [np.asarray(item.information.F) for item in nominal.values()]
     selection = largest_subsets(informations, bound, settings.least)
     subsets = selection.subsets[:most]
-    refits = run(refit_subsets, Refits, {name: (trials[name], subsets) for name in trials})
+    refits = run(
+        refit_subsets, tuple[Estimate, ...], {name: (trials[name], subsets) for name in trials}
+    )
     candidates = []
     for place, subset in enumerate(subsets):
-        fits = [item.fits[place] for item in refits.values()]
+        fits = [item[place] for item in refits.values()]
         vaf = float(np.mean([np.mean(item.vaf) for item in fits]))
-        tables = [between_visits(table) for table in _by_visit(recorded, fits, subset)]
-        # (5.6): minimum over the subset; NaN without several subjects and visits.
-        reliability, certain = (
-            float(np.min([np.nan if one is None else one[end] for one in tables])) for end in (0, 1)
-        )
+        # (5.6): minimum over the subset of the ICC, and of the lower end of its interval.
+        tables = _by_visit(recorded, fits, subset)
+        iccs = [icc(table, "A,k", "generalised")[:2] for table in tables]
+        reliability, certain = np.min(iccs, axis=0).tolist()
         diversity, explained = len({model.pathways[index] for index in subset}), vaf > least_vaf
         candidates.append(Candidate(
             subset, selection.variances[place], vaf, reliability, certain, diversity, explained,
@@ -112,7 +111,7 @@ def key_parameters(
         key=lambda item: (not item.kept, -item.diversity, -np.nan_to_num(item.reliability))
     )
     chosen = candidates[0].subset if candidates and candidates[0].kept else ()
-    alone = [item.fits[subsets.index(chosen)] for item in refits.values()] if chosen else []
+    alone = [item[subsets.index(chosen)] for item in refits.values()] if chosen else []
     return KeyParameters(
         selection,
         sweep(informations, settings.bounds, settings.least),
@@ -133,8 +132,3 @@ def _by_visit(
         place = subjects.index(subject), visits.index(visit)
         values[:, *place] = np.array(found.theta)[list(subset)]
     return frozen(values)
-
-
-def between_visits(values: Array) -> Icc | None:
-    """ICC(A,k) of a parameter's `values` (subjects, visits); None for one subject or visit."""
-    return icc(values, "A,k", "generalised") if min(values.shape) >= 2 else None

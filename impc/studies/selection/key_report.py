@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
 from impc.reporting.document import Copy, Report, Section, Terms
@@ -14,7 +13,7 @@ from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PAPER, PHONE, new_figure
 from impc.reporting.verdict import Key
-from impc.studies.selection.key_parameters import between_visits
+from impc.studies.reliability.icc import icc
 from impc.studies.selection.verdict import KEY_RULES, KeyFacts
 
 if TYPE_CHECKING:
@@ -109,9 +108,8 @@ def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
             if free == "chosen":
                 for visit, own in enumerate(values.T, start=1):
                     row |= _mean_sd(own, f"_visit_{visit}")
-            icc = between_visits(values)
-            ends = (np.nan,) * 3 if icc is None else (icc.value, icc.low, icc.high)
-            rows.append(row | dict(zip(("icc", "icc_low", "icc_high"), ends, strict=True)))
+            value, low, high, *_ = icc(values, "A,k", "generalised")
+            rows.append(row | {"icc": value, "icc_low": low, "icc_high": high})
     caption = (
         "Mean and SD over people, with all parameters free and with only the chosen ones free; "
         "ICC(A,k) between visits with its generalised 95 % interval."
@@ -122,8 +120,8 @@ def _estimates(model: ParametricModel, found: KeyParameters) -> Finding:
 
 
 def _mean_sd(values: Array, visit: str) -> dict[str, float]:
-    spread = float(np.nanstd(values, ddof=1)) if values.size > 1 else np.nan
-    return {f"mean{visit}": float(np.nanmean(values)), f"sd{visit}": spread}
+    found = pd.Series(values.ravel())
+    return {f"mean{visit}": float(found.mean()), f"sd{visit}": float(found.std())}
 
 
 def _draw(found: KeyParameters, narrow: bool) -> Figure:

@@ -2,24 +2,22 @@
 
     min over t in [-1, 1]^k   (1/N) sum e^2 + lambda ||t - t_typ||_1
 
-`proximal_lasso` solves it by Gauss-Newton steps whose quadratic programs include the absolute
-values and the bounds, so that parameters can equal their typical values exactly. `table_c1` is the
-method of the dissertation: Nelder-Mead with bounds by t = sin(u), a threshold of 0.005, and lambda
-adjusted until n parameters are beyond it. Both end with a least-squares refit of the selected
-parameters. The dissertation does not give the scale of the first term; here it is the mean square
-in the outputs' unit squared.
+It is solved by Gauss-Newton steps whose quadratic programs include the absolute values and the
+bounds, so that parameters can equal their typical values exactly. A least-squares refit of the
+selected parameters follows. The dissertation does not give the scale of the first term; here it is
+the mean square in the outputs' unit squared.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 
 from impc.arrays import Array, Frozen, frozen
+from impc.control.named_solver import require_solver, silent
 from impc.studies.selection.estimation import Estimate, estimate, residuals
 from impc.studies.selection.model import normalised, physical, stacked
 
@@ -28,20 +26,40 @@ if TYPE_CHECKING:
 
     from impc.studies.selection.model import ParametricModel, Trial
 
-_THRESHOLD, _FIRST = 0.005, 0.13
-_CHANGES, _ROUNDS, _HALVINGS = 500, 60, 30
-_ROUNDING = 1e-12  # Tolerance of the optimality test, relative to the steepest slope
+_ROUNDS, _HALVINGS, _SOLVES = 60, 30, 40
+_ROUNDING = 1e-12  # Distance from a typical value that is rounding error
 
 
 @dataclass(frozen=True)
 class Lasso(Frozen):
     """Selection by LASSO."""
 
-    weight: float  # lambda
     t: Array  # Normalised parameters (k,)
     selected: tuple[int, ...]  # Parameters that differ from their typical values
     refit: Estimate | None  # Fit of the selected parameters; None if there are none
-    objective: float  # (C.5) at t
+
+
+def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -> Lasso:
+    """Largest selection of at most `count` parameters, by bisection of lambda."""
+    typical = normalised(model, np.asarray(model.typical))
+    low, high = 1e-8, 1e3
+    t, chosen = typical, tuple[int, ...]()
+    for _ in range(_SOLVES):
+        weight = float(np.sqrt(low * high))
+        tried, _ = proximal_lasso(model, trials, weight)
+        moved = tuple(np.flatnonzero(np.abs(tried - typical) > _ROUNDING).tolist())
+        if len(moved) > count:
+            low = weight
+        else:
+            high = weight
+            if len(moved) >= len(chosen):
+                t, chosen = tried, moved
+        if len(chosen) == count or high / low < 1.01:
+            break
+    start = np.array(model.typical)
+    start[list(chosen)] = physical(model, t)[list(chosen)]
+    refit = estimate(model, trials, chosen, start) if chosen else None
+    return Lasso(frozen(t), chosen, refit)
 
 
 def proximal_lasso(
@@ -49,17 +67,15 @@ def proximal_lasso(
 ) -> tuple[Array, float]:
     """Solve (C.5): normalised parameters (k,) and the objective."""
     typical = normalised(model, np.asarray(model.typical))
-    t = typical.copy()
-
-    def value(at: Array) -> float:
-        return _mean_square(model, trials, at) + weight * float(np.sum(np.abs(at - typical)))
-
-    current, damping = value(t), 1e-6
+    t, current, damping = typical, lasso_objective(model, trials, typical, weight), 1e-6
     for _ in range(_ROUNDS):
-        H, g = _quadratic(model, trials, t)
-        step = _box_lasso(H + damping * np.eye(len(t)), g, t, typical, weight) - t
+        # Local model g'd + d'Hd/2 of the mean square.
+        errors, J = stacked(model, physical(model, t), trials)
+        g = 2 * J.T @ np.concatenate([part.ravel() for part in errors]) / len(J)
+        H = 2 * J.T @ J / len(J) + damping * np.eye(len(t))
+        step = _box_lasso(H, g, t, typical, weight) - t
         for share in 0.5 ** np.arange(_HALVINGS):
-            moved = value(t + share * step)
+            moved = lasso_objective(model, trials, t + share * step, weight)
             if moved < current:
                 break
         else:
@@ -74,133 +90,30 @@ def proximal_lasso(
     return np.asarray(t), current
 
 
-def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -> Lasso:
-    """Largest selection of at most `count` parameters, by bisection of lambda."""
-    low, high, solves = 1e-8, 1e3, 0
-    best: tuple[float, Array, float] | None = None
-    while solves < 40 and high / low >= 1.01:
-        middle = float(np.sqrt(low * high))
-        t, objective = proximal_lasso(model, trials, middle)
-        solves += 1
-        chosen = _selected(model, t)
-        if len(chosen) > count:
-            low = middle
-            continue
-        high = middle
-        if best is None or len(chosen) >= len(_selected(model, best[1])):
-            best = (middle, t, objective)
-        if len(chosen) == count:
-            break
-    if best is None:
-        best = (high, *proximal_lasso(model, trials, high))
-    return _finished(model, trials, *best)
-
-
-def table_c1(
-    model: ParametricModel, trials: Sequence[Trial], count: int, *, solves: int = 12
-) -> Lasso:
-    """Table C.1: Nelder-Mead, lambda adjusted until `count` parameters exceed the threshold.
-
-    The dissertation does not give the rule for lambda: it is multiplied by 2 if too many parameters
-    moved, divided by 2 if too few; the factor's logarithm is halved if the direction changes. At
-    most `solves` problems are solved.
-    """
-    typical = normalised(model, np.asarray(model.typical))
-    weight, factor, before = _FIRST, 2.0, 0
-    for number in range(1, solves + 1):
-
-        def value(u: Array, weight: float = weight) -> float:
-            t = np.sin(u)
-            return _mean_square(model, trials, t) + weight * float(np.sum(np.abs(t - typical)))
-
-        found = scipy.optimize.minimize(
-            value, np.arcsin(np.clip(typical, -1, 1)), method="Nelder-Mead",
-            options={"maxfev": 200 * len(typical)},
-        )  # fmt: skip
-        t = np.sin(found.x)
-        moved = int(np.count_nonzero(np.abs(t - typical) > _THRESHOLD))
-        if moved == count or number == solves:
-            break
-        direction = 1 if moved > count else -1
-        if before and direction != before:
-            factor = float(np.sqrt(factor))
-        weight, before = weight * factor**direction, direction
-    return _finished(model, trials, weight, np.asarray(t), float(found.fun), _THRESHOLD)
-
-
-def _finished(
-    model: ParametricModel,
-    trials: Sequence[Trial],
-    weight: float,
-    t: Array,
-    objective: float,
-    threshold: float = 0.0,
-) -> Lasso:
-    chosen = _selected(model, t, threshold)
-    start = np.array(model.typical)
-    start[list(chosen)] = physical(model, t)[list(chosen)]
-    refit = estimate(model, trials, chosen, start) if chosen else None
-    return Lasso(weight, frozen(t), chosen, refit, objective)
-
-
-def _selected(model: ParametricModel, t: Array, threshold: float = 0.0) -> tuple[int, ...]:
-    typical = normalised(model, np.asarray(model.typical))
-    return tuple(int(item) for item in np.flatnonzero(np.abs(t - typical) > max(threshold, 1e-12)))
-
-
-def _mean_square(model: ParametricModel, trials: Sequence[Trial], t: Array) -> float:
+def lasso_objective(
+    model: ParametricModel, trials: Sequence[Trial], t: Array, weight: float
+) -> float:
+    """(C.5) at t (k,); infinite if the outputs are not finite."""
     errors = np.concatenate(residuals(model, physical(model, t), trials))
-    mean = float(np.mean(errors**2))
-    return mean if np.isfinite(mean) else np.inf
-
-
-def _quadratic(model: ParametricModel, trials: Sequence[Trial], t: Array) -> tuple[Array, Array]:
-    """H and g of the local model g'd + d'Hd/2 of the mean square at t."""
-    errors, J = stacked(model, physical(model, t), trials)
-    error = np.concatenate([part.ravel() for part in errors])
-    return 2 * J.T @ J / len(J), 2 * J.T @ error / len(J)
+    away = np.sum(np.abs(t - normalised(model, np.asarray(model.typical))))
+    found = float(np.mean(errors**2) + weight * away)
+    return found if np.isfinite(found) else np.inf
 
 
 def _box_lasso(H: Array, g: Array, t: Array, typical: Array, weight: float) -> Array:
     """argmin over x in [-1, 1]^k of g'(x - t) + (x - t)'H(x - t)/2 + weight |x - typical|_1.
 
-    Primal active-set method from x = t, for positive definite H. Coordinates at a kink (typical
-    value) or bound are fixed; the others step to the minimum of the quadratic on their side of the
-    kink, at most to the first kink or bound, where that coordinate is fixed. At the minimum, the
-    fixed coordinate with the largest decrease is released; if there is none, x is the solution.
+    With x = typical + p - q and p, q >= 0 it is a quadratic program. Its active-set solution has
+    exact zeros. A program without a solution gives a step that `proximal_lasso` does not take.
     """
-    x, side = t.copy(), np.sign(t - typical)
-    held = (side == 0) | (np.abs(x) == 1)
-    steepest = weight + float(np.max(np.abs(g)))
-    for _ in range(_CHANGES):
-        free = np.flatnonzero(~held)
-        step = np.zeros_like(x)
-        slope = g + H @ (x - t) + weight * side
-        step[free] = -scipy.linalg.solve(H[np.ix_(free, free)], slope[free], assume_a="pos")
-        barrier = np.where((typical - x) * step > 0, typical, np.sign(step))
-        share = np.full(len(x), np.inf)
-        np.divide(barrier - x, step, out=share, where=step != 0)
-        first = int(np.argmin(share))
-        x += min(share[first], 1.0) * step
-        if share[first] < 1:
-            x[first], held[first] = barrier[first], True
-            side[first] = np.sign(x[first] - typical[first])
-            continue
-        gain, towards = _release(g + H @ (x - t), x, side, typical, weight)
-        best = int(np.argmax(np.where(held, gain, 0.0)))
-        if not held[best] or gain[best] <= steepest * _ROUNDING:
-            break
-        held[best] = False
-        side[best] = side[best] or towards[best]
-    return np.asarray(x)
-
-
-def _release(
-    gradient: Array, x: Array, side: Array, typical: Array, weight: float
-) -> tuple[Array, Array]:
-    """Slope of the objective if a coordinate leaves its kink or bound, and the direction."""
-    at_kink = side == 0
-    towards = np.where(at_kink, -np.sign(gradient), -np.sign(x))
-    steep = np.where(at_kink, np.abs(gradient) - weight, np.sign(x) * (gradient + weight * side))
-    blocked = at_kink & (typical * towards >= 1)  # typical value at a bound
-    return np.where(blocked, 0.0, steep), towards
+    both = np.hstack([np.eye(len(t)), -np.eye(len(t))])
+    square = ca.DM(both.T @ H @ both)
+    options: dict[str, Any] = {"printLevel": "none", "error_on_fail": False}
+    solver_name = require_solver("qpoases")
+    with silent():
+        solver = ca.conic("lasso", solver_name, {"h": square.sparsity()}, options)
+        found = solver(
+            h=square, g=both.T @ (g + H @ (typical - t)) + weight,
+            lbx=0, ubx=np.concatenate([1 - typical, 1 + typical]),
+        )  # fmt: skip
+    return np.asarray(np.clip(typical + both @ found["x"].full().ravel(), -1.0, 1.0))

@@ -12,7 +12,7 @@ B, which CasADi computes; with X_i = dx / dtheta_i
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -25,17 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-class Discrete(NamedTuple):
-    """Sampled matrices and their derivatives; the first axis is the parameter."""
-
-    A: Array  # (n, n)
-    B: Array  # (n, d)
-    C: Array  # (p, n)
-    dA: Array  # (k, n, n)
-    dB: Array  # (k, n, d)
-    dC: Array  # (k, p, n)
-
-
 def linear_functions(
     matrices: ca.Function, dt: float
 ) -> tuple[
@@ -43,46 +32,39 @@ def linear_functions(
 ]:
     """Functions `simulate` and `jacobian` of a `ParametricModel` from rest; `dt` in s."""
     symbol = ca.SX.sym("theta", matrices.size1_in(0))
-    parts = matrices(symbol)
-    derivative = ca.Function(
-        "derivative", [symbol], [ca.jacobian(ca.vec(part), symbol) for part in parts]
-    )
-
-    def simulate(theta: Array, given: Array) -> Array:
-        A, B, C = (item.full() for item in matrices(theta))
-        n = len(A)
-        exponential = np.asarray(scipy.linalg.expm(_joined(A, B) * dt))
-        none = np.zeros((0, n, n)), np.zeros((0, *B.shape))
-        Ad, Bd = map(np.ascontiguousarray, np.split(exponential[:n], [n], axis=1))
-        x, _ = _with_derivatives(Ad, Bd, *none, np.ascontiguousarray(given))
-        return np.asarray(x @ C.T)
+    jacobians = [ca.jacobian(ca.vec(part), symbol) for part in matrices(symbol)]
+    derivative = ca.Function("derivative", [symbol], jacobians)
 
     def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
-        continuous = [item.full() for item in matrices(theta)]
-        found = sampled(continuous, [item.full()[:, free] for item in derivative(theta)], dt)
-        x, X = _with_derivatives(found.A, found.B, found.dA, found.dB, np.ascontiguousarray(given))
-        outputs = x @ found.C.T
-        on_state = np.einsum("pn,skn->spk", found.C, X)
-        on_output = np.einsum("kpn,sn->spk", found.dC, x)
-        return np.asarray(outputs), np.asarray(on_state + on_output)
+        A, B, C = (item.full() for item in matrices(theta))
+        dA, dB, dC = (
+            # CasADi stacks columns; the first axis becomes the parameter.
+            item.full()[:, free].T.reshape(len(free), *part.T.shape).transpose(0, 2, 1)
+            for item, part in zip(derivative(theta), (A, B, C), strict=True)
+        )
+        exponential, change = _exponentials(_joined(A, B) * dt, _joined(dA, dB) * dt)
+        n = len(A)
+        parts = (
+            exponential[:n, :n],
+            exponential[:n, n:],
+            change[:, :n, :n],
+            change[:, :n, n:],
+            given,
+        )
+        x, X = _with_derivatives(*map(np.ascontiguousarray, parts))
+        on_state, on_output = np.einsum("pn,skn->spk", C, X), np.einsum("kpn,sn->spk", dC, x)
+        return np.asarray(x @ C.T), np.asarray(on_state + on_output)
+
+    def simulate(theta: Array, given: Array) -> Array:
+        return jacobian(theta, given, np.zeros(0, dtype=np.int64))[0]
 
     return simulate, jacobian
 
 
-def sampled(parts: Any, derivatives: list[Array], dt: float) -> Discrete:
-    """Sample continuous A, B, C and their derivatives (one column per parameter) at `dt` s."""
-    A, B, C = parts
-    n, d = B.shape
-    k = derivatives[0].shape[1]
-    joined = _joined(A, B) * dt
-    along = np.zeros((k, n + d, n + d))
-    along[:, :n, :n] = derivatives[0].T.reshape(k, n, n).transpose(0, 2, 1) * dt
-    along[:, :n, n:] = derivatives[1].T.reshape(k, d, n).transpose(0, 2, 1) * dt
-    exponential, change = _exponentials(joined, along)
-    dA, dB = change[:, :n, :n].copy(), change[:, :n, n:].copy()
-    dC = derivatives[2].T.reshape(k, n, C.shape[0]).transpose(0, 2, 1)
-    A, B = map(np.ascontiguousarray, np.split(exponential[:n], [n], axis=1))
-    return Discrete(A, B, np.asarray(C), dA, dB, np.ascontiguousarray(dC))
+def _joined(A: Array, B: Array) -> Array:
+    """[A B; 0 0], with the leading axes of A and B."""
+    wide = np.concatenate([A, B], axis=-1)
+    return np.pad(wide, [(0, 0)] * (wide.ndim - 2) + [(0, B.shape[-1]), (0, 0)])
 
 
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
@@ -94,15 +76,11 @@ def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
     count, size = along.shape[:2]
     length = np.linalg.norm(along, axis=(1, 2), keepdims=True) / max(np.linalg.norm(M), 1e-300)
     length[length == 0] = 1.0
-    blocks = np.zeros((count, 2 * size, 2 * size))
-    blocks[:, :size, :size] = blocks[:, size:, size:] = M
+    blocks = np.tile(np.kron(np.eye(2), M), (count, 1, 1))
     blocks[:, :size, size:] = along / length
     found = np.asarray(scipy.linalg.expm(blocks))
-    return found[0, :size, :size], found[:, :size, size:] * length
-
-
-def _joined(A: Array, B: Array) -> Array:
-    return np.pad(np.hstack([A, B]), ((0, B.shape[1]), (0, 0)))
+    first = found[0, :size, :size] if count else np.asarray(scipy.linalg.expm(M))
+    return first, found[:, :size, size:] * length
 
 
 @njit(cache=True, nogil=True)

@@ -50,13 +50,12 @@ class ParametricModel(Frozen):
     simulate: Callable[[Array, Array], Array]
     # (theta, input, free) -> (outputs, their derivatives (samples, p, f) with respect to the
     # parameters with indices `free`)
-    jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None = None
-    meanings: tuple[str, ...] = ()
+    jacobian: Callable[[Array, Array, IntArray], tuple[Array, Array]] | None
+    meanings: tuple[str, ...]  # In words; empty: the name
 
     def word(self, index: int) -> str:
         """Meaning of a parameter in words, or its name."""
-        meaning = self.meanings[index] if self.meanings else ""
-        return meaning or self.names[index].replace("_", " ")
+        return self.meanings[index] or self.names[index].replace("_", " ")
 
     def words(self, subset: Sequence[int]) -> str:
         """Parameters of a `subset` in words, separated by commas."""
@@ -98,22 +97,21 @@ def parametric_model(
     for name, values in sized.items():
         if len(values) != count:
             raise InputError(name, f"has {len(values)} values", f"give {count}, one per parameter")
-    for name, least, most, value in zip(names, low, high, typical, strict=True):
+    for name, least, most, value, sd in zip(names, *sized.values(), strict=True):
         if not least < most:
             raise InputError(f"parameter {name}", f"range {least:g} to {most:g}", "give low < high")
         if not least <= value <= most:
             raise InputError(
                 f"parameter {name}", f"typical value {value:g} is outside its range", "widen it"
             )
-    for name, value in zip(names, spread, strict=True):
-        if not 0 <= value < np.inf:
-            raise InputError(f"parameter {name}", f"deviation {value:g}", "give 0 or more")
+        if not 0 <= sd < np.inf:
+            raise InputError(f"parameter {name}", f"deviation {sd:g}", "give 0 or more")
     groups, measured, words = (
-        ("",) * count if given is None else tuple(given) for given in (pathways, units, meanings)
+        ("",) * count if one is None else tuple(one) for one in (pathways, units, meanings)
     )
     return ParametricModel(
-        tuple(names), frozen(low), frozen(high), frozen(typical), frozen(spread), groups,
-        measured, simulate, jacobian, words,
+        tuple(names), frozen(low), frozen(high), frozen(typical), frozen(spread),
+        groups, measured, simulate, jacobian, words,
     )  # fmt: skip
 
 

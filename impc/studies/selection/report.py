@@ -17,6 +17,7 @@ from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PHONE, RECORDED, RULE, new_figure
 from impc.reporting.verdict import Key
+from impc.studies.selection.fisher import unseen_scalings
 from impc.studies.selection.verdict import BIAS, SELECT_RULES, STUCK, SelectFacts
 
 if TYPE_CHECKING:
@@ -107,7 +108,11 @@ def selection_report(
 
 
 def _checks(model: ParametricModel, found: StudySelection, facts: SelectFacts) -> list[Check]:
-    scalings = dict.fromkeys(names for item in found.nominal.values() for names in item.scalings)
+    scalings = dict.fromkeys(
+        names
+        for item in found.nominal.values()
+        for names in unseen_scalings(model, item.information)
+    )
     together = " ".join(
         f"These {len(names)} can all be {math.e:.1f} times larger without a change that exceeds "
         f"the noise: {model.words([model.names.index(name) for name in names])}."
@@ -161,8 +166,9 @@ def _intervals(
                 "high": high, "note": note_of(*map(float, places[:, place])),
                 _WIDTH: 50 * (high - low) / model.gain[index], BIAS: bias[place],
             }  # fmt: skip
-            for name in ("value", "low", "high"):
-                row[f"others_exact_{name}"] = float(getattr(item.exact, name)[place])
+            exact = [item.refit.theta[index], *item.exact[:, place]]
+            for name, value in zip(("value", "low", "high"), exact, strict=True):
+                row[f"others_exact_{name}"] = float(value)
             if subject in truths:
                 row["truth"] = float(truths[subject][index])
                 row["inside"] = low <= row["truth"] <= high
@@ -251,22 +257,16 @@ def _ordered(model: ParametricModel, found: StudySelection) -> list[int]:
 def _data(model: ParametricModel, found: StudySelection) -> dict[str, Any]:
     names, chosen, nominal = model.named, found.chosen.items(), found.nominal.items()
     lasso = {key: item.lasso.refit for key, item in chosen}
-    tables = {key: item.nelder_mead for key, item in chosen if item.nelder_mead is not None}
     return {
-        "selected": {
-            "fim": names(found.free),
-            "lasso": names(found.lasso),
-            "nelder_mead": {key: names(item.selected) for key, item in tables.items()},
-        },
+        "selected": {"fim": names(found.free), "lasso": names(found.lasso)},
         "common": names(sorted(set(found.free) & set(found.lasso))),
         "deviation": dict(zip(model.names, model.deviation, strict=True)),
-        "seconds": dict(found.seconds),
         "vaf": {
             "nominal": {key: item.fit.vaf for key, item in nominal},
             "fim": {key: item.refit.vaf for key, item in chosen},
             "lasso": {key: None if fit is None else fit.vaf for key, fit in lasso.items()},
         },
-        "unseen_scalings": {key: item.scalings for key, item in nominal},
+        "unseen_scalings": {key: unseen_scalings(model, item.information) for key, item in nominal},
         "subsets": [
             {"bound": item.bound, "subsets": [names(subset) for subset in item.subsets]}
             for item in found.worst_case

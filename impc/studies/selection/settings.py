@@ -38,8 +38,6 @@ class SelectSettings:
     draw : "single" or "block"
         Resampling of the residuals in the bootstrap: single samples, or moving blocks (for
         autocorrelated residuals).
-    nelder_mead : bool
-        Whether the dissertation's LASSO by Nelder-Mead (Table C.1) is run too; slow.
     seed : int
         Seed of starts and replicates.
     """
@@ -53,7 +51,6 @@ class SelectSettings:
     starts: Annotated[int, Meta(ge=1, le=100_000)] = 3
     replicates: Annotated[int, Meta(ge=2, le=100_000)] = 200
     draw: Literal["single", "block"] = "block"
-    nelder_mead: bool = False
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
 
 

@@ -5,13 +5,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.errors import DataError, InputError
-from impc.studies.reliability.icc import FORMS, Form, icc, mean_squares, measurement_error
+from impc.errors import DataError
+from impc.studies.reliability.icc import Form, icc, mean_squares, measurement_error
+
+FORMS: tuple[Form, ...] = ("A,1", "A,k")
 
 #: Shrout and Fleiss, Psychological Bulletin 86 (1979) 420, table 2: six targets, four judges.
 SHROUT_FLEISS = np.array(
     [[9, 2, 5, 8], [6, 1, 3, 2], [8, 4, 6, 8], [7, 1, 2, 6], [10, 5, 6, 9], [6, 2, 4, 7]], float
 )
+
+
+def study(
+    rng: np.random.Generator, subjects: int, visits: int, occasion: float, error: float = 0.6
+) -> np.ndarray:
+    """Scores of subjects with SD 1 and a common visit effect of SD `occasion`."""
+    return np.asarray(
+        rng.standard_normal((subjects, 1))
+        + occasion * rng.standard_normal((1, visits))
+        + error * rng.standard_normal((subjects, visits))
+    )
 
 
 def test_mean_squares_of_shrout_and_fleiss() -> None:
@@ -23,10 +36,7 @@ def test_mean_squares_of_shrout_and_fleiss() -> None:
     assert found.error == pytest.approx(1.02, abs=5e-3)
 
 
-@pytest.mark.parametrize(
-    ("form", "value"),
-    [("A,1", 0.29), ("A,k", 0.62)],
-)
+@pytest.mark.parametrize(("form", "value"), [("A,1", 0.29), ("A,k", 0.62)])
 def test_estimates_of_shrout_and_fleiss(form: Form, value: float) -> None:
     """Table 4 of Shrout and Fleiss."""
     assert icc(SHROUT_FLEISS, form).value == pytest.approx(value, abs=5e-3)
@@ -35,19 +45,11 @@ def test_estimates_of_shrout_and_fleiss(form: Form, value: float) -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_intervals_cover(form: Form) -> None:
     """1000 tables of 15 subjects on 3 occasions with known variances; seed 3."""
-    rng = np.random.default_rng(3)
-    subject, occasion, error = 1.0, 0.0, 0.7
-    k = 3
-    single = subject**2 / (subject**2 + error**2)
-    truth = single if form.endswith("1") else k * single / (1 + (k - 1) * single)
-    inside = 0
+    rng, inside = np.random.default_rng(3), 0
+    single = 1 / (1 + 0.7**2)
+    truth = single if form == "A,1" else 3 * single / (1 + 2 * single)
     for _ in range(1000):
-        scores = (
-            subject * rng.standard_normal((15, 1))
-            + occasion * rng.standard_normal((1, k))
-            + error * rng.standard_normal((15, k))
-        )
-        found = icc(scores, form)
+        found = icc(study(rng, 15, 3, 0.0, 0.7), form)
         inside += found.low <= truth <= found.high
     assert 0.93 <= inside / 1000 <= 0.97
 
@@ -56,16 +58,10 @@ def test_negative_estimates_are_reported() -> None:
     scores = np.array([[1.0, 3.0], [3.0, 1.0], [2.0, 2.1]])
     assert icc(scores, "A,1").value < 0
     assert np.isnan(icc(scores, "A,k").value), "its denominator is negative"
-    mild = np.array(
-        [
-            [0.3, 0.8, 0.3],
-            [-1.3, 0.9, 0.4],
-            [-0.5, 0.6, 0.4],
-            [0.3, 0.0, 0.5],
-            [-0.7, -0.2, -0.5],
-            [0.6, 0.0, -0.3],
-        ]
-    )
+    mild = np.array([
+        [0.3, 0.8, 0.3], [-1.3, 0.9, 0.4], [-0.5, 0.6, 0.4], [0.3, 0.0, 0.5], [-0.7, -0.2, -0.5],
+        [0.6, 0.0, -0.3],
+    ])  # fmt: skip
     assert icc(mild, "A,k").value < 0
 
 
@@ -97,17 +93,6 @@ def test_subjects_that_are_alike_have_no_interval(form: Form) -> None:
     assert np.isnan(icc(rows, form, method="generalised").high)
 
 
-def test_agreement_falls_with_a_shift_of_occasions() -> None:
-    shifted = SHROUT_FLEISS + np.array([0, 5, 10, 15])
-    assert icc(shifted, "A,1").value < icc(SHROUT_FLEISS, "A,1").value
-
-
-@pytest.mark.parametrize("form", ["1", "k", "C,1", "C,k"])
-def test_other_forms_are_refused(form: str) -> None:
-    with pytest.raises(InputError, match="use 'A,1' or 'A,k'"):
-        icc(SHROUT_FLEISS, form)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_limits_lie_about_the_estimate_for_few_subjects(form: Form) -> None:
     """With three subjects limits of (A,1) can be below -1/(k-1); those of (A,k) are -inf."""
@@ -122,17 +107,6 @@ def test_limits_lie_about_the_estimate_for_few_subjects(form: Form) -> None:
             assert found.value <= found.high + 1e-9, f"seed {seed}"
     if form == "A,k":
         assert np.any(np.isneginf(lows))
-
-
-def study(
-    rng: np.random.Generator, subjects: int, visits: int, occasion: float, error: float = 0.6
-) -> np.ndarray:
-    """Scores of subjects with SD 1 and a common visit effect of SD `occasion`."""
-    return np.asarray(
-        rng.standard_normal((subjects, 1))
-        + occasion * rng.standard_normal((1, visits))
-        + error * rng.standard_normal((subjects, visits))
-    )
 
 
 def exceeded(subjects: int, visits: int, occasion: float, studies: int, seed: int) -> float:
@@ -171,7 +145,7 @@ def test_the_error_is_that_of_a_single_score() -> None:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("form", ["A,1", "A,k"])
+@pytest.mark.parametrize("form", FORMS)
 def test_generalised_intervals_cover_where_visits_differ_much(form: Form) -> None:
     """700 studies of 30 subjects on 2 visits, visits as different as 0.7 of subjects; seed 8.
 
@@ -198,7 +172,7 @@ def test_generalised_intervals_are_not_random() -> None:
 
 @pytest.mark.parametrize(
     ("scores", "match"),
-    [(np.ones((5, 1)), "1 occasion"), (np.ones((1, 3)), "1 subject"), (np.ones(3), "dimensions")],
+    [(np.ones((5, 1)), "1 occasion"), (np.ones((1, 3)), "1 subject")],
 )
 def test_too_little_is_a_sentence(scores: np.ndarray, match: str) -> None:
     with pytest.raises(DataError, match=match):
@@ -207,14 +181,8 @@ def test_too_little_is_a_sentence(scores: np.ndarray, match: str) -> None:
 
 #: What pingouin 0.7.0 prints (GPL: not a dependency) for the tables of `pingouin_table`.
 PINGOUIN = {
-    (30, 3, 1): {
-        "A,1": (0.665827, 0.42, 0.82),
-        "A,k": (0.856680, 0.69, 0.93),
-    },
-    (12, 4, 2): {
-        "A,1": (0.604051, 0.34, 0.84),
-        "A,k": (0.859201, 0.67, 0.95),
-    },
+    (30, 3, 1): {"A,1": (0.665827, 0.42, 0.82), "A,k": (0.856680, 0.69, 0.93)},
+    (12, 4, 2): {"A,1": (0.604051, 0.34, 0.84), "A,k": (0.859201, 0.67, 0.95)},
 }
 
 

@@ -5,33 +5,31 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.arrays import Array, frozen
-from impc.model.recordings import Recording
+from impc.arrays import Array
 from impc.reporting.finding import Level
-from impc.studies.reliability.analysis import MeasureResult, Reliability, Trials
-from impc.studies.reliability.icc import icc, measurement_error
+from impc.reporting.verdict import Verdict
+from impc.studies.reliability.analysis import Reliability, measured
+from impc.studies.reliability.icc import icc
 from impc.studies.reliability.measures import Passband
 from impc.studies.reliability.report import reliability_findings
-from impc.studies.reliability.verdict import change_text, interval_band, reliability_verdict
+from impc.studies.reliability.verdict import RULES, Facts, change_text, interval_band
 
 WORDS = {"theta1": "seat tilt", "theta2": "trunk tilt"}
 
 
 def study(*scores: Array) -> Reliability:
-    """RMS in radians; scores (subjects, visits) of each output."""
-    subjects, visits = scores[0].shape
+    """RMS in degrees; scores (subjects, visits) of each output."""
     measures = tuple(
-        MeasureResult(
-            "rms", f"theta{number + 1}", "EO", frozen(one),
-            icc(one, "A,k", method="generalised") if visits > 1 else None,
-            measurement_error(one) if visits > 1 else None,
-        )
-        for number, one in enumerate(scores)
-    )  # fmt: skip
-    names = [tuple(str(k + 1) for k in range(count)) for count in (subjects, visits)]
+        measured("rms", output, WORDS[output], "EO", "°", one)
+        for output, one in zip(WORDS, scores, strict=False)
+    )
+    subjects, visits = (tuple(str(k + 1) for k in range(count)) for count in scores[0].shape)
     band = Passband(0.1, 0.5, np.array([1, 5]))
-    outputs = tuple(WORDS)[: len(scores)]
-    return Reliability(names[0], names[1], ("EO",), outputs, band, measures, (), {}, ())
+    return Reliability(subjects, visits, ("EO",), band, measures, (), {}, ())
+
+
+def verdict(*scores: Array) -> Verdict:
+    return RULES.verdict(Facts(study(*scores)))
 
 
 def scores(subjects: int, visits: int, spread: float, differ: float = 0.02) -> Array:
@@ -50,20 +48,19 @@ def test_a_word_is_that_of_the_interval(low: float, high: float, word: str) -> N
 
 
 def test_a_reliable_test_is_called_so_with_the_change_that_shows() -> None:
-    result = study(scores(30, 3, 0.002))
-    found = reliability_verdict(result, WORDS)
+    made = scores(30, 3, 0.002)
+    found = verdict(made)
     assert (found.level, found.headline) == (Level.GREEN, "Seat sway is reliable.")
     assert not found.alerts
-    made = scores(30, 3, 0.002)
-    change = 1.96 * np.sqrt(2) * np.degrees(np.sqrt(np.mean(np.var(made, axis=1, ddof=1))))
-    value, unit = change_text(result.measures[0]).split()
+    change = 1.96 * np.sqrt(2) * np.sqrt(np.mean(np.var(made, axis=1, ddof=1)))
+    value, unit = change_text(study(made).measures[0]).split()
     assert float(value) == pytest.approx(change, rel=0.1)
     assert unit == "°"
 
 
 def test_the_badge_goes_by_the_lower_end() -> None:
     """Reliable in one signal; no differences between people in the other."""
-    found = reliability_verdict(study(scores(30, 3, 0.002), scores(30, 3, 0.02, 0.0)), WORDS)
+    found = verdict(scores(30, 3, 0.002), scores(30, 3, 0.02, 0.0))
     assert found.level is Level.AMBER
     assert found.headline.startswith("Seat sway is reliable; trunk sway is not")
     assert [claim.text for claim in found.may] == ["That seat sway is reliable in EO."]
@@ -72,35 +69,33 @@ def test_the_badge_goes_by_the_lower_end() -> None:
 
 def test_no_reliability_is_red() -> None:
     rng = np.random.default_rng(0)
-    found = reliability_verdict(study(0.05 + 0.02 * rng.standard_normal((200, 2))), WORDS)
+    found = verdict(0.05 + 0.02 * rng.standard_normal((200, 2)))
     assert (found.level, found.headline) == (Level.RED, "Seat sway is not reliable.")
 
 
 def test_few_subjects_decide_nothing_however_high_the_estimate() -> None:
     made = scores(4, 2, 0.01)
     assert icc(made, "A,k", method="generalised").value > 0.6
-    found = reliability_verdict(study(made), WORDS)
+    found = verdict(made)
     assert (found.level, found.badge) == (Level.AMBER, "Undecided")
     assert found.headline.startswith("4 people and 2 visits do not show")
 
 
 def test_one_visit_shows_nothing() -> None:
-    found = reliability_verdict(study(scores(4, 1, 0.01)), WORDS)
+    found = verdict(scores(4, 1, 0.01))
     assert (found.badge, found.may) == ("Undecided", [])
     assert "at least two people" in found.alerts[0].found
 
 
 def test_both_intervals_stand_in_columns_of_their_own() -> None:
     made = scores(10, 3, 0.01)
-    none: dict[tuple[str, str, str], tuple[Recording, ...]] = {}
-    trials = Trials(("theta1",), 100.0, none, WORDS)
-    found = reliability_findings(trials, study(made))["icc-rms"]
+    found = reliability_findings(study(made))["icc-rms"]
     assert found.table is not None
     row = found.table.iloc[0]
     for ends, method in ((("low", "high"), "generalised"), (("low_f", "high_f"), "F")):
         expected = icc(made, "A,k", method=method)  # type: ignore[arg-type]
         assert tuple(row[list(ends)]) == pytest.approx((expected.low, expected.high))
-    people = np.degrees(made.mean(axis=1))
+    people = made.mean(axis=1)
     assert tuple(row[["mean", "sd", "people"]]) == pytest.approx(
         (people.mean(), people.std(ddof=1), 10)
     )

@@ -10,18 +10,18 @@ import pytest
 
 import impc.studies.selection.fisher
 import plants
-from experiments.reproduction.appendices import discretised, kronecker_sensitivity
+from experiments.reproduction.appendices import kronecker_sensitivity
 from experiments.selection_claims import exhaustive
+from impc.checking import replace
 from impc.errors import DataError, InputError
 from impc.studies.selection.estimation import estimate, free_indices, multi_start
 from impc.studies.selection.fisher import (
-    common_scaling,
     fisher_information,
     largest_subsets,
     subset_variances,
     unseen_scalings,
 )
-from impc.studies.selection.model import normalised, parametric_model, physical, sensitivity
+from impc.studies.selection.model import Trial, normalised, parametric_model, sensitivity
 from tests.studies.selection.heads import NAMES_FIM, head_model, head_trials
 
 SEED = 1
@@ -35,37 +35,29 @@ def test_sensitivities_against_differences() -> None:
     """Central differences of 1e-4 in normalised units: 1e-6 of the largest."""
     given = TRIALS[0].input
     _, exact = sensitivity(MODEL, NOMINAL, given)
-    t = normalised(MODEL, NOMINAL)
-    for index in range(MODEL.size):
-        ends = []
-        for sign in (1, -1):
-            moved = t.copy()
-            moved[index] += sign * 1e-4
-            ends.append(MODEL.simulate(physical(MODEL, moved), given))
-        difference = (ends[0] - ends[1]) / 2e-4
-        scale = np.max(np.abs(exact[..., index])) + 1e-6 * np.max(np.abs(exact))
-        assert np.max(np.abs(difference - exact[..., index])) <= 1e-6 * scale
+    _, differences = sensitivity(replace(MODEL, jacobian=None), NOMINAL, given)
+    scale = np.max(np.abs(exact), axis=0) + 1e-6 * np.max(np.abs(exact))
+    assert np.all(np.abs(differences - exact) <= 1e-6 * scale)
 
 
 def test_sensitivities_against_the_kronecker_recursion() -> None:
     """(A.3): 1e-8."""
     given = TRIALS[0].input
     _, exact = sensitivity(MODEL, NOMINAL, given)
-    sampled = discretised(plants.head_neck_matrices(), NOMINAL, 1 / 60)
-    recursion = kronecker_sensitivity(sampled, given) * MODEL.gain
+    matrices = plants.head_neck_matrices()
+    recursion = kronecker_sensitivity(matrices, NOMINAL, 1 / 60, given) * MODEL.gain
     np.testing.assert_allclose(recursion, exact, atol=1e-8 * np.max(np.abs(exact)))
 
 
 def test_information_is_its_sum() -> None:
     """(A.2) and (A.6), sample by sample."""
-    total = np.zeros((12, 12))
-    squares = 0.0
+    total, squares, samples = np.zeros((12, 12)), 0.0, 0
     for trial in TRIALS:
         outputs, derivative = sensitivity(MODEL, NOMINAL, trial.input)
         squares += float(np.sum((trial.outputs - outputs) ** 2))
+        samples += outputs.size
         for row in derivative[:, 0]:
             total += np.outer(row, row)
-    samples = sum(trial.outputs.size for trial in TRIALS)
     np.testing.assert_allclose(FOUND.F, total / (squares / (samples - 12)), rtol=1e-9)
 
 
@@ -78,7 +70,6 @@ def test_rank_and_what_is_not_seen() -> None:
     moved[[MODEL.names.index(name) for name in gains]] *= 1.3
     before, after = (MODEL.simulate(theta, TRIALS[0].input) for theta in (NOMINAL, moved))
     assert 1 - np.sum((after - before) ** 2) / np.sum(before**2) > 0.9999999
-    assert common_scaling(MODEL, FOUND, ("Kvis",)) > 100
 
 
 @pytest.mark.parametrize("bound", [0.05, 0.25, 0.95])
@@ -131,8 +122,6 @@ def test_any_function_is_a_model() -> None:
         ["a", "k"], [0.1, 0.1], [5, 3], [2.0, 1.0], lambda p, t: p[0] * np.exp(-p[1] * t)
     )
     theta = np.array([2.0, 1.0])
-    from impc.studies.selection.model import Trial  # noqa: PLC0415
-
     found = fisher_information(model, theta, [Trial(time, model.simulate(theta, time))], 0.01)
     decay = np.exp(-time[:, 0])
     J = np.column_stack([decay, -2 * time[:, 0] * decay]) * model.gain

@@ -13,23 +13,16 @@ from impc.arrays import Array
 from impc.assess.long_run_covariance import residual_noise, white_noise
 from impc.cli.main import main
 from impc.errors import InputError
-from impc.studies.selection.estimation import PriorFit, estimate, estimate_with_prior
-from impc.studies.selection.model import ParametricModel, Trial, parametric_model
+from impc.studies.selection.estimation import estimate, estimate_with_prior
+from impc.studies.selection.model import Trial, parametric_model
 from impc.studies.selection.report import note_of, read_truths
+from tests.studies.selection.heads import line_model
 from tests.studies.selection.test_methods import MINE, blood_study
 
 RANGE, NOISE, SAMPLES = 10.0, 0.5, 150
 DEVIATION = np.array([1.0, 0.8, 0.5])
-
-
-def line(deviation: Array, width: float = RANGE) -> ParametricModel:
-    """y = u1 a + u2 b + u3 c, with c beside a."""
-
-    def simulate(p: Array, u: Array) -> Array:
-        return np.asarray(u @ p)[:, None]
-
-    ends = [-width] * 3, [width] * 3, [0.0] * 3
-    return parametric_model(["a", "b", "c"], *ends, simulate, deviation=list(deviation))
+PEOPLE = line_model(RANGE, deviation=[*DEVIATION])
+KNOWN = line_model(RANGE, deviation=[0.0] * 3)
 
 
 def person(rng: np.random.Generator, root: float = 0.0) -> tuple[Array, Trial]:
@@ -45,7 +38,7 @@ def person(rng: np.random.Generator, root: float = 0.0) -> tuple[Array, Trial]:
 def test_it_is_the_posterior_of_a_linear_model() -> None:
     """Closed form: flat prior of a, normal priors of b and c, residual variance."""
     _, trial = person(np.random.default_rng(1))
-    found = estimate_with_prior(line(DEVIATION), [trial], (0,), np.zeros(3), white_noise)
+    found = estimate_with_prior(PEOPLE, [trial], (0,), np.zeros(3), white_noise)
     left = trial.outputs[:, 0] - trial.input @ found.fit.theta
     s2 = left @ left / (SAMPLES - 3)
     P = np.diag([0, *DEVIATION[1:] ** -2.0])
@@ -64,8 +57,7 @@ def test_intervals_of_people_hold_the_truth(root: float, noise_of: object) -> No
     inside = {True: 0, False: 0}
     for _ in range(100):
         theta, trial = person(rng, root)
-        for known in inside:
-            model = line(DEVIATION * known)
+        for known, model in ((True, PEOPLE), (False, KNOWN)):
             found = estimate_with_prior(model, [trial], (0,), np.zeros(3), noise_of)  # type: ignore[arg-type]
             inside[known] += bool(found.low[0] <= theta[0] <= found.high[0])
     assert 88 <= inside[True] <= 99
@@ -74,15 +66,11 @@ def test_intervals_of_people_hold_the_truth(root: float, noise_of: object) -> No
 
 def test_without_deviations_it_is_the_fit_of_the_chosen_parameters() -> None:
     """To 1e-6 of the range, and the interval is that of ordinary least squares."""
-    theta, trial = person(np.random.default_rng(3))
-    model = line(np.zeros(3))
-    alone = estimate(model, [trial], (0, 1), theta)
-    found = estimate_with_prior(model, [trial], (0, 1), np.zeros(3), white_noise)
+    _, trial = person(np.random.default_rng(3))
+    found = estimate_with_prior(KNOWN, [trial], (0, 1), np.zeros(3), white_noise)
     assert found.fit.free == (0, 1)
-    kept = np.array([0, 0, 0.0])
-    kept[:2] = estimate(model, [trial], (0, 1), np.zeros(3)).theta[:2]
-    np.testing.assert_allclose(found.fit.theta, kept, atol=1e-6 * RANGE)
-    assert alone.free == found.fit.free
+    alone = estimate(KNOWN, [trial], (0, 1), np.zeros(3))
+    np.testing.assert_allclose(found.fit.theta, alone.theta, atol=1e-6 * RANGE)
     u = trial.input[:, :2]
     left = trial.outputs[:, 0] - u @ found.value
     expected = np.sqrt(np.diag(np.linalg.inv(u.T @ u)) * (left @ left) / (SAMPLES - 2))
@@ -94,9 +82,9 @@ def test_an_estimate_at_its_bound_has_a_one_sided_interval() -> None:
     rng = np.random.default_rng(4)
     u = rng.standard_normal((SAMPLES, 3))
     trial = Trial(u, (u @ [1.5, 0, 0] + NOISE * rng.standard_normal(SAMPLES))[:, None])
-    model = line(np.zeros(3), width=1.0)
+    model = line_model(1.0, deviation=[0.0] * 3)
     found = estimate_with_prior(model, [trial], (0,), np.zeros(3), white_noise)
-    assert found.fit.at_bound == (0,)
+    assert found.value[0] == pytest.approx(1, abs=1e-6)
     assert found.high[0] == 1
     assert 0.8 < found.low[0] < 0.97
 
@@ -121,9 +109,7 @@ def test_a_parameter_without_effect_is_not_determined() -> None:
     """c has no effect in these recordings: its interval is its range."""
     _, trial = person(np.random.default_rng(5))
     silent = Trial(trial.input * [1, 1, 0], trial.outputs)
-    found: PriorFit = estimate_with_prior(
-        line(DEVIATION), [silent], (0, 2), np.zeros(3), white_noise
-    )
+    found = estimate_with_prior(PEOPLE, [silent], (0, 2), np.zeros(3), white_noise)
     assert (found.low[1], found.high[1]) == (-RANGE, RANGE)
 
 
@@ -155,10 +141,9 @@ def test_truth_beside_simulated_recordings_is_compared(tmp_path: Path) -> None:
 
 
 def test_truths_of_others_are_left_alone(tmp_path: Path) -> None:
-    model = line(DEVIATION)
-    assert read_truths(tmp_path, model) == {}
+    assert read_truths(tmp_path, PEOPLE) == {}
     for content in (b"no json", b"[1]", b'{"recordings": {"1": {"a": 1}}}', b"\xff"):
         (tmp_path / "truth.json").write_bytes(content)
-        assert read_truths(tmp_path, model) == {}
+        assert read_truths(tmp_path, PEOPLE) == {}
     (tmp_path / "truth.json").write_text('{"recordings": {"1": {"a": 1, "b": 2, "c": 3, "d": 4}}}')
-    np.testing.assert_array_equal(read_truths(tmp_path, model)["1"], [1, 2, 3])
+    np.testing.assert_array_equal(read_truths(tmp_path, PEOPLE)["1"], [1, 2, 3])
