@@ -52,7 +52,7 @@ def command(case: str, out: Path, solver: str | None, pdf: bool, open_page: bool
     written = write_files(out, report.files(pdf=pdf))
     click.echo(f"{report.verdict.text()}\n{click.wrap_text(LOST, width=100)}")
     for finding in report.findings():
-        click.echo(f"\n{click.wrap_text(finding.caption, width=100)}\n{finding.text()}")
+        click.echo(f"\n{finding.name}\n{finding.text()}")
     print_files(out, written, open_page)
 
 

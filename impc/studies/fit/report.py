@@ -61,10 +61,7 @@ from impc.studies.fit.facts import (
 from impc.studies.fit.paper import paper_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
-from impc.studies.fit.structures import (
-    structure_draw,
-    structure_section,
-)
+from impc.studies.fit.structures import structure_section
 from impc.studies.fit.verdict import (
     GAIN,
     SHARE,
@@ -183,17 +180,15 @@ def _keys(result: FitResult) -> list[Key]:
 def _draws(result: FitResult, window: int) -> dict[str, Draw]:
     """Functions that draw the figures of the page."""
     found: dict[str, Draw] = {
-        "movement": functools.partial(figures.movement_figure, result, window),
+        "movement": functools.partial(figures.movement_figure, result.inverse_mpc, window),
         "methods": functools.partial(methods_figure, result.methods[::-1]),
-        "residuals": functools.partial(figures.residual_figure, result),
+        "residuals": functools.partial(figures.residual_figure, result.inverse_mpc),
     }
     if result.response is not None:
         response = functools.partial(figures.frequency_figure, result, result.response)
         found["frequency-response"] = response
     if result.compared and WEIGHTS not in forbidden(result):
         found["statements"] = functools.partial(figures.statements_figure, result)
-    if result.structures and result.structures[0].ratios:
-        found["structured-weights"] = structure_draw(result)
     return found
 
 

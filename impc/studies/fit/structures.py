@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,12 +10,11 @@ import pandas as pd
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.structured_weights import IDENTIFIED_FACTOR
 from impc.assess.variance_accounted_for import innovation_roots, innovations_criterion
-from impc.reporting.document import Block, Draw, Fold, Section
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.document import Block, Fold, Section
+from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import probability
 from impc.reporting.shown_units import words_of
 from impc.studies.fit.facts import shares
-from impc.studies.fit.figures import interval_figure
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,13 +24,6 @@ if TYPE_CHECKING:
 
 # Power below which the test is said to have little power.
 _BLIND = 0.1
-_PICTURE = Picture(
-    "structured-weights",
-    "Cost weights of the features with their intervals, one row each, on a logarithmic axis",
-    "Cost weights within the structure, at a cost weight of one for the first input, with 95 % "
-    "intervals that allow for autocorrelated residuals. An arrow marks an interval that goes on; "
-    "to the left, the cost weight may be zero.",
-)
 # Coverage of intervals at a zero cost weight: experiments/structures.md.
 _AT_ZERO = (
     "If the best cost weight is zero, 95 % intervals contained the true value in 78 to 96 % of "
@@ -70,16 +61,6 @@ def structure_data(result: FitResult) -> list[dict[str, Any]]:
             row |= {"Q": weights.Q, "R": weights.R, "K": estimate.gain}
         rows.append(row)
     return rows
-
-
-def structure_draw(result: FitResult) -> Draw:
-    """Function that draws the cost weights of the first structure."""
-    found = result.structures[0]
-    ends = np.exp([[item.low, item.high] for item in found.intervals])
-    values = np.exp([item.value for item in found.intervals])
-    axis = "Cost weight, first input 1 (SI)"
-    names = list(_names(result, found.structure.unknowns))
-    return functools.partial(interval_figure, names, ends, values, axis)
 
 
 def structure_sentences(result: FitResult) -> list[str]:
@@ -165,7 +146,6 @@ def _cost_weights(result: FitResult, found: StructureFit) -> Finding:
         "Unknowns of the structure: cost weights relative to that of the first command, in SI "
         "units, with 95 % intervals that allow for autocorrelated residuals. Last column: cost of "
         "the feature at its typical size, relative to the cost of the command.",
-        figure=_PICTURE if found.ratios else None,
         labels={"of": "Cost weight of"},
         hidden=["feature"],
     )

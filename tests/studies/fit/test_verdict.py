@@ -169,9 +169,9 @@ def test_angles_are_shown_as_is_asked() -> None:
     """Units of angles in the figures of a fit."""
     result = fitted(1.0)
     turned = replace(result.given.plant, units=(("place", "rad"), ("pull", "rad/s^2")))
-    shown = replace(result, fitted=replace(
-        result.fitted, problem=replace(result.fitted.problem, plant=turned)
-    ))  # fmt: skip
+    own = result.inverse_mpc
+    problem = replace(own.estimate.problem, plant=turned)
+    shown = replace(own, estimate=replace(own.estimate, problem=problem))
     for angles, label, factor in (("degrees", "°", 180 / np.pi), ("radians", "rad", 1.0)):
         with angles_in(angles), page_style():
             ax = movement_figure(shown, 0, narrow=False).axes[0]
