@@ -140,7 +140,7 @@ def _own_problem(
 def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
     """Print verdict, gain, methods and, for simulated recordings, the true gain."""
     from impc.reporting.verdict import WIDTH  # noqa: PLC0415
-    from impc.studies.fit.findings import per_unit_finding, truth_sentence  # noqa: PLC0415
+    from impc.studies.fit.findings import per_unit_finding, truth_found  # noqa: PLC0415
     from impc.studies.fit.verdict import GAIN, forbidden  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
@@ -149,7 +149,7 @@ def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
         click.echo(f"\n{per_unit_finding(result).text()}")
     click.echo(f"\n{methods_finding(result.methods[::-1]).text()}\n")
     if truth is not None:
-        click.echo(fill(truth_sentence(result, truth), WIDTH))
+        click.echo(fill(truth_found(result, truth)[1], WIDTH))
 
 
 @click.command("compare")

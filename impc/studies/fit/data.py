@@ -48,6 +48,7 @@ import numpy as np
 
 from impc.assess.intent import dominant_sentence
 from impc.assess.printed_gain import lasting_responses
+from impc.model.riccati import solve_lqr
 from impc.studies.fit.aim import aim_data
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
@@ -107,7 +108,7 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "R": weights.R,
         "weights_gain": fitted.gain,
         "weights_rule": result.intent.reported.rule,
-        "P": result.reported_P,
+        "P": solve_lqr(plant, weights).P,
         "weights_test": {**asdict(result.weights_test), "rejected": result.weights_test.rejected},
         "terminal_set": bool(fitted.problem.terminal_set),
         "doubts": fitted.doubts,
@@ -121,13 +122,14 @@ def _controller(result: FitResult) -> dict[str, Any]:
 
 
 def _intent(result: FitResult) -> dict[str, Any]:
-    found, reported = result.intent, result.intent.reported
+    found, reported, summary = result.intent, result.intent.reported, result.uncertainty.weights
+    over_set = 0.0 if summary is None else summary.widest_angle
     return {
         "eigenvalues": reported.eigenvalues,
         "vectors": reported.vectors,
         "dominant": reported.dominant,
         "sentence": dominant_sentence(reported, result.fitted.problem.plant, np.array(found.sizes)),
-        "widest_angle": result.widest_angle,
+        "widest_angle": max(found.widest_angle, over_set),
         "state_sizes": found.sizes,
         "readings": [
             {

@@ -198,7 +198,7 @@ def _sections(
     """Sections of the page; add a line here for a new section."""
     no = forbidden(result)
     return [
-        Section("Feedback gain", _gain(result, truth, GAIN in no)),
+        Section("Feedback gain", _gain(result, GAIN in no)),
         *([] if result.person is None else [result.person.section()]),
         Section("Does the limit matter?", _limit(result, SHARE in no), "Limit"),
         *([structure_section(result)] if result.structures else []),
@@ -209,11 +209,11 @@ def _sections(
     ]
 
 
-def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
+def _gain(result: FitResult, hidden: bool) -> list[Block]:
     if not result.preferred:
         return [Quiet(_HIDDEN)]
     tables = [
-        findings.gain_finding(result, truth),
+        findings.gain_finding(result),
         findings.direction_finding(result),
         *findings.parameter_findings(result),
     ]
@@ -237,7 +237,6 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
             "All gains in SI units, combinations and parameters",
             [*tables, *filter(None, [parameter_words(result)])],
         ),
-        *findings.command_findings(result),
         *findings.error_findings(result),
     ]
 
@@ -284,7 +283,7 @@ def _limit(result: FitResult, doubtful: bool) -> list[Block]:
     return [
         said,
         methods,
-        *findings.limit_findings(result),
+        *findings.alternative_findings(result),
         Fold("All methods in numbers", [methods_finding(result.methods[::-1])]),
     ]
 
@@ -296,7 +295,7 @@ def _intent(result: FitResult, hidden: bool) -> list[Block]:
             Fold("Cost weights (do not report)", [findings.weight_finding(result)]),
         ]
     plant, summary, made = result.given.plant, result.uncertainty.weights, decided(result)
-    tables = [*findings.weight_findings(result), findings.reading_finding(result)]
+    tables = findings.weight_findings(result)
     if summary is None:
         return [Quiet(f"Not available: {result.uncertainty.weights_reason}"), *tables]
     drawn = (
@@ -351,13 +350,9 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
         _weights(result),
         *_others(result),
     ]  # fmt: skip
-    if truth is not None and result.preferred:
-        inside, count, level = findings.truth_count(result, truth)
-        checks.append(
-            Check(Level.NOTE if inside == count else Level.AMBER, "Known truth",
-                  f"Simulated recordings: {inside} of {count} true gains lie inside their "
-                  f"{level:.0f} % intervals.")
-        )  # fmt: skip
+    if truth is not None:
+        right, said = findings.truth_found(result, truth)
+        checks.append(Check(Level.NOTE if right else Level.AMBER, "Known truth", said))
     residuals = Picture(
         "residuals",
         "Residuals of the first output and their autocorrelation",
@@ -474,17 +469,8 @@ def _made(provenance: Provenance, result: FitResult | None = None, missing: str 
         how = [
             ("Body", body_sentence(problem.plant)),
             ("Quadratic programs", f"Solved by {described(problem.solver)}."),
-            ("Terminal set", _terminal_set(result)),
+            ("Terminal set", "yes" if problem.terminal_set else "no"),
             ("Time of the fit", f"{result.seconds:.1f} s"),
         ]
         blocks.append(Fold("All settings", [Terms([*how, *settings])]))
     return Section("Provenance", blocks)
-
-
-def _terminal_set(result: FitResult) -> str:
-    changed, within = result.terminal_set_difference, bool(result.fitted.problem.terminal_set)
-    ends = "The controller has a terminal set" if within else "The controller has no terminal set"
-    if np.isnan(changed):
-        return f"{ends}."
-    other = "without" if within else "with"
-    return f"{ends}; {other} one, an output would change by at most {changed:.2g} of its size."

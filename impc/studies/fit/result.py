@@ -15,12 +15,9 @@ from impc.assess.printed_gain import PARAMETER, entry_names
 from impc.control.simulation import Status
 from impc.inverse.problem import simulated
 from impc.model.plant_family import LIMIT
-from impc.model.riccati import solve_lqr
 from impc.reporting.shown_units import shown_unit
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
@@ -111,9 +108,6 @@ class FitResult:
     methods: tuple[MethodFit, ...]
     # Tests of the model in the first fit and, if an unknown was added, in the last
     lack: tuple[LackOfFit | None, ...]
-    # Largest change of a scaled output if the terminal set is added (or removed); NaN if a
-    # simulation then stops early
-    terminal_set_difference: float
     seconds: float  # Run time of the whole fit, s
     weights_test: WeightsTest  # Test whether any weights explain the gain
     # Stages that failed, with the reason; their results are missing
@@ -123,8 +117,6 @@ class FitResult:
     person: PersonReport | None = None  # Result of [fit.observer]; None if not requested
     # Part of the outputs that repeats with the perturbation; None if it does not repeat
     ceiling: Ceiling | None = None
-    # Gain by regression on recorded commands (`command_regression`); None if there are none
-    commands: pd.DataFrame | None = None
     response: FrequencyResponse | None = None  # From the perturbation to the outputs
     falls: tuple[str, ...] = ()  # Trials that ended in a fall and were not fitted, with the time
 
@@ -189,18 +181,6 @@ class FitResult:
     def compared(self) -> tuple[Statement, ...]:
         """All comparisons of cost, decided or not."""
         return () if self.uncertainty.weights is None else self.uncertainty.weights.statements
-
-    @property
-    def reported_P(self) -> Array:  # noqa: N802
-        """Terminal weight (3.4) of the reported weights, shape (n, n)."""
-        return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
-
-    @property
-    def widest_angle(self) -> float:
-        """Largest angle between dominant directions of weights with this gain, degrees."""
-        found = self.uncertainty.weights
-        over_set = 0.0 if found is None else found.widest_angle
-        return max(self.intent.widest_angle, over_set)
 
     @property
     def added(self) -> ModelError | None:

@@ -8,9 +8,8 @@ gain. On request: bootstrap, profile likelihoods, input limit, other horizons
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,19 +27,16 @@ from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from impc.arrays import Array
     from impc.assess.input_limits import LimitEstimate
     from impc.assess.printed_gain import GainEstimate
-    from impc.assess.resampling import Replicate
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.studies.fit.first import FitProgress
     from impc.studies.fit.settings import FitSettings
-
-#: (stage, compute, default) -> result, or the default if it fails.
-Attempt = Callable[[str, Callable[[], Any], Any], Any]
 
 
 @dataclass(frozen=True)
@@ -75,11 +71,10 @@ def assess(
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
     settings: FitSettings,
-    done: Callable[[str], None],
-    remember: Callable[[str, Callable[[], Replicate]], Replicate],
-    attempt: Attempt,
+    progress: FitProgress,
 ) -> Uncertainty:
     """Run the requested analyses."""
+    done, attempt = progress.done, progress.attempt
     intervals = list(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     require_numbers(estimate, settings.profiles)
     for name in settings.profiles:
@@ -101,7 +96,7 @@ def assess(
         given = problem, fitted, settings.horizons, settings.settle, done
         others = functools.partial(fit_alternatives, *given)
         alternatives = attempt("other horizons", others, ())
-    replicates = functools.partial(_bootstrap, estimate, settings, done, remember)
+    replicates = functools.partial(_bootstrap, estimate, settings, progress)
     intervals += attempt("bootstrap", replicates, ())
     return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
 
@@ -109,8 +104,7 @@ def assess(
 def _bootstrap(
     estimate: GainEstimate,
     settings: FitSettings,
-    done: Callable[[str], None],
-    remember: Callable[[str, Callable[[], Replicate]], Replicate],
+    progress: FitProgress,
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
@@ -118,8 +112,8 @@ def _bootstrap(
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
         compute = functools.partial(replicate, *at, index, settings.seed)
-        found.append(remember(name, compute))
-        done(name)
+        found.append(progress.replicate(name, compute))
+        progress.done(name)
     return bootstrap_intervals(estimate, found, "block", LEVEL)
 
 

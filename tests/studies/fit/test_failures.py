@@ -70,17 +70,16 @@ def test_no_weights_is_said_before_any_weights() -> None:
 
 
 def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawn gains, model test, horizons and terminal set fail: the gain is still reported."""
+    """Drawn gains and the test of the model fail: the gain is still reported."""
 
     def fails(*_: Any, **__: Any) -> Any:
         raise SolverError("stage", "did not end", "try another")
 
     whole = fitted()
-    for name in ("estimate_draws", "_terminal_set_difference"):
-        monkeypatch.setattr(subject, name, fails)
+    monkeypatch.setattr(subject, "estimate_draws", fails)
     monkeypatch.setattr(first, "lack_of_fit", fails)
     result = fitted()
-    assert set(result.failures) == {"drawn gains", "test of the model", "terminal set"}
+    assert set(result.failures) == {"drawn gains", "test of the model"}
     page = fit_report(result, Provenance()).page()
     for stage in result.failures:
         assert f"Not available: {stage}" in page

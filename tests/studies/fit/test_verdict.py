@@ -29,6 +29,7 @@ from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.body_words import added_sentence
 from impc.studies.fit.facts import named_gains
 from impc.studies.fit.figures import movement_figure, shown_window, statements_figure
+from impc.studies.fit.first import FitProgress
 from impc.studies.fit.report import fallen_report, fit_report
 from impc.studies.fit.result import FittedParameter
 from impc.studies.fit.settings import FitSettings, missing
@@ -60,7 +61,7 @@ def fitted(limit: float) -> FitResult:
     settings = FitSettings(u_max=limit, horizon=5, methods=["inverse_lqr_output"])
     heard: list[str] = []
     problem = fit_problem(plant, [Recording(plant, outputs, push)], settings)
-    result = fit_recordings(problem, settings, heard.append)
+    result = fit_recordings(problem, settings, FitProgress(heard.append))
     assert len(heard) == stages(problem, settings)
     return result
 
