@@ -6,7 +6,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.signal
 
 from impc.arrays import Array, frozen
 from impc.checking import checked, replace
@@ -28,10 +27,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
     from impc.studies.fit.settings import FitSettings
-
-# Window in s of the Savitzky-Golay derivative: noise of 1 % of the largest angle at 100 Hz then
-# gives errors of a few per cent of the largest rate.
-_RATE_WINDOW = 0.15
 
 
 def output_feedback() -> Any:
@@ -178,22 +173,7 @@ def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[R
     if name in plant.outputs:
         column = plant.outputs.index(name)
         return max(float(np.nanmax(np.abs(trial.outputs[:, column]))) for trial in recordings)
-    base = name.removesuffix("_rate")
-    if base != name and base in plant.outputs:
-        column = plant.outputs.index(base)
-        return max(_largest_rate(trial.outputs[:, column], plant.dt) for trial in recordings)
-    raise InputError(
-        f"[fit] bounded_states {name}", "is neither an output nor the rate of one", "give a number"
-    )
-
-
-def _largest_rate(values: Array, dt: float) -> float:
-    window = max(5, 2 * round(_RATE_WINDOW / dt / 2) + 1)
-    if len(values) < window:
-        raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
-    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt, mode="nearest")
-    half = window // 2  # the filter is one-sided at the ends
-    return float(np.nanmax(np.abs(rate[half:-half])))
+    raise InputError(f"[fit] bounded_states {name}", "is not an output", "give a number")
 
 
 @checked

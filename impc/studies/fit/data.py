@@ -7,8 +7,8 @@
     solver                                   solver of the quadratic programs
     usable                                   whether the VAF of every recorded signal is >= 50 %
     K                                        estimated gain (without the restriction to weights)
-    estimate                                 standard errors of K and of its directions, and which
-                                             of them are identified
+    estimate                                 standard errors of K; whether its entries, and its
+                                             directions as in their table, are identified
     Q, R, P, S, weights_gain                 weights with the nearest gain, scaled to R[0][0] = 1
     weights_rule                             convention by which Q and R were selected
     weights_test                             test whether any weights explain K: statistic, freedom,
@@ -52,7 +52,7 @@ from impc.model.riccati import solve_lqr
 from impc.studies.fit.aim import aim_data
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
-from impc.studies.methods_table import methods_data
+from impc.studies.methods_table import problem_data
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
@@ -62,20 +62,23 @@ if TYPE_CHECKING:
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Entries of result.json in addition to the findings."""
     plant, found = result.fitted.problem.plant, result.identifiability
+    estimate, covariance = result.estimate, result.estimate.covariance
     return _controller(result) | {
-        "estimate": _estimate(result),
+        "estimate": {
+            "S": estimate.S,
+            "misfit": estimate.misfit,
+            "standard_errors": covariance.entries,
+            "identified": covariance.individually_identified,
+            "identified_directions": covariance.identified,
+        },
         "limit": None if result.limit_found is None else result.limit_found._asdict(),
         "lasting": [asdict(one) for one in lasting_responses(result.estimate)],
         "falls": result.falls,
         "intent": _intent(result),
         "identifiability": {
-            "rank": found.rank,
-            "free": found.free,
-            "chosen": found.chosen,
-            "singular_values": found.singular_values,
+            name: getattr(found, name) for name in ("rank", "free", "chosen", "singular_values")
         },
         "trials": [_trial(result, index) for index in range(len(result.trials))],
-        "methods": methods_data(result.methods),
         "structures": structure_data(result),
         "aim": aim_data(result),
         "person": None if result.person is None else result.person.data(),
@@ -95,10 +98,9 @@ def _controller(result: FitResult) -> dict[str, Any]:
     weights, bounds = result.intent.reported.weights, result.given.bounds
     held = np.array([item.vaf for item in result.held_out])
     left_out = np.mean(held, axis=0) if len(held) else [None] * len(plant.outputs)
-    return {
+    return problem_data(fitted.problem, result.methods) | {
         "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
         "held_out_vaf": dict(zip(plant.outputs, left_out, strict=True)),
-        **{name: getattr(plant, name) for name in ("states", "controls", "outputs")},
         "disturbances": plant.disturbances,
         "units": dict(plant.units),
         "usable": result.usable,
@@ -114,9 +116,6 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "doubts": fitted.doubts,
         "failures": dict(result.failures),
         "lack_of_fit": [None if one is None else asdict(one) for one in result.lack],
-        "horizon": fitted.problem.horizon,
-        "body": plant.moves,
-        "solver": fitted.problem.solver,
         "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
     }
 
@@ -142,23 +141,6 @@ def _intent(result: FitResult) -> dict[str, Any]:
             }
             for item in found.readings
         ],
-    }
-
-
-def _estimate(result: FitResult) -> dict[str, Any]:
-    estimate, covariance = result.estimate, result.estimate.covariance
-    return {
-        "S": estimate.S,
-        "misfit": estimate.misfit,
-        "standard_errors": covariance.entries,
-        "standard_errors_exact_body": None if estimate.exact is None else estimate.exact.entries,
-        "identified": covariance.individually_identified,
-        "singular_values": covariance.singular_values,
-        "directions": covariance.directions,
-        "direction_standard_errors": covariance.deviations,
-        "identified_directions": covariance.identified,
-        "natural_coordinates": covariance.T,
-        "natural_inputs": covariance.G,
     }
 
 

@@ -309,7 +309,7 @@ def no_limit(result: FitResult) -> str:
     if limit is None:
         return "No limit was given."
     if not result.met:
-        return "It was never reached."
+        return "The limit was never reached."
     return f"The limit of {limit} is in doubt."
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -15,11 +15,10 @@ from impc.reporting.finding import Finding, table_of
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
 from impc.studies.fit.facts import named_gains, shift_halves, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
-from impc.studies.fit.uncertainty import verdict
 from impc.studies.methods_table import trajectory_table, weight_entries
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from impc.arrays import Array
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.studies.fit.facts import GainRow
     from impc.studies.fit.result import FitResult
+    from impc.studies.fit.uncertainty import Alternative
 
 # Smallest component of a direction that is printed.
 _NAMED = 0.15
@@ -107,10 +107,17 @@ def direction_finding(result: FitResult) -> Finding:
     back = np.kron(np.array(covariance.G), np.linalg.inv(covariance.T).T)
     moved = (covariance.directions @ back.T) * np.tile(np.array(result.intent.sizes), plant.m)
     values, deviations = covariance.singular_values, covariance.deviations
+
+    def written(k: int) -> str:
+        """A sum of terms, largest first."""
+        parts = moved[k] / np.linalg.norm(moved[k])
+        order = [one for one in np.argsort(-np.abs(parts)) if abs(parts[one]) >= _NAMED]
+        return " ".join(f"{parts[one]:+.2f} {names[one]}" for one in order)
+
     table = table_of(
         range(len(values)),
         {
-            "direction": lambda k: direction_name(moved[k] / np.linalg.norm(moved[k]), names),
+            "direction": written,
             "relative_singular_value": lambda k: float(values[k] / values[0]),
             "standard_error": lambda k: float(deviations[k]),
             "identified": lambda k: bool(deviations[k] < IDENTIFIED),
@@ -122,13 +129,6 @@ def direction_finding(result: FitResult) -> Finding:
         f"practically unknown, above {IDENTIFIED:g} not identified."
     )
     return Finding("directions", table, caption, digits=2)
-
-
-def direction_name(direction: Array, names: tuple[str, ...]) -> str:
-    """A direction (n,) as a sum of terms called by their `names`, largest first."""
-    order = np.argsort(-np.abs(direction), kind="stable")
-    parts = [f"{direction[k]:+.2f} {names[k]}" for k in order if abs(direction[k]) >= _NAMED]
-    return " ".join(parts)
 
 
 def parameter_findings(result: FitResult) -> list[Finding]:
@@ -161,21 +161,21 @@ def alternative_findings(result: FitResult) -> list[Finding]:
     found = result.uncertainty.alternatives
     if not found:
         return []
-    table = table_of(
-        found,
-        {
-            "fit": lambda item: item.name,
-            "horizon": lambda item: int(item.horizon),
-            "aic_above_the_least": lambda item: float(item.aic),
-            "left_out_vaf": lambda item: float(item.held_out),
-            "the_recordings_say": lambda item: "" if item is found[0] else verdict(found[0], item),
-        },
-    )
+    columns: dict[str, Callable[[Alternative], Any]] = {
+        "fit": lambda item: item.name,
+        "horizon": lambda item: int(item.horizon),
+        "aic_above_the_least": lambda item: float(item.aic),
+        "left_out_vaf": lambda item: float(item.held_out),
+    }
+    if any(item.reason for item in found):
+        columns["note"] = lambda item: item.reason
+    # Burnham and Anderson (2002, 70); all alternatives fit equally many numbers.
     caption = (
         "The same recordings with other horizons and without limit. AIC: difference to the "
-        "smallest. VAF (%): in left-out trials."
+        "smallest; below 2 the recordings do not distinguish two fits, above 10 they rule out the "
+        "worse one. VAF (%): in left-out trials."
     )
-    return [Finding("alternatives", table, caption)]
+    return [Finding("alternatives", table_of(found, columns), caption)]
 
 
 def number_name(plant: Plant, name: str) -> str:
@@ -293,7 +293,7 @@ def response_findings(result: FitResult) -> list[Finding]:
 
 
 def weight_findings(result: FitResult) -> list[Finding]:
-    """Tables of comparisons of cost, ranges of cost weights, and reported weights."""
+    """Tables of comparisons of cost, and of the reported weights."""
     summary, plant = result.uncertainty.weights, result.given.plant
     if summary is None:
         return [weight_finding(result)]
@@ -315,24 +315,7 @@ def weight_findings(result: FitResult) -> list[Finding]:
         f"{summary.drawn} other gains were tried; a comparison is decided if at most one of them "
         "disagrees."
     )
-    found = [Finding("statements", table, caption)]
-    if summary.cost_weights:
-        table = table_of(
-            summary.cost_weights,
-            {
-                "state": lambda item: signal_name(plant, item.state),
-                "low_fitted_gain": lambda item: float(item.low),
-                "high_fitted_gain": lambda item: float(item.high),
-                "low": lambda item: float(item.low_drawn),
-                "high": lambda item: float(item.high_drawn),
-            },
-        )
-        caption = (
-            "Range of the cost of a typical excursion over all weights, at R = 1: with the fitted "
-            "gain, and (95 %) with all gains that the recordings allow."
-        )
-        found.append(Finding("cost_weights", table, caption))
-    return [*found, weight_finding(result)]
+    return [Finding("statements", table, caption), weight_finding(result)]
 
 
 def _verdict(item: Statement) -> str:

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from impc.assess.lack_of_fit import LIMIT
 from impc.assess.printed_gain import LastingResponse, lasting_responses
-from impc.control.named_solver import described
+from impc.checking import replace
 from impc.inverse.minimiser import Ended
 from impc.reporting.document import (
     Block,
@@ -27,7 +27,7 @@ from impc.reporting.document import (
 from impc.reporting.finding import Chart, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import fixed, number, probability
-from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
+from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
 from impc.studies.fit import figures, findings
@@ -50,6 +50,7 @@ from impc.studies.fit.facts import (
     left_out_text,
     limit_ends,
     named_gains,
+    no_limit,
     one_of,
     saturation,
     shares,
@@ -72,7 +73,7 @@ from impc.studies.fit.verdict import (
     little,
 )
 from impc.studies.methods_figure import methods_figure
-from impc.studies.methods_table import methods_finding
+from impc.studies.methods_table import methods_finding, provenance_section
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -111,7 +112,8 @@ def fit_report(
 def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
     """Report for a subject who fell in every trial."""
     verdict = fallen_verdict(falls)
-    sections = [Section("Falls", [Lines(falls)]), _made(provenance)]
+    made = Section("Provenance", [Terms(provenance.terms)])
+    sections = [Section("Falls", [Lines(falls)]), made]
     data = {"falls": falls}
     return Report("Fit report", "fit report", verdict, sections, data=data, provenance=provenance)
 
@@ -205,7 +207,7 @@ def _sections(
         Section("Intent: what the cost weights say", _intent(result, WEIGHTS in no), "Intent"),
         *([Section("Frequency response", _response(result))] if result.response else []),
         Section("Checks", _checks(result, truth)),
-        _made(provenance, result, missing),
+        _made(result, provenance, missing),
     ]
 
 
@@ -263,13 +265,9 @@ def _lasting(result: FitResult, found: LastingResponse) -> str:
 
 
 def _limit(result: FitResult, doubtful: bool) -> list[Block]:
-    limit, (ratio, without) = given_limit(result), unlimited_ratio(result)
-    if limit is None:
-        said = "No limit was given, so the model has none."
-    elif not result.met:
-        said = "These recordings cannot answer this question: the limit is never reached."
-    elif doubtful:
-        said = f"A limit may matter, but {limit} is in doubt (see the warning above)."
+    ratio, without = unlimited_ratio(result)
+    if given_limit(result) is None or not result.met or doubtful:
+        said = no_limit(result)
     elif ratio >= MATTERS:
         said = f"Yes. The same recordings were fitted with and without a limit.{without}"
     else:
@@ -345,9 +343,11 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
         _recordings(result),
         Check(Level.RED if little(result) else Level.GREEN, "Explained variance",
               left_out_text(result)),
-        *_limit_check(result),
+        _limit_check(result),
         _model(result),
-        _weights(result),
+        Check(Level.AMBER if result.weights_test.rejected else Level.GREEN, "Cost weights",
+              f"{'No' if result.weights_test.rejected else 'At least one'} cost explains this "
+              "gain."),
         *_others(result),
     ]  # fmt: skip
     if truth is not None:
@@ -383,49 +383,36 @@ def _recordings(result: FitResult) -> Check:
     return Check(Level.GREEN, "Recordings", f"{used}; no gaps, jumps or unit problems; no fall.")
 
 
-def _limit_check(result: FitResult) -> list[Check]:
-    limit, found = given_limit(result), result.limit_found
-    if limit is None:
-        return [Check(Level.NOTE, "Limit", "No limit was given.")]
-    if not result.met:
-        return [Check(Level.NOTE, "Limit", "Never reached: the recordings cannot check it.")]
-    if found is None:
-        last = result.lack[-1]
-        tested = [one for one in (last.errors if last else ()) if one.name == LIMIT]
+def _limit_check(result: FitResult) -> Check:
+    limit, found, last = given_limit(result), result.limit_found, result.lack[-1]
+    level, said = Level.NOTE, f"Given as {limit}; it was not tested."
+    if limit is None or not result.met:
+        said = no_limit(result)
+    elif found is not None:
+        level = Level.AMBER if found.disagrees else Level.GREEN
+        ends = f"{number(found.value)} {found.unit} ({limit_ends(found)})"
+        said = f"Given as {limit}; the recordings point to {ends}."
+    elif last is not None:
+        tested = [one for one in last.errors if one.name == LIMIT]
         if result.culprit is not None and result.culprit.name == LIMIT:
-            return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
-        if tested and last is not None and not last.alarm:
-            said = f"the residual points to no other ({probability(tested[0].probability)})"
-            return [Check(Level.GREEN, "Limit", f"Given as {limit}; {said}.")]
-        return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not tested.")]
-    said = (
-        f"Given as {limit}; the recordings point to {number(found.value)} {found.unit} "
-        f"({limit_ends(found)})."
-    )
-    return [Check(Level.AMBER if found.disagrees else Level.GREEN, "Limit", said)]
+            level, said = Level.AMBER, "The residual points to another limit."
+        elif tested and not last.alarm:
+            p = probability(tested[0].probability)
+            level = Level.GREEN
+            said = f"Given as {limit}; the residual points to no other ({p})."
+    return Check(level, "Limit", said)
 
 
 def _model(result: FitResult) -> Check:
-    last = result.lack[-1]
+    last, level = result.lack[-1], Level.AMBER
     if last is None:
         said = "Not tested: the recordings are too short, exact, or have gaps. Gains may be wrong."
-        return Check(Level.AMBER, "Body model", said)
-    least = min((one.probability for one in last.errors), default=1.0)
-    if last.alarm:
-        return Check(Level.AMBER, "Body model",
-                     "Part of the residual follows the perturbation; see the warning.")  # fmt: skip
-    return Check(
-        Level.GREEN,
-        "Body model",
-        f"{len(last.errors)} tests found no model error (smallest {probability(least)}).",
-    )
-
-
-def _weights(result: FitResult) -> Check:
-    test = result.weights_test
-    if test.rejected:
-        return Check(Level.AMBER, "Cost weights", "No cost explains this gain.")
-    return Check(Level.GREEN, "Cost weights", "At least one cost explains this gain.")
+    elif last.alarm:
+        said = "Part of the residual follows the perturbation; see the warning."
+    else:
+        level, least = Level.GREEN, min((one.probability for one in last.errors), default=1.0)
+        said = f"{len(last.errors)} tests found no model error (smallest {probability(least)})."
+    return Check(level, "Body model", said)
 
 
 def _others(result: FitResult) -> list[Check]:
@@ -455,22 +442,14 @@ def _others(result: FitResult) -> list[Check]:
     return found
 
 
-def _made(provenance: Provenance, result: FitResult | None = None, missing: str = "") -> Section:
-    terms = list(provenance.terms)
-    if missing:
-        terms.insert(0, ("Not given", missing.removeprefix("Not given: ")))
-    blocks: list[Block] = [Terms(terms)]
-    if result is not None:
-        code = Markup("<code>{}</code>")
-        settings = [
-            (name, code.format(value)) for name, value in plain_settings(result.settings).items()
-        ]
-        problem = result.fitted.problem
-        how = [
-            ("Body", body_sentence(problem.plant)),
-            ("Quadratic programs", f"Solved by {described(problem.solver)}."),
-            ("Terminal set", "yes" if problem.terminal_set else "no"),
-            ("Time of the fit", f"{result.seconds:.1f} s"),
-        ]
-        blocks.append(Fold("All settings", [Terms([*how, *settings])]))
-    return Section("Provenance", blocks)
+def _made(result: FitResult, provenance: Provenance, missing: str) -> Section:
+    found, problem = provenance_section(result.fitted.problem, provenance), result.fitted.problem
+    code, plain = Markup("<code>{}</code>"), plain_settings(result.settings)
+    how = [
+        ("Terminal set", "yes" if problem.terminal_set else "no"),
+        ("Time of the fit", f"{result.seconds:.1f} s"),
+        *((name, code.format(value)) for name, value in plain.items()),
+    ]
+    first = [Terms([("Not given", missing.removeprefix("Not given: "))])] if missing else []
+    fold = Fold("All settings", [Terms(how)])
+    return replace(found, blocks=[*first, *found.blocks, fold])

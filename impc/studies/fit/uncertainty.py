@@ -117,11 +117,6 @@ def _bootstrap(
     return bootstrap_intervals(estimate, found, "block", LEVEL)
 
 
-# Differences of AIC below which models are not distinguished, and above which the worse one has no
-# support (Burnham and Anderson 2002, 70). All alternatives fit equally many numbers.
-_SAME, _RULED_OUT = 2.0, 10.0
-
-
 @dataclass(frozen=True)
 class Alternative:
     """One way to fit the same recordings."""
@@ -157,23 +152,6 @@ def fit_alternatives(
         progress(name)
     least = min(item.aic for item in found)
     return tuple(replace(item, aic=item.aic - least) for item in found)
-
-
-def verdict(one: Alternative, other: Alternative) -> str:
-    """Sentence that compares two alternatives by AIC."""
-    if one.reason or other.reason:
-        failed = one if one.reason else other
-        return f"{failed.name}: no controller ({failed.reason})"
-    better, worse = (one, other) if one.aic <= other.aic else (other, one)
-    distance = worse.aic - better.aic
-    pair = f"{better.name} and {worse.name}"
-    if distance < _SAME:
-        return f"the recordings do not distinguish {pair} (AIC differs by {distance:.1f})"
-    strength = "rule out" if distance > _RULED_OUT else "give weak evidence against"
-    return (
-        f"the recordings {strength} {worse.name} compared with {better.name} (AIC +{distance:.0f}, "
-        f"held-out VAF {worse.held_out - better.held_out:+.2f} points)"
-    )
 
 
 def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:

@@ -50,7 +50,7 @@ def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
     found = data(result)
     assert np.max(result.inverse_mpc.vaf) < 50
     assert found["usable"] is False
-    assert not {"gain", "directions", "cost_weights"} & set(found["findings"])
+    assert not {"gain", "directions", "statements"} & set(found["findings"])
     assert fit_verdict(result).level is Level.RED
     assert found["verdict"]["level"] == "red"
     assert data(fitted())["usable"] is True
@@ -65,7 +65,7 @@ def test_no_weights_is_said_before_any_weights() -> None:
     assert WEIGHTS in forbidden(result)
     assert np.min(result.gain_shares) > 99
     assert f"{result.gain_shares[0]:.0f} %" in verdict.may[0].why
-    assert "cost_weights" not in data(result)["findings"]
+    assert "statements" not in data(result)["findings"]
     assert not fitted().weights_test.rejected
 
 
