@@ -11,11 +11,10 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.profiles import profile_likelihood
-from impc.errors import InputError
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.first import FitProgress
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.uncertainty import fit_alternatives
 from tests.assess.cart_fits import cart_fit, cart_problem
@@ -87,20 +86,6 @@ def test_aic_is_that_of_the_innovations() -> None:
     # The estimated coefficient of white residuals is not exactly zero.
     assert np.max(np.abs(differences)) < 0.05 * np.max(expected - np.min(expected)) + 1.0
     assert all(np.isnan(item.held_out) for item in found)
-
-
-@pytest.mark.parametrize(
-    ("table", "match"),
-    [
-        ({"replicates": 5}, "at least 20"),
-        ({"replicates": -1}, "at least 0"),
-        ({"horizons": [0]}, "horizons"),
-        ({"bootstrap": "block"}, "is not a setting"),
-    ],
-)
-def test_settings_are_checked(table: dict[str, object], match: str) -> None:
-    with pytest.raises(InputError, match=match):
-        fit_settings(table)
 
 
 def test_profiles_of_two_inputs_end_where_deviations_say() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -228,14 +227,3 @@ def test_little_is_called_little(vaf: float) -> None:
     verdict = fit_verdict(result)
     assert (verdict.level is Level.RED) == (vaf < 50)
     assert ("less than half" in verdict.headline) == (vaf < 50)
-
-
-def test_every_page_of_a_fit_has_its_parts() -> None:
-    """One h1 heading, a text for each figure, no URLs, small size."""
-    page = fit_report(fitted(1.0), Provenance(), np.array([[2.0, 1.0]])).page()
-    assert page.count("<h1") == 1
-    pictures = re.findall(r"<svg class.*?>(.*?)</title>", page, flags=re.DOTALL)
-    assert len(pictures) > 6
-    assert all(text.startswith("<title") and len(text) > 30 for text in pictures)
-    assert not re.search(r"https?://", page)
-    assert len(page) < 800_000
