@@ -46,6 +46,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.assess.assessments import ASSESSMENTS
 from impc.assess.intent import dominant_sentence
 from impc.assess.printed_gain import lasting_responses
 from impc.model.riccati import solve_lqr
@@ -96,8 +97,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
 def _controller(result: FitResult) -> dict[str, Any]:
     plant, fitted = result.fitted.problem.plant, result.fitted
     weights, bounds = result.intent.reported.weights, result.given.bounds
-    held = np.array([item.vaf for item in result.held_out])
-    left_out = np.mean(held, axis=0) if len(held) else [None] * len(plant.outputs)
+    left_out = ASSESSMENTS["held_out_vaf"].find(result.inverse_mpc)
     return problem_data(fitted.problem, result.methods) | {
         "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
         "held_out_vaf": dict(zip(plant.outputs, left_out, strict=True)),
@@ -146,7 +146,7 @@ def _intent(result: FitResult) -> dict[str, Any]:
 
 def _trial(result: FitResult, index: int) -> dict[str, Any]:
     trial, found = result.given.recordings[index], result.trials[index]
-    held = result.held_out[index] if result.held_out else None
+    held = result.inverse_mpc.held_out
     return {
         **asdict(trial.label),
         "samples": trial.samples,
@@ -158,6 +158,5 @@ def _trial(result: FitResult, index: int) -> dict[str, Any]:
         "rms_residual": found.rms,
         "saturated": found.saturated,
         "x0": result.fitted.problem.recordings[index].x0,
-        "held_out_vaf": None if held is None else held.vaf,
-        "held_out_centred_vaf": None if held is None else held.centred_vaf,
+        "held_out_vaf": held[index] if len(held) else None,
     }

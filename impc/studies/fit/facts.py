@@ -44,6 +44,11 @@ class GainRow(NamedTuple):
         return between(self.low, self.high)
 
     @property
+    def text(self) -> str:
+        """The gain with its interval, in words."""
+        return f"{number(self.value)} {self.unit} for {self.per} (95 % CI {self.ends})"
+
+    @property
     def determined(self) -> bool:
         """Whether it may be reported (`Interval.determined`)."""
         return self.interval.determined
@@ -126,16 +131,13 @@ def enough_words(result: FitResult) -> str:
 
 def first_gain(result: FitResult) -> GainRow | None:
     """The first entry that may be reported; None if there is none."""
-    rows = [row for _, row in named_gains(result) if row.determined]
-    return rows[0] if rows else None
+    return next((row for _, row in named_gains(result) if row.determined), None)
 
 
 def example_gain(result: FitResult) -> str:
     """Sentence with one gain and its interval as an example."""
     row = first_gain(result)
-    if row is None:
-        return ""
-    return f"For example {number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})."
+    return "" if row is None else f"For example {row.text}."
 
 
 def outside_offset(result: FitResult) -> str:
@@ -216,11 +218,6 @@ def shift_words(result: FitResult) -> list[str]:
     return said
 
 
-def saturation(result: FitResult) -> float:
-    """Time at the limit, %."""
-    return 100 * result.saturated
-
-
 def shares(result: FitResult, values: Array, digits: int = 2) -> str:
     """VAF (p,) with output names: 99.99 % (seat tilt) and 99.98 % (trunk tilt)."""
     plant = result.given.plant
@@ -234,8 +231,8 @@ def shares(result: FitResult, values: Array, digits: int = 2) -> str:
 
 def held_out(result: FitResult) -> Array | None:
     """Mean VAF of left-out trials (p,); None if there are none."""
-    held = [one.vaf for one in result.held_out]
-    return np.mean(held, axis=0) if held else None
+    each = result.inverse_mpc.held_out
+    return np.mean(each, axis=0) if len(each) else None
 
 
 def left_out_text(result: FitResult) -> str:
@@ -244,11 +241,6 @@ def left_out_text(result: FitResult) -> str:
     if held is None:
         return f"{shares(result, result.inverse_mpc.vaf)} of the variance, in fitted trials."
     return f"{shares(result, held)} of the variance in left-out trials."
-
-
-def shares_text(result: FitResult) -> str:
-    """VAF in fitted trials."""
-    return f"{shares(result, result.inverse_mpc.vaf, 0)} of the variance"
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:

@@ -230,7 +230,8 @@ def agreement_finding(result: FitResult) -> Finding:
     for index, trial in enumerate(result.trials):
         row: dict[str, object] = {"trial": trial_name(result, index)}
         row["length_s"] = result.given.recordings[index].samples * plant.dt
-        held = result.held_out[index].vaf if result.held_out else np.full(len(trial.vaf), np.nan)
+        each = result.inverse_mpc.held_out
+        held = each[index] if len(each) else np.full(len(trial.vaf), np.nan)
         for column, name in enumerate(plant.outputs):
             words = signal_name(plant, name)
             for key, label, value in (

@@ -52,7 +52,6 @@ from impc.studies.fit.facts import (
     named_gains,
     no_limit,
     one_of,
-    saturation,
     shares,
     shift_words,
     statement_text,
@@ -155,7 +154,7 @@ def _keys(result: FitResult) -> list[Key]:
     elif given_limit(result) and result.met:
         each = [100 * one.saturated for one in result.trials]
         keys.append(
-            Key(f"{saturation(result):.1f}", "% of the time", "at the limit",
+            Key(f"{100 * result.saturated:.1f}", "% of the time", "at the limit",
                 f"{min(each):.1f} to {max(each):.1f} % in single trials")
         )  # fmt: skip
     else:

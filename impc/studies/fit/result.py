@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
+    from impc.assess.variance_accounted_for import TrialAgreement
     from impc.assess.weights_ranges import Statement
     from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate, Identifiability
@@ -92,8 +92,6 @@ class FitResult:
 
     settings: FitSettings
     given: Problem  # Problem as posed: nominal plant, trials at rest
-    # Weights and their gain; `fitted.problem` holds the fitted initial states and plant
-    fitted: Estimate
     # Gain fitted without weights, with standard errors; the report prints its intervals
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
@@ -103,8 +101,7 @@ class FitResult:
     # Intervals, the set of weights with this gain, and other requested analyses
     uncertainty: Uncertainty
     trials: tuple[TrialAgreement, ...]  # Inverse MPC, one per trial
-    held_out: tuple[HeldOut, ...]  # One per trial; empty for a single trial or if not requested
-    # Requested methods; the last is inverse MPC
+    # Requested methods; the last is inverse MPC, with the VAF of left-out trials if requested
     methods: tuple[MethodFit, ...]
     # Tests of the model in the first fit and, if an unknown was added, in the last
     lack: tuple[LackOfFit | None, ...]
@@ -202,6 +199,11 @@ class FitResult:
     def inverse_mpc(self) -> MethodFit:
         """The fit by inverse MPC."""
         return self.methods[-1]
+
+    @property
+    def fitted(self) -> Estimate:
+        """Weights and their gain; its problem holds the fitted initial states and plant."""
+        return self.inverse_mpc.estimate
 
 
 def trial_name(result: FitResult, index: int) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from impc.assess.assessments import ASSESSMENTS
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.structured_weights import IDENTIFIED_FACTOR
 from impc.assess.variance_accounted_for import innovation_roots, innovations_criterion
@@ -188,8 +189,8 @@ def _comparison(result: FitResult) -> Finding:
     identified = int(np.count_nonzero(result.estimate.covariance.identified))
     free = innovations_criterion(result.fitted, innovation_roots(result.fitted), identified)
     least = min([free, *(item.aic for item in result.structures)])
-    held = [item.vaf for item in result.held_out]
-    left_out = np.mean(held, axis=0) if held else np.full(len(plant.outputs), np.nan)
+    left_out = ASSESSMENTS["held_out_vaf"].find(result.inverse_mpc)
+    held = not np.all(np.isnan(left_out))
     rows = [("weights of any kind", result.identifiability.free, identified,
              *result.inverse_mpc.vaf, *left_out, free - least, np.nan, "")]  # fmt: skip
     for item in result.structures:

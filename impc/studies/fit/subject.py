@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from impc.assess.intent import Intent
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
+    from impc.assess.variance_accounted_for import TrialAgreement
     from impc.assess.weights_ranges import WeightsSummary
     from impc.assess.weights_test import WeightsTest
     from impc.control.simulation import Simulation
@@ -120,23 +120,19 @@ def fit_recordings(
         whole: tuple[WeightsSummary | None, str] = None, "Not computed in a cohort."
         if not alone:
             whole = _weights(estimate, own, intended, test, settings, progress, pool)
-        held_out = pending()
-    if held_out:
-        own = replace(own, held_out=frozen([one.vaf for one in held_out]))
+        own = replace(own, held_out=pending())
     structures = _structures(problem, settings, fitted, progress, alone=alone)
     uncertainty = assess(problem, fitted, estimate, whole, settings, progress)
     person = functools.partial(_person, problem, settings, fitted, progress)
     return FitResult(
         settings=settings,
         given=problem,
-        fitted=fitted,
         estimate=estimate,
         parameters=_parameters(estimate),
         intent=intended,
         identifiability=identifiability(known, weights),
         uncertainty=uncertainty if usable or alone else replace(uncertainty, intervals=()),
         trials=_agreements(known, own.runs, problem.bounds),
-        held_out=held_out,
         methods=(*others, own),
         lack=lack,
         weights_test=test,
@@ -172,8 +168,8 @@ def _left_out(
     pool: ThreadPoolExecutor,
     *,
     free: bool,
-) -> Callable[[], tuple[HeldOut, ...]]:
-    """Submit the prediction of each trial from the others; call the result to wait for all."""
+) -> Callable[[], Array]:
+    """Submit the predictions of trials from the others; call the result for their VAF (., p)."""
     predict = functools.partial(left_out, fitted, estimate, settle=settings.settle, free=free)
     names = [f"without trial {k + 1}" for k in range(_leaves_out(fitted.problem, settings))]
     pending = [
@@ -181,14 +177,14 @@ def _left_out(
         for k, name in enumerate(names)
     ]
 
-    def found() -> tuple[HeldOut, ...]:
+    def found() -> Array:
         held = []
         for name, other in zip(names, pending, strict=True):
-            held.append(other.result())
+            one = other.result()
+            held += [] if one is None else [one.vaf]
             progress.done(name)
-        return (
-            () if any(one is None for one in held) else tuple(held)
-        )  # rows for all trials or for none
+        complete = held and len(held) == len(names)  # rows for all trials or for none
+        return frozen(held if complete else np.empty((0, len(fitted.problem.plant.outputs))))
 
     return found
 

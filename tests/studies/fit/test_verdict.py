@@ -111,7 +111,8 @@ def test_an_unconfirmed_gain_at_no_minimum_is_said(
 ) -> None:
     result = explained()
     fit = replace(result.fitted, fit=replace(result.fitted.fit, unconfirmed=unconfirmed))
-    result = replace(result, fitted=fit, estimate=replace(result.estimate, ended=ended))
+    methods = (*result.methods[:-1], replace(result.inverse_mpc, estimate=fit))
+    result = replace(result, methods=methods, estimate=replace(result.estimate, ended=ended))
     page = fit_report(result, Provenance()).page()
     assert ("did not end at a minimum, and no search from another start confirmed" in page) == said
 
