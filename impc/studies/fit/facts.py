@@ -201,6 +201,13 @@ def shift_halves(result: FitResult) -> dict[str, Array]:
     return dict(zip(names, found, strict=True)) if found.size else {}
 
 
+def shifted(plant: Plant, name: str, much: str, *, late: bool) -> str:
+    """What a time shift means for the recording of a signal."""
+    if name in plant.disturbances:
+        return f"acts {much} {'later' if late else 'earlier'} than recorded"
+    return f"is recorded {much} too {'late' if late else 'early'}"
+
+
 def shift_words(result: FitResult) -> list[str]:
     """Sentences on signals whose time shift differs from zero in a trial."""
     plant, halves, said = result.given.plant, shift_halves(result), []
@@ -209,11 +216,9 @@ def shift_words(result: FitResult) -> list[str]:
             continue
         value, half = 1e3 * float(np.mean(values)), 1e3 * float(np.mean(halves[name]))
         ends = f"{abs(value):.2g} ms ({max(abs(value) - half, 0):.2g} to {abs(value) + half:.2g})"
-        push = name in plant.disturbances
-        late = ("later" if push else "late") if value > 0 else ("earlier" if push else "early")
-        how = f"acts {ends} {late} than recorded" if push else f"is recorded {ends} {late}"
         differ = float(np.ptp(values)) > 2 * float(np.max(halves[name]))
         each = " on average; trials differ (see the table of errors)" if differ else ""
+        how = shifted(plant, name, ends, late=value > 0)
         said.append(f"The {signal_name(plant, name)} {how}{each}.")
     return said
 

@@ -120,24 +120,24 @@ class FitResult:
     @property
     def limit_found(self) -> LimitFound | None:
         """Estimated limit of the first input that has one; None if not estimated."""
-        for control, item in zip(self.given.plant.controls, self.uncertainty.limits, strict=False):
-            if item.value is not None:
-                given = float(self.given.bounds.u_max[self.given.plant.controls.index(control)])
-                return self._limit(control, given, item.value, item.low, item.high)
-        for one in self.parameters:
-            kind, _, control = one.name.partition(".")
-            if kind == LIMIT and (one.stated is None or one.deviation < one.stated / 2):
-                half = TWO_SIDED * one.deviation
-                return self._limit(control, one.nominal, one.value, one.value - half,
-                                   one.value + half)  # fmt: skip
+        plant = self.given.plant
+        for k, control in enumerate(plant.controls):
+            name, given = f"{LIMIT}.{control}", float(self.given.bounds.u_max[k])
+            stated = next((one for one in self.parameters if one.name == name), None)
+            item, known = self.preferred.get(name), 0.0
+            if item is not None and item.value is not None:
+                ends = item.value, item.low, item.high
+            elif stated is not None and stated.deviation < (stated.stated or np.inf) / 2:
+                half, given = TWO_SIDED * stated.deviation, stated.nominal
+                ends = stated.value, stated.value - half, stated.value + half
+            else:
+                continue
+            if stated is not None and self.added is None:
+                known = stated.stated or 0.0
+            factor, unit = shown_unit(plant, control)
+            value, low, high = (factor * one for one in ends)
+            return LimitFound(factor * given, value, low, high, unit, TWO_SIDED * factor * known)
         return None
-
-    def _limit(self, control: str, *numbers: float) -> LimitFound:
-        factor, unit = shown_unit(self.given.plant, control)
-        stated = {one.name: one.stated or 0.0 for one in self.parameters}
-        known = 0.0 if self.added is not None else stated.get(f"{LIMIT}.{control}", 0.0)
-        given, value, low, high = (factor * one for one in numbers)
-        return LimitFound(given, value, low, high, unit, TWO_SIDED * factor * known)
 
     @property
     def usable(self) -> bool:

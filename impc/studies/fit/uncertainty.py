@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from impc.arrays import Array
-    from impc.assess.input_limits import LimitEstimate
     from impc.assess.printed_gain import GainEstimate
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
@@ -47,7 +46,6 @@ class Uncertainty:
     # Set of weights with the fitted gain; None if its programs fail
     weights: WeightsSummary | None
     weights_reason: str  # Why there is none; otherwise empty
-    limits: tuple[LimitEstimate, ...]  # One per input, if requested
     # The fit itself, no limit, other horizons; empty unless requested
     alternatives: tuple[Alternative, ...]
 
@@ -82,12 +80,10 @@ def assess(
         profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
         intervals += [] if profile is None else [profile]
         done(stage)
-    limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
         name = problem.plant.controls[control]
         limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
         if limit is not None:
-            limits.append(limit)
             ends = limit.value, limit.low, limit.high
             intervals.append(Interval(f"u_max.{name}", "profile", LEVEL, *ends))
         done(f"limit of {name}")
@@ -98,7 +94,7 @@ def assess(
         alternatives = attempt("other horizons", others, ())
     replicates = functools.partial(_bootstrap, estimate, settings, progress)
     intervals += attempt("bootstrap", replicates, ())
-    return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
+    return Uncertainty(tuple(intervals), *weights, alternatives)
 
 
 def _bootstrap(
