@@ -20,8 +20,7 @@ from impc.control.feasibility import require_complete
 from impc.control.named_solver import COMPILED
 from impc.control.simulation import Simulation, scenario
 from impc.inverse.problem import Problem
-from impc.inverse.proximal_search import AUXILIARY_CONDITION_WEIGHT
-from impc.inverse.table31 import CONDITION_WEIGHT, table_3_1
+from impc.inverse.table31 import table_3_1
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights, weight_error
@@ -51,14 +50,6 @@ HORIZON = 3
 STEPS = 20
 #: Largest magnitude of the input.
 BOUND = 1.0
-#: Settings of the example by their names on the page and in result.json.
-SETTINGS: dict[str, float] = {
-    "horizon": HORIZON,
-    "steps": STEPS,
-    "input_bound": BOUND,
-    "condition_weight": CONDITION_WEIGHT,
-    "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
-}
 #: Sentences on the dissertation's own plant.
 LOST = (
     "The dissertation's own plant, initial state and limit are not available. This plant replaces "

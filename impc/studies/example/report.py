@@ -15,7 +15,7 @@ from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.style import HALF
 from impc.reporting.verdict import Key, Verdict
-from impc.studies.example.cases import BOUND, EXAMPLE, LOST, SETTINGS, distance, true_weights
+from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights
 from impc.studies.fit.figures import movement_figure
 from impc.studies.methods_figure import methods_figure
 from impc.studies.methods_table import (
@@ -30,7 +30,6 @@ from impc.studies.methods_table import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from impc.model.weights import Weights
     from impc.reporting.provenance import Provenance
     from impc.studies.example.cases import CaseResult
 
@@ -202,21 +201,19 @@ def example_data(cases: Sequence[CaseResult], provenance: Provenance) -> dict[st
     plant = cases[0].controller.plant
     return {
         "plant": {"name": provenance.plant_name, "A": plant.A, "B": plant.B, "dt": plant.dt},
-        "settings": SETTINGS,
         "solver": cases[0].controller.solver,
         "cases": {case.name: _case(case) for case in cases},
     }
 
 
 def _case(case: CaseResult) -> dict[str, Any]:
-    found = case.identifiability
+    found, true = case.identifiability, true_weights(case.controller.plant)
     named = ("free", "rank", "chosen", "singular_values", "tolerance")
-    others = [{**_weights(item.weights), "misfit": item.misfit} for item in found.others]
-    own = {**_weights(true_weights(case.controller.plant)), "K": case.controller.K}
     return {
         "x0": case.truth.x[0],
         "branch": case.branch,
-        "truth": {**own, "x": case.truth.x, "u": case.truth.u},
+        "truth": {"Q": true.Q, "R": true.R, "condition_number": condition_number(true),
+                  "K": case.controller.K, "x": case.truth.x, "u": case.truth.u},
         "methods": {
             fit.name: {
                 **methods_data([fit])[fit.name],
@@ -225,9 +222,5 @@ def _case(case: CaseResult) -> dict[str, Any]:
             }
             for fit in case.methods
         },
-        "identifiability": {name: getattr(found, name) for name in named} | {"others": others},
-    }
-
-
-def _weights(weights: Weights) -> dict[str, Any]:
-    return {"Q": weights.Q, "R": weights.R, "condition_number": condition_number(weights)}
+        "identifiability": {name: getattr(found, name) for name in named},
+    }  # fmt: skip

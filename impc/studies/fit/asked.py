@@ -131,15 +131,6 @@ def require_dressed(plant: Plant, settings: FitSettings) -> None:
             raise InputError(f"[fit] {name}", "is set, but the plant was made without it", remedy)
 
 
-def moving_body(
-    plant: Plant, family: PlantFamily | None, settings: FitSettings
-) -> tuple[Plant, PlantFamily | None]:
-    """Plant and family with the equations of motion that [fit] body selects."""
-    if settings.body != "linear":
-        return plant, family
-    return plant.linear(), None if family is None else family.linear()
-
-
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
     """Bounds of the controller: inputs from the settings, states from settings or data (3.22)."""
     x_max = np.full(plant.n, np.inf)
@@ -234,7 +225,8 @@ def fit_problem(
             "use longer trials, or lower [fit] settle",
         )
     require_dressed(plant, settings)
-    plant, family = moving_body(plant, family, settings)
+    if settings.body == "linear":
+        plant, family = plant.linear(), None if family is None else family.linear()
     posed = Problem(
         plant,
         fit_bounds(plant, settings, recordings),

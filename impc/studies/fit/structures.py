@@ -189,23 +189,22 @@ def _comparison(result: FitResult) -> Finding:
     identified = int(np.count_nonzero(result.estimate.covariance.identified))
     free = innovations_criterion(result.fitted, innovation_roots(result.fitted), identified)
     least = min([free, *(item.aic for item in result.structures)])
-    left_out = ASSESSMENTS["held_out_vaf"].find(result.inverse_mpc)
-    held = not np.all(np.isnan(left_out))
-    rows = [("weights of any kind", result.identifiability.free, identified,
-             *result.inverse_mpc.vaf, *left_out, free - least, np.nan, "")]  # fmt: skip
+    held = len(result.inverse_mpc.held_out) > 0  # else of the fitted trials
+    name = "held_out_vaf" if held else "vaf"
+    own = ASSESSMENTS[name].find(result.inverse_mpc)
+    rows = [("weights of any kind", result.identifiability.free, identified, *own, free - least,
+             np.nan, "")]  # fmt: skip
     for item in result.structures:
-        test, said = item.test, item.reason
+        test, said, vaf = item.test, item.reason, item.held_out if held else item.vaf
         p = np.nan if test is None or not test.freedom else test.probability
         if test is not None:
             said = "rejected" if test.refused else "not rejected" if test.freedom else "not tested"
-        rows.append((item.structure.name, item.structure.count, item.identified, *item.vaf,
-                     *item.held_out, item.aic - least, p, said))  # fmt: skip
-    kinds = {"vaf": "VAF of", "left_out_vaf": "Left-out VAF of"}
-    labels = {
-        f"{kind}_{name}": f"{words} {words_of(plant, name)} (%)"
-        for kind, words in kinds.items()
-        for name in plant.outputs
-    }
+        structure = item.structure
+        rows.append((structure.name, structure.count, item.identified, *vaf, item.aic - least, p,
+                     said))  # fmt: skip
+    kind = "left_out_vaf" if held else "vaf"
+    words = "Left-out VAF of" if held else "VAF of"
+    labels = {f"{kind}_{name}": f"{words} {words_of(plant, name)} (%)" for name in plant.outputs}
     heads = ["structure", "unknowns", "identified", *labels, "aic_above_the_least", "p", "test"]
     return Finding(
         "structures",
@@ -214,5 +213,4 @@ def _comparison(result: FitResult) -> Finding:
         "from the innovations of the residuals, with a penalty of two for each identified "
         "combination.",
         labels={**labels, "aic_above_the_least": "AIC above the smallest"},
-        hidden=[name for name in labels if name.startswith("vaf" if held else "left_out")],
     )

@@ -32,7 +32,7 @@ from impc.inverse.structured import fit_structured
 from impc.studies.fit.asked import fit_structures, output_feedback
 from impc.studies.fit.first import FitProgress, first_fits
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
-from impc.studies.fit.uncertainty import assess, count_stages
+from impc.studies.fit.uncertainty import assess
 from impc.studies.pool import threads
 
 if TYPE_CHECKING:
@@ -59,13 +59,16 @@ _UNUSABLE = "the controller explains less than half of a recorded signal (VAF be
 
 def stages(problem: Problem, settings: FitSettings) -> int:
     """Number of stages that `fit_recordings` reports."""
-    structures = (settings.structure is not None) + len(settings.structures)
-    models = 0
+    count = 2 + len(_beside(settings)) + _leaves_out(problem, settings)  # 2: fit, set of weights
+    count += (settings.structure is not None) + len(settings.structures)
     if settings.observer is not None:
         feedback = output_feedback()
-        models = len(feedback.persons(problem, *_asked(problem, settings.observer))) + 1
-    others = structures + models + count_stages(problem, settings)
-    return 1 + len(_beside(settings)) + _leaves_out(problem, settings) + others
+        count += len(feedback.persons(problem, *_asked(problem, settings.observer))) + 1
+    count += settings.replicates + len(settings.profiles)
+    count += problem.plant.m if settings.unknown_limit else 0
+    others = [length for length in settings.horizons if length != problem.horizon]
+    limited = int(np.any(np.isfinite(problem.bounds.u_max)))
+    return count + (1 + limited + len(others) if settings.horizons else 0)
 
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:

@@ -50,19 +50,6 @@ class Uncertainty:
     alternatives: tuple[Alternative, ...]
 
 
-def count_stages(problem: Problem, settings: FitSettings) -> int:
-    """Number of stages that `assess` reports, and one for the set of weights."""
-    limited = int(np.any(np.isfinite(problem.bounds.u_max)))
-    others = [length for length in settings.horizons if length != problem.horizon]
-    return (
-        1
-        + settings.replicates
-        + len(settings.profiles)
-        + (problem.plant.m if settings.unknown_limit else 0)
-        + (1 + limited + len(others) if settings.horizons else 0)
-    )
-
-
 def assess(
     problem: Problem,
     fitted: Estimate,

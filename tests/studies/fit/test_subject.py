@@ -208,23 +208,6 @@ def test_a_memory_of_another_fit_is_not_used(
         assert not kept_names(open_memory(tmp_path, problem, settings))
 
 
-def unwanted() -> Estimate:
-    raise AssertionError("computed again")
-
-
-def test_a_remembered_controller_is_the_same(
-    small: tuple[Problem, FitSettings], tmp_path: Path
-) -> None:
-    problem, settings = small
-    found = fit_controller(problem)
-    open_memory(tmp_path, problem, settings).estimate("inverse_mpc", lambda: found)
-    again = open_memory(tmp_path, problem, settings).estimate("inverse_mpc", unwanted)
-    np.testing.assert_array_equal(again.gain, found.gain)
-    assert (again.misfit, again.noise, again.status) == (found.misfit, found.noise, found.status)
-    for one, other in zip(again.problem.recordings, found.problem.recordings, strict=True):
-        np.testing.assert_array_equal(one.x0, other.x0)
-
-
 def test_what_cannot_be_fitted_is_said() -> None:
     plant = cart()
     with pytest.raises(DataError, match="the list is empty"):
@@ -285,3 +268,6 @@ def test_what_is_kept_has_the_body_that_was_found(tmp_path: Path) -> None:
         assert not np.array_equal(one.problem.plant.A, person.problem.plant.A)
         np.testing.assert_array_equal(again[name].problem.plant.A, one.problem.plant.A)
         np.testing.assert_array_equal(again[name].gain, one.gain)
+        np.testing.assert_array_equal(again[name].problem.starts, one.problem.starts)
+        kept = again[name]
+        assert (kept.misfit, kept.noise, kept.status) == (one.misfit, one.noise, one.status)
