@@ -11,6 +11,7 @@ from impc.assess.printed_gain import entry_names, follows_command
 from impc.reporting.rendering import fixed, number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.result import LITTLE
+from impc.studies.methods_figure import explained
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -242,10 +243,8 @@ def held_out(result: FitResult) -> Array | None:
 
 def left_out_text(result: FitResult) -> str:
     """VAF in left-out trials if there are any, else in fitted trials."""
-    held = held_out(result)
-    if held is None:
-        return f"{shares(result, result.inverse_mpc.vaf)} of the variance, in fitted trials."
-    return f"{shares(result, held)} of the variance in left-out trials."
+    where = ", in fitted trials" if held_out(result) is None else " in left-out trials"
+    return f"{shares(result, explained(result.inverse_mpc))} of the variance{where}."
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:

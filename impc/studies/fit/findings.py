@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.assess.weights_ranges import Statement
     from impc.model.plant import Plant
     from impc.studies.fit.facts import GainRow
     from impc.studies.fit.result import FitResult
@@ -302,7 +301,13 @@ def weight_findings(result: FitResult) -> list[Finding]:
         sorted(summary.statements, key=lambda item: (not item.made, item.holds is None)),
         {
             "comparison": lambda item: statement_text(plant, item),
-            "verdict": _verdict,
+            "verdict": lambda item: (
+                "undecided: weights with the fitted gain differ"
+                if item.holds is None
+                else "decided"
+                if item.made
+                else "undecided: other possible gains differ"
+            ),
             "other_gains_that_agree_percent": lambda item: (
                 np.nan if item.confidence is None else 100 * float(item.confidence)
             ),
@@ -317,12 +322,6 @@ def weight_findings(result: FitResult) -> list[Finding]:
         "disagrees."
     )
     return [Finding("statements", table, caption), weight_finding(result)]
-
-
-def _verdict(item: Statement) -> str:
-    if item.holds is None:
-        return "undecided: weights with the fitted gain differ"
-    return "decided" if item.made else "undecided: other possible gains differ"
 
 
 def weight_finding(result: FitResult) -> Finding:

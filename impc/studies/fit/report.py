@@ -71,7 +71,7 @@ from impc.studies.fit.verdict import (
     forbidden,
     little,
 )
-from impc.studies.methods_figure import methods_figure
+from impc.studies.methods_figure import explained, methods_figure
 from impc.studies.methods_table import methods_finding, provenance_section
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def _hero(result: FitResult, index: int) -> Picture:
 
 def _keys(result: FitResult) -> list[Key]:
     plant, held = result.given.plant, held_out(result)
-    vaf = result.inverse_mpc.vaf if held is None else held
+    vaf = explained(result.inverse_mpc)
     names = [signal_name(plant, name) for name in plant.outputs]
     others = "; ".join(
         f"{name} {value:.2f} %" for name, value in zip(names[1:], vaf[1:], strict=True)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from impc.assess.assessments import ASSESSMENTS
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.structured_weights import IDENTIFIED_FACTOR
 from impc.assess.variance_accounted_for import innovation_roots, innovations_criterion
@@ -16,6 +15,7 @@ from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import probability
 from impc.reporting.shown_units import words_of
 from impc.studies.fit.facts import shares
+from impc.studies.methods_figure import explained
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -189,9 +189,7 @@ def _comparison(result: FitResult) -> Finding:
     identified = int(np.count_nonzero(result.estimate.covariance.identified))
     free = innovations_criterion(result.fitted, innovation_roots(result.fitted), identified)
     least = min([free, *(item.aic for item in result.structures)])
-    held = len(result.inverse_mpc.held_out) > 0  # else of the fitted trials
-    name = "held_out_vaf" if held else "vaf"
-    own = ASSESSMENTS[name].find(result.inverse_mpc)
+    own, held = explained(result.inverse_mpc), len(result.inverse_mpc.held_out) > 0
     rows = [("weights of any kind", result.identifiability.free, identified, *own, free - least,
              np.nan, "")]  # fmt: skip
     for item in result.structures:
