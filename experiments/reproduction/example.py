@@ -184,9 +184,10 @@ def example_entries(evidence: Evidence) -> list[Entry]:
     methods = case["methods"]
     gain, mpc = methods["feedback_gain"], methods["inverse_mpc"]
     gradient, output = methods["inverse_lqr_gradient"], methods["inverse_lqr_output"]
-    auxiliary, truth = methods["inverse_lqr_auxiliary"], methods["truth"]
+    auxiliary, truth = methods["inverse_lqr_auxiliary"], case["truth"]
     saturated = sum(abs(abs(u[0]) - BOUND) < 1e-9 for u in truth["u"])
-    residuals = {name: it["residual"] for name, it in methods.items() if "residual" in it}
+    residuals = {name: it["distance"] for name, it in methods.items() if it["distance"] is not None}
+    largest = {name: it["largest_input"]["u"] for name, it in methods.items()}
     least_lqr = min(value for name, value in residuals.items() if "lqr" in name)
     return [
         _stand_in("(3.8)", "An unstable discrete plant.", "Spectral radius 1.18."),
@@ -222,16 +223,16 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             "Inverse MPC estimated the weights accurately; its residual is below that of inverse"
             " LQR.",
             ("impc.inverse.table31:inverse_mpc",),
-            f"Residual {mpc['residual']:.1e}; the least of inverse LQR is {least_lqr:.2g}."
+            f"Residual {mpc['distance']:.1e}; the least of inverse LQR is {least_lqr:.2g}."
             " The recording determines two of three directions, the condition number chose the"
             " third, which falls on the truth because Q = I has the least there is.",
-            agrees(mpc["residual"] < 1e-6 < least_lqr),
+            agrees(mpc["distance"] < 1e-6 < least_lqr),
         ),
         Entry(
             "(3.16)",
             "Inverse LQR with the penalty on outputs in place of gains.",
             ("impc.inverse.table31:inverse_mpc",),
-            f"Misfit of the states {output['state_misfit']:.3f}.",
+            f"Misfit of the states {output['misfit']:.3f}.",
             Verdict.IN_KIND,
             "Weights w1, w2 and c are lost.",
         ),
@@ -243,30 +244,30 @@ def example_entries(evidence: Evidence) -> list[Entry]:
         Entry(
             "Figure 3.2",
             "States and control with the estimated gain against the reference.",
-            ("impc.studies.example.figures",),
-            f"Good states (misfit {gain['state_misfit']:.3f}); largest |u|"
-            f" {gain['max_abs_u']:.3f} against {BOUND:g}.",
-            kind(gain["max_abs_u"] > BOUND),
+            ("impc.studies.fit.figures:movement_figure",),
+            f"Good states (misfit {gain['misfit']:.3f}); largest |u|"
+            f" {largest['feedback_gain']:.3f} against {BOUND:g}.",
+            kind(largest["feedback_gain"] > BOUND),
             _LOST_SYSTEM,
-            "example/figures/comparison-case-A.svg",
+            "example/figures/feedback_gain-case-A.svg",
         ),
         Entry(
             "Figure 3.3",
             "States and control of inverse MPC: a perfect fit.",
-            ("impc.studies.example.figures",),
-            f"Misfit {mpc['state_misfit']:.0e}.",
-            kind(mpc["state_misfit"] < 1e-9),
+            ("impc.studies.fit.figures:movement_figure",),
+            f"Misfit {mpc['misfit']:.0e}.",
+            kind(mpc["misfit"] < 1e-9),
             _LOST_SYSTEM,
-            "example/figures/comparison-case-A.svg",
+            "example/figures/inverse_mpc-case-A.svg",
         ),
         Entry(
             "Figure 3.4",
             "States and control of (3.16): worse than figure 3.2.",
-            ("impc.studies.example.figures",),
-            f"Misfit {output['state_misfit']:.3f} against {gain['state_misfit']:.3f}.",
-            kind(output["state_misfit"] > gain["state_misfit"]),
+            ("impc.studies.fit.figures:movement_figure",),
+            f"Misfit {output['misfit']:.3f} against {gain['misfit']:.3f}.",
+            kind(output["misfit"] > gain["misfit"]),
             _LOST_SYSTEM,
-            "example/figures/comparison-case-A.svg",
+            "example/figures/inverse_lqr_output-case-A.svg",
         ),
         Entry(
             "Claim, 3.4",
@@ -280,11 +281,11 @@ def example_entries(evidence: Evidence) -> list[Entry]:
             "Claim, 3.4",
             "Feedback gain and inverse LQR exceed the bound; inverse MPC does not.",
             ("impc.studies.example.cases:run_case",),
-            f"Largest |u|: gain {gain['max_abs_u']:.3f}, (3.16) {output['max_abs_u']:.3f}, inverse"
-            f" MPC {mpc['max_abs_u']:.3f}.",
+            f"Largest |u|: gain {largest['feedback_gain']:.3f}, (3.16)"
+            f" {largest['inverse_lqr_output']:.3f}, inverse MPC {largest['inverse_mpc']:.3f}.",
             kind(
-                min(gain["max_abs_u"], output["max_abs_u"]) > BOUND
-                and mpc["max_abs_u"] < BOUND + 1e-9
+                min(largest["feedback_gain"], largest["inverse_lqr_output"]) > BOUND
+                and largest["inverse_mpc"] < BOUND + 1e-9
             ),
             _LOST_SYSTEM,
         ),

@@ -118,7 +118,8 @@ def _subject(fit: dict[str, Any], truth: dict[str, Any]) -> list[Entry]:
             "(3.22)",
             "Bounds on angles and rates from the data, on the torque half the lateral strength.",
             ("impc.studies.fit.settings",),
-            f"[fit] bounded_states with a margin, u_max; here {fit['bounds']['u_max'][0]:g} N m.",
+            "[fit] bounded_states with a margin (angles; bounds of rates are numbers), u_max; here"
+            f" {fit['bounds']['u_max'][0]:g} N m.",
             Verdict.IN_KIND,
             "Half the lateral strength, 70 N m, is never reached under a perturbation of 5 N m, so"
             " the experiment does not show a saturating subject; ours has a lower limit.",

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from impc.cli.console import print_files, progress
 from impc.cli.options import out_option, page_options, solver_option
 from impc.cli.plant import load_plant
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.model.plant import Plant
-    from impc.studies.example.cases import CaseResult
 
 # impc does not import `plants`: the plant is named by its import path, ``module:function``.
 _EXAMPLE_PLANT = "plants:yalmip_example"
@@ -41,23 +34,18 @@ def command(case: str, out: Path, solver: str | None, pdf: bool, open_page: bool
     from impc.control.named_solver import COMPILED, require_solver  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.example.cases import CASES, LOST  # noqa: PLC0415
+    from impc.studies.example.cases import CASES, EXAMPLE, LOST, run_case  # noqa: PLC0415
     from impc.studies.example.report import example_report  # noqa: PLC0415
 
     require_writable(out)
     chosen = require_solver(COMPILED if solver is None else solver)
     plant = load_plant(_EXAMPLE_PLANT)
-    cases = _run(plant, tuple(CASES) if case == "all" else (case,), chosen)
+    names = tuple(CASES) if case == "all" else (case,)
+    with progress(len(names) * len(EXAMPLE), "method") as step:
+        cases = [run_case(plant, name, solver=chosen, progress=step) for name in names]
     report = example_report(cases, Provenance(_EXAMPLE_PLANT, f"impc example --case {case}"))
     written = write_files(out, report.files(pdf=pdf))
     click.echo(f"{report.verdict.text()}\n{click.wrap_text(LOST, width=100)}")
     for finding in report.findings():
-        click.echo(f"\n{click.wrap_text(finding.caption, width=100)}\n{finding.text()}")
+        click.echo(f"\n{finding.name}\n{finding.text()}")
     print_files(out, written, open_page)
-
-
-def _run(plant: Plant, names: Sequence[str], solver: str) -> list[CaseResult]:
-    from impc.studies.example.cases import EXAMPLE, run_case  # noqa: PLC0415
-
-    with progress(len(names) * len(EXAMPLE), "method") as step:
-        return [run_case(plant, name, solver=solver, progress=step) for name in names]

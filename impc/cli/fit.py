@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.cli.plant import AllFellError
     from impc.reporting.verdict import Verdict
     from impc.studies.fit.memory import FitMemory
     from impc.studies.fit.result import FitResult
@@ -50,7 +49,7 @@ def command(
     from impc.studies.fit.findings import read_truth  # noqa: PLC0415
     from impc.studies.fit.first import FitProgress  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
-    from impc.studies.fit.report import fit_report  # noqa: PLC0415
+    from impc.studies.fit.report import fallen_report, fit_report  # noqa: PLC0415
     from impc.studies.fit.settings import missing  # noqa: PLC0415
     from impc.studies.fit.subject import fit_recordings, stages  # noqa: PLC0415
 
@@ -60,7 +59,9 @@ def command(
     try:
         subject = read_subject("fit", files, plant_name, config, solver)
     except AllFellError as fallen:
-        _print_falls(fallen, out, open_page)
+        report = fallen_report(fallen.falls, fallen.provenance)
+        click.echo(report.verdict.text())
+        print_files(out, write_files(out, report.files()), open_page)
         return
     problem, settings = subject.problem, subject.settings
     require_consent(fit_effort(problem, settings), yes)
@@ -87,16 +88,6 @@ def command(
     with angles_in(subject.angles):
         _print(result, report.verdict, truth)
     print_files(out, written, open_page)
-
-
-def _print_falls(fallen: AllFellError, out: Path, open_page: bool) -> None:
-    """Write and print the report for recordings that all end in a fall."""
-    from impc.reporting.writer import write_files  # noqa: PLC0415
-    from impc.studies.fit.report import fallen_report  # noqa: PLC0415
-
-    report = fallen_report(fallen.falls, fallen.provenance)
-    click.echo(report.verdict.text())
-    print_files(out, write_files(out, report.files()), open_page)
 
 
 def _own_problem(
@@ -140,7 +131,7 @@ def _own_problem(
 def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
     """Print verdict, gain, methods and, for simulated recordings, the true gain."""
     from impc.reporting.verdict import WIDTH  # noqa: PLC0415
-    from impc.studies.fit.findings import per_unit_finding, truth_sentence  # noqa: PLC0415
+    from impc.studies.fit.findings import per_unit_finding, truth_found  # noqa: PLC0415
     from impc.studies.fit.verdict import GAIN, forbidden  # noqa: PLC0415
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
@@ -149,7 +140,7 @@ def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
         click.echo(f"\n{per_unit_finding(result).text()}")
     click.echo(f"\n{methods_finding(result.methods[::-1]).text()}\n")
     if truth is not None:
-        click.echo(fill(truth_sentence(result, truth), WIDTH))
+        click.echo(fill(truth_found(result, truth)[1], WIDTH))
 
 
 @click.command("compare")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 #: Version of the files that are written now.
-SCHEMA = 8
+SCHEMA = 9
 
 Matrix = list[list[float]]
 
@@ -41,8 +41,7 @@ class MethodRecord(msgspec.Struct, frozen=True):
     R : list of list of float
         Input weight (m, m), scaled to R[0][0] = 1; null without weights.
     status : str
-        How the method ended: "explained", "settled", "stopped", "gain only" or "none"; empty for
-        the methods of the example.
+        How the method ended: "explained", "settled", "stopped", "gain only" or "none".
     reason : str
         Explanation if there is no result, or if weights fit worse than the gain; else empty.
     """

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from impc.assess.assessments import evaluate_method
 from impc.checking import checked, replace
@@ -112,13 +111,12 @@ def _document(fit: MethodFit) -> Report:
     page = replace(page, window=f"impc: {label}", kind="estimate of one method")
     if page.verdict.level is Level.RED:
         return page
-    drawn: Any = SimpleNamespace(fitted=fit.estimate, inverse_mpc=fit, given=problem)
     return replace(
         page,
         sections=[*page.sections, Section("Gain and cost weights", page.beside[:2])],
         beside=page.beside[2:],
         meta=(label, *page.meta[2:]),
         hero=_PICTURE,
-        figures={"trial-1": lambda narrow: movement_figure(drawn, 0, narrow)},
+        figures={"trial-1": lambda narrow: movement_figure(fit, 0, narrow)},
         data={**page.data, "starts": problem.starts, "logarithms": problem.logarithms},
     )

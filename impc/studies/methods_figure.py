@@ -47,9 +47,9 @@ def unexplained(fit: MethodFit) -> float:
     return max(100.0 - float(np.mean(explained(fit))), 1e-9)
 
 
-def first_fall(fit: MethodFit) -> float | None:
-    """Earliest time in s at which a simulation stops (divergence or no admissible input)."""
-    return min((time for time in fit.fell if time is not None), default=None)
+def first_fall(fit: MethodFit) -> float:
+    """Earliest time in s at which a simulation stops; NaN if none does."""
+    return float(ASSESSMENTS["first_fall"].find(fit)[0])
 
 
 def by_score(fits: Sequence[MethodFit]) -> list[MethodFit]:
@@ -114,7 +114,7 @@ def _unexplained(ax: Axes, fits: Sequence[MethodFit]) -> None:
     for row, fit in enumerate(fits):
         fell = first_fall(fit)
         missing = "no prediction" if np.any(np.isnan(left[row])) else ""
-        text = missing if fell is None else f"stops at {fell:.1f} s"
+        text = missing if np.isnan(fell) else f"stops at {fell:.1f} s"
         ax.text(0.02, row, text, transform=ax.get_yaxis_transform(), va="center", color=MUTED)
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.xaxis.set_minor_locator(NullLocator())
@@ -124,7 +124,7 @@ def _unexplained(ax: Axes, fits: Sequence[MethodFit]) -> None:
 def _commands(ax: Axes, fits: Sequence[MethodFit], thick: float) -> None:
     rows = [largest_commands(fit) for fit in fits]
     limit, label = rows[0][1:]
-    sizes = {k: row[0] for k, row in enumerate(rows) if first_fall(fits[k]) is None}
+    sizes = {k: row[0] for k, row in enumerate(rows) if np.isnan(first_fall(fits[k]))}
     end = 1.2 * max([*sizes.values(), limit if np.isfinite(limit) else 0.0, 1e-12])
     if np.isfinite(limit):
         ax.axvspan(limit, end, color=FORBIDDEN, linewidth=0, zorder=0)

@@ -76,12 +76,13 @@ def _fitted(found: dict[str, Any]) -> Numbers:
 
 
 def _example(folder: Path) -> Numbers:
-    methods = _typed(folder, "example", "--case", "A")["cases"]["A"]["methods"]
+    case = _typed(folder, "example", "--case", "A")["cases"]["A"]
+    methods = {"truth": case["truth"], **case["methods"]}
     return {
         f"{name} {key}": _exact(found[key])
         for name, found in methods.items()
         for key in ("Q", "K")
-        if key in found and (key == "K" or name.startswith("inverse_mpc"))
+        if found[key] is not None and (key == "K" or name.startswith("inverse_mpc"))
     }
 
 

@@ -46,17 +46,15 @@ def test_table_3_1_recovers_the_weights(case: str) -> None:
 def test_the_dissertations_comparison_shows_in_case_A(case_a: CaseResult) -> None:
     gain, output = case_a.method("feedback_gain"), case_a.method("inverse_lqr_output")
     assert case_a.branch == "gradient"
-    assert gain.K is not None
-    np.testing.assert_allclose(gain.K, NO_WEIGHTS_GAIN, atol=1e-5)
-    assert gain.state_misfit == pytest.approx(0.2333, abs=1e-4)
-    assert gain.max_abs_u == pytest.approx(1.2295, abs=1e-4)
+    assert gain.estimate.K is not None
+    np.testing.assert_allclose(gain.estimate.K, NO_WEIGHTS_GAIN, atol=1e-5)
+    assert gain.estimate.misfit == pytest.approx(0.2333, abs=1e-4)
+    assert gain.largest_input[0] == pytest.approx(1.2295, abs=1e-4)
     kept = {"inverse_mpc": True, "inverse_mpc_reduced": True}
     kept |= {"feedback_gain": False, "inverse_lqr_output": False}
-    assert {name: case_a.method(name).bound_kept for name in kept} == kept
-    assert output.state_misfit is not None
-    assert gain.state_misfit is not None
-    assert output.state_misfit > gain.state_misfit
-    assert not case_a.method("inverse_lqr_lmi").feasible
+    assert {name: case_a.method(name).keeps_bounds for name in kept} == kept
+    assert output.estimate.misfit > gain.estimate.misfit
+    assert case_a.method("inverse_lqr_lmi").estimate.K is None
     counts = case_a.identifiability
     assert (counts.rank, counts.free, counts.chosen) == (2, 3, 1)
 

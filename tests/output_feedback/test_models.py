@@ -32,6 +32,7 @@ from impc.reporting.document import Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.rendering import plain
 from impc.studies.fit.asked import fit_problem
+from impc.studies.fit.first import FitProgress
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_recordings, stages
@@ -64,7 +65,7 @@ def reported(*, profiles: bool = False) -> tuple[PersonReport, list[str]]:
     settings = fit_settings(TABLE | {"observer": {"sensed": ["x", "v"], "profiles": profiles}})
     without = fit_settings({key: item for key, item in TABLE.items() if key != "observer"})
     problem, heard = fit_problem(cart(), trials(), settings), list[str]()
-    report = fit_recordings(problem, settings, heard.append).person
+    report = fit_recordings(problem, settings, FitProgress(heard.append)).person
     assert report is not None
     assert len(heard) == stages(problem, settings)
     assert len(heard) - stages(problem, without) == len(report.models) + 1

@@ -107,36 +107,30 @@ def _keys(facts: Facts) -> list[Key]:
 
 
 def _checks(facts: Facts, problem: Problem) -> list[Check]:
-    count = len(problem.recordings)
+    count, good, note = len(problem.recordings), Level.GREEN, Level.NOTE
     odd = sum(bool(trial.findings) for trial in problem.recordings)
     falls = [(name_of(fit), first_fall(fit)) for fit in facts.fits]
-    fallen = " ".join(f"{name}: stops at {time:.1f} s." for name, time in falls if time is not None)
+    fallen = " ".join(f"{name}: stops at {at:.1f} s." for name, at in falls if not np.isnan(at))
     stopped = [name_of(f) for f in facts.fits if f.estimate.status is Status.STOPPED]
-    left_out, level = "No trial was left out.", Level.NOTE
+    ended = f"Not converged: {'; '.join(stopped)}." if stopped else "All searches converged."
+    left_out, leads = "No trial was left out.", False
     if facts.held and facts.others:
         ahead = facts.best.held_out.mean(axis=1) > facts.others[0].held_out.mean(axis=1)
-        level = Level.GREEN if np.all(ahead) else Level.NOTE
+        leads = bool(np.all(ahead))
         left_out = f"The best model leads in {np.count_nonzero(ahead)} of {len(ahead)} trials."
-    good, doubt, note = Level.GREEN, Level.AMBER, Level.NOTE
-    ended = f"Not converged: {'; '.join(stopped)}." if stopped else "All searches converged."
-    rows = [
-        (
-            doubt if odd else good,
-            "Recordings",
-            f"{count - odd} of {count} trials without problems.",
-        ),
-        (level, "Left-out trials", left_out),
-        (note if fallen else good, "Simulations", fallen or "All simulations reach the end."),
-        (doubt if stopped else good, "Searches", ended),
+    used = f"{count - odd} of {count} trials without problems."
+    checks = [
+        Check(Level.AMBER if odd else good, "Recordings", used),
+        Check(good if leads else note, "Left-out trials", left_out),
+        Check(note if fallen else good, "Simulations", fallen or "All simulations reach the end."),
+        Check(Level.AMBER if stopped else good, "Searches", ended),
     ]
     for fit in facts.fits:
         doubts = fit.estimate.doubts if len(facts.fits) == 1 else ()
         # Without the remedy, which is for Python users
-        for said in (fit.estimate.reason.partition(";")[0], *doubts):
-            if said:
-                text = f"{sentence_case(said).rstrip('.')}."
-                rows.append((note, name_of(fit), text))
-    return [Check(*row) for row in rows]
+        for said in filter(None, (fit.estimate.reason.partition(";")[0], *doubts)):
+            checks.append(Check(note, name_of(fit), f"{sentence_case(said).rstrip('.')}."))
+    return checks
 
 
 def _copy(facts: Facts, count: int) -> Copy:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Frozen
 from impc.assess.assessments import evaluate_method
 from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate
@@ -19,9 +19,8 @@ from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
 from impc.control.named_solver import COMPILED
 from impc.control.simulation import Simulation, scenario
-from impc.inverse.problem import Problem, misfit
-from impc.inverse.proximal_search import AUXILIARY_CONDITION_WEIGHT
-from impc.inverse.table31 import CONDITION_WEIGHT, table_3_1
+from impc.inverse.problem import Problem
+from impc.inverse.table31 import table_3_1
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights, weight_error
@@ -51,14 +50,6 @@ HORIZON = 3
 STEPS = 20
 #: Largest magnitude of the input.
 BOUND = 1.0
-#: Settings of the example by their names on the page and in result.json.
-SETTINGS: dict[str, float] = {
-    "horizon": HORIZON,
-    "steps": STEPS,
-    "input_bound": BOUND,
-    "condition_weight": CONDITION_WEIGHT,
-    "auxiliary_condition_weight": AUXILIARY_CONDITION_WEIGHT,
-}
 #: Sentences on the dissertation's own plant.
 LOST = (
     "The dissertation's own plant, initial state and limit are not available. This plant replaces "
@@ -67,38 +58,23 @@ LOST = (
 
 
 @dataclass(frozen=True)
-class MethodResult(Frozen):
-    """Result of one method on one recording."""
-
-    name: str  # Name of the method
-    weights: Weights | None  # Scaled to R[0, 0] = 1; None for a gain without weights
-    K: Array | None  # Gain (m, n); None if the method has no solution
-    simulation: Simulation | None  # Simulation with this gain
-    state_misfit: float | None  # 2-norm over all states and steps
-    max_abs_u: float | None  # Largest magnitude of an input
-    bound_kept: bool | None  # Whether every input is inside the bound, to 1e-9
-    residual: float | None  # Distance (3.10) to the true weights
-    seconds: float  # Run time of the method without its start, s
-    # Number of simulated closed loops with derivatives; 0 for methods that need none
-    simulations: int
-    feasible: bool | None  # Whether the LMI is feasible; None for other methods
-
-
-@dataclass(frozen=True)
 class CaseResult(Frozen):
     """Results for one initial state."""
 
     name: str  # One of `CASES`
-    x0: Array  # Initial state (n,)
     controller: Controller  # True controller with its terminal set
     truth: Simulation  # The recording
-    branch: str  # Branch of Table 3.1 that was taken: ``"LMI"`` or ``"gradient"``
-    methods: tuple[MethodResult, ...]
+    methods: tuple[MethodFit, ...]  # In the order of `EXAMPLE`
     identifiability: Identifiability  # At the weights of the direct inverse MPC
 
-    def method(self, name: str) -> MethodResult:
+    def method(self, name: str) -> MethodFit:
         """Result of the method `name`."""
         return next(item for item in self.methods if item.name == name)
+
+    @property
+    def branch(self) -> str:
+        """Branch of Table 3.1 that was taken: the LMI is infeasible, or it is not."""
+        return "gradient" if self.method("inverse_lqr_lmi").estimate.weights is None else "LMI"
 
 
 def true_weights(plant: Plant) -> Weights:
@@ -115,8 +91,7 @@ def run_case(
 ) -> CaseResult:
     """Simulate the true controller from an initial state and run every method."""
     bounds = Bounds(plant, u_min=-BOUND, u_max=BOUND)
-    truth_weights = true_weights(plant)
-    controller = Controller(plant, truth_weights, bounds, HORIZON, solver=solver)
+    controller = Controller(plant, true_weights(plant), bounds, HORIZON, solver=solver)
     truth = require_complete(controller, simulate(controller, scenario(plant, CASES[name], STEPS)))
     # No scaling: the equations of the table are in the plant's own units.
     problem = Problem(
@@ -130,34 +105,12 @@ def run_case(
         solver=solver,
     )
     table = table_3_1(problem, absolute=True, progress=progress)
-    results = [_result(evaluate_method(table[name], bounds), truth_weights) for name in EXAMPLE]
-    branch = "gradient" if table["inverse_lqr_lmi"].weights is None else "LMI"
-    direct = next(item for item in results if item.name == "inverse_mpc")
-    assert direct.weights is not None  # the method raises otherwise
-    return CaseResult(
-        name,
-        frozen(CASES[name]),
-        controller,
-        truth,
-        branch,
-        tuple(results),
-        identifiability(problem, direct.weights),
-    )
+    fits = tuple(evaluate_method(table[method], bounds) for method in EXAMPLE)
+    found = identifiability(problem, table["inverse_mpc"].stage_weights)
+    return CaseResult(name, controller, truth, fits, found)
 
 
-def _result(fit: MethodFit, truth: Weights) -> MethodResult:
-    found = fit.estimate
-    largest = float(fit.largest_input[0]) if fit.runs else None
-    return MethodResult(
-        name=fit.name,
-        weights=found.weights,
-        K=found.K,
-        simulation=fit.runs[0] if fit.runs else None,
-        state_misfit=misfit(found.problem, list(fit.runs)) if fit.runs else None,
-        max_abs_u=largest,
-        bound_kept=None if largest is None else largest <= BOUND * (1 + 1e-9),
-        residual=None if found.weights is None else weight_error(found.weights, truth),
-        seconds=found.seconds,
-        simulations=found.evaluations,
-        feasible=found.weights is not None if fit.name == "inverse_lqr_lmi" else None,
-    )
+def distance(fit: MethodFit) -> float:
+    """Distance (3.10) to the true weights; NaN without weights."""
+    found, plant = fit.estimate.weights, fit.estimate.problem.plant
+    return float("nan") if found is None else weight_error(found, true_weights(plant))

@@ -7,33 +7,36 @@ from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
-from impc.control.named_solver import described
-from impc.model.weights import condition_number, normalised
-from impc.reporting.document import Block, Lines, Report, Section, Terms
+from impc.model.weights import condition_number
+from impc.reporting.document import Block, Draw, Fold, Lines, Report, Section
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.style import HALF, WIDE
+from impc.reporting.style import HALF
 from impc.reporting.verdict import Key, Verdict
-from impc.studies.example.cases import BOUND, EXAMPLE, LOST, SETTINGS, true_weights
-from impc.studies.example.figures import comparison_figure
-from impc.studies.methods_table import method_label, methods_fold
+from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights
+from impc.studies.fit.figures import movement_figure
+from impc.studies.methods_figure import methods_figure
+from impc.studies.methods_table import (
+    controller_findings,
+    method_label,
+    methods_data,
+    methods_finding,
+    methods_fold,
+    provenance_section,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from impc.arrays import Array
-    from impc.model.weights import Weights
     from impc.reporting.provenance import Provenance
-    from impc.studies.example.cases import CaseResult, MethodResult
+    from impc.studies.example.cases import CaseResult
 
 # Largest distance to the true weights that counts as found; typical 1e-14.
 _FOUND = 1e-6
-# Decimal places; further ones are rounding errors of a search.
-_DIGITS = 9
+# Methods whose states and commands are drawn.
+_DRAWN = ("feedback_gain", "inverse_mpc", "inverse_lqr_output")
 _COUNTS = ("None", "One", "Two", "Three", "Four", "Five", "Six", "Seven")
 _SETTING = (
     "A model predictive controller (MPC) drives an unstable system to rest without exceeding a "
@@ -62,20 +65,12 @@ _YOURS = (
 
 def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Report:
     """Report of `impc example`."""
-    plant, first = cases[0].controller.plant, cases[0]
-    figures = {
-        f"comparison-case-{case.name}": partial(
-            comparison_figure, case, HALF if case is first else WIDE
-        )
-        for case in cases
-    }
-    settings = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in SETTINGS.items())
-    made = [
-        ("Plant", _CODE.format(provenance.plant_name)),
-        ("Matrices", f"A = {plant.A.tolist()}, B = {plant.B.tolist()}"),
-        ("Settings", settings),
-        ("Quadratic programs", f"Solved by {described(first.controller.solver)}."),
-    ]
+    first = cases[0]
+    figures: dict[str, Draw] = {}
+    for case in cases:
+        figures[_name(case)] = partial(methods_figure, case.methods, width=HALF)
+        figures |= {_name(case, one): partial(movement_figure, case.method(one), 0)
+                    for one in _DRAWN}  # fmt: skip
     return Report(
         "impc example",
         "example",
@@ -84,7 +79,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
             *(_case_section(case, hero=case is first) for case in cases),
             Section("What the example shows", [_SETTING, _GAIN, LOST, methods_fold(EXAMPLE)]),
             Section("Your own recordings", [Lines(_YOURS)]),
-            Section("Provenance", [Terms([*provenance.terms, *made])]),
+            provenance_section(first.methods[0].estimate.problem, provenance),
         ],
         meta=(
             "Simulation",
@@ -94,7 +89,8 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
         hero=_picture(first),
         keys=_keys(cases),
         figures=figures,
-        data=example_data(cases, provenance, SETTINGS),
+        beside=[finding for case in cases for finding in _controllers(case)],
+        data=example_data(cases, provenance),
         provenance=provenance,
     )
 
@@ -104,14 +100,14 @@ class _Facts:
 
     def __init__(self, cases: Sequence[CaseResult]) -> None:
         each = {name: [case.method(name) for case in cases] for name in EXAMPLE}
-        self.within = [name for name, own in each.items() if all(one.bound_kept for one in own)]
+        self.within = [name for name, own in each.items() if all(one.keeps_bounds for one in own)]
         self.found = [
             name for name in self.within
-            if all(one.residual is not None and one.residual <= _FOUND for one in each[name])
+            if all(distance(one) <= _FOUND for one in each[name])
         ]  # fmt: skip
         self.largest = max(
-            (one.max_abs_u for name, own in each.items() for one in own
-             if name not in self.within and one.max_abs_u is not None), default=0.0,
+            (float(one.largest_input[0]) for name, own in each.items() for one in own
+             if name not in self.within and one.runs), default=0.0,
         )  # fmt: skip
         names = " and ".join(f"“{method_label(name)}”" for name in self.found) or "No method"
         self.finds, self.others = f"{names} find{'s' * (len(self.found) < 2)}", ""
@@ -168,114 +164,63 @@ def _keys(cases: Sequence[CaseResult]) -> list[Key]:
 
 
 def _case_section(case: CaseResult, *, hero: bool) -> Section:
-    start = ", ".join(f"{value:g}" for value in case.x0)
-    blocks: list[Block] = [methods_finding(case)]
+    start = ", ".join(f"{value:g}" for value in case.truth.x[0])
+    words = "Grey: recorded; blue: model; orange: at the limit, or beyond it."
+    drawn = [
+        Picture(_name(case, one), "States and command over time", f"{method_label(one)}. {words}")
+        for one in _DRAWN
+    ]
+    table = replace(methods_finding(case.methods), name=f"methods-{case.name}")
+    blocks: list[Block] = [table, Fold("States and command of three methods", drawn)]
     blocks = blocks if hero else [_picture(case), *blocks]
     return Section(f"Case {case.name}: start at ({start})", blocks, f"Case {case.name}")
 
 
 def _picture(case: CaseResult) -> Picture:
     return Picture(
-        f"comparison-case-{case.name}",
-        "States and command over time: recorded, and modelled by three methods",
-        f"Case {case.name}. Grey: recorded. Blue: model; orange: model beyond the limit.",
+        _name(case),
+        "Variance that each method leaves unexplained, and the largest command it needs",
+        f"Case {case.name}. Left: unexplained variance; farther left is better (logarithmic axis). "
+        "Blue: stays within the limit. Shaded: beyond it.",
     )
 
 
-def methods_finding(case: CaseResult) -> Finding:
-    """Table of the true controller and all methods."""
-    truth, K = true_weights(case.controller.plant), case.controller.K
-    largest = float(np.max(np.abs(case.truth.u)))
-    rows: list[dict[str, Any]] = [
-        {"method": "Truth", **_entries(truth, K), "largest_u": largest, "kept": "yes",
-         "name": "truth"}
-    ]  # fmt: skip
-    for item in case.methods:
-        kept = {None: "", True: "yes", False: "no"}[item.bound_kept]
-        rows.append(
-            {
-                "method": method_label(item.name),
-                **_entries(item.weights, item.K),
-                "misfit": item.state_misfit,
-                "largest_u": item.max_abs_u,
-                "kept": "no weights" if item.feasible is False else kept,
-                "residual": item.residual,
-                "seconds": item.seconds,
-                "name": item.name,
-            }
-        )
-    numeric = [*_entries(truth, K), "misfit", "largest_u", "residual", "seconds"]
-    heads = ["method", *numeric[:-2], "kept", *numeric[-2:], "name"]
-    table = pd.DataFrame(rows, columns=heads)
-    # Adding zero turns -0 into 0.
-    table[numeric] = table[numeric].astype(float).round(_DIGITS) + 0.0
-    return Finding(
-        f"methods-{case.name}",
-        table,
-        f"Case {case.name}: cost weights Q if that of the command, R, is 1; gain K (command per "
-        "unit of each state); misfit (root of the summed squared differences of all states); and "
-        "the largest command u.",
-        digits=3,
-        labels={"largest_u": "Largest u", "kept": "Limit kept"},
-        hidden=["residual", "seconds", "name"],
-    )
+def _name(case: CaseResult, method: str = "comparison") -> str:
+    return f"{method}-case-{case.name}"
 
 
-def _entries(weights: Weights | None, gain: Array | None) -> dict[str, float]:
-    """Entries Q11, Q12, Q22 at R = 1, then the gain."""
-    found: dict[str, float] = {}
-    if weights is not None:
-        Q = normalised(weights).Q
-        places = np.transpose(np.triu_indices(len(Q)))
-        found |= {f"Q{i + 1}{j + 1}": float(Q[i, j]) for i, j in places}
-    if gain is not None:
-        found |= {f"K{k + 1}": float(value) for k, value in enumerate(gain.ravel())}
-    return found
+def _controllers(case: CaseResult) -> list[Finding]:
+    """Tables of gains and cost weights, for the files."""
+    return [
+        replace(one, name=f"{one.name}-{case.name}") for one in controller_findings(case.methods)
+    ]
 
 
-def example_data(
-    cases: Sequence[CaseResult], provenance: Provenance, settings: Mapping[str, float]
-) -> dict[str, Any]:
-    """Content of result.json, with the `settings` of the example."""
+def example_data(cases: Sequence[CaseResult], provenance: Provenance) -> dict[str, Any]:
+    """Content of result.json."""
     plant = cases[0].controller.plant
     return {
         "plant": {"name": provenance.plant_name, "A": plant.A, "B": plant.B, "dt": plant.dt},
-        "settings": settings,
         "solver": cases[0].controller.solver,
         "cases": {case.name: _case(case) for case in cases},
     }
 
 
 def _case(case: CaseResult) -> dict[str, Any]:
-    truth = {
-        **_weights(true_weights(case.controller.plant)),
-        "K": case.controller.K,
-        "max_abs_u": float(np.max(np.abs(case.truth.u))),
-        "x": case.truth.x,
-        "u": case.truth.u,
-    }
-    found = case.identifiability
+    found, true = case.identifiability, true_weights(case.controller.plant)
     named = ("free", "rank", "chosen", "singular_values", "tolerance")
-    others = [{**_weights(item.weights), "state_misfit": item.misfit} for item in found.others]
     return {
-        "x0": case.x0,
+        "x0": case.truth.x[0],
         "branch": case.branch,
-        "truth": truth,
-        # The truth is also listed as a method, so that programs can loop over all.
-        "methods": {"truth": truth} | {item.name: _method(item) for item in case.methods},
-        "identifiability": {name: getattr(found, name) for name in named} | {"others": others},
-    }
-
-
-def _method(method: MethodResult) -> dict[str, Any]:
-    run = method.simulation
-    named = ("K", "state_misfit", "max_abs_u", "bound_kept", "residual", "feasible", "seconds",
-             "simulations")  # fmt: skip
-    found = {name: getattr(method, name) for name in named}
-    found |= {} if run is None else {"x": run.x, "u": run.u}
-    found |= {} if method.weights is None else _weights(method.weights)
-    return {name: value for name, value in found.items() if value is not None}
-
-
-def _weights(weights: Weights) -> dict[str, Any]:
-    return {"Q": weights.Q, "R": weights.R, "condition_number": condition_number(weights)}
+        "truth": {"Q": true.Q, "R": true.R, "condition_number": condition_number(true),
+                  "K": case.controller.K, "x": case.truth.x, "u": case.truth.u},
+        "methods": {
+            fit.name: {
+                **methods_data([fit])[fit.name],
+                "distance": distance(fit),
+                **({"x": fit.runs[0].x, "u": fit.runs[0].u} if fit.runs else {}),
+            }
+            for fit in case.methods
+        },
+        "identifiability": {name: getattr(found, name) for name in named},
+    }  # fmt: skip

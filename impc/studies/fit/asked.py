@@ -6,7 +6,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.signal
 
 from impc.arrays import Array, frozen
 from impc.checking import checked, replace
@@ -28,10 +27,6 @@ if TYPE_CHECKING:
     from impc.model.plant import Plant
     from impc.model.recordings import Recording
     from impc.studies.fit.settings import FitSettings
-
-# Window in s of the Savitzky-Golay derivative: noise of 1 % of the largest angle at 100 Hz then
-# gives errors of a few per cent of the largest rate.
-_RATE_WINDOW = 0.15
 
 
 def output_feedback() -> Any:
@@ -136,15 +131,6 @@ def require_dressed(plant: Plant, settings: FitSettings) -> None:
             raise InputError(f"[fit] {name}", "is set, but the plant was made without it", remedy)
 
 
-def moving_body(
-    plant: Plant, family: PlantFamily | None, settings: FitSettings
-) -> tuple[Plant, PlantFamily | None]:
-    """Plant and family with the equations of motion that [fit] body selects."""
-    if settings.body != "linear":
-        return plant, family
-    return plant.linear(), None if family is None else family.linear()
-
-
 def fit_bounds(plant: Plant, settings: FitSettings, recordings: Sequence[Recording]) -> Bounds:
     """Bounds of the controller: inputs from the settings, states from settings or data (3.22)."""
     x_max = np.full(plant.n, np.inf)
@@ -178,22 +164,7 @@ def _recorded_maximum(plant: Plant, name: str, word: str, recordings: Sequence[R
     if name in plant.outputs:
         column = plant.outputs.index(name)
         return max(float(np.nanmax(np.abs(trial.outputs[:, column]))) for trial in recordings)
-    base = name.removesuffix("_rate")
-    if base != name and base in plant.outputs:
-        column = plant.outputs.index(base)
-        return max(_largest_rate(trial.outputs[:, column], plant.dt) for trial in recordings)
-    raise InputError(
-        f"[fit] bounded_states {name}", "is neither an output nor the rate of one", "give a number"
-    )
-
-
-def _largest_rate(values: Array, dt: float) -> float:
-    window = max(5, 2 * round(_RATE_WINDOW / dt / 2) + 1)
-    if len(values) < window:
-        raise InputError("recording", f"has {len(values)} samples", f"give at least {window}")
-    rate = scipy.signal.savgol_filter(values, window, 2, deriv=1, delta=dt, mode="nearest")
-    half = window // 2  # the filter is one-sided at the ends
-    return float(np.nanmax(np.abs(rate[half:-half])))
+    raise InputError(f"[fit] bounded_states {name}", "is not an output", "give a number")
 
 
 @checked
@@ -254,7 +225,8 @@ def fit_problem(
             "use longer trials, or lower [fit] settle",
         )
     require_dressed(plant, settings)
-    plant, family = moving_body(plant, family, settings)
+    if settings.body == "linear":
+        plant, family = plant.linear(), None if family is None else family.linear()
     posed = Problem(
         plant,
         fit_bounds(plant, settings, recordings),

@@ -22,6 +22,7 @@ from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Finding, Level, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, signal_name
+from impc.studies.fit.facts import shifted
 
 if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
@@ -147,10 +148,8 @@ def _size_words(plant: Plant, kind: str, name: str, size: float, deviation: floa
         return ""
     unit = 1e3 * plant.dt if kind == "shift" else 100
     much = f"{unit * abs(size):.3g} ± {unit * deviation:.2g} {'ms' if kind == 'shift' else '%'}"
-    if kind == "shift" and name in plant.outputs:
-        return f" (it is recorded {much} too {'late' if size > 0 else 'early'})"
     if kind == "shift":
-        return f" (it acts {much} {'later' if size > 0 else 'earlier'} than recorded)"
+        return f" (it {shifted(plant, name, much, late=size > 0)})"
     return f" (by {'+' if size > 0 else '-'}{much})"
 
 

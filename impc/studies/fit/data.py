@@ -7,8 +7,8 @@
     solver                                   solver of the quadratic programs
     usable                                   whether the VAF of every recorded signal is >= 50 %
     K                                        estimated gain (without the restriction to weights)
-    estimate                                 standard errors of K and of its directions, and which
-                                             of them are identified
+    estimate                                 standard errors of K; whether its entries, and its
+                                             directions as in their table, are identified
     Q, R, P, S, weights_gain                 weights with the nearest gain, scaled to R[0][0] = 1
     weights_rule                             convention by which Q and R were selected
     weights_test                             test whether any weights explain K: statistic, freedom,
@@ -46,12 +46,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.assess.assessments import ASSESSMENTS
 from impc.assess.intent import dominant_sentence
 from impc.assess.printed_gain import lasting_responses
+from impc.model.riccati import solve_lqr
 from impc.studies.fit.aim import aim_data
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
-from impc.studies.methods_table import methods_data
+from impc.studies.methods_table import problem_data
 
 if TYPE_CHECKING:
     from impc.reporting.provenance import Provenance
@@ -61,20 +63,23 @@ if TYPE_CHECKING:
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
     """Entries of result.json in addition to the findings."""
     plant, found = result.fitted.problem.plant, result.identifiability
+    estimate, covariance = result.estimate, result.estimate.covariance
     return _controller(result) | {
-        "estimate": _estimate(result),
+        "estimate": {
+            "S": estimate.S,
+            "misfit": estimate.misfit,
+            "standard_errors": covariance.entries,
+            "identified": covariance.individually_identified,
+            "identified_directions": covariance.identified,
+        },
         "limit": None if result.limit_found is None else result.limit_found._asdict(),
         "lasting": [asdict(one) for one in lasting_responses(result.estimate)],
         "falls": result.falls,
         "intent": _intent(result),
         "identifiability": {
-            "rank": found.rank,
-            "free": found.free,
-            "chosen": found.chosen,
-            "singular_values": found.singular_values,
+            name: getattr(found, name) for name in ("rank", "free", "chosen", "singular_values")
         },
         "trials": [_trial(result, index) for index in range(len(result.trials))],
-        "methods": methods_data(result.methods),
         "structures": structure_data(result),
         "aim": aim_data(result),
         "person": None if result.person is None else result.person.data(),
@@ -92,12 +97,10 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
 def _controller(result: FitResult) -> dict[str, Any]:
     plant, fitted = result.fitted.problem.plant, result.fitted
     weights, bounds = result.intent.reported.weights, result.given.bounds
-    held = np.array([item.vaf for item in result.held_out])
-    left_out = np.mean(held, axis=0) if len(held) else [None] * len(plant.outputs)
-    return {
+    left_out = ASSESSMENTS["held_out_vaf"].find(result.inverse_mpc)
+    return problem_data(fitted.problem, result.methods) | {
         "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
         "held_out_vaf": dict(zip(plant.outputs, left_out, strict=True)),
-        **{name: getattr(plant, name) for name in ("states", "controls", "outputs")},
         "disturbances": plant.disturbances,
         "units": dict(plant.units),
         "usable": result.usable,
@@ -107,27 +110,25 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "R": weights.R,
         "weights_gain": fitted.gain,
         "weights_rule": result.intent.reported.rule,
-        "P": result.reported_P,
+        "P": solve_lqr(plant, weights).P,
         "weights_test": {**asdict(result.weights_test), "rejected": result.weights_test.rejected},
         "terminal_set": bool(fitted.problem.terminal_set),
         "doubts": fitted.doubts,
         "failures": dict(result.failures),
         "lack_of_fit": [None if one is None else asdict(one) for one in result.lack],
-        "horizon": fitted.problem.horizon,
-        "body": plant.moves,
-        "solver": fitted.problem.solver,
         "bounds": {name: getattr(bounds, name) for name in ("x_min", "x_max", "u_min", "u_max")},
     }
 
 
 def _intent(result: FitResult) -> dict[str, Any]:
-    found, reported = result.intent, result.intent.reported
+    found, reported, summary = result.intent, result.intent.reported, result.uncertainty.weights
+    over_set = 0.0 if summary is None else summary.widest_angle
     return {
         "eigenvalues": reported.eigenvalues,
         "vectors": reported.vectors,
         "dominant": reported.dominant,
         "sentence": dominant_sentence(reported, result.fitted.problem.plant, np.array(found.sizes)),
-        "widest_angle": result.widest_angle,
+        "widest_angle": max(found.widest_angle, over_set),
         "state_sizes": found.sizes,
         "readings": [
             {
@@ -143,26 +144,9 @@ def _intent(result: FitResult) -> dict[str, Any]:
     }
 
 
-def _estimate(result: FitResult) -> dict[str, Any]:
-    estimate, covariance = result.estimate, result.estimate.covariance
-    return {
-        "S": estimate.S,
-        "misfit": estimate.misfit,
-        "standard_errors": covariance.entries,
-        "standard_errors_exact_body": None if estimate.exact is None else estimate.exact.entries,
-        "identified": covariance.individually_identified,
-        "singular_values": covariance.singular_values,
-        "directions": covariance.directions,
-        "direction_standard_errors": covariance.deviations,
-        "identified_directions": covariance.identified,
-        "natural_coordinates": covariance.T,
-        "natural_inputs": covariance.G,
-    }
-
-
 def _trial(result: FitResult, index: int) -> dict[str, Any]:
     trial, found = result.given.recordings[index], result.trials[index]
-    held = result.held_out[index] if result.held_out else None
+    held = result.inverse_mpc.held_out
     return {
         **asdict(trial.label),
         "samples": trial.samples,
@@ -174,6 +158,5 @@ def _trial(result: FitResult, index: int) -> dict[str, Any]:
         "rms_residual": found.rms,
         "saturated": found.saturated,
         "x0": result.fitted.problem.recordings[index].x0,
-        "held_out_vaf": None if held is None else held.vaf,
-        "held_out_centred_vaf": None if held is None else held.centred_vaf,
+        "held_out_vaf": held[index] if len(held) else None,
     }

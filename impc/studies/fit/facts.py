@@ -11,6 +11,7 @@ from impc.assess.printed_gain import entry_names, follows_command
 from impc.reporting.rendering import fixed, number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.result import LITTLE
+from impc.studies.methods_figure import explained
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -42,6 +43,11 @@ class GainRow(NamedTuple):
     def ends(self) -> str:
         """The interval in words."""
         return between(self.low, self.high)
+
+    @property
+    def text(self) -> str:
+        """The gain with its interval, in words."""
+        return f"{number(self.value)} {self.unit} for {self.per} (95 % CI {self.ends})"
 
     @property
     def determined(self) -> bool:
@@ -126,16 +132,13 @@ def enough_words(result: FitResult) -> str:
 
 def first_gain(result: FitResult) -> GainRow | None:
     """The first entry that may be reported; None if there is none."""
-    rows = [row for _, row in named_gains(result) if row.determined]
-    return rows[0] if rows else None
+    return next((row for _, row in named_gains(result) if row.determined), None)
 
 
 def example_gain(result: FitResult) -> str:
     """Sentence with one gain and its interval as an example."""
     row = first_gain(result)
-    if row is None:
-        return ""
-    return f"For example {number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})."
+    return "" if row is None else f"For example {row.text}."
 
 
 def outside_offset(result: FitResult) -> str:
@@ -199,6 +202,13 @@ def shift_halves(result: FitResult) -> dict[str, Array]:
     return dict(zip(names, found, strict=True)) if found.size else {}
 
 
+def shifted(plant: Plant, name: str, much: str, *, late: bool) -> str:
+    """What a time shift means for the recording of a signal."""
+    if name in plant.disturbances:
+        return f"acts {much} {'later' if late else 'earlier'} than recorded"
+    return f"is recorded {much} too {'late' if late else 'early'}"
+
+
 def shift_words(result: FitResult) -> list[str]:
     """Sentences on signals whose time shift differs from zero in a trial."""
     plant, halves, said = result.given.plant, shift_halves(result), []
@@ -207,18 +217,11 @@ def shift_words(result: FitResult) -> list[str]:
             continue
         value, half = 1e3 * float(np.mean(values)), 1e3 * float(np.mean(halves[name]))
         ends = f"{abs(value):.2g} ms ({max(abs(value) - half, 0):.2g} to {abs(value) + half:.2g})"
-        push = name in plant.disturbances
-        late = ("later" if push else "late") if value > 0 else ("earlier" if push else "early")
-        how = f"acts {ends} {late} than recorded" if push else f"is recorded {ends} {late}"
         differ = float(np.ptp(values)) > 2 * float(np.max(halves[name]))
         each = " on average; trials differ (see the table of errors)" if differ else ""
+        how = shifted(plant, name, ends, late=value > 0)
         said.append(f"The {signal_name(plant, name)} {how}{each}.")
     return said
-
-
-def saturation(result: FitResult) -> float:
-    """Time at the limit, %."""
-    return 100 * result.saturated
 
 
 def shares(result: FitResult, values: Array, digits: int = 2) -> str:
@@ -234,21 +237,14 @@ def shares(result: FitResult, values: Array, digits: int = 2) -> str:
 
 def held_out(result: FitResult) -> Array | None:
     """Mean VAF of left-out trials (p,); None if there are none."""
-    held = [one.vaf for one in result.held_out]
-    return np.mean(held, axis=0) if held else None
+    each = result.inverse_mpc.held_out
+    return np.mean(each, axis=0) if len(each) else None
 
 
 def left_out_text(result: FitResult) -> str:
     """VAF in left-out trials if there are any, else in fitted trials."""
-    held = held_out(result)
-    if held is None:
-        return f"{shares(result, result.inverse_mpc.vaf)} of the variance, in fitted trials."
-    return f"{shares(result, held)} of the variance in left-out trials."
-
-
-def shares_text(result: FitResult) -> str:
-    """VAF in fitted trials."""
-    return f"{shares(result, result.inverse_mpc.vaf, 0)} of the variance"
+    where = ", in fitted trials" if held_out(result) is None else " in left-out trials"
+    return f"{shares(result, explained(result.inverse_mpc))} of the variance{where}."
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:
@@ -309,7 +305,7 @@ def no_limit(result: FitResult) -> str:
     if limit is None:
         return "No limit was given."
     if not result.met:
-        return "It was never reached."
+        return "The limit was never reached."
     return f"The limit of {limit} is in doubt."
 
 

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from impc.arrays import Array
+    from impc.assess.assessments import MethodFit
     from impc.assess.frequency_response import FrequencyResponse
+    from impc.model.bounds import Bounds
     from impc.studies.fit.result import FitResult
 
 _WINDOW, _PHONE_WINDOW = 10.0, 6.0  # s
@@ -41,11 +42,11 @@ _MOST_STATEMENTS = 12
 _POINT = 0.01
 
 
-def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
+def movement_figure(fit: MethodFit, index: int, narrow: bool) -> Figure:
     """Part of a trial: recorded and modelled outputs, and commands with their limits."""
-    plant, trial = result.fitted.problem.plant, result.fitted.problem.recordings[index]
-    run = result.inverse_mpc.runs[index]
-    window = shown_window(result, index, _PHONE_WINDOW if narrow else _WINDOW)
+    plant, trial = fit.estimate.problem.plant, fit.estimate.problem.recordings[index]
+    run, bounds = fit.runs[index], _bounds(fit)
+    window = shown_window(fit, index, _PHONE_WINDOW if narrow else _WINDOW)
     outputs, controls = plant.outputs[:_MOST], plant.controls[:_MOST]
     rows = len(outputs) + len(controls)
     figure = new_figure(PHONE if narrow else HALF, 0.6 + 1.35 * rows)
@@ -64,9 +65,9 @@ def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
         reach = 1.18 * float(np.nanmax(np.abs(recorded), initial=1e-9))
         ax.set_ylim(-reach, reach)
     for column, (ax, name) in enumerate(zip(axes[len(outputs) :], controls, strict=True)):
-        _command(ax, result, index, column, window)
+        _command(ax, fit, index, column, window)
         ax.set_title(f"{axis_label(plant, name).replace(' (', ' in the model (')}", pad=5)
-    if np.any(np.isfinite(result.given.bounds.u_max)):
+    if np.any(np.isfinite(bounds.u_max)):
         axes[0].plot([], [], color=VERMILLION, linewidth=4.5, label="at the limit")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=4, columnspacing=1.2)
@@ -75,12 +76,17 @@ def movement_figure(result: FitResult, index: int, narrow: bool) -> Figure:
     return figure
 
 
-def _command(ax: Axes, result: FitResult, index: int, column: int, window: slice) -> None:
-    """Plot the modelled command, its limit, and the samples at the limit."""
-    plant, bounds = result.fitted.problem.plant, result.fitted.problem.bounds
+def _bounds(fit: MethodFit) -> Bounds:
+    """The bounds that the method uses; those of the subject if it ignores them."""
+    own = fit.estimate.problem.bounds
+    return own if np.any(np.isfinite([own.u_min, own.u_max])) else fit.bounds
+
+
+def _command(ax: Axes, fit: MethodFit, index: int, column: int, window: slice) -> None:
+    """Plot the modelled command, its limit, and the samples at the limit or beyond."""
+    plant, bounds = fit.estimate.problem.plant, _bounds(fit)
     factor, _ = shown_unit(plant, plant.controls[column])
-    run = result.inverse_mpc.runs[index]
-    u = factor * run.u[window, column]
+    u = factor * fit.runs[index].u[window, column]
     time = (window.start + np.arange(len(u))) * plant.dt
     low, high = factor * bounds.u_min[column], factor * bounds.u_max[column]
     top = 1.15 * float(np.max(np.abs(u), initial=1e-9))
@@ -91,22 +97,22 @@ def _command(ax: Axes, result: FitResult, index: int, column: int, window: slice
                 fontsize=10, ha="right", va="bottom")  # fmt: skip
     if np.isfinite(low):
         ax.axhspan(-top, low, color=FORBIDDEN, linewidth=0)
-    recorded = result.given.recordings[index].commands
+    recorded = fit.estimate.problem.recordings[index].commands
     if len(recorded):
         ax.plot(time, factor * recorded[window, column][: len(u)], color=RECORDED, linewidth=4.5)
     ax.plot(time, u, color=BLUE, linewidth=1.3)
-    for limit in (low, high):
+    for limit, side in ((low, -1), (high, 1)):
         if np.isfinite(limit):
             ax.axhline(limit, color=VERMILLION, linewidth=0.9, linestyle=(0, (4, 3)))
-            at = np.where(np.isclose(u, limit, rtol=1e-4), limit, np.nan)
+            at = np.where(side * (u - limit) >= -1e-4 * abs(limit), u, np.nan)
             ax.plot(time, at, color=VERMILLION, linewidth=4.5, solid_capstyle="butt")
     ax.set_ylim(-top, top)
 
 
-def shown_window(result: FitResult, index: int, seconds: float) -> slice:
+def shown_window(fit: MethodFit, index: int, seconds: float) -> slice:
     """Samples of a trial to draw: the window with most samples at the limit."""
-    problem = result.fitted.problem
-    run, samples = result.inverse_mpc.runs[index], problem.recordings[index].samples
+    problem = fit.estimate.problem
+    run, samples = fit.runs[index], problem.recordings[index].samples
     length = min(round(seconds / problem.plant.dt), samples)
     high = np.asarray(problem.bounds.u_max)
     at = np.any(np.abs(run.u) >= (1 - 1e-6) * np.where(np.isfinite(high), high, np.inf), axis=1)
@@ -115,13 +121,13 @@ def shown_window(result: FitResult, index: int, seconds: float) -> slice:
     return slice(max(first, 0), max(first, 0) + length)
 
 
-def residual_figure(result: FitResult, narrow: bool) -> Figure:
+def residual_figure(fit: MethodFit, narrow: bool) -> Figure:
     """Residuals of the first output in each trial, and their autocorrelation."""
-    plant, trials = result.fitted.problem.plant, result.fitted.problem.recordings
+    plant, trials = fit.estimate.problem.plant, fit.estimate.problem.recordings
     factor, unit = shown_unit(plant, plant.outputs[0])
     series = [
         factor * (trial.corrected - run.x @ plant.C.T)[:, 0]
-        for trial, run in zip(trials, result.inverse_mpc.runs, strict=True)
+        for trial, run in zip(trials, fit.runs, strict=True)
     ][:_MOST]
     figure = new_figure(PHONE if narrow else 5.4, 3.5)
     above, below = figure.subplots(2, 1)
@@ -234,29 +240,4 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
     ax.text(0, 1.01, words, transform=ax.get_xaxis_transform(), ha="center", color=MUTED)
     ax.set_xlabel("Difference (in costs of the first)" if narrow else
                   "How much more the first costs (in multiples of its own cost)")  # fmt: skip
-    return figure
-
-
-def interval_figure(
-    labels: list[str], ends: Array, values: Array, axis: str, narrow: bool
-) -> Figure:
-    """Values with intervals (rows, 2) on a logarithmic axis; arrows mark truncated ends."""
-    figure = new_figure(PHONE if narrow else WIDE, 0.9 + 0.32 * len(labels))
-    ax = figure.subplots()
-    finite = np.append(ends[np.isfinite(ends) & (ends > 0)], values[np.isfinite(values)])
-    left, right = float(np.min(finite)) / 3, float(np.max(finite)) * 3
-    for row in range(len(labels)):
-        low, high = np.clip(ends[row], left, right)
-        ax.plot([low, high], [row, row], color=BLUE, linewidth=1.6)
-        for end, at, mark in ((ends[row, 0], low, "<"), (ends[row, 1], high, ">")):
-            if end != at:
-                ax.plot(at, row, mark, color=BLUE, clip_on=False)
-        if np.isfinite(values[row]) and values[row] > 0:
-            ax.plot(values[row], row, "o", color=VERMILLION)
-    ax.set_xscale("log")
-    ax.set_xlim(left, right)
-    ax.set_yticks(range(len(labels)), labels)
-    ax.tick_params(axis="y", length=0, labelcolor=INK)
-    ax.set_ylim(len(labels) - 0.4, -0.7)
-    ax.set_xlabel(axis)
     return figure

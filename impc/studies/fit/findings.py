@@ -2,40 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names
-from impc.assess.profiles import QUANTILE
 from impc.files.disk import truth_beside
 from impc.inverse.refit import IDENTIFIED
 from impc.model.plant import UNKNOWN, gain_unit
 from impc.reporting.finding import Finding, table_of
-from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
 from impc.studies.fit.facts import named_gains, shift_halves, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
-from impc.studies.fit.uncertainty import verdict
 from impc.studies.methods_table import trajectory_table, weight_entries
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from impc.arrays import Array
-    from impc.assess.printed_gain import Interval
-    from impc.assess.weights_ranges import Statement
     from impc.model.plant import Plant
     from impc.studies.fit.facts import GainRow
     from impc.studies.fit.result import FitResult
+    from impc.studies.fit.uncertainty import Alternative
 
 # Smallest component of a direction that is printed.
 _NAMED = 0.15
-# Methods whose intervals have columns of their own.
-_OTHER = ("block", "profile")
 
 
 def per_unit_finding(result: FitResult) -> Finding:
@@ -75,54 +68,30 @@ def per_unit_finding(result: FitResult) -> Finding:
     return Finding("gain_per_unit", table, caption, labels=labels, digits=3)
 
 
-def gain_finding(result: FitResult, truth: Array | None = None) -> Finding:
-    """All fitted numbers with intervals, in SI units, and the gain of the weights."""
-    uncertainty, plant = result.uncertainty, result.fitted.problem.plant
-    of_weights = dict(zip(entry_names(plant), np.ravel(result.fitted.gain), strict=True))
-    found = {(item.name, item.method): item for item in uncertainty.intervals}
-    units, rows, alone = number_units(plant), [], result.estimate.exact
-    deviations = np.zeros(0) if alone is None else np.ravel(alone.entries)
-    exact = dict(zip(entry_names(plant), deviations, strict=False))
-    true = {} if truth is None else dict(zip(entry_names(plant), truth.ravel(), strict=True))
-    for name, item in result.preferred.items():
-        row = {
-            "number": number_name(plant, name),
-            "unit": units.get(name, UNKNOWN),
-            "value": np.nan if item.value is None else float(item.value),
-            "low": float(item.low),
-            "high": float(item.high),
-            "identified": item.identified,
-            "excludes_zero": item.excludes_zero,
-        }
-        if alone is not None:
-            half, middle = TWO_SIDED * exact.get(name, np.nan), (item.low + item.high) / 2
-            row |= {"exact_body_low": middle - half, "exact_body_high": middle + half}
-        for method in _OTHER:
-            other = found.get((name, method))
-            if any(key == method for _, key in found):
-                row[f"{method}_low"] = np.nan if other is None else float(other.low)
-                row[f"{method}_high"] = np.nan if other is None else float(other.high)
-        row["gain_of_the_weights"] = float(of_weights.get(name, np.nan))
-        if true:
-            value = float(true.get(name, np.nan))
-            row |= {"true_value": value, "inside": bool(item.low <= value <= item.high)}
-        rows.append(row)
-    level = 100 * uncertainty.intervals[0].level if rows else 95
-    exact_words = (
-        " Exact body: interval for a body that is known exactly and equals the fitted one."
-        if exact
-        else ""
+def gain_finding(result: FitResult) -> Finding:
+    """All fitted numbers with intervals by every method, the preferred first, in SI units."""
+    plant, found = result.fitted.problem.plant, result.uncertainty.intervals
+    units, several = number_units(plant), len({item.method for item in found}) > 1
+    table = table_of(
+        found,
+        {
+            "number": lambda item: number_name(plant, item.name),
+            "unit": lambda item: units.get(item.name, UNKNOWN),
+            **({"method": lambda item: item.method} if several else {}),
+            "value": lambda item: np.nan if item.value is None else float(item.value),
+            "low": lambda item: float(item.low),
+            "high": lambda item: float(item.high),
+            "identified": lambda item: item.identified,
+            "excludes_zero": lambda item: item.excludes_zero,
+        },
     )
-    return Finding(
-        "gain",
-        pd.DataFrame(rows),
+    level = 100 * found[0].level if found else 95
+    caption = (
         f"The gain K of u = -K x with {level:.0f} % intervals, which allow for autocorrelated "
         "residuals. If an entry is not identified, the recordings may still determine its "
-        f"combinations with others.{exact_words} The files also have the gain of the reported "
-        "cost weights.",
-        hidden=("gain_of_the_weights",),
-        labels={"number": "Gain on"},
+        "combinations with others."
     )
+    return Finding("gain", table, caption, labels={"number": "Gain on"})
 
 
 def direction_finding(result: FitResult) -> Finding:
@@ -137,10 +106,17 @@ def direction_finding(result: FitResult) -> Finding:
     back = np.kron(np.array(covariance.G), np.linalg.inv(covariance.T).T)
     moved = (covariance.directions @ back.T) * np.tile(np.array(result.intent.sizes), plant.m)
     values, deviations = covariance.singular_values, covariance.deviations
+
+    def written(k: int) -> str:
+        """A sum of terms, largest first."""
+        parts = moved[k] / np.linalg.norm(moved[k])
+        order = [one for one in np.argsort(-np.abs(parts)) if abs(parts[one]) >= _NAMED]
+        return " ".join(f"{parts[one]:+.2f} {names[one]}" for one in order)
+
     table = table_of(
         range(len(values)),
         {
-            "direction": lambda k: direction_name(moved[k] / np.linalg.norm(moved[k]), names),
+            "direction": written,
             "relative_singular_value": lambda k: float(values[k] / values[0]),
             "standard_error": lambda k: float(deviations[k]),
             "identified": lambda k: bool(deviations[k] < IDENTIFIED),
@@ -152,13 +128,6 @@ def direction_finding(result: FitResult) -> Finding:
         f"practically unknown, above {IDENTIFIED:g} not identified."
     )
     return Finding("directions", table, caption, digits=2)
-
-
-def direction_name(direction: Array, names: tuple[str, ...]) -> str:
-    """A direction (n,) as a sum of terms called by their `names`, largest first."""
-    order = np.argsort(-np.abs(direction), kind="stable")
-    parts = [f"{direction[k]:+.2f} {names[k]}" for k in order if abs(direction[k]) >= _NAMED]
-    return " ".join(parts)
 
 
 def parameter_findings(result: FitResult) -> list[Finding]:
@@ -186,40 +155,26 @@ def parameter_findings(result: FitResult) -> list[Finding]:
     return [Finding("parameters", table, caption)]
 
 
-def limit_findings(result: FitResult) -> list[Finding]:
-    """Limits of the commands and other horizons, as far as computed."""
-    found, plant = [], result.given.plant
-    if result.uncertainty.limits:
-        table = table_of(
-            zip(plant.controls, result.uncertainty.limits, strict=False),
-            {
-                "input": lambda pair: signal_name(plant, pair[0]),
-                "limit": lambda pair: np.nan if pair[1].value is None else float(pair[1].value),
-                "low": lambda pair: float(pair[1].low),
-                "high": lambda pair: float(pair[1].high),
-                "distance_of_no_limit": lambda pair: float(pair[1].against_none),
-                "threshold": lambda _: QUANTILE,
-            },
-        )
-        found.append(Finding("limits", table, "Estimated limits of the command, 95 % intervals."))
-    if result.uncertainty.alternatives:
-        first = result.uncertainty.alternatives[0]
-        table = table_of(
-            result.uncertainty.alternatives,
-            {
-                "fit": lambda item: item.name,
-                "horizon": lambda item: int(item.horizon),
-                "aic_above_the_least": lambda item: float(item.aic),
-                "left_out_vaf": lambda item: float(item.held_out),
-                "the_recordings_say": lambda item: "" if item is first else verdict(first, item),
-            },
-        )
-        caption = (
-            "The same recordings with other horizons and without limit. AIC: difference to the "
-            "smallest. VAF (%): in left-out trials."
-        )
-        found.append(Finding("alternatives", table, caption))
-    return found
+def alternative_findings(result: FitResult) -> list[Finding]:
+    """Table of other horizons, and of no limit, if requested."""
+    found = result.uncertainty.alternatives
+    if not found:
+        return []
+    columns: dict[str, Callable[[Alternative], Any]] = {
+        "fit": lambda item: item.name,
+        "horizon": lambda item: int(item.horizon),
+        "aic_above_the_least": lambda item: float(item.aic),
+        "left_out_vaf": lambda item: float(item.held_out),
+    }
+    if any(item.reason for item in found):
+        columns["note"] = lambda item: item.reason
+    # Burnham and Anderson (2002, 70); all alternatives fit equally many numbers.
+    caption = (
+        "The same recordings with other horizons and without limit. AIC: difference to the "
+        "smallest; below 2 the recordings do not distinguish two fits, above 10 they rule out the "
+        "worse one. VAF (%): in left-out trials."
+    )
+    return [Finding("alternatives", table_of(found, columns), caption)]
 
 
 def number_name(plant: Plant, name: str) -> str:
@@ -254,56 +209,18 @@ def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
     return gain if states == plant.states and gain.shape == (plant.m, plant.n) else None
 
 
-def truth_count(result: FitResult, truth: Array) -> tuple[int, int, float]:
-    """Number of true gain entries inside their intervals, number of all, level in %."""
-    pairs = _pairs(result, truth)
-    inside = sum(item.low <= value <= item.high for item, value in pairs)
-    return inside, len(pairs), 100 * pairs[0][0].level
-
-
-def truth_sentence(result: FitResult, truth: Array) -> str:
-    """Sentence that compares the estimated gains with the true gain (m, n)."""
-    if not result.preferred:
-        return "The recordings are simulated, but there is no estimated gain to compare."
-    inside, count, level = truth_count(result, truth)
-    text = (
-        f"The recordings are simulated: {inside} of the {count} entries of their true gain lie "
-        f"inside their {level:.0f} % intervals"
-    )
-    person = _of_person(result, truth)
-    off = [pair for pair in _pairs(result, truth) if not pair[0].low <= pair[1] <= pair[0].high]
-    if not off:
-        return f"{text}.{person}"
-    item, value = max(off, key=lambda pair: _distance(*pair))
-    name = number_name(result.given.plant, item.name)
-    return (
-        f"{text}. The largest deviation is in the gain on {name}: interval {number(item.low, 4)} "
-        f"to {number(item.high, 4)}, true value {number(value, 4)}.{person}"
-    )
-
-
-def _of_person(result: FitResult, truth: Array) -> str:
-    if result.person is None or result.person.fit is None:
-        return ""
-    ends = np.array(result.person.entries)  # NaN if not individually identified
-    identified = np.count_nonzero(~np.isnan(ends[:, 0]))
-    inside = np.count_nonzero((ends[:, 0] <= truth.ravel()) & (truth.ravel() <= ends[:, 1]))
-    return (
-        f" In the model with sensory noise, {inside} of the {identified} identified entries lie "
-        "inside their intervals."
-    )
-
-
-def _pairs(result: FitResult, truth: Array) -> list[tuple[Interval, float]]:
-    first = result.preferred
+def truth_found(result: FitResult, truth: Array) -> tuple[bool, str]:
+    """Whether all gain entries of the truth (m, n) lie inside their intervals, in words too."""
     values = zip(entry_names(result.given.plant), truth.ravel(), strict=True)
-    return [(first[name], float(value)) for name, value in values if name in first]
-
-
-def _distance(item: Interval, value: float) -> float:
-    """Distance of `value` from the centre of the interval, in half widths."""
-    half = (item.high - item.low) / 2
-    return abs(value - (item.low + item.high) / 2) / half if half else np.inf
+    pairs = [(result.preferred[name], one) for name, one in values if name in result.preferred]
+    if not pairs:
+        return True, "The recordings are simulated, but there is no estimated gain to compare."
+    inside = sum(item.low <= value <= item.high for item, value in pairs)
+    level = 100 * pairs[0][0].level
+    return inside == len(pairs), (
+        f"The recordings are simulated: {inside} of the {len(pairs)} entries of their true gain "
+        f"lie inside their {level:.0f} % intervals."
+    )
 
 
 def agreement_finding(result: FitResult) -> Finding:
@@ -312,7 +229,8 @@ def agreement_finding(result: FitResult) -> Finding:
     for index, trial in enumerate(result.trials):
         row: dict[str, object] = {"trial": trial_name(result, index)}
         row["length_s"] = result.given.recordings[index].samples * plant.dt
-        held = result.held_out[index].vaf if result.held_out else np.full(len(trial.vaf), np.nan)
+        each = result.inverse_mpc.held_out
+        held = each[index] if len(each) else np.full(len(trial.vaf), np.nan)
         for column, name in enumerate(plant.outputs):
             words = signal_name(plant, name)
             for key, label, value in (
@@ -341,26 +259,6 @@ def error_findings(result: FitResult) -> list[Finding]:
     table = pd.DataFrame(rows, columns=heads).dropna(axis="columns", how="all")
     caption = "Errors of the recorded signals, estimated with the gain in each trial."
     return [Finding("signal_errors", table, caption, folded="Errors of signals")] if rows else []
-
-
-def command_findings(result: FitResult) -> list[Finding]:
-    """Table of the gain by regression on recorded commands and of the fitted gain, if any."""
-    if result.commands is None:
-        return []
-    table = result.commands.reset_index(names="number")
-    table["number"] = [number_name(result.given.plant, name) for name in table["number"]]
-    inside = table["fitted"].between(table["low"], table["high"])
-    said = (
-        f"{inside.sum()} of the {len(table)} entries of the fitted gain lie inside the 95 % "
-        "intervals of a regression of the recorded commands on the states."
-    )
-    caption = (
-        "The regression uses samples inside the limit. Noise in recorded states biases the "
-        "regression; a wrong body model or limit biases the fit. A large difference indicates one "
-        "of these errors."
-    )
-    folded = "Regression of the commands"
-    return [Finding("command_regression", table, caption, [said], folded=folded)]
 
 
 def trajectory_finding(result: FitResult) -> Finding:
@@ -395,7 +293,7 @@ def response_findings(result: FitResult) -> list[Finding]:
 
 
 def weight_findings(result: FitResult) -> list[Finding]:
-    """Tables of comparisons of cost, ranges of cost weights, and reported weights."""
+    """Tables of comparisons of cost, and of the reported weights."""
     summary, plant = result.uncertainty.weights, result.given.plant
     if summary is None:
         return [weight_finding(result)]
@@ -403,7 +301,13 @@ def weight_findings(result: FitResult) -> list[Finding]:
         sorted(summary.statements, key=lambda item: (not item.made, item.holds is None)),
         {
             "comparison": lambda item: statement_text(plant, item),
-            "verdict": _verdict,
+            "verdict": lambda item: (
+                "undecided: weights with the fitted gain differ"
+                if item.holds is None
+                else "decided"
+                if item.made
+                else "undecided: other possible gains differ"
+            ),
             "other_gains_that_agree_percent": lambda item: (
                 np.nan if item.confidence is None else 100 * float(item.confidence)
             ),
@@ -417,30 +321,7 @@ def weight_findings(result: FitResult) -> list[Finding]:
         f"{summary.drawn} other gains were tried; a comparison is decided if at most one of them "
         "disagrees."
     )
-    found = [Finding("statements", table, caption)]
-    if summary.cost_weights:
-        table = table_of(
-            summary.cost_weights,
-            {
-                "state": lambda item: signal_name(plant, item.state),
-                "low_fitted_gain": lambda item: float(item.low),
-                "high_fitted_gain": lambda item: float(item.high),
-                "low": lambda item: float(item.low_drawn),
-                "high": lambda item: float(item.high_drawn),
-            },
-        )
-        caption = (
-            "Range of the cost of a typical excursion over all weights, at R = 1: with the fitted "
-            "gain, and (95 %) with all gains that the recordings allow."
-        )
-        found.append(Finding("cost_weights", table, caption))
-    return [*found, weight_finding(result)]
-
-
-def _verdict(item: Statement) -> str:
-    if item.holds is None:
-        return "undecided: weights with the fitted gain differ"
-    return "decided" if item.made else "undecided: other possible gains differ"
+    return [Finding("statements", table, caption), weight_finding(result)]
 
 
 def weight_finding(result: FitResult) -> Finding:
@@ -467,26 +348,3 @@ def weight_finding(result: FitResult) -> Finding:
     ]
     table.insert(1, "entry", words)
     return Finding("weights", table, caption, hidden=("first", "second"))
-
-
-def reading_finding(result: FitResult) -> Finding:
-    """Table of weights with the fitted gain by several conventions."""
-    plant, found = result.fitted.problem.plant, result.intent
-    names = tuple(signal_name(plant, state) for state in plant.states)
-    table = table_of(
-        found.readings,
-        {
-            "convention": lambda item: item.rule,
-            "largest_eigenvalue": lambda item: float(item.eigenvalues[-1]),
-            "costliest_combination": lambda item: direction_name(item.dominant, names),
-            "turned_by_degrees": lambda item: float(item.angle),
-            "condition_number": lambda item: float(item.condition),
-        },
-    )
-    caption = (
-        "Weights with exactly the same gain, and therefore the same movement, by several "
-        f"conventions. The costliest combination depends on the convention: it turns by up to "
-        f"{result.widest_angle:.0f} degrees."
-    )
-    said = [f"Not available: {line}" for line in found.missing]
-    return Finding("readings", table, caption, said, digits=3)

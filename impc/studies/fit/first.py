@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.inverse.unknowns import Fitted
-    from impc.studies.fit.uncertainty import Attempt
 
 # Evidence (-log p) of an alarm in a first search that cannot come from its early end.
 _PLAIN = 50.0
@@ -46,27 +45,27 @@ class FitProgress:
     part: Callable[..., Any] = lambda _name, compute, _encode, _decode: compute()
     # Callbacks for a problem with one more unknown; None if nothing is stored
     about: Callable[[Problem], FitProgress] | None = None
+    failures: dict[str, str] = field(default_factory=dict)  # Reasons, by stage
 
     def anew(self, problem: Problem) -> FitProgress:
         """Callbacks for another problem."""
-        return FitProgress(self.done) if self.about is None else self.about(problem)
+        other = FitProgress(self.done) if self.about is None else self.about(problem)
+        return replace(other, failures=self.failures)
 
-
-def attempted(
-    failures: dict[str, str], stage: str, compute: Callable[[], Any], default: Any
-) -> Any:
-    """Result of a stage; if it fails, the default, with the reason in `failures`."""
-    try:
-        return compute()
-    except (ImpcError, np.linalg.LinAlgError) as error:
-        failures[stage] = str(error)
-        return default
+    def attempt(self, stage: str, compute: Callable[[], Any], default: Any) -> Any:
+        """Result of a stage; if it fails, the default, with the reason in `failures`."""
+        try:
+            return compute()
+        except (ImpcError, np.linalg.LinAlgError) as error:
+            self.failures[stage] = str(error)
+            return default
 
 
 def first_fits(
-    problem: Problem, progress: FitProgress, attempt: Attempt
+    problem: Problem, progress: FitProgress
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
     """Inverse MPC, with one more unknown if tests of a first search or of the fit point to it."""
+    attempt = progress.attempt
 
     def tested(at: GainEstimate | Fitted) -> LackOfFit | None:
         found: LackOfFit | None

@@ -17,7 +17,6 @@ from impc.studies.fit.facts import (
     given_limit,
     held_out,
     named_gains,
-    saturation,
     shares,
     statement_text,
     unlimited_ratio,
@@ -90,16 +89,12 @@ def _results(result: FitResult) -> list[str]:
     if result.falls:
         said.append(f"Trials that ended in a fall were left out ({len(result.falls)}).")
     if given_limit(result) and result.met and SHARE not in no:
-        share, (_, without) = saturation(result), unlimited_ratio(result)
+        share, (_, without) = 100 * result.saturated, unlimited_ratio(result)
         said.append(f"The command was at its limit for {share:.1f} % of the time.{without}")
     if GAIN in no:
         why = reason(result, GAIN)
         return [*said, f"Gains are not reported: {why[:1].lower()}{why[1:]}."]
-    gains = [
-        f"{number(row.value)} {row.unit} for {row.per} (95 % CI {row.ends})"
-        for _, row in named_gains(result)
-        if row.determined
-    ]
+    gains = [row.text for _, row in named_gains(result) if row.determined]
     said.append(f"Gains were {'; '.join(gains)}.")
     if WEIGHTS in no:
         return said

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from impc.assess.lack_of_fit import LIMIT
 from impc.assess.printed_gain import LastingResponse, lasting_responses
-from impc.control.named_solver import described
+from impc.checking import replace
 from impc.inverse.minimiser import Ended
 from impc.reporting.document import (
     Block,
@@ -27,7 +27,7 @@ from impc.reporting.document import (
 from impc.reporting.finding import Chart, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import fixed, number, probability
-from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
+from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
 from impc.studies.fit import figures, findings
@@ -50,8 +50,8 @@ from impc.studies.fit.facts import (
     left_out_text,
     limit_ends,
     named_gains,
+    no_limit,
     one_of,
-    saturation,
     shares,
     shift_words,
     statement_text,
@@ -61,10 +61,7 @@ from impc.studies.fit.facts import (
 from impc.studies.fit.paper import paper_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
-from impc.studies.fit.structures import (
-    structure_draw,
-    structure_section,
-)
+from impc.studies.fit.structures import structure_section
 from impc.studies.fit.verdict import (
     GAIN,
     SHARE,
@@ -74,8 +71,8 @@ from impc.studies.fit.verdict import (
     forbidden,
     little,
 )
-from impc.studies.methods_figure import methods_figure
-from impc.studies.methods_table import methods_finding
+from impc.studies.methods_figure import explained, methods_figure
+from impc.studies.methods_table import methods_finding, provenance_section
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -114,7 +111,8 @@ def fit_report(
 def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
     """Report for a subject who fell in every trial."""
     verdict = fallen_verdict(falls)
-    sections = [Section("Falls", [Lines(falls)]), _made(provenance)]
+    made = Section("Provenance", [Terms(provenance.terms)])
+    sections = [Section("Falls", [Lines(falls)]), made]
     data = {"falls": falls}
     return Report("Fit report", "fit report", verdict, sections, data=data, provenance=provenance)
 
@@ -137,7 +135,7 @@ def _hero(result: FitResult, index: int) -> Picture:
 
 def _keys(result: FitResult) -> list[Key]:
     plant, held = result.given.plant, held_out(result)
-    vaf = result.inverse_mpc.vaf if held is None else held
+    vaf = explained(result.inverse_mpc)
     names = [signal_name(plant, name) for name in plant.outputs]
     others = "; ".join(
         f"{name} {value:.2f} %" for name, value in zip(names[1:], vaf[1:], strict=True)
@@ -156,7 +154,7 @@ def _keys(result: FitResult) -> list[Key]:
     elif given_limit(result) and result.met:
         each = [100 * one.saturated for one in result.trials]
         keys.append(
-            Key(f"{saturation(result):.1f}", "% of the time", "at the limit",
+            Key(f"{100 * result.saturated:.1f}", "% of the time", "at the limit",
                 f"{min(each):.1f} to {max(each):.1f} % in single trials")
         )  # fmt: skip
     else:
@@ -183,17 +181,15 @@ def _keys(result: FitResult) -> list[Key]:
 def _draws(result: FitResult, window: int) -> dict[str, Draw]:
     """Functions that draw the figures of the page."""
     found: dict[str, Draw] = {
-        "movement": functools.partial(figures.movement_figure, result, window),
+        "movement": functools.partial(figures.movement_figure, result.inverse_mpc, window),
         "methods": functools.partial(methods_figure, result.methods[::-1]),
-        "residuals": functools.partial(figures.residual_figure, result),
+        "residuals": functools.partial(figures.residual_figure, result.inverse_mpc),
     }
     if result.response is not None:
         response = functools.partial(figures.frequency_figure, result, result.response)
         found["frequency-response"] = response
     if result.compared and WEIGHTS not in forbidden(result):
         found["statements"] = functools.partial(figures.statements_figure, result)
-    if result.structures and result.structures[0].ratios:
-        found["structured-weights"] = structure_draw(result)
     return found
 
 
@@ -203,22 +199,22 @@ def _sections(
     """Sections of the page; add a line here for a new section."""
     no = forbidden(result)
     return [
-        Section("Feedback gain", _gain(result, truth, GAIN in no)),
+        Section("Feedback gain", _gain(result, GAIN in no)),
         *([] if result.person is None else [result.person.section()]),
         Section("Does the limit matter?", _limit(result, SHARE in no), "Limit"),
         *([structure_section(result)] if result.structures else []),
         Section("Intent: what the cost weights say", _intent(result, WEIGHTS in no), "Intent"),
         *([Section("Frequency response", _response(result))] if result.response else []),
         Section("Checks", _checks(result, truth)),
-        _made(provenance, result, missing),
+        _made(result, provenance, missing),
     ]
 
 
-def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
+def _gain(result: FitResult, hidden: bool) -> list[Block]:
     if not result.preferred:
         return [Quiet(_HIDDEN)]
     tables = [
-        findings.gain_finding(result, truth),
+        findings.gain_finding(result),
         findings.direction_finding(result),
         *findings.parameter_findings(result),
     ]
@@ -242,7 +238,6 @@ def _gain(result: FitResult, truth: Array | None, hidden: bool) -> list[Block]:
             "All gains in SI units, combinations and parameters",
             [*tables, *filter(None, [parameter_words(result)])],
         ),
-        *findings.command_findings(result),
         *findings.error_findings(result),
     ]
 
@@ -269,13 +264,9 @@ def _lasting(result: FitResult, found: LastingResponse) -> str:
 
 
 def _limit(result: FitResult, doubtful: bool) -> list[Block]:
-    limit, (ratio, without) = given_limit(result), unlimited_ratio(result)
-    if limit is None:
-        said = "No limit was given, so the model has none."
-    elif not result.met:
-        said = "These recordings cannot answer this question: the limit is never reached."
-    elif doubtful:
-        said = f"A limit may matter, but {limit} is in doubt (see the warning above)."
+    ratio, without = unlimited_ratio(result)
+    if given_limit(result) is None or not result.met or doubtful:
+        said = no_limit(result)
     elif ratio >= MATTERS:
         said = f"Yes. The same recordings were fitted with and without a limit.{without}"
     else:
@@ -289,7 +280,7 @@ def _limit(result: FitResult, doubtful: bool) -> list[Block]:
     return [
         said,
         methods,
-        *findings.limit_findings(result),
+        *findings.alternative_findings(result),
         Fold("All methods in numbers", [methods_finding(result.methods[::-1])]),
     ]
 
@@ -301,7 +292,7 @@ def _intent(result: FitResult, hidden: bool) -> list[Block]:
             Fold("Cost weights (do not report)", [findings.weight_finding(result)]),
         ]
     plant, summary, made = result.given.plant, result.uncertainty.weights, decided(result)
-    tables = [*findings.weight_findings(result), findings.reading_finding(result)]
+    tables = findings.weight_findings(result)
     if summary is None:
         return [Quiet(f"Not available: {result.uncertainty.weights_reason}"), *tables]
     drawn = (
@@ -351,18 +342,16 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
         _recordings(result),
         Check(Level.RED if little(result) else Level.GREEN, "Explained variance",
               left_out_text(result)),
-        *_limit_check(result),
+        _limit_check(result),
         _model(result),
-        _weights(result),
+        Check(Level.AMBER if result.weights_test.rejected else Level.GREEN, "Cost weights",
+              f"{'No' if result.weights_test.rejected else 'At least one'} cost explains this "
+              "gain."),
         *_others(result),
     ]  # fmt: skip
-    if truth is not None and result.preferred:
-        inside, count, level = findings.truth_count(result, truth)
-        checks.append(
-            Check(Level.NOTE if inside == count else Level.AMBER, "Known truth",
-                  f"Simulated recordings: {inside} of {count} true gains lie inside their "
-                  f"{level:.0f} % intervals.")
-        )  # fmt: skip
+    if truth is not None:
+        right, said = findings.truth_found(result, truth)
+        checks.append(Check(Level.NOTE if right else Level.AMBER, "Known truth", said))
     residuals = Picture(
         "residuals",
         "Residuals of the first output and their autocorrelation",
@@ -393,49 +382,36 @@ def _recordings(result: FitResult) -> Check:
     return Check(Level.GREEN, "Recordings", f"{used}; no gaps, jumps or unit problems; no fall.")
 
 
-def _limit_check(result: FitResult) -> list[Check]:
-    limit, found = given_limit(result), result.limit_found
-    if limit is None:
-        return [Check(Level.NOTE, "Limit", "No limit was given.")]
-    if not result.met:
-        return [Check(Level.NOTE, "Limit", "Never reached: the recordings cannot check it.")]
-    if found is None:
-        last = result.lack[-1]
-        tested = [one for one in (last.errors if last else ()) if one.name == LIMIT]
+def _limit_check(result: FitResult) -> Check:
+    limit, found, last = given_limit(result), result.limit_found, result.lack[-1]
+    level, said = Level.NOTE, f"Given as {limit}; it was not tested."
+    if limit is None or not result.met:
+        said = no_limit(result)
+    elif found is not None:
+        level = Level.AMBER if found.disagrees else Level.GREEN
+        ends = f"{number(found.value)} {found.unit} ({limit_ends(found)})"
+        said = f"Given as {limit}; the recordings point to {ends}."
+    elif last is not None:
+        tested = [one for one in last.errors if one.name == LIMIT]
         if result.culprit is not None and result.culprit.name == LIMIT:
-            return [Check(Level.AMBER, "Limit", "The residual points to another limit.")]
-        if tested and last is not None and not last.alarm:
-            said = f"the residual points to no other ({probability(tested[0].probability)})"
-            return [Check(Level.GREEN, "Limit", f"Given as {limit}; {said}.")]
-        return [Check(Level.NOTE, "Limit", f"Given as {limit}; it was not tested.")]
-    said = (
-        f"Given as {limit}; the recordings point to {number(found.value)} {found.unit} "
-        f"({limit_ends(found)})."
-    )
-    return [Check(Level.AMBER if found.disagrees else Level.GREEN, "Limit", said)]
+            level, said = Level.AMBER, "The residual points to another limit."
+        elif tested and not last.alarm:
+            p = probability(tested[0].probability)
+            level = Level.GREEN
+            said = f"Given as {limit}; the residual points to no other ({p})."
+    return Check(level, "Limit", said)
 
 
 def _model(result: FitResult) -> Check:
-    last = result.lack[-1]
+    last, level = result.lack[-1], Level.AMBER
     if last is None:
         said = "Not tested: the recordings are too short, exact, or have gaps. Gains may be wrong."
-        return Check(Level.AMBER, "Body model", said)
-    least = min((one.probability for one in last.errors), default=1.0)
-    if last.alarm:
-        return Check(Level.AMBER, "Body model",
-                     "Part of the residual follows the perturbation; see the warning.")  # fmt: skip
-    return Check(
-        Level.GREEN,
-        "Body model",
-        f"{len(last.errors)} tests found no model error (smallest {probability(least)}).",
-    )
-
-
-def _weights(result: FitResult) -> Check:
-    test = result.weights_test
-    if test.rejected:
-        return Check(Level.AMBER, "Cost weights", "No cost explains this gain.")
-    return Check(Level.GREEN, "Cost weights", "At least one cost explains this gain.")
+    elif last.alarm:
+        said = "Part of the residual follows the perturbation; see the warning."
+    else:
+        level, least = Level.GREEN, min((one.probability for one in last.errors), default=1.0)
+        said = f"{len(last.errors)} tests found no model error (smallest {probability(least)})."
+    return Check(level, "Body model", said)
 
 
 def _others(result: FitResult) -> list[Check]:
@@ -465,31 +441,14 @@ def _others(result: FitResult) -> list[Check]:
     return found
 
 
-def _made(provenance: Provenance, result: FitResult | None = None, missing: str = "") -> Section:
-    terms = list(provenance.terms)
-    if missing:
-        terms.insert(0, ("Not given", missing.removeprefix("Not given: ")))
-    blocks: list[Block] = [Terms(terms)]
-    if result is not None:
-        code = Markup("<code>{}</code>")
-        settings = [
-            (name, code.format(value)) for name, value in plain_settings(result.settings).items()
-        ]
-        problem = result.fitted.problem
-        how = [
-            ("Body", body_sentence(problem.plant)),
-            ("Quadratic programs", f"Solved by {described(problem.solver)}."),
-            ("Terminal set", _terminal_set(result)),
-            ("Time of the fit", f"{result.seconds:.1f} s"),
-        ]
-        blocks.append(Fold("All settings", [Terms([*how, *settings])]))
-    return Section("Provenance", blocks)
-
-
-def _terminal_set(result: FitResult) -> str:
-    changed, within = result.terminal_set_difference, bool(result.fitted.problem.terminal_set)
-    ends = "The controller has a terminal set" if within else "The controller has no terminal set"
-    if np.isnan(changed):
-        return f"{ends}."
-    other = "without" if within else "with"
-    return f"{ends}; {other} one, an output would change by at most {changed:.2g} of its size."
+def _made(result: FitResult, provenance: Provenance, missing: str) -> Section:
+    found, problem = provenance_section(result.fitted.problem, provenance), result.fitted.problem
+    code, plain = Markup("<code>{}</code>"), plain_settings(result.settings)
+    how = [
+        ("Terminal set", "yes" if problem.terminal_set else "no"),
+        ("Time of the fit", f"{result.seconds:.1f} s"),
+        *((name, code.format(value)) for name, value in plain.items()),
+    ]
+    first = [Terms([("Not given", missing.removeprefix("Not given: "))])] if missing else []
+    fold = Fold("All settings", [Terms(how)])
+    return replace(found, blocks=[*first, *found.blocks, fold])

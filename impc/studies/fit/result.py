@@ -15,12 +15,9 @@ from impc.assess.printed_gain import PARAMETER, entry_names
 from impc.control.simulation import Status
 from impc.inverse.problem import simulated
 from impc.model.plant_family import LIMIT
-from impc.model.riccati import solve_lqr
 from impc.reporting.shown_units import shown_unit
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from impc.arrays import Array
     from impc.assess.assessments import MethodFit
     from impc.assess.ceiling import Ceiling
@@ -29,7 +26,7 @@ if TYPE_CHECKING:
     from impc.assess.lack_of_fit import LackOfFit, ModelError
     from impc.assess.printed_gain import GainEstimate, Interval
     from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import HeldOut, TrialAgreement
+    from impc.assess.variance_accounted_for import TrialAgreement
     from impc.assess.weights_ranges import Statement
     from impc.assess.weights_test import WeightsTest
     from impc.inverse.estimates import Estimate, Identifiability
@@ -95,8 +92,6 @@ class FitResult:
 
     settings: FitSettings
     given: Problem  # Problem as posed: nominal plant, trials at rest
-    # Weights and their gain; `fitted.problem` holds the fitted initial states and plant
-    fitted: Estimate
     # Gain fitted without weights, with standard errors; the report prints its intervals
     estimate: GainEstimate
     parameters: tuple[FittedParameter, ...]
@@ -106,14 +101,10 @@ class FitResult:
     # Intervals, the set of weights with this gain, and other requested analyses
     uncertainty: Uncertainty
     trials: tuple[TrialAgreement, ...]  # Inverse MPC, one per trial
-    held_out: tuple[HeldOut, ...]  # One per trial; empty for a single trial or if not requested
-    # Requested methods; the last is inverse MPC
+    # Requested methods; the last is inverse MPC, with the VAF of left-out trials if requested
     methods: tuple[MethodFit, ...]
     # Tests of the model in the first fit and, if an unknown was added, in the last
     lack: tuple[LackOfFit | None, ...]
-    # Largest change of a scaled output if the terminal set is added (or removed); NaN if a
-    # simulation then stops early
-    terminal_set_difference: float
     seconds: float  # Run time of the whole fit, s
     weights_test: WeightsTest  # Test whether any weights explain the gain
     # Stages that failed, with the reason; their results are missing
@@ -123,32 +114,30 @@ class FitResult:
     person: PersonReport | None = None  # Result of [fit.observer]; None if not requested
     # Part of the outputs that repeats with the perturbation; None if it does not repeat
     ceiling: Ceiling | None = None
-    # Gain by regression on recorded commands (`command_regression`); None if there are none
-    commands: pd.DataFrame | None = None
     response: FrequencyResponse | None = None  # From the perturbation to the outputs
     falls: tuple[str, ...] = ()  # Trials that ended in a fall and were not fitted, with the time
 
     @property
     def limit_found(self) -> LimitFound | None:
         """Estimated limit of the first input that has one; None if not estimated."""
-        for control, item in zip(self.given.plant.controls, self.uncertainty.limits, strict=False):
-            if item.value is not None:
-                given = float(self.given.bounds.u_max[self.given.plant.controls.index(control)])
-                return self._limit(control, given, item.value, item.low, item.high)
-        for one in self.parameters:
-            kind, _, control = one.name.partition(".")
-            if kind == LIMIT and (one.stated is None or one.deviation < one.stated / 2):
-                half = TWO_SIDED * one.deviation
-                return self._limit(control, one.nominal, one.value, one.value - half,
-                                   one.value + half)  # fmt: skip
+        plant = self.given.plant
+        for k, control in enumerate(plant.controls):
+            name, given = f"{LIMIT}.{control}", float(self.given.bounds.u_max[k])
+            stated = next((one for one in self.parameters if one.name == name), None)
+            item, known = self.preferred.get(name), 0.0
+            if item is not None and item.value is not None:
+                ends = item.value, item.low, item.high
+            elif stated is not None and stated.deviation < (stated.stated or np.inf) / 2:
+                half, given = TWO_SIDED * stated.deviation, stated.nominal
+                ends = stated.value, stated.value - half, stated.value + half
+            else:
+                continue
+            if stated is not None and self.added is None:
+                known = stated.stated or 0.0
+            factor, unit = shown_unit(plant, control)
+            value, low, high = (factor * one for one in ends)
+            return LimitFound(factor * given, value, low, high, unit, TWO_SIDED * factor * known)
         return None
-
-    def _limit(self, control: str, *numbers: float) -> LimitFound:
-        factor, unit = shown_unit(self.given.plant, control)
-        stated = {one.name: one.stated or 0.0 for one in self.parameters}
-        known = 0.0 if self.added is not None else stated.get(f"{LIMIT}.{control}", 0.0)
-        given, value, low, high = (factor * one for one in numbers)
-        return LimitFound(given, value, low, high, unit, TWO_SIDED * factor * known)
 
     @property
     def usable(self) -> bool:
@@ -191,18 +180,6 @@ class FitResult:
         return () if self.uncertainty.weights is None else self.uncertainty.weights.statements
 
     @property
-    def reported_P(self) -> Array:  # noqa: N802
-        """Terminal weight (3.4) of the reported weights, shape (n, n)."""
-        return solve_lqr(self.fitted.problem.plant, self.intent.reported.weights).P
-
-    @property
-    def widest_angle(self) -> float:
-        """Largest angle between dominant directions of weights with this gain, degrees."""
-        found = self.uncertainty.weights
-        over_set = 0.0 if found is None else found.widest_angle
-        return max(self.intent.widest_angle, over_set)
-
-    @property
     def added(self) -> ModelError | None:
         """Model error that the first fit pointed to and that was added as an unknown."""
         first = self.lack[0]
@@ -222,6 +199,11 @@ class FitResult:
     def inverse_mpc(self) -> MethodFit:
         """The fit by inverse MPC."""
         return self.methods[-1]
+
+    @property
+    def fitted(self) -> Estimate:
+        """Weights and their gain; its problem holds the fitted initial states and plant."""
+        return self.inverse_mpc.estimate
 
 
 def trial_name(result: FitResult, index: int) -> str:

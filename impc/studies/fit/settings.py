@@ -108,8 +108,7 @@ class FitSettings:
         Largest magnitude of each input, in its unit. Not given: no limit.
     bounded_states : dict of str to float or "data"
         Largest magnitude of states by name, in SI units. "data": the largest recorded value of the
-        output of that name (for a state `y_rate`, of the derivative of output y) times `margin`
-        (3.22).
+        output of that name times `margin` (3.22).
     margin : float
         Factor of "data" in `bounded_states`. With 1 the bound equals the recorded maximum, so that
         the fitted controller reaches it even if the person had no such bound.
@@ -143,9 +142,7 @@ class FitSettings:
     held_out : bool
         Whether each trial is also predicted by a fit to the other trials.
     replicates : int
-        Number of bootstrap replicates: 0 (none) or at least 20.
-    bootstrap : "block"
-        Resampling of the residuals: moving blocks.
+        Number of bootstrap replicates, which resample residuals in moving blocks: 0 or at least 20.
     seed : int
         Seed of the bootstrap.
     profiles : list of str
@@ -196,7 +193,6 @@ class FitSettings:
     settle: Annotated[float, Meta(ge=0, le=1_000_000)] = 1.0
     held_out: bool = True
     replicates: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
-    bootstrap: Literal["block"] = "block"
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     profiles: list[str] = field(default_factory=list)
     intent_draws: bool = True
@@ -248,8 +244,6 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
             raise InputError(
                 f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or remove the line"
             )
-    if table.get("bootstrap") == "model":
-        raise InputError("[fit] bootstrap", '"model" was removed', 'use "block"')
     settings = read_settings("fit", FitSettings, table)
     if 0 < settings.replicates < _FEWEST:
         raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,12 +10,12 @@ import pandas as pd
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.structured_weights import IDENTIFIED_FACTOR
 from impc.assess.variance_accounted_for import innovation_roots, innovations_criterion
-from impc.reporting.document import Block, Draw, Fold, Section
-from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.document import Block, Fold, Section
+from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import probability
 from impc.reporting.shown_units import words_of
 from impc.studies.fit.facts import shares
-from impc.studies.fit.figures import interval_figure
+from impc.studies.methods_figure import explained
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,13 +25,6 @@ if TYPE_CHECKING:
 
 # Power below which the test is said to have little power.
 _BLIND = 0.1
-_PICTURE = Picture(
-    "structured-weights",
-    "Cost weights of the features with their intervals, one row each, on a logarithmic axis",
-    "Cost weights within the structure, at a cost weight of one for the first input, with 95 % "
-    "intervals that allow for autocorrelated residuals. An arrow marks an interval that goes on; "
-    "to the left, the cost weight may be zero.",
-)
 # Coverage of intervals at a zero cost weight: experiments/structures.md.
 _AT_ZERO = (
     "If the best cost weight is zero, 95 % intervals contained the true value in 78 to 96 % of "
@@ -70,16 +62,6 @@ def structure_data(result: FitResult) -> list[dict[str, Any]]:
             row |= {"Q": weights.Q, "R": weights.R, "K": estimate.gain}
         rows.append(row)
     return rows
-
-
-def structure_draw(result: FitResult) -> Draw:
-    """Function that draws the cost weights of the first structure."""
-    found = result.structures[0]
-    ends = np.exp([[item.low, item.high] for item in found.intervals])
-    values = np.exp([item.value for item in found.intervals])
-    axis = "Cost weight, first input 1 (SI)"
-    names = list(_names(result, found.structure.unknowns))
-    return functools.partial(interval_figure, names, ends, values, axis)
 
 
 def structure_sentences(result: FitResult) -> list[str]:
@@ -165,7 +147,6 @@ def _cost_weights(result: FitResult, found: StructureFit) -> Finding:
         "Unknowns of the structure: cost weights relative to that of the first command, in SI "
         "units, with 95 % intervals that allow for autocorrelated residuals. Last column: cost of "
         "the feature at its typical size, relative to the cost of the command.",
-        figure=_PICTURE if found.ratios else None,
         labels={"of": "Cost weight of"},
         hidden=["feature"],
     )
@@ -208,23 +189,20 @@ def _comparison(result: FitResult) -> Finding:
     identified = int(np.count_nonzero(result.estimate.covariance.identified))
     free = innovations_criterion(result.fitted, innovation_roots(result.fitted), identified)
     least = min([free, *(item.aic for item in result.structures)])
-    held = [item.vaf for item in result.held_out]
-    left_out = np.mean(held, axis=0) if held else np.full(len(plant.outputs), np.nan)
-    rows = [("weights of any kind", result.identifiability.free, identified,
-             *result.inverse_mpc.vaf, *left_out, free - least, np.nan, "")]  # fmt: skip
+    own, held = explained(result.inverse_mpc), len(result.inverse_mpc.held_out) > 0
+    rows = [("weights of any kind", result.identifiability.free, identified, *own, free - least,
+             np.nan, "")]  # fmt: skip
     for item in result.structures:
-        test, said = item.test, item.reason
+        test, said, vaf = item.test, item.reason, item.held_out if held else item.vaf
         p = np.nan if test is None or not test.freedom else test.probability
         if test is not None:
             said = "rejected" if test.refused else "not rejected" if test.freedom else "not tested"
-        rows.append((item.structure.name, item.structure.count, item.identified, *item.vaf,
-                     *item.held_out, item.aic - least, p, said))  # fmt: skip
-    kinds = {"vaf": "VAF of", "left_out_vaf": "Left-out VAF of"}
-    labels = {
-        f"{kind}_{name}": f"{words} {words_of(plant, name)} (%)"
-        for kind, words in kinds.items()
-        for name in plant.outputs
-    }
+        structure = item.structure
+        rows.append((structure.name, structure.count, item.identified, *vaf, item.aic - least, p,
+                     said))  # fmt: skip
+    kind = "left_out_vaf" if held else "vaf"
+    words = "Left-out VAF of" if held else "VAF of"
+    labels = {f"{kind}_{name}": f"{words} {words_of(plant, name)} (%)" for name in plant.outputs}
     heads = ["structure", "unknowns", "identified", *labels, "aic_above_the_least", "p", "test"]
     return Finding(
         "structures",
@@ -233,5 +211,4 @@ def _comparison(result: FitResult) -> Finding:
         "from the innovations of the residuals, with a penalty of two for each identified "
         "combination.",
         labels={**labels, "aic_above_the_least": "AIC above the smallest"},
-        hidden=[name for name in labels if name.startswith("vaf" if held else "left_out")],
     )

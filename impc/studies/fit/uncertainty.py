@@ -8,9 +8,8 @@ gain. On request: bootstrap, profile likelihoods, input limit, other horizons
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,19 +27,15 @@ from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from impc.arrays import Array
-    from impc.assess.input_limits import LimitEstimate
     from impc.assess.printed_gain import GainEstimate
-    from impc.assess.resampling import Replicate
     from impc.assess.weights_ranges import WeightsSummary
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
+    from impc.studies.fit.first import FitProgress
     from impc.studies.fit.settings import FitSettings
-
-#: (stage, compute, default) -> result, or the default if it fails.
-Attempt = Callable[[str, Callable[[], Any], Any], Any]
 
 
 @dataclass(frozen=True)
@@ -51,22 +46,8 @@ class Uncertainty:
     # Set of weights with the fitted gain; None if its programs fail
     weights: WeightsSummary | None
     weights_reason: str  # Why there is none; otherwise empty
-    limits: tuple[LimitEstimate, ...]  # One per input, if requested
     # The fit itself, no limit, other horizons; empty unless requested
     alternatives: tuple[Alternative, ...]
-
-
-def count_stages(problem: Problem, settings: FitSettings) -> int:
-    """Number of stages that `assess` reports, and one for the set of weights."""
-    limited = int(np.any(np.isfinite(problem.bounds.u_max)))
-    others = [length for length in settings.horizons if length != problem.horizon]
-    return (
-        1
-        + settings.replicates
-        + len(settings.profiles)
-        + (problem.plant.m if settings.unknown_limit else 0)
-        + (1 + limited + len(others) if settings.horizons else 0)
-    )
 
 
 def assess(
@@ -75,11 +56,10 @@ def assess(
     estimate: GainEstimate,
     weights: tuple[WeightsSummary | None, str],
     settings: FitSettings,
-    done: Callable[[str], None],
-    remember: Callable[[str, Callable[[], Replicate]], Replicate],
-    attempt: Attempt,
+    progress: FitProgress,
 ) -> Uncertainty:
     """Run the requested analyses."""
+    done, attempt = progress.done, progress.attempt
     intervals = list(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     require_numbers(estimate, settings.profiles)
     for name in settings.profiles:
@@ -87,12 +67,10 @@ def assess(
         profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
         intervals += [] if profile is None else [profile]
         done(stage)
-    limits = []
     for control in range(problem.plant.m if settings.unknown_limit else 0):
         name = problem.plant.controls[control]
         limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
         if limit is not None:
-            limits.append(limit)
             ends = limit.value, limit.low, limit.high
             intervals.append(Interval(f"u_max.{name}", "profile", LEVEL, *ends))
         done(f"limit of {name}")
@@ -101,16 +79,15 @@ def assess(
         given = problem, fitted, settings.horizons, settings.settle, done
         others = functools.partial(fit_alternatives, *given)
         alternatives = attempt("other horizons", others, ())
-    replicates = functools.partial(_bootstrap, estimate, settings, done, remember)
+    replicates = functools.partial(_bootstrap, estimate, settings, progress)
     intervals += attempt("bootstrap", replicates, ())
-    return Uncertainty(tuple(intervals), *weights, tuple(limits), alternatives)
+    return Uncertainty(tuple(intervals), *weights, alternatives)
 
 
 def _bootstrap(
     estimate: GainEstimate,
     settings: FitSettings,
-    done: Callable[[str], None],
-    remember: Callable[[str, Callable[[], Replicate]], Replicate],
+    progress: FitProgress,
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
@@ -118,14 +95,9 @@ def _bootstrap(
     for index in range(settings.replicates):
         name = f"replicate {index + 1}"
         compute = functools.partial(replicate, *at, index, settings.seed)
-        found.append(remember(name, compute))
-        done(name)
+        found.append(progress.replicate(name, compute))
+        progress.done(name)
     return bootstrap_intervals(estimate, found, "block", LEVEL)
-
-
-# Differences of AIC below which models are not distinguished, and above which the worse one has no
-# support (Burnham and Anderson 2002, 70). All alternatives fit equally many numbers.
-_SAME, _RULED_OUT = 2.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -163,23 +135,6 @@ def fit_alternatives(
         progress(name)
     least = min(item.aic for item in found)
     return tuple(replace(item, aic=item.aic - least) for item in found)
-
-
-def verdict(one: Alternative, other: Alternative) -> str:
-    """Sentence that compares two alternatives by AIC."""
-    if one.reason or other.reason:
-        failed = one if one.reason else other
-        return f"{failed.name}: no controller ({failed.reason})"
-    better, worse = (one, other) if one.aic <= other.aic else (other, one)
-    distance = worse.aic - better.aic
-    pair = f"{better.name} and {worse.name}"
-    if distance < _SAME:
-        return f"the recordings do not distinguish {pair} (AIC differs by {distance:.1f})"
-    strength = "rule out" if distance > _RULED_OUT else "give weak evidence against"
-    return (
-        f"the recordings {strength} {worse.name} compared with {better.name} (AIC +{distance:.0f}, "
-        f"held-out VAF {worse.held_out - better.held_out:+.2f} points)"
-    )
 
 
 def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:

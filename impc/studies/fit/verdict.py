@@ -37,9 +37,7 @@ from impc.studies.fit.facts import (
     no_limit,
     outside_offset,
     reported_shares,
-    saturation,
     shares,
-    shares_text,
     unlimited_ratio,
 )
 from impc.studies.fit.result import LITTLE
@@ -180,7 +178,7 @@ _WORDS: dict[str, Callable[[FitResult], object]] = {
     "largest": lambda it: amount(it, it.inverse_mpc.largest_input),
     "explained": explained_words,
     "where": lambda it: reported_shares(it)[1],
-    "shares": shares_text,
+    "shares": lambda it: f"{shares(it, it.inverse_mpc.vaf, 0)} of the variance",
     "gain_shares": lambda it: shares(it, it.gain_shares, 0),
     "left_out": left_out_text,
     "status": lambda it: it.fitted.status.sentence,
@@ -210,11 +208,13 @@ _WORDS: dict[str, Callable[[FitResult], object]] = {
     "gains": lambda it: len(named_gains(it)),
     "ends": ends_words,
     "enough": enough_words,
-    "held": lambda it: "It predicts trials it was not fitted to, a" if it.held_out else "A",
+    "held": lambda it: (
+        "It predicts trials it was not fitted to, a" if len(it.inverse_mpc.held_out) else "A"
+    ),
     "matters": lambda it: (
         "The limit matters." if unlimited_ratio(it)[0] >= MATTERS else "The limit is reached."
     ),
-    "time": lambda it: f"{saturation(it):.1f} %",
+    "time": lambda it: f"{100 * it.saturated:.1f} %",
     "without": lambda it: unlimited_ratio(it)[1],
     "known": lambda it: _names(it, known=True),
     "unknown": lambda it: _names(it, known=False),

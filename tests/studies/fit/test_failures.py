@@ -50,7 +50,7 @@ def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
     found = data(result)
     assert np.max(result.inverse_mpc.vaf) < 50
     assert found["usable"] is False
-    assert not {"gain", "directions", "cost_weights"} & set(found["findings"])
+    assert not {"gain", "directions", "statements"} & set(found["findings"])
     assert fit_verdict(result).level is Level.RED
     assert found["verdict"]["level"] == "red"
     assert data(fitted())["usable"] is True
@@ -65,22 +65,21 @@ def test_no_weights_is_said_before_any_weights() -> None:
     assert WEIGHTS in forbidden(result)
     assert np.min(result.gain_shares) > 99
     assert f"{result.gain_shares[0]:.0f} %" in verdict.may[0].why
-    assert "cost_weights" not in data(result)["findings"]
+    assert "statements" not in data(result)["findings"]
     assert not fitted().weights_test.rejected
 
 
 def test_a_stage_that_fails_is_one_sentence_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawn gains, model test, horizons and terminal set fail: the gain is still reported."""
+    """Drawn gains and the test of the model fail: the gain is still reported."""
 
     def fails(*_: Any, **__: Any) -> Any:
         raise SolverError("stage", "did not end", "try another")
 
     whole = fitted()
-    for name in ("estimate_draws", "_terminal_set_difference"):
-        monkeypatch.setattr(subject, name, fails)
+    monkeypatch.setattr(subject, "estimate_draws", fails)
     monkeypatch.setattr(first, "lack_of_fit", fails)
     result = fitted()
-    assert set(result.failures) == {"drawn gains", "test of the model", "terminal set"}
+    assert set(result.failures) == {"drawn gains", "test of the model"}
     page = fit_report(result, Provenance()).page()
     for stage in result.failures:
         assert f"Not available: {stage}" in page

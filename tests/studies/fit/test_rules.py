@@ -10,7 +10,7 @@ import pytest
 
 from impc.assess.assessments import MethodFit
 from impc.assess.lack_of_fit import LackOfFit, ModelError
-from impc.assess.variance_accounted_for import HeldOut, explained_share, vaf
+from impc.assess.variance_accounted_for import explained_share, vaf
 from impc.checking import replace
 from impc.reporting.document import Check, Checks, Copy, Report
 from impc.reporting.finding import Level
@@ -30,8 +30,8 @@ def made_up(
 ) -> FitResult:
     """A fit of a cart with other shares, tests and intervals."""
     base = explained()
-    own = replace(base.inverse_mpc, vaf=np.array([fitted]))
-    held = () if left_out is None else (HeldOut(np.array([left_out]), np.array([left_out])),)
+    held = np.empty((0, 1)) if left_out is None else np.array([[left_out]])
+    own = replace(base.inverse_mpc, vaf=np.array([fitted]), held_out=held)
     trials = tuple(replace(one, vaf=np.array([fitted])) for one in base.trials)
     error = LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=())
     wide = [
@@ -42,7 +42,6 @@ def made_up(
     return replace(
         base,
         methods=(*base.methods[:-1], own),
-        held_out=held,
         trials=trials,
         lack=(error if alarm else None,),
         weights_test=replace(base.weights_test, p_value=1e-9 if rejected else 0.5),

@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 
 from experiments.benchmarks.workloads import seat
+from experiments.coverage import cart, noisy_trial, true_controller
 from experiments.simulated_subjects import noisy_recordings
 from experiments.uncertain_body import cart_person
 from impc.assess.intent import dominant_sentence, intent
 from impc.assess.variance_accounted_for import predicted, vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import DataError, InputError
 from impc.inverse.delayed_feedback import preliminary_gain
 from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import Problem
-from impc.model.bounds import Bounds
 from impc.model.plant import Plant, change_coordinates
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
@@ -39,32 +38,6 @@ from tests.support import kept_names
 
 FEEDBACK = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
 SEED = 4
-
-
-def cart(dt: float = 0.05) -> Plant:
-    """A cart on a falling track: position and speed, a force, a push."""
-    A, B = [[0.0, 1.0], [2.0, -0.3]], [[0.0, 0.0], [1.0, 1.0]]
-    system = control.c2d(
-        control.ss(A, B, [[1.0, 0.0]], 0, inputs=["force", "push"], outputs=["position"]), dt
-    )
-    return Plant(system, ["force"])
-
-
-def cart_trials(count: int, noise: float, samples: int = 300) -> list[Recording]:
-    """Trials of a cart whose force is at its limit of 1 for a part of the time."""
-    plant, rng = cart(), np.random.default_rng(SEED)
-    weights = Weights(np.diag([4.0, 1.0]), 1)
-    controller = Controller(
-        plant, weights, Bounds(plant, u_min=-1, u_max=1), 10, terminal_set=False
-    )
-    trials = []
-    for _ in range(count):
-        push = np.repeat(rng.choice([-0.6, 0.0, 0.6], samples // 10), 10)
-        run = simulate(controller, scenario(plant, rng.normal(0, 0.05, 2), disturbance=push))
-        clean = (run.x @ plant.C.T)[:samples]
-        size = noise * np.sqrt(np.mean(clean**2))
-        trials.append(Recording(plant, clean + size * rng.standard_normal(clean.shape), push))
-    return trials
 
 
 @pytest.fixture(scope="module")
@@ -87,9 +60,8 @@ def test_variance_accounted_for_is_that_of_the_trajectories(noisy: FitResult) ->
 
 
 def test_trials_left_out_are_predicted_to_the_ceiling(noisy: FitResult) -> None:
-    assert len(noisy.held_out) == 3
-    for item in noisy.held_out:
-        assert np.all(np.abs(item.vaf - 90) < 1.0)
+    assert noisy.inverse_mpc.held_out.shape == (3, 2)
+    assert np.all(np.abs(noisy.inverse_mpc.held_out - 90) < 1.0)
 
 
 def test_a_trial_left_out_is_predicted_as_by_a_fit_of_the_others(
@@ -102,7 +74,7 @@ def test_a_trial_left_out_is_predicted_as_by_a_fit_of_the_others(
         other = fit_controller(problem.leaving_out(index))
         pair = other.gain, np.array(other.metric)
         wanted = predicted(other.problem, *pair, trial, settings.settle)
-        np.testing.assert_allclose(found.held_out[index].vaf, wanted.vaf, atol=0.1)
+        np.testing.assert_allclose(found.inverse_mpc.held_out[index], wanted.vaf, atol=0.1)
 
 
 def test_the_preliminary_estimate_is_shown_beside_the_others(noisy: FitResult) -> None:
@@ -177,7 +149,7 @@ def test_preliminary_gain_without_noise_finds_gains_of_its_own_form() -> None:
 @pytest.fixture
 def small() -> tuple[Problem, FitSettings]:
     settings = FitSettings(horizon=10, u_max=1.0)
-    return fit_problem(cart(), cart_trials(3, 0.2), settings), settings
+    return fit_problem(cart(), [noisy_trial(seed, 0.0) for seed in (1, 2, 3)], settings), settings
 
 
 @pytest.mark.full
@@ -189,7 +161,7 @@ def test_a_plant_of_ones_own_with_one_output(small: tuple[Problem, FitSettings])
     assert np.all(np.abs(result.inverse_mpc.vaf - 100 / 1.04) < 1.5)
     assert result.identifiability.rank == 2
     single = replace(small[0], recordings=small[0].recordings[:1])
-    assert fit_recordings(single, small[1]).held_out == ()
+    assert not len(fit_recordings(single, small[1]).inverse_mpc.held_out)
 
 
 def test_an_interrupted_fit_goes_on(
@@ -214,8 +186,7 @@ def test_an_interrupted_fit_goes_on(
     monkeypatch.setattr("impc.inverse.methods.fit_controller", fitted_again)
     result = fit_recordings(*small, FitProgress(lambda _: None, again.estimate))
     np.testing.assert_array_equal(result.fitted.stage_weights.Q, whole.fitted.stage_weights.Q)
-    for one, other in zip(result.held_out, whole.held_out, strict=True):
-        np.testing.assert_array_equal(one.vaf, other.vaf)
+    np.testing.assert_array_equal(result.inverse_mpc.held_out, whole.inverse_mpc.held_out)
     again.cache.forget()
     assert list((tmp_path / "out").iterdir()) == []
 
@@ -237,48 +208,27 @@ def test_a_memory_of_another_fit_is_not_used(
         assert not kept_names(open_memory(tmp_path, problem, settings))
 
 
-def unwanted() -> Estimate:
-    raise AssertionError("computed again")
-
-
-def test_a_remembered_controller_is_the_same(
-    small: tuple[Problem, FitSettings], tmp_path: Path
-) -> None:
-    problem, settings = small
-    found = fit_controller(problem)
-    open_memory(tmp_path, problem, settings).estimate("inverse_mpc", lambda: found)
-    again = open_memory(tmp_path, problem, settings).estimate("inverse_mpc", unwanted)
-    np.testing.assert_array_equal(again.gain, found.gain)
-    assert (again.misfit, again.noise, again.status) == (found.misfit, found.noise, found.status)
-    for one, other in zip(again.problem.recordings, found.problem.recordings, strict=True):
-        np.testing.assert_array_equal(one.x0, other.x0)
-
-
 def test_what_cannot_be_fitted_is_said() -> None:
     plant = cart()
     with pytest.raises(DataError, match="the list is empty"):
         fit_problem(plant, [], FitSettings())
     with pytest.raises(DataError, match="zero in every trial"):
         fit_problem(plant, [Recording(plant, np.zeros(100))], FitSettings())
+    trial = noisy_trial(1, 0.0)
+    short = replace(trial, outputs=trial.outputs[:15], disturbance=trial.disturbance[:15])
     with pytest.raises(DataError, match="the shortest trial has 15 samples"):
-        fit_problem(plant, [*cart_trials(1, 0.1, 150), _short()], FitSettings())
-
-
-def _short() -> Recording:
-    trial = cart_trials(1, 0.1, 150)[0]
-    return replace(trial, outputs=trial.outputs[:15], disturbance=trial.disturbance[:15])
+        fit_problem(plant, [trial, short], FitSettings())
 
 
 def test_a_release_without_disturbance_is_fitted() -> None:
     """Trials that are driven only by their unknown initial states."""
-    plant = cart()
-    weights = Weights(np.diag([4.0, 1.0]), 1)
-    bounds = Bounds(plant, u_min=-1, u_max=1)
-    controller = Controller(plant, weights, bounds, 10, terminal_set=False)
-    trials = []
-    for x0 in ([0.4, 0.0], [-0.2, 0.3], [0.3, 0.1]):
-        run = simulate(controller, scenario(plant, x0, 100))
-        trials.append(Recording(plant, (run.x @ plant.C.T)[:100]))
+    controller = true_controller()
+    plant = controller.plant
+    runs = [
+        simulate(controller, scenario(plant, x0, 100))
+        for x0 in ([0.4, 0.0], [-0.2, 0.3], [0.3, 0.1])
+    ]
+    trials = [Recording(plant, (run.x @ plant.C.T)[:100]) for run in runs]
     settings = FitSettings(horizon=10, u_max=1.0)
     fitted = fit_controller(fit_problem(plant, trials, settings))
     np.testing.assert_allclose(fitted.gain, controller.K, rtol=1e-6)
@@ -318,3 +268,6 @@ def test_what_is_kept_has_the_body_that_was_found(tmp_path: Path) -> None:
         assert not np.array_equal(one.problem.plant.A, person.problem.plant.A)
         np.testing.assert_array_equal(again[name].problem.plant.A, one.problem.plant.A)
         np.testing.assert_array_equal(again[name].gain, one.gain)
+        np.testing.assert_array_equal(again[name].problem.starts, one.problem.starts)
+        kept = again[name]
+        assert (kept.misfit, kept.noise, kept.status) == (one.misfit, one.noise, one.status)
