@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 # One second of lags reveals a missed rhythm; at least ten lags.
 _LEAST_LAGS = 10
-# Decrease that a refit without a trial may leave out.
-_PROMISE = 0.1
+# Decrease that a refit without a trial may leave out: the fit to all trials is near its end.
+_PROMISE = 1.0
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def left_out(
     """
     others = estimate.problem.with_body_fixed().leaving_out(index)
     K, S = np.array(estimate.K), np.array(estimate.S)
-    change = refit(others, K, S, _PROMISE).K - K
+    change = refit(others, K, S, _PROMISE, rounds=1).K - K
     trial = fitted.problem.recordings[index]
     base = (K, S) if free else (np.array(fitted.gain), np.array(fitted.metric))
     return predicted(fitted.problem, base[0] + change, base[1], trial, settle)

@@ -45,13 +45,19 @@ _ROUNDS, _EVALUATIONS = 12, 100
 _STAYS = 0.1
 
 
-def refit(problem: Problem, gain: Array, metric: Array, promise: float = 0.1 * PROMISE) -> Fitted:
+def refit(
+    problem: Problem,
+    gain: Array,
+    metric: Array,
+    promise: float = 0.1 * PROMISE,
+    rounds: int = _ROUNDS,
+) -> Fitted:
     """Refit from a `gain` (m, n) and `metric` (m, m), at the other values of the problem.
 
     A round ends where an undamped step promises a decrease of at most `promise` in the objective.
     """
     require_riccati(problem)
-    return _refitted(_Key(problem, gain.tobytes(), metric.tobytes()), promise)
+    return _refitted(_Key(problem, gain.tobytes(), metric.tobytes()), promise, rounds)
 
 
 @dataclass(frozen=True)
@@ -72,13 +78,13 @@ class _Key:
 
 
 @functools.lru_cache(maxsize=8)
-def _refitted(key: _Key, promise: float) -> Fitted:
+def _refitted(key: _Key, promise: float, rounds: int) -> Fitted:
     problem, m = key.problem, key.problem.plant.m
     gain, metric = np.frombuffer(key.gain).reshape(m, -1), np.frombuffer(key.metric).reshape(m, m)
     law = GainLaw(problem, gain, metric)
     space = Unknowns(problem, law)
     end, spent = space.ended(space.start), 0
-    for _ in range(0 if explains(problem, end.misfit) else _ROUNDS):
+    for _ in range(0 if explains(problem, end.misfit) else rounds):
         rows, errors = space.deviations(space.start, gain.size)
         beside, parameters = len(law.start) - gain.size, len(problem.logarithms)
         centre = space.centre

@@ -258,8 +258,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
         "The model does not describe these recordings",
         "In {where} it explains {explained}. If a model suits the recordings, values above 90 % "
         "are typical.",
-        "Gains and cost weights come from a poor fit and do not describe the person. They are kept "
-        "under details for troubleshooting only.",
+        "Gains and cost weights come from a poor fit and do not describe the person.",
         (
             "Look at the figure above. If the model moves in the opposite direction, a sign may be "
             "reversed; if it lags or leads, the clocks of two devices may differ; if it has the "
