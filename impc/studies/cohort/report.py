@@ -239,7 +239,7 @@ def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> l
     fits, (name, known, of) = len(units), cohort.determined
     never = int(np.sum(units["saturated"] == 0)) if fits else 0
     refused = int(units.get("structure_refused", pd.Series(dtype=bool)).sum())
-    drawn = fits * int(study.configuration.fit.get("replicates", 0))
+    drawn = fits * study.replicates
     lost = sum(map(len, failures.replicates.values()))
     cases = (
         (True, fits == total, "Fits", f"{fits} of {total} fits are complete."),

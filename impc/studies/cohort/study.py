@@ -110,6 +110,11 @@ class Study:
     model: str = ""  # Import path of the model; empty if not given
     reference: str = ""  # Group, visit or condition of comparison; empty for the usual one
 
+    @property
+    def replicates(self) -> int:
+        """Number of bootstrap replicates of each unit."""
+        return int(self.configuration.fit.get("replicates", 0))
+
 
 def read_study(path: Path) -> Study:
     """Read the study at `path` and find its recordings without opening them."""

@@ -34,7 +34,6 @@ _CENTRE = "analytic centre (no units)"
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
     """Tables by name (see the module's docstring); units without a fit are omitted."""
     found: dict[str, list[dict[str, Any]]] = {"units": [], "replicates": [], "intervals": []}
-    count = int(study.configuration.fit.get("replicates", 0))
     for unit in study.units:
         fit = store.fit(unit.name)
         if fit is None:
@@ -42,7 +41,7 @@ def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:
         labels = {"unit": unit.name} | {name: getattr(unit, name) for name in LABELS}
         found["units"].append(labels | _unit_row(fit))
         drawn = []
-        for index in range(count):
+        for index in range(study.replicates):
             again = store.fit(unit.name, index)
             if again is not None:
                 own = zip(fit["parameters"], again["parameters"], strict=True)
