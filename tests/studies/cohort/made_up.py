@@ -10,15 +10,14 @@ import numpy as np
 from impc.assess.assessments import ASSESSMENTS, Assessment
 from impc.files.configuration import Configuration, RecordingTable
 from impc.model.plant import Plant
-from impc.studies.cohort.study import KEYS, Study, Unit
+from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.tasks import FitTask
 
 __all__ = ["fit_of", "made_up_study", "replicate_of", "tasks_of"]
 
 
-def made_up_study(subjects: int, replicates: int = 0, **labels: str) -> Study:
+def made_up_study(subjects: int, replicates: int = 0) -> Study:
     """Subjects 1, 2, ... of one visit in two groups."""
-    assert set(labels) <= set(KEYS)
     configuration = Configuration(RecordingTable(), {}, fit={"replicates": replicates})
     units = tuple(
         Unit(str(number + 1), "1", "", (), "ab"[number % 2]) for number in range(subjects)

@@ -73,15 +73,6 @@ def test_bids_finds_all_formats_and_no_trial_twice(tmp_path: Path) -> None:
         read_study(study(tmp_path, 'bids = "."'))
 
 
-@pytest.mark.parametrize("again", ["1.csv", "x/../1.csv", "link.csv", "./1.csv"])
-def test_a_trial_counts_once_whatever_its_name(tmp_path: Path, again: str) -> None:
-    touch(tmp_path, "1.csv", "x/.keep")
-    (tmp_path / "link.csv").symlink_to("1.csv")
-    (tmp_path / "t.csv").write_text(f"file,subject,trial\n1.csv,a,1\n{again},b,2\n")
-    with pytest.raises(InputError, match="names the same file twice"):
-        read_study(study(tmp_path, 'table = "t.csv"'))
-
-
 def test_a_table_and_participants(tmp_path: Path) -> None:
     touch(tmp_path, "x.csv", "y.csv")
     (tmp_path / "t.tsv").write_text("file\tsubject\ttrial\nx.csv\tA\t1\ny.csv\tA\t2\n")
@@ -100,10 +91,10 @@ def test_a_table_and_participants(tmp_path: Path) -> None:
         ('recordings = "{person}.csv"', "names person"),
         ('recordings = "{trial}.csv"', "names no subject"),
         ('recordings = "none-{subject}.csv"', "matches no file"),
-        ('recordings = "{subject}.csv"\nparticipants = "missing.csv"', "cannot be read"),
+        ('recordings = "{subject}.csv"\nparticipants = "missing.csv"', "does not exist"),
         ('recordings = "{subject}.csv"\nparticipants = "p.csv"', "is not in p.csv"),
-        ('recordings = "{subject}.csv"\nparticipants = "q.csv"', "has a row without subject"),
-        ('table = "q.csv"', "lacks a column"),
+        ('recordings = "{subject}.csv"\nparticipants = "q.csv"', "has no subject"),
+        ('table = "q.csv"', "has a row without file"),
         ('recordings = "{subject}.csv"\nspeed = 1', "unknown field"),
     ],
 )
@@ -117,25 +108,24 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, match: str) -> None:
 
 
 HOSTILE = [
-    ("table = 't.csv'", "file,subject\n1.csv,../../../../evil\n", "begins with '.'|contains '/'"),
-    ("table = 't.csv'", "file,subject\n1.csv,a/b\n", "contains '/'"),
-    ("table = 't.csv'", "file,subject,visit\n1.csv,a,../..\n", "begins with '.'|contains '/'"),
-    ("table = 't.csv'", "file,subject,trial\n1.csv,a,b/c\n", "contains '/'"),
-    ("table = 't.csv'", "file,subject\n1.csv,a\\b\n", "contains '"),
-    ("table = 't.csv'", "file,subject\n1.csv,=HYPERLINK(1)\n", "contains '='"),
-    ("table = 't.csv'", "file,subject\n1.csv,.hidden\n", "begins with '.'"),
-    ("table = 't.csv'", "file,subject\n1.csv,\u202eb\n", "contains '"),
-    ("table = 't.csv'", f"file,subject\n1.csv,{'a' * 300}\n", "has 300 characters"),
-    ("table = 't.csv'", "file,subject\n1.csv,a\0b\n", "contains a NUL"),
+    ("table = 't.csv'", "file,subject\n1.csv,../../../../evil\n", "is no name"),
+    ("table = 't.csv'", "file,subject\n1.csv,a/b\n", "is no name"),
+    ("table = 't.csv'", "file,subject,visit\n1.csv,a,../..\n", "is no name"),
+    ("table = 't.csv'", "file,subject,trial\n1.csv,a,b/c\n", "is no name"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\\b\n", "is no name"),
+    ("table = 't.csv'", "file,subject\n1.csv,=HYPERLINK(1)\n", "is no name"),
+    ("table = 't.csv'", "file,subject\n1.csv,.hidden\n", "is no name"),
+    ("table = 't.csv'", "file,subject\n1.csv,\u202eb\n", "is no name"),
+    ("table = 't.csv'", f"file,subject\n1.csv,{'a' * 300}\n", "is no name"),
+    ("table = 't.csv'", "file,subject\n1.csv,a\0b\n", "is no name"),
     ("table = 't.csv'", "file,subject\n", "has no rows"),
-    ("table = 't.csv'", "", "has no rows"),
-    ("table = 't.csv'", "file,subject,subject\n1.csv,a,b\n", "has 2 columns 'subject'"),
+    ("table = 't.csv'", "", "is empty"),
+    ("table = 't.csv'", "file,subject,subject\n1.csv,a,b\n", "has two columns 'subject'"),
     ("table = 't.csv'", "file,subject,\n1.csv,a,b\n", "unnamed column"),
     ("table = 't.csv'", "file,subject\n1.csv\n", "row 2 has 1 cells"),
     ("table = 't.csv'", "file,subject\n1.csv,\n", "without file or subject"),
-    ("table = 't.csv'", "file,subject\n1.csv,a\n1.csv,a\n", "twice"),
     ("table = 't.csv'", 'file,subject\n"1.csv,a\n', "no rows|cells"),
-    ("table = '.'", "", "is not a regular file"),
+    ("table = '.'", "", "is a folder"),
     ("table = ''", "", "study.table: is empty"),
     ("bids = ' '", "", "study.bids: is empty"),
     ("recordings = ''", "", "study.recordings: is empty"),
@@ -143,7 +133,7 @@ HOSTILE = [
     ("recordings = '{subject}.csv'\nparticipants = ''", "", "study.participants: is empty"),
     ("recordings = '/nowhere/{subject}.csv'", "", "matches no file"),
     ("recordings = '**/{subject}.csv'", "", "invalid pattern"),
-    ("recordings = '{subject}{trial}{visit}.csv'", "", "nothing between {subject}{trial}"),
+    ("recordings = '{subject}{trial}{visit}.csv'", "", "a separator between two"),
     ("recordings = '{subject!r}.csv'", "", "names no subject"),
     ("recordings = '[{subject}.csv'", "", "matches no file"),
 ]
@@ -165,15 +155,15 @@ PEOPLE = [
     ("subject;mass;note\n1;70,5;a, b\n", {"mass": 70.5, "note": "a, b"}),
     ("subject,mass,sex\n1,1e2,n/a\n", {"mass": 100.0}),
     ("subject,note\n1,1_000\n", {"note": "1_000"}),
-    ("subject,mass\n1,1_000\n", "write a number in kg"),
-    ("subject;mass\n1;70.5\n2;70,5\n", "decimal points or only commas"),
-    ('subject,mass\n1,"1,234"\n', "may have a thousands"),
-    ("subject;mass\n1;70,500\n", "may have a thousands"),
-    ("subject,mass\n1,nan\n", "leave the cell empty"),
-    ("subject,mass\n1,-inf\n", "leave the cell empty"),
-    ("subject,mass\n1,1e999\n", "give a finite number"),
+    ("subject,mass\n1,1_000\n", "write a number in kg, or n/a"),
+    ("subject;mass\n1;70.5\n2;70,5\n", "write it with a decimal point"),
+    ('subject,mass\n1,"1,234"\n', "write it with a decimal point"),
+    ("subject;mass\n1;70,500\n", "write it with a decimal point"),
+    ("subject,mass\n1,nan\n", "write a number in kg"),
+    ("subject,mass\n1,-inf\n", "write a number in kg"),
+    ("subject,mass\n1,1e999\n", "write a number in kg"),
     ("subject,mass\n1,70\n1,80\n", "two rows of subject 1"),
-    ("subject,mass,mass\n1,70,80\n", "has 2 columns 'mass'"),
+    ("subject,mass,mass\n1,70,80\n", "has two columns 'mass'"),
     (
         "Proband;Alter;Masse (kg);Größe (cm)\n1;44;70,5;178\n",
         {"age": 44.0, "mass": 70.5, "height": 1.78},
@@ -190,11 +180,11 @@ PEOPLE = [
     ("subject,gender\n1,F\n", {"sex": "female"}),
     ("subject,Geschlecht\n1,männlich\n", {"sex": "male"}),
     ("subject,sex\n1,divers\n", {"sex": "divers"}),
-    ("subject,tau_d (ms),mass,weight\n1,80,70,71\n", {"tau_d": 0.08, "mass": 70.0, "weight": 71.0}),
+    ("subject,tau_d (ms),mass\n1,80,70\n", {"tau_d": 0.08, "mass": 70.0}),
     ("subject,height (kg)\n1,70\n", "kg is no unit of height, use m"),
-    ("subject,Masse,Gewicht\n1,70,80\n", "'Masse' and 'Gewicht' are both mass"),
+    ("subject,Masse,Gewicht\n1,70,80\n", "two columns are mass, one of them 'Gewicht'"),
     ("subject,mass\n1,70,5\n", "row 2 has 3 cells"),
-    ("subject,group\n1,a/b\n", "contains '/'"),
+    ("subject,group\n1,a/b\n", "is no name"),
     ("subject,mass\n", "has no rows"),
 ]
 
@@ -219,8 +209,8 @@ def test_all_faults_of_participants_are_said_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         read_study(path)
     for part in (
-        "row 2, mass: 'ca. 70'", "row 3, group: contains '/'", "row 3: two rows of subject 1",
-        "row 4: has a row without subject", "row 4, mass: 'nan'", "nothing was fitted",
+        "row 2, mass: 'ca. 70'", "row 3, group: 'a/b' is no name", "row 3: two rows of subject 1",
+        "row 4: has no subject", "row 4, mass: 'nan'", "nothing was fitted",
     ):  # fmt: skip
         assert part in str(caught.value)
 
@@ -264,7 +254,7 @@ def test_an_unknown_reference_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [b"s1\xff.csv", b"s1\n2.csv", b"s1\x1b[2J.csv"])
 def test_file_names_that_are_no_text(tmp_path: Path, name: bytes) -> None:
     (tmp_path / os.fsdecode(name)).write_text("x")
-    with pytest.raises(InputError, match="contains '") as caught:
+    with pytest.raises(InputError, match="is no name") as caught:
         read_study(study(tmp_path, 'recordings = "s{subject}.csv"'))
     assert str(caught.value).isprintable()
 
