@@ -107,8 +107,6 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
     assert (found["units"], found["fitted"], found["failed"]) == (2, 2, {})
     assert found["failed_replicates"] == {name: {"2": REASON} for name in NAMES}
     assert found["digests"] == DIGESTS
-    assert found["not_determined"] == {"K.force.position_rate": 2}
-    assert found["outliers"] == []
     page = (tmp_path / "report.html").read_text()
     assert "4 of 6 " in page
     assert "2 failed" in page
@@ -119,11 +117,12 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
 
 @pytest.mark.usefixtures("blank_figures")
 def test_pages_leave_out_inner_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit = fit_of(0) | {"inner": ["position_rate"]}
+    fit = fit_of(0)
+    fit["shown"]["K.force.position_rate"] |= {"inner": True, "compared": False}
     run_and_report(tmp_path, monkeypatch, lambda _: fit, lambda *_: replicate_of(0))
     page = (tmp_path / "subjects" / "sub-1.html").read_text()
     assert "hand position" in page
-    assert "position_rate" not in page
+    assert "N s/m" not in page
     assert "K.force.position_rate" in pd.read_csv(tmp_path / "units.csv")
 
 

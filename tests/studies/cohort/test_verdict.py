@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,17 +14,13 @@ from impc.studies.cohort.results import Cohort
 from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.verdict import cohort_verdict
 from impc.studies.fit.verdict import UNDETERMINED
+from tests.studies.cohort.made_up import column, gain_column
 
-FIT: dict[str, Any] = {
-    "words": {"command": "commanded torque", "theta1": "seat tilt"},
-    "units": {"K.command.theta1": "N m/rad"},
-    "shown_gains": {
-        "K.command.theta1": [np.pi / 180, "N m/°", "N m", "1° of seat tilt"],
-    },
-    "controls": ["command"],
-    "outputs": ["theta1"],
-}
 GAIN = "K.command.theta1"
+COLUMNS = {
+    GAIN: gain_column("seat tilt", "commanded torque", "N m/rad", np.pi / 180, "N m", "1°"),
+    "vaf.theta1": column("variance accounted for, seat tilt", "seat tilt", "%"),
+}
 
 
 def cohort(
@@ -54,7 +48,7 @@ def cohort(
                 "K_determined.command.theta1": number not in wide,
                 "vaf.theta1": 99.0 + 0.1 * rng.random(), "saturated": 0.1,
             })  # fmt: skip
-    return Cohort(pd.DataFrame(rows), FIT, {})
+    return Cohort(pd.DataFrame(rows), COLUMNS, {})
 
 
 def test_the_headline_has_direction_size_and_unit() -> None:
@@ -135,7 +129,7 @@ def test_the_reference_is_subtracted() -> None:
         group=made.units["group"].map({"first": "LBP", "second": "control"})
     )
     for reference, first in (("", "control"), ("LBP", "LBP")):
-        table = comparisons(Cohort(renamed, FIT, {}, reference)).table
+        table = comparisons(Cohort(renamed, COLUMNS, {}, reference)).table
         assert table is not None
         assert table["compared"].iloc[0].endswith(f" - {first}")
         assert (table["difference"].iloc[0] > 0) == (first == "control")
@@ -158,8 +152,8 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
 def test_fits_that_determine_no_gain_are_no_warning_of_the_study() -> None:
     made = cohort(-139.0, warned=(3, 4, 12, 13))
     units = made.units.assign(kind=made.units["kind"].where(made.units.index != 3, UNDETERMINED))
-    assert Cohort(units, FIT, {}).warned == 3
-    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), FIT, {})).level is Level.GREEN
+    assert Cohort(units, COLUMNS, {}).warned == 3
+    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), COLUMNS, {})).level is Level.GREEN
 
 
 def test_too_few_gains_are_no_comparison() -> None:
@@ -188,7 +182,8 @@ def test_cost_weights_are_compared_as_ratios() -> None:
     units = made.units.rename(columns={GAIN: "log_cost_weight.theta1"})
     units["log_cost_weight.theta1"] = np.log(4.0) + 0.01 * np.random.default_rng(0).random(20)
     units.loc[units["group"] == "second", "log_cost_weight.theta1"] -= np.log(2.0)
-    made = Cohort(units.assign(structure_refused=False), FIT, {})
+    weight = {"log_cost_weight.theta1": column("cost weight of seat tilt", "seat tilt", "-")}
+    made = Cohort(units.assign(structure_refused=False), weight, {})
     headline = cohort_verdict(made).headline
     assert headline.startswith("The cost weight of seat tilt is 0.5 times as high in the second")
     table = comparisons(made).table
