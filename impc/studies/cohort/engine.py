@@ -92,12 +92,12 @@ def _name(unit: str, index: int | None = None) -> str:
 
 def work_kept(study: Study, store: Store) -> tuple[int, int]:
     """Number of tasks with a stored result, and number of all tasks."""
-    names = [
-        _name(unit.name, index)
-        for unit in study.units
-        for index in (None, *range(study.replicates))
-    ]
-    return sum(store.cache.path(name).exists() for name in names), len(names)
+    kept = 0
+    for unit in study.units:
+        fit = store.cache.path(_name(unit.name))
+        replicates = len([*fit.parent.glob("replicate-*.json")])
+        kept += fit.exists() + min(replicates, study.replicates)
+    return kept, len(study.units) * (1 + study.replicates)
 
 
 def open_store(folder: Path, tasks: Mapping[str, FitTask]) -> Store:
