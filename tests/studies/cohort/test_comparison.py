@@ -37,27 +37,43 @@ def table(subjects: int, visits: int, shift: float = 0.0, seed: int = SEED) -> p
     return pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.u.x", "vaf.y"])
 
 
+def found_of(units: pd.DataFrame, question: str, reference: str = "") -> dict[str, Comparison]:
+    """Comparisons of one question by measure."""
+    found = compared(units, reference)
+    return {item.measure: item for item in found if item.question == question}
+
+
 def test_groups_are_welch_on_subject_means() -> None:
+    """A value without a number changes no weights."""
     units = table(20, 2, 1.0)
-    found = {item.measure: item for item in compared(units) if item.question == "group"}["K.u.x"]
-    means = units.groupby(["group", "subject"])["K.u.x"].mean()
-    a, b = means["a"].to_numpy(), means["b"].to_numpy()
-    expected = scipy.stats.ttest_ind(b, a, equal_var=False)
-    assert found.p == pytest.approx(expected.pvalue)
-    assert found.estimate == pytest.approx(b.mean() - a.mean())
-    assert found.low < found.estimate < found.high
-    pooled = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / 2)
-    assert found.effect == pytest.approx((b.mean() - a.mean()) / pooled * (1 - 3 / (4 * 18 - 1)))
+    units.loc[0, "vaf.y"] = np.nan
+    for measure, found in found_of(units, "group").items():
+        means = units.groupby(["group", "subject"])[measure].mean()
+        a, b = means["a"].to_numpy(), means["b"].to_numpy()
+        assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
+        assert found.estimate == pytest.approx(b.mean() - a.mean())
+        assert found.low < found.estimate < found.high
+        pooled = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / 2)
+        hedges = (b.mean() - a.mean()) / pooled * (1 - 3 / (4 * 18 - 1))
+        assert found.effect == pytest.approx(hedges)
 
 
-def test_visits_are_paired() -> None:
+def test_visits_and_conditions_are_paired_and_the_reference_comes_first() -> None:
     units = table(12, 2)
-    found = {item.measure: item for item in compared(units) if item.question == "visit"}
-    wide = units.pivot_table(index="subject", columns="visit", values="K.u.x")
-    expected = scipy.stats.ttest_rel(wide["2"], wide["1"])
-    assert found["K.u.x"].p == pytest.approx(expected.pvalue)
-    ps = sorted(item.p for item in found.values())
-    assert sorted(item.p_holm for item in found.values())[0] == pytest.approx(min(2 * ps[0], 1))
+    named = units.assign(condition=units["visit"].map({"1": "EC", "2": "EO"}), visit="1")
+    for given, question, first, second in (
+        (units, "visit", "1", "2"), (named, "condition", "EO", "EC"),
+    ):  # fmt: skip
+        found = found_of(given, question)
+        wide = given.pivot_table(index="subject", columns=question, values="K.u.x")
+        expected = scipy.stats.ttest_rel(wide[second], wide[first])
+        gain = found["K.u.x"]
+        assert (gain.first, gain.second, gain.n) == (first, second, 12)
+        assert gain.p == pytest.approx(expected.pvalue)
+        least = min(item.p for item in found.values())
+        assert min(item.p_holm for item in found.values()) == pytest.approx(min(2 * least, 1))
+        other = found_of(given, question, second)["K.u.x"]
+        assert (other.first, other.estimate) == (second, -gain.estimate)
 
 
 def test_a_different_change_is_found_and_reliability_too() -> None:
@@ -150,25 +166,6 @@ def test_nothing_known_is_nothing_compared() -> None:
     assert {item.note for item in both} == {"too few subjects (0)"}
     (found,) = compared(gains(dict.fromkeys((0, 2, 4, 6), 1e5)))
     assert found.note == "one subject counts for more than all others together"
-
-
-def test_a_value_without_a_number_changes_no_weights() -> None:
-    units = table(10, 1)
-    units.loc[0, "vaf.y"] = np.nan
-    found = next(item for item in compared(units) if item.measure == "vaf.y")
-    a, b = (units.loc[units["group"] == group, "vaf.y"].dropna() for group in "ab")
-    assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
-
-
-def test_conditions_are_paired_and_the_reference_comes_first() -> None:
-    units = table(8, 2).assign(condition=lambda found: found["visit"].map({"1": "EC", "2": "EO"}))
-    units["visit"] = "1"
-    found = next(item for item in compared(units) if item.question == "condition")
-    wide = units.pivot_table(index="subject", columns="condition", values="K.u.x")
-    assert (found.first, found.second, found.n) == ("EO", "EC", 8)
-    assert found.p == pytest.approx(scipy.stats.ttest_rel(wide["EC"], wide["EO"]).pvalue)
-    other = next(item for item in compared(units, "EC") if item.question == "condition")
-    assert (other.first, other.estimate) == ("EC", -found.estimate)
 
 
 @pytest.mark.parametrize(
