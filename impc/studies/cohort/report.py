@@ -78,12 +78,16 @@ def write_report(
     fits = filter(None, (store.fit(unit.name) for unit in study.units))
     first: dict[str, Any] = next(fits, {"shown": {}})
     cohort = Cohort(tables["units"], first["shown"], failures.units, study.reference)
+    known = {name: cohort.units.get(f"K_determined{name[1:]}") for name in cohort.measures}
+    unknown = {name: len(one) - int(one.sum()) for name, one in known.items() if one is not None}
     data = {
         "units": len(study.units),
         "fitted": len(cohort.units),
         "failed": failures.units,
         "failed_replicates": failures.replicates,
         "digests": store.digests,
+        "not_determined": {name: count for name, count in unknown.items() if count},
+        "outliers": list(cohort.units["unit"][cohort.far.notna()]) if cohort.outliers else [],
     }
     beside = [Finding(name, table, _BESIDE[name]) for name, table in tables.items()]
     report = _page(study, cohort, _checks(study, failures, cohort), command)

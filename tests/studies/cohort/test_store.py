@@ -88,6 +88,8 @@ def test_failed_replicates_are_said_and_no_unit_is_lost(
     assert (found["units"], found["fitted"], found["failed"]) == (2, 2, {})
     assert found["failed_replicates"] == {name: {"2": REASON} for name in NAMES}
     assert found["digests"] == DIGESTS
+    assert found["not_determined"] == {"K.force.position_rate": 2}
+    assert found["outliers"] == []
     page = (tmp_path / "report.html").read_text()
     assert "4 of 6 " in page
     assert "2 failed" in page
