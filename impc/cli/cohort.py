@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from tqdm import tqdm
 
 from impc.checking import replace
 from impc.cli.console import print_files, progress
@@ -61,7 +59,6 @@ def command(
     the same command continues from the last finished task.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.studies.cohort.engine import open_store  # noqa: PLC0415
     from impc.studies.cohort.report import write_report  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -69,7 +66,6 @@ def command(
     from impc.studies.fit.settings import fit_settings, require_used  # noqa: PLC0415
 
     study = read_study(study_file)
-    require_distinct([file for unit in study.units for file in unit.files])
     require_used(fit_settings(study.configuration.fit), _USED, "cohort")
     source = named_plant(study_file, study, plant_name, allowed)
     unused = unused_columns(study, source)
@@ -143,7 +139,6 @@ def reliability_command(
     The study file is that of `impc cohort`.
     """
     from impc.files.digests import gather_inputs  # noqa: PLC0415
-    from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -151,7 +146,6 @@ def reliability_command(
     from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
 
     study = read_study(study_file)
-    require_distinct([file for unit in study.units for file in unit.files])
     source = named_plant(study_file, study, plant_name, allowed)
     units = [replace(unit, files=unit.files[-last:]) for unit in study.units]
     trials = _trials_of(units, study.configuration, source)
@@ -182,9 +176,11 @@ def _trials_of(units: Sequence[Unit], configuration: Configuration, source: Plan
     cells = {}
     recorded = configuration.recorded
     plant = make_plant(source, recorded)
-    for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
-        found = read_recordings(unit.files, configuration, plant)
-        require_whole(found, "reliability")
-        cells[unit.subject, unit.visit, unit.condition] = found
+    with progress(len(units), "visit") as done:
+        for unit in units:
+            found = read_recordings(unit.files, configuration, plant)
+            require_whole(found, "reliability")
+            cells[unit.subject, unit.visit, unit.condition] = found
+            done(unit.name)
     words = {name: signal_name(plant, name) for name in plant.outputs}
     return Trials(tuple(plant.outputs), 1 / plant.dt, cells, words)

@@ -161,7 +161,8 @@ class Cohort:
 
     def numbers(self, item: Comparison) -> str:
         """Interval, number of people, SD between them, p-value and effect size."""
-        size = f", {effect_name(item)} = {number(item.effect)}" if np.isfinite(item.effect) else ""
+        effect = "Cohen's d" if item.question in ("visit", "condition") else "Hedges' g"
+        size = f", {effect} = {number(item.effect)}" if np.isfinite(item.effect) else ""
         _, ends, unit = self.amount(item)
         column = self.of(item.measure)
         apart = with_unit(number(item.between * column["scale"]), column["unit"])
@@ -201,11 +202,6 @@ class Cohort:
             return f" Without {without}, too few people are left."
         value, ends, unit = self.amount(other)
         return f" Without {without} it is {value} {unit} (95 % CI {ends}, n = {other.n})."
-
-
-def effect_name(item: Comparison) -> str:
-    """Name of the effect size."""
-    return "Cohen's d" if item.question in ("visit", "condition") else "Hedges' g"
 
 
 def _place(question: str, name: str) -> str:

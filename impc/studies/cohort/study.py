@@ -28,6 +28,7 @@ import msgspec
 from impc.errors import InputError
 from impc.files.configuration import Configuration, read_configuration
 from impc.files.formats import FORMATS
+from impc.files.reading import require_distinct
 from impc.studies.cohort.participants import Participant, read_participants
 from impc.studies.cohort.sheet import checked_name, read_sheet
 
@@ -117,7 +118,7 @@ class Study:
 
 
 def read_study(path: Path) -> Study:
-    """Read the study at `path` and find its recordings without opening them."""
+    """Read the study at `path` and find its recordings, each of which may be given once."""
     configuration = read_configuration(path, "study", "model", "select")
     table = _table(path, configuration)
     named = table.participants
@@ -136,7 +137,8 @@ def read_study(path: Path) -> Study:
         units.append(Unit(*key, files, own.group, own.values, own.row))
     if missing:
         raise InputError(f"{path}: subject {', '.join(missing)}", f"is not in {named}", "add a row")
-    _require_distinct(path, units)
+    require_distinct([file for unit in units for file in unit.files])
+    _require_folders(path, units)
     _require_reference(path, table.reference, units)
     return Study(
         table.plant or "", configuration, tuple(units), table.model or "", table.reference or ""
@@ -188,7 +190,7 @@ def _natural(text: str) -> tuple[Any, ...]:
     )
 
 
-def _require_distinct(path: Path, units: Sequence[Unit]) -> None:
+def _require_folders(path: Path, units: Sequence[Unit]) -> None:
     """Raise InputError if two units have the same folder or two subjects the same page."""
     folders = Counter(unit.name.lower() for unit in units)
     pages = Counter(safe_name(name).lower() for name in {unit.subject for unit in units})

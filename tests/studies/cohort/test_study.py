@@ -28,7 +28,7 @@ def study(folder: Path, text: str) -> Path:
 def touch(folder: Path, *names: str) -> None:
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text("x")
+        (folder / name).write_text(name)
 
 
 def with_people(folder: Path, text: str, *subjects: str) -> Path:
@@ -121,6 +121,7 @@ FAULTS = [
     *(("table = 't.csv'", rows, match) for rows, match in (
         ("name,group\nother,a\n", "without file or subject"),
         ("file,subject\n1.csv,\n", "without file or subject"),
+        ("file,subject\n1.csv,a\n1.csv,b\n", "is given twice"),
         ("file,subject\n", "has no rows"),
         ("file,subject,subject\n1.csv,a,b\n", "has two columns 'subject'"),
         ("file,subject,\n1.csv,a,b\n", "unnamed column"),
