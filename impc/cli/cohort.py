@@ -93,7 +93,7 @@ def _run(
     """Run the remaining tasks with a progress bar; an interruption prints what is kept."""
     from impc.cli.console import require_consent  # noqa: PLC0415
     from impc.studies.cohort.engine import run_study, work_kept  # noqa: PLC0415
-    from impc.studies.cohort.tasks import study_effort  # noqa: PLC0415
+    from impc.studies.cohort.tasks import unit_effort  # noqa: PLC0415
     from impc.studies.scheduler import connected  # noqa: PLC0415
 
     kept, total = work_kept(study, store)
@@ -104,8 +104,8 @@ def _run(
 
     with progress(total, "task", said) as tell, connected(cluster) as pool:
         if kept < total:
-            one, units = study_effort(tasks)
-            effort = one.shared(units * (total - kept) / total, pool.threads)
+            left = len(tasks) * (total - kept) / total
+            effort = unit_effort(tasks.values()).shared(left, pool.threads)
             if cluster.scheduler:  # the memory of other machines is unknown
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)

@@ -69,14 +69,14 @@ def test_a_scheduler_with_certificates(
     address = scheduler.scheduler_address
     assert address.startswith("tls://")
     queue = deque([Task("one", "", abs, (-2,)), Task("two", "", int, ("x\ny",))])
-    queue.extend(Task(f"many {number}", "", abs, (number,)) for number in range(500))
+    queue.extend(Task(f"many {number}", "", abs, (number,)) for number in range(50))
     with connected(Cluster(address, None, *files)) as pool:
         assert pool.threads == 1
         found = {result.task.name: result for result in run(pool, queue, Cache(tmp_path))}
     assert found["one"].content == 2
     assert "task two: ValueError: " in str(found["two"].fault)
     assert "\n" not in str(found["two"].fault)
-    assert [found[f"many {number}"].content for number in range(500)] == list(range(500))
+    assert [found[f"many {number}"].content for number in range(50)] == list(range(50))
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2])

@@ -33,7 +33,7 @@ from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_alone
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
@@ -109,6 +109,7 @@ def unit_digest(
         dict(arguments),
         configuration.recording,
         configuration.signals,
+        configuration.report,
         # The number of replicates does not affect any result.
         {key: value for key, value in configuration.fit.items() if key != "replicates"},
         versions(),
@@ -170,19 +171,12 @@ def unit_problem(task: FitTask) -> tuple[Problem, FitSettings, tuple[str, ...]]:
     return fit_problem(plant, recordings, settings, family), settings, falls
 
 
-def study_effort(tasks: Mapping[str, FitTask]) -> tuple[Effort, float]:
-    """Effort of the first readable unit, and the number of such units that all `tasks` equal.
-
-    Units are compared by the size of their files. Without a readable unit the effort is zero.
-    """
-    sizes = {
-        name: sum(Path(file).stat().st_size for file in task.files) for name, task in tasks.items()
-    }
-    for name, task in tasks.items():
+def unit_effort(tasks: Iterable[FitTask]) -> Effort:
+    """Effort of the first readable unit, zero without one."""
+    for task in tasks:
         try:
             problem, settings, _ = unit_problem(task)
         except ImpcError:  # reported when the unit is fitted
             continue
-        alone = replace(settings, profiles=[], horizons=[], unknown_limit=False)
-        return fit_effort(problem, alone), sum(sizes.values()) / max(sizes[name], 1)
-    return Effort(0.0, 0.0), 0.0
+        return fit_effort(problem, replace(settings, profiles=[], horizons=[], unknown_limit=False))
+    return Effort(0.0, 0.0)
