@@ -104,46 +104,43 @@ def _shown(plant: Plant, columns: list[str]) -> dict[str, dict[str, Any]]:
     measures reduce the power after Holm's correction.
     """
     recorded = {*plant.outputs, *(f"{name}_rate" for name in plant.outputs)} & {*plant.states}
-    own = dict(zip(plant.states, follows_command(plant), strict=True))
-    structured = any(name.startswith(LOGARITHM) for name in columns)
+    own = follows_command(plant)
+    inner = own if not own.all() else ~own
     found: dict[str, dict[str, Any]] = {}
-    for wanted, column in itertools.product(
-        ("log_cost_weight", "K", "centre_weight", "vaf"), columns
+    for column in columns:
+        if column.startswith(LOGARITHM):
+            words = signal_name(plant, column.removeprefix(LOGARITHM))
+            found[column] = _entry(f"cost weight of {words}", words, "-")
+    centre = [] if found else [name for name in plant.outputs if f"centre_weight.{name}" in columns]
+    for control, (state, hidden) in itertools.product(
+        plant.controls, zip(plant.states, inner.tolist(), strict=True)
     ):
-        kind, _, signal = column.partition(".")
-        words = signal_name(plant, signal)
-        if kind != wanted:
-            continue
-        if kind == "log_cost_weight":
-            found[column] = _entry(f"cost weight of {words}", words, "-", True)
-        elif kind == "vaf":
-            found[column] = _entry(f"variance accounted for, {words}", words, "%", True)
-        elif kind == "centre_weight":
-            compared = signal in plant.outputs and not structured
-            unit = weight_unit(plant, signal, signal)
-            found[column] = _entry(f"central cost weight of {words}", words, unit, compared)
-        else:
-            control, _, state = signal.partition(".")
-            inner = bool(own[state]) and not all(own.values())
-            compared = state in recorded if recorded else not inner
-            found[column] = {"inner": inner, **_gain(plant, control, state, compared)}
+        found[f"K.{control}.{state}"] = _gain(plant, control, state) | {
+            "inner": hidden, "compared": state in recorded if recorded else not hidden,
+        }  # fmt: skip
+    for name in centre:
+        words, unit = signal_name(plant, name), weight_unit(plant, name, name)
+        found[f"centre_weight.{name}"] = _entry(f"central cost weight of {words}", words, unit)
+    for name in plant.outputs:
+        words = signal_name(plant, name)
+        found[f"vaf.{name}"] = _entry(f"variance accounted for, {words}", words, "%")
     return found
 
 
-def _entry(name: str, signal: str, unit: str, compared: bool) -> dict[str, Any]:
+def _entry(name: str, signal: str, unit: str) -> dict[str, Any]:
     unit = "-" if unit == "1" else unit
     return {"name": name, "signal": signal, "scale": 1.0, "unit": unit, "unit_si": unit,
-            "compared": compared}  # fmt: skip
+            "compared": True}  # fmt: skip
 
 
-def _gain(plant: Plant, control: str, state: str, compared: bool) -> dict[str, Any]:
+def _gain(plant: Plant, control: str, state: str) -> dict[str, Any]:
     """Words of a gain: its shown unit, that of the command, and for what it is given."""
     (scale, top), (factor, of) = shown_unit(plant, control), shown_unit(plant, state)
     si, words = gain_unit(plant, control, state), signal_name(plant, state)
     effort = signal_name(plant, control)
     unit = si.replace("rad", "°") if si != UNKNOWN and (scale, factor) != (1.0, 1.0) else si
     name = f"gain on {words}" + f" ({effort})" * (plant.m > 1)
-    return _entry(name, words, si, compared) | {
+    return _entry(name, words, si) | {
         "scale": scale / factor, "unit": "-" if unit == "1" else unit, "control": effort,
         "top": top, "per": f"{one_of(of)} of {words}",
     }  # fmt: skip
@@ -153,13 +150,12 @@ def _trajectory(fit: MethodFit) -> dict[str, Any]:
     """Thinned recorded and modelled outputs of the first trial, in shown units."""
     plant, first = fit.estimate.problem.plant, fit.estimate.problem.recordings[0]
     step, simulated = max(1, first.samples // 600), fit.runs[0].x @ plant.C.T
-    signals = [
-        {
-            "label": axis_label(plant, name),
-            "recorded": factor * first.corrected[::step, column],
-            "simulated": factor * simulated[::step, column],
-        }
-        for column, name in enumerate(plant.outputs)
-        for factor, _ in [shown_unit(plant, name)]
-    ]
+    signals = []
+    for column, name in enumerate(plant.outputs):
+        factor, _ = shown_unit(plant, name)
+        recorded, modelled = first.corrected[::step, column], simulated[::step, column]
+        signals.append({
+            "label": axis_label(plant, name), "recorded": factor * recorded,
+            "simulated": factor * modelled,
+        })  # fmt: skip
     return {"dt": plant.dt * step, "signals": signals}
