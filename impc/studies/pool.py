@@ -9,6 +9,7 @@ others.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -215,5 +216,6 @@ def _prepare(watched: Connection) -> None:
 
 
 def _end_with_client(watched: Connection) -> None:
-    watched.poll(None)
+    with contextlib.suppress(EOFError, OSError):
+        watched.recv()
     os._exit(1)
