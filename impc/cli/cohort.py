@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from tqdm import tqdm
 
 from impc.checking import replace
 from impc.cli.console import print_files, progress
@@ -30,14 +27,11 @@ if TYPE_CHECKING:
     from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Study, Unit
     from impc.studies.cohort.tasks import FitTask
-    from impc.studies.pool import Result
     from impc.studies.reliability.analysis import Trials
     from impc.studies.scheduler import Cluster
 
 # Settings with extra computations that a worker supports.
 _USED = ("replicates", "structure")
-# Seconds between two progress lines in cohort.log.
-_LOGGED = 10.0
 
 
 @click.command("cohort")
@@ -65,25 +59,20 @@ def command(
     the same command continues from the last finished task.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.files.reading import require_distinct  # noqa: PLC0415
-    from impc.studies.cohort.engine import Store, keep_failure  # noqa: PLC0415
+    from impc.studies.cohort.engine import open_store  # noqa: PLC0415
     from impc.studies.cohort.report import write_report  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.cohort.tasks import study_tasks, unused_columns  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings, require_used  # noqa: PLC0415
 
     study = read_study(study_file)
-    require_distinct([file for unit in study.units for file in unit.files])
     require_used(fit_settings(study.configuration.fit), _USED, "cohort")
     source = named_plant(study_file, study, plant_name, allowed)
-    study = replace(study, plant=source.name)
     unused = unused_columns(study, source)
     if unused:
         click.echo(f"columns that the plant has no argument for: {', '.join(unused)} (not used)")
     tasks, unreadable = study_tasks(study, source)
-    store = Store(out, {name: task.digest for name, task in tasks.items()})
-    for unit, reason in unreadable.items():
-        keep_failure(store, unit, reason)
+    store = open_store(out, tasks)
     failures = _run(study, tasks, store, cluster, yes)
     failures.units |= unreadable
     report = write_report(study, store, failures, f"impc cohort {study_file.name}", pdf=pdf)
@@ -102,49 +91,27 @@ def _run(
     study: Study, tasks: dict[str, FitTask], store: Store, cluster: Cluster, yes: bool
 ) -> Failures:
     """Run the remaining tasks with a progress bar; an interruption prints what is kept."""
-    import psutil  # noqa: PLC0415
-
     from impc.cli.console import require_consent  # noqa: PLC0415
-    from impc.studies.cohort.engine import require_same, run_study, work_kept  # noqa: PLC0415
-    from impc.studies.cohort.tasks import study_effort  # noqa: PLC0415
+    from impc.studies.cohort.engine import run_study, work_kept  # noqa: PLC0415
+    from impc.studies.cohort.tasks import unit_effort  # noqa: PLC0415
     from impc.studies.scheduler import connected  # noqa: PLC0415
 
-    require_same(store)
     kept, total = work_kept(study, store)
-    begun = logged = time.monotonic()
-    ended = here = 0
 
     def said(_: int) -> str:
         finished, _ = work_kept(study, store)
         return f"{finished} of {total} tasks are kept in {store.folder}; the same command continues"
 
     with progress(total, "task", said) as tell, connected(cluster) as pool:
-
-        def stated(result: Result) -> None:
-            nonlocal ended, here, logged
-            ended, here = ended + 1, here + (not result.found)
-            tell(result.task.name, found=result.found)
-            now = time.monotonic()
-            if here and now - logged > _LOGGED:
-                left, logged = (total - ended) * (now - begun) / here, now
-                memory = psutil.Process().memory_info().rss / 1e6
-                store.log(
-                    f"{ended} of {total} tasks, {left / 60:.1f} min left; "
-                    f"memory of client {memory:.0f} MB"
-                )
-
         if kept < total:
-            one, units = study_effort(tasks)
-            effort = one.shared(units * (total - kept) / total, pool.threads)
+            left = len(tasks) * (total - kept) / total
+            effort = unit_effort(tasks.values()).shared(left, pool.threads)
             if cluster.scheduler:  # the memory of other machines is unknown
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)
-        failures = run_study(study, tasks, store, pool, stated)
-    store.log(
-        f"end: {len(failures.units)} of {len(study.units)} units without a result, "
-        f"{sum(map(len, failures.replicates.values()))} replicates failed"
-    )
-    return failures
+        return run_study(
+            study, tasks, store, pool, lambda one: tell(one.task.name, found=one.found)
+        )
 
 
 @click.command("reliability")
@@ -172,7 +139,6 @@ def reliability_command(
     The study file is that of `impc cohort`.
     """
     from impc.files.digests import gather_inputs  # noqa: PLC0415
-    from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
@@ -180,7 +146,6 @@ def reliability_command(
     from impc.studies.reliability.report import reliability_report  # noqa: PLC0415
 
     study = read_study(study_file)
-    require_distinct([file for unit in study.units for file in unit.files])
     source = named_plant(study_file, study, plant_name, allowed)
     units = [replace(unit, files=unit.files[-last:]) for unit in study.units]
     with angles_in(study.configuration.report.angles):
@@ -212,11 +177,13 @@ def _trials_of(units: Sequence[Unit], configuration: Configuration, source: Plan
     factor, shown = shown_angle()
     recorded = configuration.recorded
     plant = make_plant(source, recorded)
-    for unit in tqdm(units, unit="visit", file=sys.stderr, disable=None, leave=False):
-        found = read_recordings(unit.files, configuration, plant)
-        require_whole(found, "reliability")
-        cells[unit.subject, unit.visit, unit.condition] = [
-            (item.disturbance[:, 0], factor * item.outputs) for item in found
-        ]
+    with progress(len(units), "visit") as done:
+        for unit in units:
+            found = read_recordings(unit.files, configuration, plant)
+            require_whole(found, "reliability")
+            cells[unit.subject, unit.visit, unit.condition] = [
+                (item.disturbance[:, 0], factor * item.outputs) for item in found
+            ]
+            done(unit.name)
     words = {name: signal_name(plant, name) for name in plant.outputs}
     return Trials(words, shown, 1 / plant.dt, cells)

@@ -74,7 +74,7 @@ def command(
     with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
 
         def remembered(memory: FitMemory) -> FitProgress:
-            kept = (memory.estimate, memory.replicate, memory.part)
+            kept = (memory.estimate, memory.replicate, memory.get)
             return FitProgress(done, *kept, lambda further: remembered(memory.about(further)))
 
         result = fit_recordings(problem, settings, remembered(memory))

@@ -126,13 +126,11 @@ def read_model_study(
     """The study at `path`, its model, all recordings, and the digests of its files."""
     from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
-    from impc.files.reading import require_distinct  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
     from impc.studies.selection.model_source import model_source, read_trials  # noqa: PLC0415
 
     study, where = read_study(path), f"{path}: study.model"
     name = consented_name(where, study.model, given, allowed, "model", ())
-    require_distinct([file for unit in study.units for file in unit.files])
     arguments: dict[str, Any] = dict(study.configuration.model)
     source = model_source(name, arguments)
     recorded = read_trials(study, source)

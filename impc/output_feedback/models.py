@@ -193,9 +193,9 @@ class PersonReport(Frozen):
         }
 
 
-#: (name, compute, encode, decode) -> the model, from the store or computed.
+#: (name, compute, decode, encode) -> the model, from the store or computed.
 Remember = Callable[
-    [str, Callable[[], PersonModel], Callable[[PersonModel], Any], Callable[[Any], PersonModel]],
+    [str, Callable[[], PersonModel], Callable[[Any], PersonModel], Callable[[PersonModel], Any]],
     PersonModel,
 ]
 
@@ -207,18 +207,18 @@ def person_report(
     *,
     profiled: bool = False,
     done: Callable[[str], None] = lambda _: None,
-    remember: Remember = lambda _name, compute, _encode, _decode: compute(),
+    remember: Remember = lambda _name, compute, _decode, _encode: compute(),
 ) -> PersonReport:
     """Fit the requested and the comparison models, starting from a least squares fit.
 
-    `walk` (d,); `remember` (name, compute, encode, decode).
+    `walk` (d,); `remember` (name, compute, decode, encode).
     """
     models: list[PersonModel] = []
     for name, posed, person in persons(found.problem, asked, walk):
         first, budget = replace(found, problem=posed), _BESIDE if models else _ASKED
         fit_one = functools.partial(_model, name, first, person, budget)
         decode = functools.partial(decode_model, name, posed, person)
-        models.append(remember(name, fit_one, encode_model, decode))
+        models.append(remember(name, fit_one, decode, encode_model))
         done(name)
     fit, plant, none = models[0].fit, found.problem.plant, frozen(np.zeros((0, 2)))
     report = PersonReport(

@@ -58,6 +58,11 @@ class Cache:
             return None
         return found["content"]
 
+    def digest(self, name: str) -> str | None:
+        """Digest under which the result `name` is stored; None if there is none."""
+        found = _unsealed(self.path(name))
+        return None if found is None else found["digest"]
+
     def keep(self, name: str, digest: str, content: Any) -> None:
         """Store the `content` of a result under its `name` and the `digest` of its inputs."""
         body = {"content": content, "digest": digest, "name": name}
@@ -65,13 +70,6 @@ class Cache:
         seal = hashlib.sha256(text).hexdigest().encode()
         # No flush (1 to 20 ms): a file cut short by a power failure is detected and recomputed.
         write_whole(self.path(name), _SEAL % seal + text, flush=False)
-
-    def discard(self, name: str) -> None:
-        """Remove the result `name`, if there is one."""
-        try:
-            self.path(name).unlink(missing_ok=True)
-        except OSError as error:
-            raise _unremovable(f"file {self.path(name)}", error) from None
 
     def forget(self) -> None:
         """Remove all stored results and keep other files."""
@@ -82,7 +80,8 @@ class Cache:
                     path.unlink()
             remove_empty(self.folder)
         except OSError as error:
-            raise _unremovable(f"folder {self.folder}", error) from None
+            problem = f"cannot be removed ({error.strerror})"
+            raise OutputError(f"folder {self.folder}", problem, "remove it") from None
 
 
 def _unsealed(path: Path) -> dict[str, Any] | None:
@@ -98,10 +97,6 @@ def _unsealed(path: Path) -> dict[str, Any] | None:
         return None
     found: dict[str, Any] = json.loads(b"{" + text[_SEALED:])
     return found
-
-
-def _unremovable(subject: str, error: OSError) -> OutputError:
-    return OutputError(subject, f"cannot be removed ({error.strerror})", "remove it")
 
 
 @dataclass(frozen=True)

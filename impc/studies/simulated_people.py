@@ -21,6 +21,8 @@ from impc.control.simulation import Scenario, Status
 from impc.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import ArrayLike
 
     from impc.control.controller import Controller
@@ -64,9 +66,14 @@ def simulate_subject(
     d = finite_array(
         "disturbance", columns[:, None] if columns.ndim == 1 else columns, (None, plant.E.shape[1])
     )
+    if person is None:
+        from impc.output_feedback.observer import Observer  # noqa: PLC0415  # optional
+
+        person = Observer(plant, motor=motor)
+    if np.any(person.process):
+        raise InputError("process", "process noise cannot be simulated", "set process=0")
     rng = np.random.default_rng(seed)
-    senses = _Senses(plant, person, rng, np.asarray(motor))
-    x, u, end = _moved(controller, step.mapaccum(within), d, within, senses, largest)
+    x, u, end = _moved(controller, step.mapaccum(within), d, within, person, rng, largest)
     limits = controller.bounds
     sensed = np.asarray(sensor) * rng.standard_normal((len(d), len(plant.outputs)))
     return SubjectTrial(
@@ -80,75 +87,62 @@ def simulate_subject(
     )
 
 
-class _Senses:
-    """State that the controller receives (true or estimated), and motor noise."""
-
-    def __init__(
-        self, plant: Plant, person: Observer | None, rng: np.random.Generator, motor: Array
-    ) -> None:
-        self.plant, self.person, self.rng, self.motor = plant, person, rng, motor
-        if person is not None and np.any(person.process):
-            raise InputError("process", "process noise cannot be simulated", "set process=0")
-        self.estimating = person is not None and person.estimates
-        if person is not None and self.estimating:
-            from impc.output_feedback.observer import (  # noqa: PLC0415  # optional
-                believed_filter,
-                believed_matrices,
-            )
-
-            self.F, self.C, _, _ = believed_matrices(plant, person)
-            self.L = believed_filter(plant, person).L
-            self.found = np.zeros(len(self.F))
-
-    def of(self, state: Array) -> Array:
-        """State estimate (n,) at a true `state` (n,)."""
-        return np.asarray(self.found[: self.plant.n]) if self.estimating else state
-
-    def noise(self, command: Array) -> Array:
-        """Motor noise that is added to a command (m,)."""
-        deviation, person = self.motor, self.person
-        if person is not None:
-            deviation = np.hypot(person.motor, person.share * command)
-        return np.asarray(deviation * self.rng.standard_normal(len(command)))
-
-    def look(self, state: Array, command: Array, d: Array) -> None:
-        """Update the estimate with a noisy observation of `state` (n,), then predict one sample."""
-        if self.person is None or not self.estimating:
-            return
-        noise = self.person.sensory * self.rng.standard_normal(len(self.C))
-        error = self.person.C @ state + noise - self.C @ self.found
-        self.found = self.F @ self.found + self.L @ error
-        self.found[: self.plant.n] += self.plant.B @ command
-        if self.person.walk is None:
-            self.found[: self.plant.n] += self.plant.E @ d
-
-
 def _moved(
-    controller: Controller, several: Any, d: Array, within: int, senses: _Senses, largest: float
+    controller: Controller,
+    several: Any,
+    d: Array,
+    within: int,
+    person: Observer,
+    rng: np.random.Generator,
+    largest: float,
 ) -> tuple[Array, Array, int | None]:
     """States (samples, n) and commands (samples, m) from rest; sample of a fall or None."""
     plant, samples = controller.plant, len(d)
     prepared = prepare_loop(controller, directions(controller, 0))
+    observe = _filter(plant, person, rng) if person.estimates else None
     still = np.zeros((1, plant.E.shape[1]))
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
-    state = np.zeros(plant.n)
+    state: Array = np.zeros(plant.n)
+    seen = state
     for first in range(0, samples, within):
-        run, _ = run_loop(prepared, Scenario(senses.of(state), still))
+        run, _ = run_loop(prepared, Scenario(seen, still))
         last = min(first + within, samples)
         if run.status[0] > Status.SOFTENED:
             x[first:], u[first:] = state, u[first - 1]
             return x, u, first
         command = run.u[0]
-        moved = command + senses.noise(command)
-        senses.look(state, command, np.mean(d[first:last], axis=0))
-        inputs = np.hstack(
-            [np.tile(moved, (within, 1)), np.resize(d[first:last], (within, d.shape[1]))]
-        )
-        ahead = np.asarray(several(state, inputs.T)).T
+        noise = np.hypot(person.motor, person.share * command) * rng.standard_normal(plant.m)
+        moved = np.tile(command + noise, (within, 1))
+        pushed = np.resize(d[first:last], (within, d.shape[1]))
+        ahead = np.asarray(several(state, np.hstack([moved, pushed]).T)).T
         x[first:last] = np.vstack([state, ahead[:-1]])[: last - first]
         u[first:last] = command
-        state = ahead[-1]
+        before, state = state, ahead[-1]
+        seen = (
+            state if observe is None else observe(before, command, np.mean(d[first:last], axis=0))
+        )
         if not np.all(np.isfinite(state)) or np.max(np.abs(plant.C @ state)) > largest:
             x[last:], u[last:] = x[last - 1], command
             return x, u, last
     return x, u, None
+
+
+def _filter(
+    plant: Plant, person: Observer, rng: np.random.Generator
+) -> Callable[[Array, Array, Array], Array]:
+    """Function (state, command, disturbance) -> state estimate (n,) at the next sample."""
+    from impc.output_feedback.observer import believed_filter, believed_matrices  # noqa: PLC0415
+
+    F, C, _, _ = believed_matrices(plant, person)
+    L, found = believed_filter(plant, person).L, np.zeros(len(F))
+
+    def observe(state: Array, command: Array, push: Array) -> Array:
+        nonlocal found
+        noise = person.sensory * rng.standard_normal(len(C))
+        found = F @ found + L @ (person.C @ state + noise - C @ found)
+        found[: plant.n] += plant.B @ command
+        if person.walk is None:
+            found[: plant.n] += plant.E @ push
+        return np.array(found[: plant.n])
+
+    return observe

@@ -14,7 +14,7 @@ import pytest
 
 from impc.checking import replace
 from impc.errors import DataError
-from impc.files.configuration import Configuration, RecordingTable, SignalTable
+from impc.files.configuration import Configuration, RecordingTable, ReportTable, SignalTable
 from impc.files.digests import content_digest, digest, source_digest
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
@@ -135,6 +135,9 @@ def test_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             RecordingTable(rate=100.0), configuration.signals, fit={"horizon": 5})),
         other(configuration=Configuration(
             RecordingTable(rate=100.1), configuration.signals, fit={"horizon": 20})),
+        other(configuration=Configuration(
+            RecordingTable(rate=100.0), configuration.signals, fit={"horizon": 20},
+            report=ReportTable("radians"))),
     ]  # fmt: skip
     monkeypatch.setattr("impc.studies.cohort.tasks.versions", lambda: {"numpy": "0"})
     different.append(other())

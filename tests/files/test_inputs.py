@@ -10,6 +10,7 @@ import importlib
 import json
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import impc.studies.pool
 import impc.studies.scheduler
 import impc.studies.selection.model_source
 from impc.cli.main import main
-from impc.studies.pool import Answer
+from impc.studies.pool import Answer, Task
 from tests.studies.selection.test_methods import blood_study
 from tests.support import ThisProcess
 
@@ -50,18 +51,18 @@ def here(monkeypatch: pytest.MonkeyPatch, stop: int = -1) -> list[str]:
     done: list[str] = []
 
     class Interrupted(ThisProcess):
-        def take(self) -> tuple[int, list[Answer] | str]:
+        def submit(self, task: Task) -> Future[Answer]:
             if len(done) == stop:
                 raise KeyboardInterrupt
-            done.extend(task.name for task in self._waiting[0][1])
-            return super().take()
+            done.append(task.name)
+            return super().submit(task)
 
     @contextmanager
     def connected(_: object) -> Iterator[Interrupted]:
         yield Interrupted()
 
     monkeypatch.setattr(impc.studies.scheduler, "connected", connected)
-    monkeypatch.setattr(impc.studies.pool, "_SECONDS", 0.0)  # one task a batch
+    monkeypatch.setattr(impc.studies.pool, "_AHEAD", 1)
     return done
 
 

@@ -121,7 +121,7 @@ def test_workbooks_of_impc_are_read_by_openpyxl(tmp_path: Path) -> None:
     cells = [("=1+1", True, 0.1), ("<x>\x00", False, -np.inf)]
     path.write_bytes(workbook_bytes({"a": pd.DataFrame(cells, columns=["x", "@y", "z"])}))
     (sheet,) = openpyxl.load_workbook(path).worksheets
-    assert [[cell.value for cell in row] for row in sheet.rows] == [
+    assert [[cell.value for cell in row] for row in sheet] == [
         ["x", "'@y", "z"], ["'=1+1", "yes", 0.1], ["<x>\\x00", "no", None]
     ]  # fmt: skip
     assert sheet["A2"].data_type == "s"  # no formula
@@ -157,7 +157,7 @@ def test_participants_in_a_workbook(tmp_path: Path, ending: str) -> None:
     else:
         book(path, rows)
     sheet = read_sheet(path)
-    assert [row["subject"] for row in sheet.rows] == ["1", "2"]
+    assert [row["subject"] for row in sheet] == ["1", "2"]
     assert [one.values["mass"] for one in read_participants(path).values()] == [79.7, 68.0]
     path.write_bytes(b"PK\x03\x04")
     with pytest.raises(InputError, match="is damaged and cannot be read"):

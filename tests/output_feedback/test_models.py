@@ -150,16 +150,16 @@ def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> N
     whole = person_report(found, person, np.zeros(0))
     memory = open_memory(tmp_path, found.problem, settings)
     with pytest.raises(KeyboardInterrupt):
-        person_report(found, person, np.zeros(0), done=interrupt, remember=memory.part)
+        person_report(found, person, np.zeros(0), done=interrupt, remember=memory.get)
     again = open_memory(tmp_path, found.problem, settings)
 
-    def counted(name: str, compute: Any, encode: Any, decode: Any) -> PersonModel:
+    def counted(name: str, compute: Any, decode: Any, encode: Any) -> PersonModel:
         def counting() -> PersonModel:
             computed.append(name)
             model: PersonModel = compute()
             return model
 
-        model: PersonModel = again.part(name, counting, encode, decode)
+        model: PersonModel = again.get(name, counting, decode, encode)
         return model
 
     report = person_report(found, person, np.zeros(0), remember=counted)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tracemalloc
 from pathlib import Path
 
@@ -93,7 +92,9 @@ def test_consent(monkeypatch: pytest.MonkeyPatch) -> None:
         require_consent(Effort(60, machine + 1), given=True)
 
 
-@pytest.mark.parametrize("setting", ["replicates = 1000000", 'horizon = 5000\nsolver = "daqp"'])
+@pytest.mark.parametrize(
+    "setting", ["horizon = 10\nreplicates = 1000000", 'horizon = 5000\nsolver = "daqp"']
+)
 def test_a_request_for_hours_or_memory_ends_at_once(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -103,18 +104,12 @@ def test_a_request_for_hours_or_memory_ends_at_once(
         raise AssertionError("the request is refused before the work")
 
     monkeypatch.setattr(impc.studies.fit.subject, "fit_recordings", unwanted)
-    push = np.repeat(np.random.default_rng(0).choice([-1.0, 0.0, 1.0], 60), 10)
-    rows = [f"{k / 100},{np.sin(k / 10) / 50},{value}" for k, value in enumerate(push)]
-    (tmp_path / "a.csv").write_text("\n".join(["t,e,p", *rows]) + "\n")
-    signals = "\n".join(
-        f'[signals.{name}]\ncolumn = "{column}"\nunit = "{unit}"'
-        for name, column, unit in (
-            ("theta1", "e", "rad"), ("theta2", "e", "rad"), ("perturbation", "p", "N*m"),
-        )
-    )  # fmt: skip
+    _, table, settings = write_study(tmp_path, 1).read_text().partition("[recording]")
     config = tmp_path / "a.toml"
-    config.write_text(f'[recording]\ntime = "t"\n{signals}\n[fit]\nu_max = 6.0\n{setting}\n')
-    words = ["fit", str(tmp_path / "a.csv"), "--plant", "seated-balance", "--config", str(config)]
+    config.write_text(table + settings.replace("horizon = 10\n", "").replace(
+        "replicates = 0\n", f"{setting}\n"))  # fmt: skip
+    words = ["fit", str(tmp_path / "sub-01/cart_1.csv"), "--config", str(config),
+             "--plant", "tests.studies.cohort.carts:cart_plant"]  # fmt: skip
     done = CliRunner().invoke(main, [*words, "--out", str(tmp_path / "out")])
     assert done.exit_code == 2, done.stderr
     assert done.stderr.startswith("impc: error: this request: would ")
@@ -172,15 +167,9 @@ def test_compiling_a_model_is_no_part_of_what_a_selection_takes(
 
 
 def test_a_cohort_for_days_ends_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six subjects: refused, started with --yes, and not asked again when finished."""
+    """Refused without output files, and started with --yes."""
     here(monkeypatch)
-    study = write_study(tmp_path, 1, replicates=100_000)
-    for number in range(2, 7):
-        shutil.copytree(tmp_path / "sub-01", tmp_path / f"sub-{number:02d}")
-        with (tmp_path / f"sub-{number:02d}" / "cart_1.csv").open("a") as stream:
-            stream.write("\n" * number)  # no copy to the byte, which would be refused
-    people = [f"{number:02d},a,0.3" for number in range(1, 7)]
-    (tmp_path / "people.csv").write_text("\n".join(["subject,group,drag", *people]) + "\n")
+    study = write_study(tmp_path, 1, replicates=1_000_000)
     words = ["cohort", str(study), "--allow-plant", "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(main, words)
     assert done.exit_code == 2, done.output

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 _FEWEST = 3  # People in each mean
 _LEAST = 2.0  # People of equal shares to whom a mean must correspond, 1 / sum p^2
 _KNOWN = 1e9  # Degrees of freedom of a standard error that the fits state
-_COST_WEIGHT = "log_cost_weight."
 # Usual names of what the others are compared with.
 _USUAL = re.compile(r"(?<![^\W_])(eo|open|baseline|pre|control)(?![^\W_])", re.IGNORECASE)
 # Ratio of a gain to the median of its group, up or down, at which the fit is to be looked at.
@@ -129,25 +128,6 @@ def weighted_mean(given: pd.Series[float], squares: pd.Series[float]) -> Mean:
     return Mean(n, mean, error, freedom, between, spread, 1 / of_squares)
 
 
-def measures_of(units: pd.DataFrame, inner: Collection[str] = ()) -> tuple[str, ...]:
-    """Columns of the table `units` that are compared, independent of the data.
-
-    Logarithms of cost weights within a structure (without one: cost weights of recorded outputs in
-    the analytic centre), gains on recorded outputs and their rates (if no state has the name of an
-    output: all gains except on `inner` states), and VAF. More measures reduce the power after
-    Holm's correction.
-    """
-    outputs = [name.removeprefix("vaf.") for name in units.columns if name.startswith("vaf.")]
-    shown = {*outputs, *(f"{name}_rate" for name in outputs)}
-    gains = [name for name in units.columns if name.startswith("K.")]
-    named = [name for name in gains if name.split(".", 2)[2] in shown]
-    others = [name for name in gains if name.split(".", 2)[2] not in inner]
-    penalised = [name for name in units.columns if name.startswith(_COST_WEIGHT)]
-    centre = [name for name in units.columns if name in {f"centre_weight.{o}" for o in outputs}]
-    shares = [name for name in units.columns if name.startswith("vaf.")]
-    return (*penalised, *(named or others), *(() if penalised else centre), *shares)
-
-
 def interval_of(units: pd.DataFrame, measure: str) -> pd.DataFrame:
     """Columns value, low and high of a measure; without ends they are NaN."""
     kind, _, rest = measure.partition(".")
@@ -196,16 +176,16 @@ def in_order(names: Iterable[str], reference: str) -> list[str]:
 
 
 def compare_cohort(
-    units: pd.DataFrame, reference: str = "", inner: Collection[str] = ()
+    units: pd.DataFrame, measures: Collection[str], reference: str = ""
 ) -> tuple[Comparison, ...]:
     """All possible comparisons, with p-values corrected over the measures of each question."""
     if len(units) == 0:
         return ()
-    chosen, found = measures_of(units, inner), list[Comparison]()
+    found = list[Comparison]()
 
     def ask(question: str, condition: str, names: Iterable[str]) -> None:
         for pair in itertools.combinations(in_order(names, reference), 2):
-            asked = (Comparison(question, name, condition, *pair) for name in chosen)
+            asked = (Comparison(question, name, condition, *pair) for name in measures)
             tests = [difference_of(units, one, reference) for one in asked]
             corrected = holm(np.array([item.p for item in tests])).tolist()
             found.extend(map(lambda one, p: replace(one, p_holm=p), tests, corrected))
@@ -217,7 +197,7 @@ def compare_cohort(
         ask("change", name, groups if several else ())
         ask("visit", name, visits)
         if several:
-            found += [_reliable(part, Comparison("reliability", one, name)) for one in chosen]
+            found += [_reliable(part, Comparison("reliability", one, name)) for one in measures]
     ask("condition", "", sorted(set(units["condition"])))
     return tuple(found)
 

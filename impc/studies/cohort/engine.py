@@ -1,28 +1,22 @@
 """Run a study: the fit of each unit, then its replicates; results are stored at once.
 
-    OUT/manifest.json                  units, their digests, versions
-    OUT/units/NAME/fit.json            a fit (`impc.studies.cache`), or
-    OUT/units/NAME/failed.json         the reason why there is none
-    OUT/units/NAME/replicate-0007.json, or replicate-0007-failed.json
-    OUT/cohort.log                     log with times
+    OUT/units/NAME/fit.json               a fit (`impc.studies.cache`)
+    OUT/units/NAME/replicate-0007.json
+    OUT/cohort.log                        times, memory, and what failed
 
 Stored results are not computed again. A unit that cannot be fitted does not stop the others.
 """
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError
-from impc.files.digests import versions
 from impc.files.disk import IN_ITS_PLACE, require_ordinary, unwritable
-from impc.reporting.writer import write_files
 from impc.studies.cache import Cache
-from impc.studies.cohort.study import LABELS
 from impc.studies.cohort.tasks import fit_unit, replicate_unit
 from impc.studies.pool import Task, run
 
@@ -35,7 +29,7 @@ if TYPE_CHECKING:
     from impc.studies.pool import Pool, Result
 
 # Entries of a fit that its replicates need.
-_NEEDED = ("starts", "logarithms", "errors", "added", "K", "S", "Q", "R")
+_NEEDED = ("starts", "logarithms", "errors", "added", "K", "S")
 
 
 @dataclass(frozen=True)
@@ -98,30 +92,25 @@ def _name(unit: str, index: int | None = None) -> str:
 
 def work_kept(study: Study, store: Store) -> tuple[int, int]:
     """Number of tasks with a stored result, and number of all tasks."""
-    count = int(study.configuration.fit.get("replicates", 0))
-    names = [
-        name
-        for unit in study.units
-        for name in (_name(unit.name), *(_name(unit.name, index) for index in range(count)))
-    ]
-    return sum(store.cache.path(name).exists() for name in names), len(names)
+    kept = 0
+    for unit in study.units:
+        fit = store.cache.path(_name(unit.name))
+        replicates = len([*fit.parent.glob("replicate-*.json")])
+        kept += fit.exists() + min(replicates, study.replicates)
+    return kept, len(study.units) * (1 + study.replicates)
 
 
-def require_same(store: Store) -> None:
-    """Raise InputError if the folder has fits of other recordings, settings or versions."""
-    try:
-        known = json.loads((store.folder / "manifest.json").read_bytes())["units"]
-        before = {unit: known[unit]["digest"] for unit in store.digests if unit in known}
-    except (OSError, ValueError, KeyError, TypeError):  # none or damaged: then results with
-        return  # another digest are ignored
-    for unit, digest in before.items():
-        path = store.cache.path(_name(unit))
-        if digest not in (None, store.digests[unit]) and path.exists():
+def open_store(folder: Path, tasks: Mapping[str, FitTask]) -> Store:
+    """The results in a folder; InputError if they are of other recordings, settings or versions."""
+    store = Store(folder, {name: task.digest for name, task in tasks.items()})
+    for unit, digest in store.digests.items():
+        if store.cache.digest(_name(unit)) not in (None, digest):
             raise InputError(
-                f"file {path}",
+                f"file {store.cache.path(_name(unit))}",
                 "was fitted to other recordings or with other settings, plant or versions",
                 "choose another folder, or remove it",
             )
+    return store
 
 
 def run_study(
@@ -132,28 +121,10 @@ def run_study(
     done: Callable[[Result], None] = lambda _: None,
 ) -> Failures:
     """Run the remaining tasks of a study."""
-    require_same(store)
-    count = int(study.configuration.fit.get("replicates", 0))
-    manifest = {
-        "plant": study.plant,
-        "replicates": count,
-        "made": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions(),
-        "units": {
-            unit.name: {
-                **{name: getattr(unit, name) for name in LABELS},
-                "files": [file.name for file in unit.files],
-                "digest": tasks[unit.name].digest if unit.name in tasks else None,
-            }
-            for unit in study.units
-        },
-    }
-    text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
-    write_files(store.folder, {"manifest.json": text.encode()})
     store.log(f"run of {len(study.units)} units on {pool.threads} threads")
-    failures, cache = Failures(), store.cache
+    failures = Failures()
     queue = deque(Task(_name(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
-    for result in run(pool, queue, cache):
+    for result in run(pool, queue, store.cache):
         task, content = result.task, result.content
         unit, _, name = task.name.partition("/")
         index = None if task.work is fit_unit else task.given[-1]
@@ -164,9 +135,7 @@ def run_study(
             else:
                 failures.replicates.setdefault(unit, {})[index + 1] = reason
             store.log(f"{unit}: {name}: {reason}")
-            cache.keep(_failed(task.name), task.digest, {"reason": reason})
         elif not result.found:
-            cache.discard(_failed(task.name))
             store.log(
                 f"{unit}: {name} in {content['seconds']:.2f} s; memory of worker "
                 f"{content['memory_mb']:.0f} MB"
@@ -176,17 +145,7 @@ def run_study(
             needed = {key: content[key] for key in _NEEDED}
             queue.extendleft(
                 Task(_name(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
-                for k in reversed(range(count))
+                for k in reversed(range(study.replicates))
             )
         done(result)
     return failures
-
-
-def keep_failure(store: Store, unit: str, reason: str) -> None:
-    """Store the `reason` why the recordings of a `unit` cannot be read."""
-    store.cache.keep(_failed(_name(unit)), "", {"reason": reason})
-
-
-def _failed(name: str) -> str:
-    """Name in the cache of the reason why the result `name` is missing."""
-    return f"{name}-failed".replace("/fit-", "/")

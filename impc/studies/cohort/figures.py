@@ -20,7 +20,7 @@ from impc.reporting.style import (
     strip,
 )
 from impc.studies.cohort.comparison import mean_of
-from impc.studies.cohort.results import LOGARITHM
+from impc.studies.cohort.unit_result import LOGARITHM
 from impc.studies.fit.facts import between
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
     ax.set_ylim(at + 0.8, 0.9)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
-    words = cohort.name(cohort.measure)
-    ax.set_xlabel(f"{sentence_case(words)} ({cohort.unit(cohort.measure)})", loc="left")
+    shown = cohort.of(cohort.measure)
+    ax.set_xlabel(f"{sentence_case(shown['name'])} ({shown['unit']})", loc="left")
     ax.xaxis.set_label_position("top")
     return figure
 
@@ -89,17 +89,15 @@ def _mean(ax: Axes, ends: Array, at: float, rows: int, across: Any) -> None:
 
 def subject_figure(fit: Mapping[str, Any], narrow: bool) -> Figure:
     """Recorded and modelled outputs of a unit's first trial, from its stored `fit`."""
-    shown = fit["trajectory"]
-    recorded, simulated = np.array(shown["recorded"]), np.array(shown["simulated"])
-    time = np.arange(len(recorded) // (3 if narrow else 1)) * shown["dt"]
-    outputs = recorded.shape[1]
-    figure = new_figure(PHONE if narrow else HALF, 0.5 + 1.35 * outputs)
-    axes = np.ravel(figure.subplots(outputs, 1, sharex=True, squeeze=False))
-    for index, ax in enumerate(axes):
-        factor, unit = fit["shown_units"][index]
-        words = fit["words"].get(fit["outputs"][index], fit["outputs"][index])
-        strip(ax, f"{sentence_case(words)} ({unit})")
-        ax.plot(time, factor * recorded[: len(time), index], color=RECORDED, linewidth=4.5)
-        ax.plot(time, factor * simulated[: len(time), index], color=BLUE)
+    signals = fit["trajectory"]["signals"]
+    kept = slice(len(signals[0]["recorded"]) // (3 if narrow else 1))
+    figure = new_figure(PHONE if narrow else HALF, 0.5 + 1.35 * len(signals))
+    axes = np.ravel(figure.subplots(len(signals), 1, sharex=True, squeeze=False))
+    for ax, signal in zip(axes, signals, strict=True):
+        recorded, simulated = signal["recorded"][kept], signal["simulated"][kept]
+        time = np.arange(len(recorded)) * fit["trajectory"]["dt"]
+        strip(ax, signal["label"])
+        ax.plot(time, recorded, color=RECORDED, linewidth=4.5)
+        ax.plot(time, simulated, color=BLUE)
     axes[-1].set_xlabel("Time (s)")
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +19,10 @@ from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key, Verdict
 from impc.reporting.writer import write_files
 from impc.studies.cohort.figures import forest, subject_figure
-from impc.studies.cohort.results import LOGARITHM, Cohort
+from impc.studies.cohort.results import Cohort
 from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.tables import cohort_tables, or_nan
+from impc.studies.cohort.tables import cohort_tables, row_of
+from impc.studies.cohort.unit_result import LOGARITHM
 from impc.studies.cohort.verdict import cohort_verdict
 from impc.studies.fit.facts import between
 
@@ -73,8 +75,9 @@ def write_report(
         # Written one by one: the pages of a thousand subjects would fill the memory.
         page = _subject_page(subject, own, store, failures)
         write_files(store.folder, {_address(subject): page.page().encode()})
-    described = next((fit for unit in study.units if (fit := store.fit(unit.name))), {})
-    cohort = Cohort(tables["units"], described, failures.units, study.reference)
+    fits = filter(None, (store.fit(unit.name) for unit in study.units))
+    first: dict[str, Any] = next(fits, {"shown": {}})
+    cohort = Cohort(tables["units"], first["shown"], failures.units, study.reference)
     known = {name: cohort.units.get(f"K_determined{name[1:]}") for name in cohort.measures}
     unknown = {name: len(one) - int(one.sum()) for name, one in known.items() if one is not None}
     data = {
@@ -87,7 +90,7 @@ def write_report(
         "outliers": list(cohort.units["unit"][cohort.far.notna()]) if cohort.outliers else [],
     }
     beside = [Finding(name, table, _BESIDE[name]) for name, table in tables.items()]
-    report = _page(study, cohort, _checks(study, store, failures, cohort), command)
+    report = _page(study, cohort, _checks(study, failures, cohort), command)
     report = replace(report, data=data, beside=beside)
     write_files(store.folder, report.files(pdf=pdf))
     return report
@@ -95,7 +98,7 @@ def write_report(
 
 def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -> Report:
     """Report of a cohort."""
-    verdict, name = cohort_verdict(cohort), cohort.name(cohort.measure)
+    verdict, name = cohort_verdict(cohort), cohort.of(cohort.measure)["name"]
     people = len({unit.subject for unit in study.units})
     provenance = Provenance(command=command)
     recordings = f"{sum(len(unit.files) for unit in study.units)} files of {people} people"
@@ -138,7 +141,7 @@ def _keys(cohort: Cohort) -> list[Key]:
     keys = []
     if cohort.lead is not None:
         value, ends, unit = cohort.amount(cohort.lead)
-        what = f"difference, {cohort.name(cohort.lead.measure)}"
+        what = f"difference, {cohort.of(cohort.lead.measure)['name']}"
         keys = [Key(value, unit, what, f"95 % CI {ends}")]
     if name:
         keys.append(Key(f"{known} of {of}", "people", f"{name} determined", "others count little"))
@@ -149,19 +152,18 @@ def comparisons(cohort: Cohort) -> Finding:
     """Table of all comparisons; logarithms are shown as ratios."""
     rows = []
     for item in cohort.compared:
-        own = np.array([item.estimate, item.low, item.high])
-        ends, unit = cohort.shown(item.measure, own), cohort.unit(item.measure)
-        si = cohort.plant_unit(item.measure)
+        own, column = np.array([item.estimate, item.low, item.high]), cohort.of(item.measure)
+        ends, unit, si = cohort.shown(item.measure, own), column["unit"], column["unit_si"]
         if item.question == "reliability":
             ends, unit, si = own, "-", "-"
         elif item.measure.startswith(LOGARITHM):
             unit = "ratio"
         rows.append({
-            "measure": cohort.name(item.measure), "question": _QUESTIONS[item.question],
+            "measure": column["name"], "question": _QUESTIONS[item.question],
             "condition": item.condition,
             "compared": f"{item.second} - {item.first}" if item.first else "",
             **dict(zip(("difference", "low", "high"), map(float, ends), strict=True)),
-            "unit": unit, "n": item.n, "sd_between": item.between * cohort.scale(item.measure),
+            "unit": unit, "n": item.n, "sd_between": item.between * column["scale"],
             "effect": item.effect, "p": item.p, "p_holm": item.p_holm, "note": item.note,
             "difference_si": item.estimate, "low_si": item.low, "high_si": item.high, "unit_si": si,
         })  # fmt: skip
@@ -191,56 +193,59 @@ def comparisons(cohort: Cohort) -> Finding:
 
 def subjects(study: Study, cohort: Cohort) -> Finding:
     """Table of all units with a badge and a link to their pages."""
-    rows, name = [], cohort.name(cohort.measure)
+    column, signals = cohort.of(cohort.measure), {
+        name: f"{one['signal']}, VAF (%)" for name, one in cohort.columns.items()
+        if name.startswith("vaf.")
+    }  # fmt: skip
+    name, unit = column["name"], column["unit"]
     found = cohort.units.join(cohort.ends).assign(far=cohort.far) if name else cohort.units
     made = {row["unit"]: row for row in found.to_dict("records")}
-    signals = {f"vaf.{one}": cohort.word(one) for one in cohort.described.get("outputs", ())}
-    for unit in study.units:
-        row = {head: getattr(unit, head) for head in ("subject", "group", "visit", "condition")}
-        own = made.get(unit.name)
-        if own is None:
-            row |= {"verdict": "Not fitted", "why": cohort.failed.get(unit.name, "")}
-        else:
-            row |= {"verdict": _BADGES[own["level"]][0]}
-            row |= {head: own[head] for head in ("value", "low", "high", *signals)}
-            row |= {"at_limit_percent": 100 * float(own["saturated"])}
-            far = f"Look at it: a gain is {own['far']:.2g} times its group's median."
-            row |= {"determined": own["determined"], "why": " ".join(filter(None, (
-                "" if own["level"] == Level.GREEN.value else own["headline"],
-                far if np.isfinite(own["far"]) else "")))}  # fmt: skip
-        rows.append(row)
-    heads = ["subject", "group", "visit", "condition", "verdict", "value", "low", "high"]
-    table = pd.DataFrame(rows, columns=[*heads, "determined", *signals, "at_limit_percent", "why"])
+    rows = [_subject_row(one, made.get(one.name), cohort) for one in study.units]
+    heads = ["subject", "group", "visit", "condition", "verdict", "value", "low", "high",
+             "determined", *signals, "at_limit_percent", "why"]  # fmt: skip
+    table = pd.DataFrame(rows, columns=heads)
     table.insert(5, "measure", name)
-    table.insert(9, "unit", cohort.unit(cohort.measure))
+    table.insert(9, "unit", unit)
     si = [f"{head}_si" for head in ("value", "low", "high")]
-    table[si] = table[["value", "low", "high"]].astype(float) / cohort.scale(cohort.measure)
-    table["unit_si"] = cohort.plant_unit(cohort.measure)
+    table[si] = table[["value", "low", "high"]].astype(float) / column["scale"]
+    table["unit_si"] = column["unit_si"]
     plain = [one for one in ("group", "visit", "condition", "why") if table[one].nunique() < 2]
     return Finding(
         "subjects", table,
         "All subjects and visits; click a heading to sort. Determined: the recordings identify "
         "the gain, and its 95 % interval is not wider than the gain itself.",
         digits=4,
-        labels={
-            **{head: f"{words}, VAF (%)" for head, words in signals.items()}, **_INTERVAL,
-            "value": f"{name} ({cohort.unit(cohort.measure)})",
-            "at_limit_percent": "At limit (% of time)",
-        },
+        labels={**signals, **_INTERVAL, "value": f"{name} ({unit})",
+                "at_limit_percent": "At limit (% of time)"},
         hidden=["measure", "unit", *si, "unit_si", *plain],
-        links={unit.subject: _address(unit.subject) for unit in study.units},
+        links={one.subject: _address(one.subject) for one in study.units},
         badges=dict(_BADGES.values()) | {"Not fitted": Level.RED},
     )  # fmt: skip
 
 
-def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> list[Check]:
+def _subject_row(unit: Unit, own: Mapping[Any, Any] | None, cohort: Cohort) -> dict[str, Any]:
+    """Row of a unit from its own row in the table of results."""
+    row = {head: getattr(unit, head) for head in ("subject", "group", "visit", "condition")}
+    if own is None:
+        return row | {"verdict": "Not fitted", "why": cohort.failed.get(unit.name, "")}
+    why = [] if own["level"] == Level.GREEN.value else [own["headline"]]
+    if np.isfinite(own["far"]):
+        why.append(f"Look at it: a gain is {own['far']:.2g} times its group's median.")
+    at_limit = 100 * float(own["saturated"])
+    verdict, _ = _BADGES[own["level"]]
+    found = {**own, **row, "verdict": verdict, "at_limit_percent": at_limit}
+    return found | {"why": " ".join(why)}
+
+
+def _checks(study: Study, failures: Failures, cohort: Cohort) -> list[Check]:
     """Checks over all fits; amber if they restrict what may be reported."""
     units, total, warned = cohort.units, len(study.units), cohort.warned
     fits, (name, known, of) = len(units), cohort.determined
     never = int(np.sum(units["saturated"] == 0)) if fits else 0
     refused = int(units.get("structure_refused", pd.Series(dtype=bool)).sum())
-    drawn = fits * int(study.configuration.fit.get("replicates", 0))
+    drawn = fits * study.replicates
     lost = sum(map(len, failures.replicates.values()))
+    fallen = _fallen(study, failures, cohort)
     cases = (
         (True, fits == total, "Fits", f"{fits} of {total} fits are complete."),
         (True, not warned, "Warnings", f"{warned} of {fits} fits have a warning."),
@@ -255,28 +260,26 @@ def _checks(study: Study, store: Store, failures: Failures, cohort: Cohort) -> l
          "chance."),
         (drawn, not lost, "Bootstrap",
          f"{drawn - lost} of {drawn} bootstrap replicates are complete, {lost} failed."),
+        (not fallen, True, "Falls", "No person fell in any trial."),
+        (fallen, False, "Falls",
+         f"Trials with a fall were left out ({fallen}). If one group falls more often, the other "
+         "trials may understate the difference between groups: also compare the numbers of "
+         "falls."),
     )  # fmt: skip
     levels = {True: Level.GREEN, False: Level.AMBER, None: Level.NOTE}
-    found = [Check(levels[passed], head, said) for there, passed, head, said in cases if there]
-    return [*found, _falls(study.units, store, failures)]
+    return [Check(levels[passed], head, said) for there, passed, head, said in cases if there]
 
 
-def _falls(units: Sequence[Unit], store: Store, failures: Failures) -> Check:
-    """Check of the number of trials with a fall, by group."""
-    fallen: dict[str, int] = {}
-    for unit in units:
-        fit, group = store.fit(unit.name), unit.group or "all"
+def _fallen(study: Study, failures: Failures, cohort: Cohort) -> str:
+    """Number of trials with a fall in each group: "2 in group a"; empty without a fall."""
+    rows = cohort.units.to_dict("records")
+    kept, lost = {row["unit"]: row["trials"] for row in rows}, Counter[str]()
+    for unit in study.units:
         all_fell = FELL in failures.units.get(unit.name, "")
-        kept = 0 if all_fell else len(unit.files) if fit is None else int(fit["trials"])
-        fallen[group] = fallen.get(group, 0) + len(unit.files) - kept
-    if not any(fallen.values()):
-        return Check(Level.GREEN, "Falls", "No person fell in any trial.")
-    counts = ", ".join(f"{lost} in group {group}" for group, lost in sorted(fallen.items()))
-    return Check(
-        Level.AMBER, "Falls",
-        f"Trials with a fall were left out ({counts}). If one group falls more often, the other "
-        "trials may understate the difference between groups: also compare the numbers of falls.",
-    )  # fmt: skip
+        left = kept.get(unit.name, 0 if all_fell else len(unit.files))
+        lost[unit.group or "all"] += len(unit.files) - left
+    groups = sorted(lost.items()) if lost.total() else []
+    return ", ".join(f"{count} in group {group}" for group, count in groups)
 
 
 def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failures) -> Report:
@@ -306,45 +309,47 @@ def _subject_page(subject: str, units: list[Unit], store: Store, failures: Failu
 
 
 def _subject_keys(fit: Mapping[str, Any]) -> list[Key]:
-    least, name = min((or_nan(value), name) for name, value in fit["vaf"].items())
+    row = row_of(fit)
+    least, name = min((value, name) for name, value in row.items() if name.startswith("vaf."))
+    words = fit["shown"][name]["signal"]
     return [
-        Key(number(least, 4), "%", "explained (VAF)", f"lowest: {fit['words'].get(name, name)}"),
-        Key(number(100 * fit["saturated"]), "% of the time", "at the torque limit"),
-        *(Key(number(row["gain"]), row["unit"], f"gain on {row['state']}",
-              f"95 % CI {between(row['low'], row['high'])}")
-          for row in _gains(fit) if row["determined"]),
+        Key(number(least, 4), "%", "explained (VAF)", f"lowest: {words}"),
+        Key(number(100 * row["saturated"]), "% of the time", "at the torque limit"),
+        *(Key(number(one["gain"]), one["unit"], f"gain on {one['state']}",
+              f"95 % CI {between(one['low'], one['high'])}")
+          for one in _gains(fit) if one["determined"]),
     ][:3]  # fmt: skip
 
 
 def _blocks(unit: Unit, fit: Mapping[str, Any]) -> list[Block]:
-    left_out = {name: f" (left-out trials: {number(value, 4)} %)"
-                for name, value in fit["held_out_vaf"].items() if value is not None}  # fmt: skip
-    explained = " and ".join(
-        f"{number(or_nan(fit['vaf'][name]), 4)} % of {fit['words'].get(name, name)}"
-        f"{left_out.get(name, '')}" for name in fit["outputs"]
-    )  # fmt: skip
+    row, explained = row_of(fit), []
+    for name, column in fit["shown"].items():
+        if name.startswith("vaf."):
+            held_out = row[f"held_out_{name}"]
+            left_out = f" (left-out trials: {number(held_out, 4)} %)"
+            said = f"{number(row[name], 4)} % of {column['signal']}"
+            explained.append(said + left_out * bool(np.isfinite(held_out)))
     gains = pd.DataFrame(_gains(fit))
     notes = [line for trial in fit["findings"] for line in trial]
+    shares = " and ".join(explained)
     return [
-        f"{fit['verdict']['headline']} Explained in {fit['trials']} trials (VAF): {explained}.",
+        f"{row['headline']} Explained in {row['trials']} trials (VAF): {shares}.",
         Finding(f"{unit.name}-gain", gains, "Feedback gain.", digits=3, labels=_INTERVAL,
-                hidden=["control"] if len(fit["controls"]) == 1 else []),
+                hidden=["control"] if gains["control"].nunique() < 2 else []),
         *([Lines(notes)] if notes else []),
     ]  # fmt: skip
 
 
 def _gains(fit: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Entries of the gain with a meaning, in shown units."""
-    words, rows = fit["words"], []
-    for i, control in enumerate(fit["controls"]):
-        for j, state in enumerate(fit["states"]):
-            if state in fit["inner"]:
-                continue
-            factor, unit, *_ = fit["shown_gains"][f"K.{control}.{state}"]
-            gain, *ends = (factor * or_nan(fit[name][i][j]) for name in ("K", "K_low", "K_high"))
+    row, rows = row_of(fit), []
+    for name, column in fit["shown"].items():
+        if name.startswith("K.") and not column["inner"]:
+            entry = name.removeprefix("K")
+            ends = {end: column["scale"] * row[f"K_{end}{entry}"] for end in ("low", "high")}
             rows.append({
-                "state": words.get(state, state), "control": words.get(control, control),
-                "gain": gain, "low": ends[0], "high": ends[1], "unit": unit,
-                "determined": bool(fit["K_determined"][i][j]),
+                "state": column["signal"], "control": column["control"],
+                "gain": column["scale"] * row[name], **ends, "unit": column["unit"],
+                "determined": bool(row[f"K_determined{entry}"]),
             })  # fmt: skip
     return rows

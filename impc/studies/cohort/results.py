@@ -15,9 +15,9 @@ from impc.studies.cohort.comparison import (
     compare_cohort,
     difference_of,
     interval_of,
-    measures_of,
     outlying,
 )
+from impc.studies.cohort.unit_result import LOGARITHM
 from impc.studies.fit.facts import between, with_unit
 from impc.studies.fit.verdict import UNDETERMINED
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.studies.cohort.comparison import Comparison
 
-#: Prefix of columns of logarithms, which are compared as ratios.
-LOGARITHM = "log_cost_weight."
 _LEADING = ("K.", LOGARITHM)
 # Questions about means, in the order of preference.
 _QUESTIONS = ("group", "change", "condition", "visit")
@@ -43,7 +41,8 @@ class Cohort:
     """Results of a cohort for page, figures and terminal."""
 
     units: pd.DataFrame  # Table units.csv
-    described: Mapping[str, Any]  # Content of any fit: signals and their units
+    # Words and units of the columns of any fit (`impc.studies.cohort.unit_result`)
+    columns: Mapping[str, Mapping[str, Any]]
     failed: Mapping[str, str]  # Unit -> reason why it has no fit
     reference: str = ""  # Group, visit or condition of comparison; empty for the usual one
 
@@ -73,16 +72,15 @@ class Cohort:
         """Number of people with a fit."""
         return int(self.units["subject"].nunique())
 
-    @cached_property
-    def measures(self) -> tuple[str, ...]:
+    @property
+    def measures(self) -> list[str]:
         """Columns of `units` that are compared."""
-        inner = self.described.get("inner", ())
-        return measures_of(self.units, inner) if len(self.units) else ()
+        return [name for name, column in self.columns.items() if column["compared"]]
 
     @cached_property
     def compared(self) -> tuple[Comparison, ...]:
         """All comparisons of green and amber fits."""
-        return compare_cohort(self.usable, self.reference, self.described.get("inner", ()))
+        return compare_cohort(self.usable, self.measures, self.reference)
 
     @cached_property
     def tested(self) -> list[Comparison]:
@@ -113,48 +111,16 @@ class Cohort:
     def ends(self) -> pd.DataFrame:
         """Measure of each unit with its interval in shown units, and whether it is determined."""
         found = interval_of(self.units, self.measure)
-        ratio, scale = self.measure.startswith(LOGARITHM), self.scale(self.measure)
-        found = found.map(np.exp) if ratio else scale * found
+        found[:] = self.shown(self.measure, found.to_numpy())
         kind, _, rest = self.measure.partition(".")
         known = self.units.get(f"{kind}_determined.{rest}", True)
         usable = self.units.index.isin(self.usable.index)
         return found.assign(determined=known & usable).astype({"determined": bool})
 
-    def word(self, signal: str) -> str:
-        """Name of a signal in words."""
-        return str(self.described.get("words", {}).get(signal, signal.replace("_", " ")))
-
-    def name(self, measure: str) -> str:
-        """Name of a column of units.csv in words."""
-        kind, _, rest = measure.partition(".")
-        if kind == "K":
-            control, _, state = rest.partition(".")
-            several = len(self.described.get("controls", ())) > 1
-            return f"gain on {self.word(state)}" + f" ({self.word(control)})" * several
-        words = {"vaf": "variance accounted for, {}", "centre_weight": "central cost weight of {}",
-                 "log_cost_weight": "cost weight of {}"}  # fmt: skip
-        return words.get(kind, kind.replace("_", " ")).format(self.word(rest))
-
-    def scale(self, measure: str) -> float:
-        """Factor from a column of units.csv to the numbers on pages."""
-        return float(self._gain(measure)[0])
-
-    def unit(self, measure: str) -> str:
-        """Unit of a measure on pages; "-" for logarithms."""
-        return str(self._gain(measure)[1])
-
-    def plant_unit(self, measure: str) -> str:
-        """Unit of a column of units.csv."""
-        known = {"vaf": "%", "log_cost_weight": "-"} | self.described.get("units", {})
-        return str(known.get(measure, known.get(measure.partition(".")[0], UNKNOWN)))
-
-    def _gain(self, measure: str) -> tuple[float, str, str, str]:
-        """Factor, unit, unit of the command, and for what a gain is given."""
-        own = self.plant_unit(measure)
-        found: tuple[float, str, str, str] = self.described.get("shown_gains", {}).get(
-            measure, (1.0, own, own, f"1 of {self.word(measure.rpartition('.')[2])}")
-        )
-        return found
+    def of(self, measure: str) -> Mapping[str, Any]:
+        """Words and units of a measure."""
+        nothing = {"name": "", "scale": 1.0, "unit": UNKNOWN, "unit_si": UNKNOWN}
+        return self.columns[measure] if measure else nothing
 
     def amount(self, item: Comparison) -> tuple[str, str, str]:
         """Difference and its interval, both without unit, and the unit with "less" or "more"."""
@@ -165,24 +131,24 @@ class Cohort:
         below = item.measure.startswith("K.") and self.usable[item.measure].median() < 0
         word = "less" if (item.estimate < 0) != below else "more"
         low, high = sorted(np.sign(item.estimate or 1.0) * ends[1:])
-        unit = self.unit(item.measure).replace("%", "percentage points")
+        unit = self.of(item.measure)["unit"].replace("%", "percentage points")
         return number(abs(ends[0])), between(low, high), f"{unit} {word}"
 
     def shown(self, measure: str, values: Array) -> Array:
         """Values of a measure as pages show them; logarithms as ratios."""
-        return np.exp(values) if measure.startswith(LOGARITHM) else self.scale(measure) * values
+        ratio = measure.startswith(LOGARITHM)
+        return np.exp(values) if ratio else np.asarray(self.of(measure)["scale"] * values)
 
     def sentence(self, item: Comparison) -> str:
         """Sentence on a difference."""
         value, _, unit = self.amount(item)
-        amount, name = f"{value} {unit}", self.name(item.measure)
+        amount, name = f"{value} {unit}", self.of(item.measure)["name"]
         first, second = (_place(item.question, one) for one in (item.first, item.second))
         if item.question == "change":
             said = f"from visit to visit, the {name} rises by {amount} {second} than {first}"
         elif item.measure.startswith("K."):
-            _, control, _ = item.measure.split(".", 2)
-            effort, (*_, top, per) = self.word(control), self._gain(item.measure)
-            amount = f"{value} {top} {unit.rpartition(' ')[2]} {effort.removeprefix('commanded ')}"
+            top, per, control = (self.of(item.measure)[key] for key in ("top", "per", "control"))
+            amount = f"{value} {top} {unit.rpartition(' ')[2]} {control.removeprefix('commanded ')}"
             groups = item.question == "group"
             who = f"{second[3:]} answers" if groups else f"{second} people answer"
             said = f"{who} {per} with {amount} than {first[3:] if groups else first}"
@@ -195,10 +161,12 @@ class Cohort:
 
     def numbers(self, item: Comparison) -> str:
         """Interval, number of people, SD between them, p-value and effect size."""
-        size = f", {effect_name(item)} = {number(item.effect)}" if np.isfinite(item.effect) else ""
+        effect = "Cohen's d" if item.question in ("visit", "condition") else "Hedges' g"
+        size = f", {effect} = {number(item.effect)}" if np.isfinite(item.effect) else ""
         _, ends, unit = self.amount(item)
-        apart = number(item.between * self.scale(item.measure))
-        differ = f" who differ by an SD of {with_unit(apart, self.unit(item.measure))}"
+        column = self.of(item.measure)
+        apart = with_unit(number(item.between * column["scale"]), column["unit"])
+        differ = f" who differ by an SD of {apart}"
         people = f"n = {item.n} people{differ * (item.measure[:2] == 'K.' and item.between > 0)}"
         p = p_value(item.p_holm)
         p_holm = f"p_holm {p}" if p[0] == "<" else f"p_holm = {p}"
@@ -212,7 +180,7 @@ class Cohort:
             return "", 0, 0
         known = self.usable.get(f"K_determined{gains[0][1:]}")
         rows = self.usable if known is None else self.usable[known.astype(bool)]
-        return self.name(gains[0]), rows["subject"].nunique(), self.people
+        return self.of(gains[0])["name"], rows["subject"].nunique(), self.people
 
     def without_warned(self) -> str:
         """The leading difference in fits without a warning, as a sentence; empty without one."""
@@ -234,11 +202,6 @@ class Cohort:
             return f" Without {without}, too few people are left."
         value, ends, unit = self.amount(other)
         return f" Without {without} it is {value} {unit} (95 % CI {ends}, n = {other.n})."
-
-
-def effect_name(item: Comparison) -> str:
-    """Name of the effect size."""
-    return "Cohen's d" if item.question in ("visit", "condition") else "Hedges' g"
 
 
 def _place(question: str, name: str) -> str:

@@ -3,101 +3,65 @@
 from __future__ import annotations
 
 import csv
+import re
 import unicodedata
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from impc.errors import InputError
 from impc.files.apart import cells_apart
+from impc.files.disk import require_readable
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 # Largest file in bytes; 100 000 participants of 100 characters are 10 MB.
 _LARGEST = 100_000_000
-_BETWEEN = frozenset(" .+-_")
-_LONGEST = 64  # Characters of a name
+_NAME = re.compile(r"([^\W_][\w .+-]{0,63})?")
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """The rows of a table."""
-
-    name: str  # Name of its file
-    heads: tuple[str, ...]  # Names of the columns
-    rows: tuple[dict[str, str], ...]  # Column name -> stripped text
-
-    @property
-    def where(self) -> str:
-        """Name of the table in messages."""
-        return f"table {self.name}"
-
-
-def read_sheet(path: Path) -> Sheet:
-    """Read the table at `path`."""
+def read_sheet(path: Path) -> list[dict[str, str]]:
+    """Rows of the table at `path`: name of a column -> stripped text."""
     where = f"table {path.name}"
-    lines = _cells(where, path)
+    lines = [[cell.strip() for cell in line] for line in _cells(path) if any(line)]
     if len(lines) < 2:
         raise InputError(where, "has no rows", "write a row of column names, then the data")
-    heads = tuple(cell.strip() for cell in lines[0])
-    for name in heads:
-        if not name or heads.count(name) > 1:
-            problem = (
-                f"has {heads.count(name)} columns {name!a}" if name else "has an unnamed column"
-            )
-            raise InputError(where, problem, "give each column a unique name")
+    heads = lines[0]
+    if "" in heads or len({*heads}) < len(heads):
+        twice = next((name for name in heads if heads.count(name) > 1), "")
+        problem = f"has two columns {twice!a}" if twice else "has an unnamed column"
+        raise InputError(where, problem, "give each column a unique name")
     for number, line in enumerate(lines[1:], start=2):
         if len(line) != len(heads):
             raise InputError(
                 where, f"row {number} has {len(line)} cells, but there are {len(heads)} columns",
                 "quote cells with decimal commas, or separate cells by semicolons",
             )  # fmt: skip
-    rows = (dict(zip(heads, map(str.strip, line), strict=True)) for line in lines[1:])
-    return Sheet(path.name, heads, tuple(rows))
+    return [dict(zip(heads, line, strict=True)) for line in lines[1:]]
 
 
-def _cells(where: str, path: Path) -> list[list[str]]:
-    """All lines that are not empty."""
+def _cells(path: Path) -> list[list[str]]:
+    require_readable(path, _LARGEST, InputError)
+    if path.suffix.lower() in (".xlsx", ".ods"):
+        return cells_apart(path, _LARGEST)
     try:
-        if path.exists() and not path.is_file():
-            raise InputError(where, "is not a regular file", "check the path")
-        if path.stat().st_size > _LARGEST:
-            raise InputError(where, f"has more than {_LARGEST // 1_000_000} MB", "check the path")
-        if path.suffix.lower() in (".xlsx", ".ods"):
-            return [row for row in cells_apart(path, _LARGEST) if any(row)]
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(where, f"cannot be read ({error.strerror})", "check the path") from None
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:  # as a German Excel writes it
-        text = content.decode("cp1252", "replace")
-    if "\0" in text:
-        raise InputError(where, "contains a NUL character", "save it again as UTF-8 text")
-    first = text.partition("\n")[0]
-    delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
-    try:
-        return [line for line in csv.reader(text.splitlines(), delimiter=delimiter) if any(line)]
-    except csv.Error as error:
-        raise InputError(where, f"cannot be read ({error})", "save it again as CSV") from None
+        try:
+            text = content.decode("utf-8-sig")
+        except UnicodeDecodeError:  # as a German Excel writes it
+            text = content.decode("cp1252", "replace")
+        first = text.partition("\n")[0]
+        delimiter = "\t" if "\t" in first else ";" if ";" in first else ","
+        return [*csv.reader(text.splitlines(), delimiter=delimiter)]
+    except (OSError, csv.Error) as error:
+        raise InputError(str(path), f"cannot be read ({error})", "save it again as CSV") from None
 
 
 def checked_name(where: str, what: str, text: str) -> str:
     """Strip and normalise (NFC) a name; InputError if it is not safe."""
     name = unicodedata.normalize("NFC", text.strip())
-    bad = [letter for letter in name if not (letter.isalnum() or letter in _BETWEEN)]
-    if bad:
+    if not _NAME.fullmatch(name):
         raise InputError(
-            f"{where}: {what} {name[:_LONGEST]!a}", f"contains {bad[0]!a}",
-            "use letters, digits, spaces and . + - _",
-        )  # fmt: skip
-    if name and not name[0].isalnum():
-        raise InputError(
-            f"{where}: {what} {name!a}", f"begins with {name[0]!a}", "begin with a letter or digit"
-        )
-    if len(name) > _LONGEST:
-        raise InputError(
-            f"{where}: {what} {name[:_LONGEST]!a}...", f"has {len(name)} characters",
-            f"use at most {_LONGEST}",
+            f"{where}: {what}", f"{name[:70]!a} is no name",
+            "use at most 64 letters, digits, spaces and . + - _, beginning with a letter or digit",
         )  # fmt: skip
     return name

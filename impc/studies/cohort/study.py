@@ -17,8 +17,8 @@ spaces and . + - _, beginning with a letter or digit.
 from __future__ import annotations
 
 import glob
-import os
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,11 +28,12 @@ import msgspec
 from impc.errors import InputError
 from impc.files.configuration import Configuration, read_configuration
 from impc.files.formats import FORMATS
+from impc.files.reading import require_distinct
 from impc.studies.cohort.participants import Participant, read_participants
 from impc.studies.cohort.sheet import checked_name, read_sheet
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
@@ -110,17 +111,20 @@ class Study:
     model: str = ""  # Import path of the model; empty if not given
     reference: str = ""  # Group, visit or condition of comparison; empty for the usual one
 
+    @property
+    def replicates(self) -> int:
+        """Number of bootstrap replicates of each unit."""
+        return int(self.configuration.fit.get("replicates", 0))
+
 
 def read_study(path: Path) -> Study:
-    """Read the study at `path` and find its recordings without opening them."""
+    """Read the study at `path` and find its recordings, each of which may be given once."""
     configuration = read_configuration(path, "study", "model", "select")
     table = _table(path, configuration)
     named = table.participants
     people = read_participants(path.parent / named) if named else None
     together: dict[tuple[str, str, str], list[tuple[str, Path]]] = {}
-    found = _found(path, table)
-    _require_once(path, found)
-    for labels, file in found:
+    for labels, file in _found(path, table):
         key = (labels["subject"], labels["visit"], labels["condition"])
         together.setdefault(key, []).append((labels["trial"], file))
     units, missing = [], dict[str, None]()
@@ -133,7 +137,8 @@ def read_study(path: Path) -> Study:
         units.append(Unit(*key, files, own.group, own.values, own.row))
     if missing:
         raise InputError(f"{path}: subject {', '.join(missing)}", f"is not in {named}", "add a row")
-    _require_distinct(path, units)
+    require_distinct([file for unit in units for file in unit.files])
+    _require_folders(path, units)
     _require_reference(path, table.reference, units)
     return Study(
         table.plant or "", configuration, tuple(units), table.model or "", table.reference or ""
@@ -153,23 +158,27 @@ def _table(path: Path, configuration: Configuration) -> StudyTable:
 
 
 def _found(path: Path, table: StudyTable) -> list[Found]:
-    given = [name for name in ("recordings", "table", "bids") if getattr(table, name) is not None]
+    """Recordings of the study at `path` with their labels."""
+    finders = {"recordings": find_by_pattern, "table": find_by_table, "bids": find_by_entities}
+    given = [name for name in finders if getattr(table, name) is not None]
     if len(given) != 1:
         raise InputError(
             f"{path}: study", f"has {', '.join(given) or 'none'} of recordings, table and bids",
             "give exactly one",
         )  # fmt: skip
-    where, written = f"{path}: study.{given[0]}", str(getattr(table, given[0]))
+    where = f"{path}: study.{given[0]}"
     try:
-        if given[0] == "recordings":
-            found = find_by_pattern(where, path.parent, written)
-        else:
-            find = find_by_entities if given[0] == "bids" else find_by_table
-            found = find(path.parent / written)
+        found = finders[given[0]](where, path.parent / getattr(table, given[0]))
     except OSError as error:
         raise InputError(where, f"cannot be searched ({error.strerror})", "check it") from None
     if not found:
         raise InputError(where, "matches no file", "check the path")
+    stems: dict[Path, Path] = {}
+    for _, file in found:
+        other = stems.setdefault(file.with_suffix(""), file)
+        if other != file:
+            problem = f"finds {str(other)!a} and {file.name!a}, the same trial in two formats"
+            raise InputError(where, problem, "move one of them elsewhere")
     return found
 
 
@@ -181,29 +190,12 @@ def _natural(text: str) -> tuple[Any, ...]:
     )
 
 
-def _require_once(path: Path, found: Iterable[Found]) -> None:
-    """Raise InputError if a file, or a trial in two formats, is found twice."""
-    places: dict[str, Path] = {}
-    stems: dict[Path, Path] = {}
-    for _, file in found:
-        other = places.setdefault(os.path.realpath(file), file)
-        if other is not file:
-            problem = f"names the same file twice, {str(other)!a} and {str(file)!a}"
-            raise InputError(f"{path}: study", problem, "name each trial once")
-        other = stems.setdefault(file.with_suffix(""), file)
-        if other is not file:
-            problem = f"finds {str(other)!a} and {file.name!a}, the same trial in two formats"
-            raise InputError(f"{path}: study", problem, "move one of them elsewhere")
-
-
-def _require_distinct(path: Path, units: Iterable[Unit]) -> None:
+def _require_folders(path: Path, units: Sequence[Unit]) -> None:
     """Raise InputError if two units have the same folder or two subjects the same page."""
-    seen: dict[str, Unit] = {}
-    subjects: dict[str, str] = {}
+    folders = Counter(unit.name.lower() for unit in units)
+    pages = Counter(safe_name(name).lower() for name in {unit.subject for unit in units})
     for unit in units:
-        other = seen.setdefault(unit.name.lower(), unit)
-        page = subjects.setdefault(safe_name(unit.subject).lower(), unit.subject)
-        if other is not unit or page != unit.subject:
+        if folders[unit.name.lower()] > 1 or pages[safe_name(unit.subject).lower()] > 1:
             raise InputError(
                 f"{path}: {unit.name}", "is the folder of two units", "use letters, digits, - and +"
             )
@@ -218,91 +210,58 @@ def _require_reference(path: Path, reference: str | None, units: Iterable[Unit])
         raise InputError(f"{path}: study.reference", problem, remedy)
 
 
-#: Labels of a trial.
-KEYS = ("subject", "visit", "condition", "trial")
-_ENTITIES = {"subject": "sub", "visit": "ses", "condition": "task", "trial": "run"}
-_NAME = r"[^/\\_]+?"
+#: Labels of a trial, and their short names in BIDS.
+KEYS = {"subject": "sub", "visit": "ses", "condition": "task", "trial": "run"}
 
 #: A recording with its labels, by `KEYS`.
 Found = tuple[dict[str, str], Path]
 
 
-def find_by_pattern(where: str, folder: Path, pattern: str) -> list[Found]:
+def find_by_pattern(where: str, pattern: Path) -> list[Found]:
     """Files whose paths match a pattern with {subject}, {visit}, {condition} and {trial}."""
-    if Path(pattern).is_absolute():
-        folder = Path(Path(pattern).anchor)
-        pattern = pattern[len(folder.as_posix()) :]
-    matching = re.compile(_expression(where, pattern))
-    parts = re.split(r"(\{\w+\}|(?<=\.)\*$)", pattern)
-    wild = "".join("*" if part[:1] in ("{", "*") else glob.escape(part) for part in parts)
-    found = []
-    for file in sorted(folder.glob(wild)):
-        match = matching.fullmatch(file.relative_to(folder).as_posix())
-        if match:
-            found.append((_labels(_printable(file), match.groupdict()), file))
-    return found
-
-
-def _expression(where: str, pattern: str) -> str:
-    """Regular expression of a pattern."""
-    names = re.findall(r"\{(\w+)\}", pattern)
+    text = pattern.as_posix()
+    fixed, names = re.split(r"\{\w+\}", text.removesuffix(".*")), re.findall(r"\{(\w+)\}", text)
     unknown = [name for name in names if name not in KEYS]
     if unknown or "subject" not in names:
         raise InputError(
             where, f"names {', '.join(unknown) or 'no subject'}",
             f"use {', '.join(f'{{{name}}}' for name in KEYS)}",
         )  # fmt: skip
-    rest = re.sub(r"\{\w+\}", "", pattern)
-    if re.search(r"[{}\x00-\x1f]", rest) or "**" in pattern:
+    if re.search(r"[{}\x00-\x1f]|\*\*", "".join(fixed)) or "" in fixed[1:-1]:
         raise InputError(
-            where, f"invalid pattern {pattern[:80]!a}", "write a path with names in {braces}"
-        )
-    together = re.search(r"\{\w+\}\{\w+\}", pattern)
-    if together:
-        raise InputError(
-            where, f"has nothing between {together[0]}", "add a separator, or use `table`"
-        )
-    expression = ""
-    for part in re.split(r"(\{\w+\}|\.\*$)", Path(pattern).as_posix()):
-        group = f"(?P<{part[1:-1]}>"
-        if part == ".*":  # any format
-            expression += f"(?i:{'|'.join(map(re.escape, FORMATS))})"
-        elif not part.startswith("{"):
-            expression += re.escape(part)
-        else:
-            expression += f"(?P={part[1:-1]})" if group in expression else f"{group}{_NAME})"
-    return expression
+            where, f"invalid pattern {text[-80:]!a}",
+            "write a path with names in {braces} and a separator between two of them",
+        )  # fmt: skip
+    expression, wild = re.escape(fixed[0]), "*".join(map(glob.escape, fixed))
+    for index, name in enumerate(names):
+        group = f"(?P={name})" if name in names[:index] else rf"(?P<{name}>[^/\\_]+?)"
+        expression += group + re.escape(fixed[index + 1])
+    if text.endswith(".*"):
+        expression, wild = f"{expression}(?i:{'|'.join(map(re.escape, FORMATS))})", f"{wild}.*"
+    files = [Path(name) for name in sorted(glob.glob(wild))]
+    matches = ((file, re.fullmatch(expression, file.as_posix())) for file in files)
+    return [(_labels(file, match.groupdict()), file) for file, match in matches if match]
 
 
-def find_by_entities(folder: Path) -> list[Found]:
+def find_by_entities(_where: str, folder: Path) -> list[Found]:
     """Files in a `folder` and below with sub- (and ses-, task-, run-) in their names."""
     found = []
     for file in sorted(folder.rglob("sub-*")):
         hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-        if hidden or file.suffix.lower() not in FORMATS or not file.is_file():
-            continue
         entities = dict(re.findall(r"(?:^|_)([a-z]+)-([^_.]+)", file.name))
-        labels = {key: entities.get(short, "") for key, short in _ENTITIES.items()}
-        if labels["subject"]:
-            found.append((_labels(_printable(file), labels), file))
+        if not hidden and file.suffix.lower() in FORMATS and file.is_file() and "sub" in entities:
+            labels = {key: entities.get(short, "") for key, short in KEYS.items()}
+            found.append((_labels(file, labels), file))
     return found
 
 
-def find_by_table(path: Path) -> list[Found]:
+def find_by_table(where: str, path: Path) -> list[Found]:
     """Files and labels from the table at `path` with the columns file, subject and others."""
-    sheet = read_sheet(path)
-    if not {"file", "subject"} <= set(sheet.heads):
-        raise InputError(sheet.where, "lacks a column", "add the columns file and subject")
-    if not all(row["file"] and row["subject"] for row in sheet.rows):
-        raise InputError(sheet.where, "has a row without file or subject", "fill every row")
-    return [(_labels(sheet.where, row), path.parent / row["file"]) for row in sheet.rows]
+    rows = read_sheet(path)
+    if not all(row.get("file") and row.get("subject") for row in rows):
+        raise InputError(where, "has a row without file or subject", "fill both columns")
+    return [(_labels(path, row), path.parent / row["file"]) for row in rows]
 
 
-def _labels(where: str, given: dict[str, str]) -> dict[str, str]:
-    return {key: checked_name(where, key, given.get(key) or "") for key in KEYS}
-
-
-def _printable(file: Path) -> str:
-    """Printable form of a path, whose name may contain control characters or invalid bytes."""
-    text = str(file).encode("utf-8", "backslashreplace").decode()
-    return text if text.isprintable() else ascii(text)[1:-1]
+def _labels(file: Path, given: dict[str, str]) -> dict[str, str]:
+    return {key: checked_name(ascii(str(file)), key, given.get(key) or "") for key in KEYS}

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from impc.reporting.finding import Level
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim, Verdict
-from impc.studies.cohort.results import LOGARITHM, SIGNIFICANT, Cohort
+from impc.studies.cohort.results import SIGNIFICANT, Cohort
+from impc.studies.cohort.unit_result import LOGARITHM
 
 if TYPE_CHECKING:
     from collections.abc import Callable

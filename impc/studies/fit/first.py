@@ -41,8 +41,8 @@ class FitProgress:
     estimate: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute()
     # (name of stage, compute) -> bootstrap replicate, stored or computed
     replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
-    # (name of stage, compute, encode, decode) -> result of an optional subpackage
-    part: Callable[..., Any] = lambda _name, compute, _encode, _decode: compute()
+    # (name of stage, compute, decode, encode) -> result of an optional subpackage
+    part: Callable[..., Any] = lambda _name, compute, _decode, _encode: compute()
     # Callbacks for a problem with one more unknown; None if nothing is stored
     about: Callable[[Problem], FitProgress] | None = None
     failures: dict[str, str] = field(default_factory=dict)  # Reasons, by stage

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
-
-Part = TypeVar("Part")
 
 # Names of stages that decide which problem an estimate belongs to.
 _WHOLE = "inverse_mpc"
@@ -62,16 +60,6 @@ class FitMemory(Steps):
     def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
         """Stored bootstrap replicate of the stage `name`, or the result of `compute`."""
         return self.get(name, compute, lambda kept: from_json(kept, Replicate))
-
-    def part(
-        self,
-        name: str,
-        compute: Callable[[], Part],
-        encode: Callable[[Part], Any],
-        decode: Callable[[Any], Part],
-    ) -> Part:
-        """Stored result of an optional subpackage, or the result of `compute`."""
-        return self.get(name, compute, decode, encode)
 
 
 def open_memory(

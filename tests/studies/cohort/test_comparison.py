@@ -9,13 +9,19 @@ import scipy.stats
 
 from experiments.coverage import cart
 from impc.inverse.noisy_fit import fit_controller
-from impc.studies.cohort.comparison import compare_cohort, in_order, outlying
+from impc.studies.cohort.comparison import Comparison, compare_cohort, in_order, outlying
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
 from tests.studies.cohort.carts import subject_trial
 
 SEED = 15
 SETTINGS = FitSettings(horizon=10, u_max=1.0)
+
+
+def compared(units: pd.DataFrame, reference: str = "") -> tuple[Comparison, ...]:
+    """Comparisons of all gains and VAF."""
+    measures = [name for name in units.columns if name.startswith(("K.", "vaf."))]
+    return compare_cohort(units, measures, reference)
 
 
 def table(subjects: int, visits: int, shift: float = 0.0, seed: int = SEED) -> pd.DataFrame:
@@ -31,36 +37,50 @@ def table(subjects: int, visits: int, shift: float = 0.0, seed: int = SEED) -> p
     return pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.u.x", "vaf.y"])
 
 
+def found_of(units: pd.DataFrame, question: str, reference: str = "") -> dict[str, Comparison]:
+    """Comparisons of one question by measure."""
+    found = compared(units, reference)
+    return {item.measure: item for item in found if item.question == question}
+
+
 def test_groups_are_welch_on_subject_means() -> None:
+    """A value without a number changes no weights."""
     units = table(20, 2, 1.0)
-    found = {item.measure: item for item in compare_cohort(units) if item.question == "group"}[
-        "K.u.x"
-    ]
-    means = units.groupby(["group", "subject"])["K.u.x"].mean()
-    a, b = means["a"].to_numpy(), means["b"].to_numpy()
-    expected = scipy.stats.ttest_ind(b, a, equal_var=False)
-    assert found.p == pytest.approx(expected.pvalue)
-    assert found.estimate == pytest.approx(b.mean() - a.mean())
-    assert found.low < found.estimate < found.high
-    pooled = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / 2)
-    assert found.effect == pytest.approx((b.mean() - a.mean()) / pooled * (1 - 3 / (4 * 18 - 1)))
+    units.loc[0, "vaf.y"] = np.nan
+    for measure, found in found_of(units, "group").items():
+        means = units.groupby(["group", "subject"])[measure].mean()
+        a, b = means["a"].to_numpy(), means["b"].to_numpy()
+        assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
+        assert found.estimate == pytest.approx(b.mean() - a.mean())
+        assert found.low < found.estimate < found.high
+        pooled = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / 2)
+        hedges = (b.mean() - a.mean()) / pooled * (1 - 3 / (4 * 18 - 1))
+        assert found.effect == pytest.approx(hedges)
 
 
-def test_visits_are_paired() -> None:
+def test_visits_and_conditions_are_paired_and_the_reference_comes_first() -> None:
     units = table(12, 2)
-    found = {item.measure: item for item in compare_cohort(units) if item.question == "visit"}
-    wide = units.pivot_table(index="subject", columns="visit", values="K.u.x")
-    expected = scipy.stats.ttest_rel(wide["2"], wide["1"])
-    assert found["K.u.x"].p == pytest.approx(expected.pvalue)
-    ps = sorted(item.p for item in found.values())
-    assert sorted(item.p_holm for item in found.values())[0] == pytest.approx(min(2 * ps[0], 1))
+    named = units.assign(condition=units["visit"].map({"1": "EC", "2": "EO"}), visit="1")
+    for given, question, first, second in (
+        (units, "visit", "1", "2"), (named, "condition", "EO", "EC"),
+    ):  # fmt: skip
+        found = found_of(given, question)
+        wide = given.pivot_table(index="subject", columns=question, values="K.u.x")
+        expected = scipy.stats.ttest_rel(wide[second], wide[first])
+        gain = found["K.u.x"]
+        assert (gain.first, gain.second, gain.n) == (first, second, 12)
+        assert gain.p == pytest.approx(expected.pvalue)
+        least = min(item.p for item in found.values())
+        assert min(item.p_holm for item in found.values()) == pytest.approx(min(2 * least, 1))
+        other = found_of(given, question, second)["K.u.x"]
+        assert (other.first, other.estimate) == (second, -gain.estimate)
 
 
 def test_a_different_change_is_found_and_reliability_too() -> None:
     units = table(40, 2)
     changed = (units["group"] == "b") & (units["visit"] == "2")
     units.loc[changed, "K.u.x"] += 2.0
-    found = {(item.question, item.measure): item for item in compare_cohort(units)}
+    found = {(item.question, item.measure): item for item in compared(units)}
     assert found["change", "K.u.x"].p < 1e-6
     assert found["change", "vaf.y"].p > 1e-3
     assert found["reliability", "vaf.y"].low < 0 < found["reliability", "vaf.y"].high
@@ -79,7 +99,7 @@ def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:
         fitted = fit_controller(fit_problem(cart(), [trial], SETTINGS))
         rows.append((str(number), "1", "", group, fitted.gain[0, 0]))
     units = pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.force.x"])
-    (found,) = compare_cohort(units)
+    (found,) = compared(units)
     return found.p
 
 
@@ -90,7 +110,7 @@ def test_a_planted_difference_is_found() -> None:
 
 def test_without_a_difference_p_values_are_uniform() -> None:
     """Two measures in 40 tables of two groups of five; seeds 0 to 39."""
-    ps = [item.p for seed in range(40) for item in compare_cohort(table(10, 1, seed=seed))]
+    ps = [item.p for seed in range(40) for item in compared(table(10, 1, seed=seed))]
     assert scipy.stats.kstest(ps, "uniform").pvalue > 0.01
 
 
@@ -118,53 +138,34 @@ def test_two_wild_gains_do_not_carry_a_mean() -> None:
     """Gains known to -1500 to 4000 count little, and all ten people are counted."""
     units = gains({3: 1400.0, 5: 1400.0})
     units.loc[[3, 5], "K.u.x"] = 3000.0
-    (found,) = compare_cohort(units)
+    (found,) = compared(units)
     rest = units.drop(index=[3, 5])
     a, b = (rest.loc[rest["group"] == group, "K.u.x"] for group in "ab")
     assert found.n == 10
     assert found.estimate == pytest.approx(b.mean() - a.mean(), abs=10)
     assert found.high - found.low < 350
-    (unweighted,) = compare_cohort(units.drop(columns="K_deviation.u.x"))
+    (unweighted,) = compared(units.drop(columns="K_deviation.u.x"))
     assert unweighted.estimate > 850
     assert unweighted.high - unweighted.low > 2500
 
 
 @pytest.mark.parametrize("error", [np.nan, np.inf])
 def test_a_gain_without_an_error_is_counted_and_has_no_weight(error: float) -> None:
-    (found,) = compare_cohort(gains({0: error, 5: error}))
-    (rest,) = compare_cohort(gains({}).drop(index=[0, 5]))
+    (found,) = compared(gains({0: error, 5: error}))
+    (rest,) = compared(gains({}).drop(index=[0, 5]))
     assert (found.n, rest.n) == (10, 8)
     assert (found.estimate, found.p) == (rest.estimate, rest.p)
 
 
 def test_nothing_known_is_nothing_compared() -> None:
     units = gains(dict.fromkeys(range(10), np.nan))
-    (found,) = compare_cohort(units)
+    (found,) = compared(units)
     assert np.isnan(found.p)
     assert found.note == "too few subjects (0)"
-    both = compare_cohort(pd.concat([units, units.assign(visit="2")]))
+    both = compared(pd.concat([units, units.assign(visit="2")]))
     assert {item.note for item in both} == {"too few subjects (0)"}
-    (found,) = compare_cohort(gains(dict.fromkeys((0, 2, 4, 6), 1e5)))
+    (found,) = compared(gains(dict.fromkeys((0, 2, 4, 6), 1e5)))
     assert found.note == "one subject counts for more than all others together"
-
-
-def test_a_value_without_a_number_changes_no_weights() -> None:
-    units = table(10, 1)
-    units.loc[0, "vaf.y"] = np.nan
-    found = next(item for item in compare_cohort(units) if item.measure == "vaf.y")
-    a, b = (units.loc[units["group"] == group, "vaf.y"].dropna() for group in "ab")
-    assert found.p == pytest.approx(scipy.stats.ttest_ind(b, a, equal_var=False).pvalue)
-
-
-def test_conditions_are_paired_and_the_reference_comes_first() -> None:
-    units = table(8, 2).assign(condition=lambda found: found["visit"].map({"1": "EC", "2": "EO"}))
-    units["visit"] = "1"
-    found = next(item for item in compare_cohort(units) if item.question == "condition")
-    wide = units.pivot_table(index="subject", columns="condition", values="K.u.x")
-    assert (found.first, found.second, found.n) == ("EO", "EC", 8)
-    assert found.p == pytest.approx(scipy.stats.ttest_rel(wide["EC"], wide["EO"]).pvalue)
-    other = next(item for item in compare_cohort(units, "EC") if item.question == "condition")
-    assert (other.first, other.estimate) == ("EC", -found.estimate)
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ import pytest
 from impc.checking import replace
 from impc.errors import InputError
 from impc.files.plant_sources import plant_source
-from impc.studies.cohort.comparison import compare_cohort, measures_of
+from impc.studies.cohort.comparison import compare_cohort
 from impc.studies.cohort.engine import Store
 from impc.studies.cohort.study import Study, read_study
-from impc.studies.cohort.tables import cohort_tables, structure_row
+from impc.studies.cohort.tables import cohort_tables
 from impc.studies.cohort.tasks import fit_unit, study_tasks
 from tests.studies.cohort.carts import write_study
 
@@ -46,27 +46,20 @@ def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]
     # Subjects differ by 10 % and one interval in twenty misses: six of them, seed 0.
     assert np.sum((low - 0.2 < truth) & (truth < high + 0.2)) == len(units) == 6
     assert np.sum(units["structure_refused"]) <= 1
-    assert measures_of(units)[:2] == ("log_cost_weight.x[0]", "log_cost_weight.x[1]")
+    study, store = fitted
+    kept = store.fit(study.units[0].name)
+    assert kept is not None
+    compared = [name for name, column in kept["shown"].items() if column["compared"]]
+    assert compared[:2] == ["log_cost_weight.x[0]", "log_cost_weight.x[1]"]
     found = {
         item.question: item
-        for item in compare_cohort(units)
+        for item in compare_cohort(units, compared)
         if item.measure == "log_cost_weight.x[0]"
     }
     assert set(found) == {"group"}
     assert found["group"].low < np.log(2.0) < found["group"].high
     assert found["group"].p < 0.05
     assert cost_weight.notna().all()
-
-
-def test_a_unit_without_a_structure_has_no_columns_for_it() -> None:
-    assert structure_row({"structure": None}) == {}
-    identified = {
-        "name": "x", "unknowns": ["a"], "log_cost_weight": [None], "low": [None], "high": [1.0],
-        "refused": False, "p": 0.4, "reason": "",
-    }  # fmt: skip
-    row = structure_row({"structure": identified})
-    assert np.isnan(row["log_cost_weight.a"])
-    assert row["log_cost_weight_high.a"] == 1.0
 
 
 def test_a_structure_that_loses_its_plant_names_why(tmp_path: Path) -> None:

@@ -16,17 +16,13 @@ from impc.studies.cohort.results import Cohort
 from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.verdict import cohort_verdict
 from impc.studies.fit.verdict import UNDETERMINED
+from tests.studies.cohort.made_up import column, gain_column
 
-FIT: dict[str, Any] = {
-    "words": {"command": "commanded torque", "theta1": "seat tilt"},
-    "units": {"K.command.theta1": "N m/rad"},
-    "shown_gains": {
-        "K.command.theta1": [np.pi / 180, "N m/°", "N m", "1° of seat tilt"],
-    },
-    "controls": ["command"],
-    "outputs": ["theta1"],
-}
 GAIN = "K.command.theta1"
+COLUMNS = {
+    GAIN: gain_column("seat tilt", "commanded torque", "N m/rad", np.pi / 180, "N m", "1°"),
+    "vaf.theta1": column("variance accounted for, seat tilt", "seat tilt", "%"),
+}
 
 
 def cohort(
@@ -54,39 +50,38 @@ def cohort(
                 "K_determined.command.theta1": number not in wide,
                 "vaf.theta1": 99.0 + 0.1 * rng.random(), "saturated": 0.1,
             })  # fmt: skip
-    return Cohort(pd.DataFrame(rows), FIT, {})
+    return Cohort(pd.DataFrame(rows), COLUMNS, {})
 
 
-def test_the_headline_has_direction_size_and_unit() -> None:
-    made = cohort(-139.0, spread=0.1)
-    found = cohort_verdict(made)
-    assert found.level is Level.GREEN
-    assert found.headline == (
-        "The second group answers 1° of seat tilt with 2.43 N m less torque than the first group."
-    )
-    for part in (
-        "n = 20 people",
-        "95 % CI 2.4258 to 2.4281 N m/° less",
-        "p_holm < .001",
-        "Hedges' g",
-    ):
+HEADLINES: list[tuple[dict[str, Any], str]] = [
+    (
+        {"shift": -139.0, "spread": 0.1},
+        "The second group answers 1° of seat tilt with 2.43 N m less torque than the first group.",
+    ),
+    (  # a gain below zero is larger the lower it is
+        {"shift": -139.0, "spread": 0.1, "mean": -800.0},
+        "The second group answers 1° of seat tilt with 2.43 N m more torque than the first group.",
+    ),
+    (
+        {"shift": 50.0, "spread": 0.1, "visits": 2},
+        "At visit 2 people answer 1° of seat tilt with 0.872 N m more torque than at visit 1.",
+    ),
+    ({"shift": 0.0}, "No difference in a gain between the groups was found."),
+]
+
+
+@pytest.mark.parametrize(("given", "headline"), HEADLINES)
+def test_headlines(given: dict[str, Any], headline: str) -> None:
+    found = cohort_verdict(cohort(**given))
+    assert (found.level, found.headline) == (Level.GREEN, headline)
+
+
+def test_numbers_of_a_difference_and_no_claim_of_equality_without_one() -> None:
+    found = cohort_verdict(cohort(-139.0, spread=0.1))
+    for part in ("n = 20 people", "95 % CI 2.4258 to 2.4281 N m/° less", "p_holm < .001",
+                 "Hedges' g"):  # fmt: skip
         assert part in found.sentence
-
-
-def test_a_gain_below_zero_is_larger_the_lower_it_is() -> None:
-    made = cohort(-139.0, spread=0.1, mean=-800.0)
-    assert "2.43 N m more torque" in cohort_verdict(made).headline
-
-
-def test_visits_of_one_group_are_compared() -> None:
-    found = cohort_verdict(cohort(50.0, spread=0.1, visits=2))
-    assert found.headline.startswith("At visit 2 people answer 1° of seat tilt with 0.872 N m")
-    assert found.headline.endswith("more torque than at visit 1.")
-
-
-def test_no_difference_is_no_claim_that_groups_are_alike() -> None:
     found = cohort_verdict(cohort(0.0))
-    assert found.headline == "No difference in a gain between the groups was found."
     assert any("equal" in claim.text for claim in found.may_not)
     assert "p_holm = .208" in found.sentence
 
@@ -135,7 +130,7 @@ def test_the_reference_is_subtracted() -> None:
         group=made.units["group"].map({"first": "LBP", "second": "control"})
     )
     for reference, first in (("", "control"), ("LBP", "LBP")):
-        table = comparisons(Cohort(renamed, FIT, {}, reference)).table
+        table = comparisons(Cohort(renamed, COLUMNS, {}, reference)).table
         assert table is not None
         assert table["compared"].iloc[0].endswith(f" - {first}")
         assert (table["difference"].iloc[0] > 0) == (first == "control")
@@ -158,8 +153,8 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
 def test_fits_that_determine_no_gain_are_no_warning_of_the_study() -> None:
     made = cohort(-139.0, warned=(3, 4, 12, 13))
     units = made.units.assign(kind=made.units["kind"].where(made.units.index != 3, UNDETERMINED))
-    assert Cohort(units, FIT, {}).warned == 3
-    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), FIT, {})).level is Level.GREEN
+    assert Cohort(units, COLUMNS, {}).warned == 3
+    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), COLUMNS, {})).level is Level.GREEN
 
 
 def test_too_few_gains_are_no_comparison() -> None:
@@ -188,7 +183,8 @@ def test_cost_weights_are_compared_as_ratios() -> None:
     units = made.units.rename(columns={GAIN: "log_cost_weight.theta1"})
     units["log_cost_weight.theta1"] = np.log(4.0) + 0.01 * np.random.default_rng(0).random(20)
     units.loc[units["group"] == "second", "log_cost_weight.theta1"] -= np.log(2.0)
-    made = Cohort(units.assign(structure_refused=False), FIT, {})
+    weight = {"log_cost_weight.theta1": column("cost weight of seat tilt", "seat tilt", "-")}
+    made = Cohort(units.assign(structure_refused=False), weight, {})
     headline = cohort_verdict(made).headline
     assert headline.startswith("The cost weight of seat tilt is 0.5 times as high in the second")
     table = comparisons(made).table
