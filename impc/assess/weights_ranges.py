@@ -16,6 +16,7 @@ least 38 of the 39 drawn gains.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -32,9 +33,9 @@ from impc.inverse.solution_set import gain_fibre, split_blocks
 from impc.model.riccati import gain_gradients, solve_lqr
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
-    from impc.arrays import Array
+    from impc.arrays import Array, BoolArray
     from impc.assess.bounded_weights import WeightsSet
     from impc.assess.covariance import GainCovariance
     from impc.assess.printed_gain import GainEstimate
@@ -114,26 +115,6 @@ class EntryRange:
 
 
 @dataclass(frozen=True)
-class WeightRange:
-    """Cost of a typical excursion of a state, d^2 Q_ii at trace R = m."""
-
-    state: str  # Name of the state
-    low: float  # Over all weights with the fitted gain, in units of the cost
-    high: float
-    low_drawn: float  # Over all weights with any drawn gain: 95 %
-    high_drawn: float
-
-
-@dataclass(frozen=True)
-class DrawnSet:
-    """What holds for all weights of a drawn gain."""
-
-    # Least and largest cost of a typical excursion of each requested state
-    cost_weights: tuple[tuple[float, float], ...]
-    agrees: tuple[bool, ...]  # Whether each requested statement also holds here
-
-
-@dataclass(frozen=True)
 class WeightsSummary:
     """Set of equivalent weights of a gain."""
 
@@ -144,7 +125,6 @@ class WeightsSummary:
     # further.
     widest_angle: float
     drawn: int  # Number of drawn gains
-    cost_weights: tuple[WeightRange, ...]  # Costs of the named states; empty without draws
 
 
 def summarise_weights(
@@ -153,7 +133,7 @@ def summarise_weights(
     metrics: Array,
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
-    each: Callable[..., Iterable[DrawnSet]] = map,
+    each: Callable[..., Iterable[BoolArray]] = map,
 ) -> WeightsSummary:
     """Summarise the set of weights of a gain and of drawn gains, which `each` maps."""
     found = weights_set(gain_fibre(plant, gain, metrics), _RATIO)
@@ -166,27 +146,25 @@ def summarise_weights(
     ]
     angle = max(angle_between(first, other) for other in others)
     statements = pair_statements(found, sizes, names) if len(names) > 1 else ()
-
-    def set_of(drawn: LqrSolution) -> DrawnSet:
-        return _set_of_gain(plant, drawn, metrics, sizes, names, statements)
-
-    sets, costs = tuple(each(set_of, draws)), []
-    if sets:
-        shares = np.mean([one.agrees for one in sets], axis=0)
+    decided = [item for item in statements if item.holds is not None]
+    # Functions that are negative for every member if the statement holds.
+    against = [
+        (-1 if item.holds else 1)
+        * statement_function(plant, sizes, item.kind, item.first, item.second)
+        for item in decided
+    ]
+    agreed = functools.partial(_agreed, plant, metrics, against)
+    if decided and draws:
+        shares = dict(zip(decided, np.mean(list(each(agreed, draws)), axis=0), strict=True))
         statements = tuple(
-            item if item.holds is None else replace(item, confidence=float(share))
-            for item, share in zip(statements, shares, strict=True)
+            replace(item, confidence=float(shares[item])) if item in shares else item
+            for item in statements
         )
-        drawn = np.array([one.cost_weights for one in sets])
-        for position, (k, name) in enumerate(zip(named, names, strict=True)):
-            low, high = (sizes[k] ** 2 * end for end in (ranges[k, k].low, ranges[k, k].high))
-            widest = min(low, drawn[:, position, 0].min()), max(high, drawn[:, position, 1].max())
-            costs.append(WeightRange(name, low, high, *widest))
     entries = tuple(
         EntryRange(plant.states[i], plant.states[j], item.low, item.high)
         for (i, j), item in ranges.items()
     )
-    return WeightsSummary(entries, statements, angle, len(sets), tuple(costs))
+    return WeightsSummary(entries, statements, angle, len(draws))
 
 
 def weights_summary_or_reason(
@@ -195,7 +173,7 @@ def weights_summary_or_reason(
     metrics: Array,
     sizes: Array,
     draws: tuple[LqrSolution, ...] = (),
-    each: Callable[..., Iterable[DrawnSet]] = map,
+    each: Callable[..., Iterable[BoolArray]] = map,
 ) -> tuple[WeightsSummary | None, str]:
     """Summary and "", or None and the reason."""
     try:
@@ -204,45 +182,22 @@ def weights_summary_or_reason(
         return None, str(error)
 
 
-def _set_of_gain(
-    plant: Plant,
-    solution: LqrSolution,
-    metrics: Array,
-    sizes: Array,
-    states: tuple[str, ...],
-    statements: tuple[Statement, ...],
-) -> DrawnSet:
-    """Evaluate the statements for all weights of a drawn gain; `metrics` (k, m, m)."""
-    penalised = np.zeros((len(states), plant.n + plant.m, plant.n + plant.m))
-    for cost, name in zip(penalised, states, strict=True):
-        index = plant.states.index(name)
-        cost[index, index] = sizes[index] ** 2
-    # Functions that are negative for every member if the statement holds.
-    against = np.array(
-        [
-            (-1 if item.holds else 1)
-            * statement_function(plant, sizes, item.kind, item.first, item.second)
-            for item in statements
-            if item.holds is not None
-        ]
-    )
+def _agreed(
+    plant: Plant, metrics: Array, against: Sequence[Array], solution: LqrSolution
+) -> BoolArray:
+    """Which functions are negative for all weights of a drawn gain; `metrics` (k, m, m)."""
     try:
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
         # Rough solutions suffice: only the extent of the set is needed.
         found = weights_set(gain_fibre(plant, solution.K, own), _RATIO, rough=True)
-        ranges = linear_ranges(found, penalised, tolerance=_ROUGH)
-        # A member found on the way that breaks a statement decides it without a program.
-        ends = [end.weights.block for one in ranges for end in (one.least, one.most)]
-        seen = np.tensordot(against, [*ends, found.least.weights.block], ([1, 2], [1, 2]))
-        unbroken = np.flatnonzero(np.all(seen < 0, axis=1))
-        most = linear_maxima(found, against[unbroken], tolerance=_ROUGH) if len(unbroken) else ()
+        functions, member = np.array(against), found.least.weights.block
+        holds = np.tensordot(functions, member, ([1, 2], [0, 1])) < 0
+        # A member that breaks a statement decides it without a program.
+        most = linear_maxima(found, functions[holds], tolerance=_ROUGH) if np.any(holds) else ()
+        holds[holds] = [end.value < 0 for end in most]
     except (WeightsError, SolverError):
-        return DrawnSet(((0.0, np.inf),) * len(states), (False,) * len(statements))
-    kept = np.zeros(len(against), dtype=bool)
-    kept[unbroken] = [end.value < 0 for end in most]
-    holding = iter(kept.tolist())
-    agrees = tuple(item.holds is not None and next(holding) for item in statements)
-    return DrawnSet(tuple((one.low, one.high) for one in ranges), agrees)
+        return np.zeros(len(against), dtype=bool)
+    return holds
 
 
 def _shown(plant: Plant, weights: Weights, sizes: Array) -> list[int]:
