@@ -145,11 +145,9 @@ def _plan(folder: Path) -> Numbers:
     (folder / "plan.toml").write_text(EXACT, encoding="utf-8")
     found = _typed(folder, "plan", str(folder / "plan.toml"), "--plant", "seated-balance")
     table = pd.read_csv(folder / "out/experiments.csv")
-    ending = "_standard_error"
-    errors = [name for name in map(str, table.columns) if name.endswith(ending)]
-    return {"best": found["best"]} | {
-        f"{name.removesuffix(ending)} deviation": _exact(table[name]) for name in errors
-    }
+    gains = ("theta1", "theta2", "theta1_rate", "theta2_rate")
+    widths = {f"{name} width": _exact(table[f"{name}_percent"]) for name in gains}
+    return {"best": found["best"]} | widths
 
 
 def _reliability(folder: Path) -> Numbers:
