@@ -31,7 +31,7 @@ from impc.reporting.document import (
     Section,
     Terms,
 )
-from impc.reporting.finding import Chart, Finding, Level, Picture
+from impc.reporting.finding import Chart, Finding, Level, Picture, table_of
 from impc.reporting.provenance import Provenance
 from impc.reporting.style import new_figure
 from impc.reporting.verdict import Alert, Claim, Key, Verdict
@@ -229,6 +229,23 @@ def test_no_heading_of_the_workbook_is_there_twice() -> None:
         io.BytesIO(files["tables.xlsx"]), "methods", header=None, engine="openpyxl"
     )
     assert sheet.iloc[0].tolist() == ["VAF (%)", "held_out_vaf"]
+
+
+def test_a_new_table_is_one_list_of_columns() -> None:
+    """Page, CSV, workbook and result.json follow from it."""
+    rows = table_of([("1", 0.25), ("2", np.nan)],
+                    {"trial": lambda row: row[0], "peak_tilt": lambda row: row[1]})  # fmt: skip
+    verdict = Verdict(Level.NOTE, "A", "b")
+    files = Report("a", "A", verdict, [Section("One", [Finding("peaks", rows)])]).files()
+    page = files["report.html"].decode()
+    assert re.findall(r"<t[hd][^>]*>(?:<span>)?([^<]+)<", page.partition("<table")[2]) == [
+        "Trial", "Peak tilt", "1", "0.2500", "2", "-"
+    ]  # fmt: skip
+    assert files["peaks.csv"] == b"trial,peak_tilt\n1,0.25\n2,\n"
+    found = json.loads(files["result.json"])["findings"]["peaks"]["table"]
+    assert found == {"trial": ["1", "2"], "peak_tilt": [0.25, None]}
+    sheet = pd.read_excel(io.BytesIO(files["tables.xlsx"]), "peaks", engine="openpyxl")
+    assert sheet.iloc[:, 1].tolist()[0] == 0.25
 
 
 # Writing
