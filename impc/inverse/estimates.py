@@ -329,12 +329,14 @@ class Estimate(Frozen):
 
     def controller(self) -> Controller:
         """Return the identified controller with its bounds; SolverError without a gain."""
-        return controller_for(self.problem, self.gain, self.metric, weights=self.weights)
+        found = controller_for(self.problem, self.gain, self.metric, weights=self.weights)
+        return replace(found, solver=self.problem.solver)
 
     @cached_property
     def simulations(self) -> tuple[Simulation, ...]:
         """Simulations of the recorded trials under this controller, one per trial."""
-        return tuple(simulated(self.problem, self.gain, self.metric, self.weights))
+        problem = self.problem
+        return tuple(simulated(problem, self.gain, self.metric, self.weights, problem.solver))
 
     @property
     def time(self) -> tuple[Array, ...]:

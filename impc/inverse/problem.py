@@ -114,7 +114,8 @@ class Problem(Value):
     feedback_states : tuple of str
         States with feedback in the method "preliminary" (3.20).
     solver : str
-        Solver of the controller's quadratic programs in simulations, see `Controller`.
+        Solver of the controller's quadratic programs, see `Controller`. Searches use the compiled
+        one; the answer is simulated with this one.
     terminal_weight : ndarray of shape (n, n), or None
         P of the terminal cost x_N'P x_N, in the scale in which R[0, 0] = 1; pass 0 for none. None
         uses the Riccati solution. With a given P, `impc.fit` estimates the weights directly and
@@ -515,7 +516,10 @@ def controller_for(
     near: TerminalSet | None = None,
     weights: Weights | None = None,
 ) -> Controller:
-    """Controller of a `gain` (m, n) and `metric` (m, m), or of `weights` with a fixed P."""
+    """Controller of a `gain` (m, n) and `metric` (m, m), or of `weights` with a fixed P.
+
+    With the compiled solver: one by name is for answers (`Estimate.simulations`), not for searches.
+    """
     if problem.terminal_weight is not None and weights is not None:
         return weights_controller(problem, weights)
     require_riccati(problem)
@@ -528,7 +532,6 @@ def controller_for(
         terminal_set=bool(problem.terminal_set),
         softening=problem.softening,
         near=near,
-        solver=problem.solver,
     )
 
 
@@ -541,7 +544,6 @@ def weights_controller(problem: Problem, weights: Weights, *, hard: bool = False
         problem.horizon,
         terminal_set=bool(problem.terminal_set),
         softening=None if hard else problem.softening,
-        solver=problem.solver,
         terminal_weight=problem.terminal_weight,
     )
 
@@ -643,10 +645,15 @@ def typical_output(problem: Problem) -> float:
 
 
 def simulated(
-    problem: Problem, gain: Array, metric: Array, weights: Weights | None = None
+    problem: Problem,
+    gain: Array,
+    metric: Array,
+    weights: Weights | None = None,
+    solver: str = COMPILED,
 ) -> list[Simulation]:
     """Simulate every recording with a `gain` (m, n) and a `metric` (m, m)."""
     controller = controller_for(problem, gain, metric, weights=weights)
+    controller = replace(controller, solver=solver)
     return [simulate(controller, drive) for drive in scenarios(problem)]
 
 

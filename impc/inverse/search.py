@@ -22,7 +22,6 @@ import numpy as np
 
 from impc.arrays import Array
 from impc.checking import replace
-from impc.control.named_solver import COMPILED
 from impc.errors import ImpcError, SolverError
 from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.laws import FixedLaw, GainLaw
@@ -292,7 +291,6 @@ def _predictable(problem: Problem) -> Problem:
         plant=problem.plant.linear(),
         terminal_set=False,
         signal_errors=(),
-        solver=COMPILED,  # only a start: a solver by name would take minutes
     )
 
 
