@@ -244,9 +244,9 @@ class Unknowns:
 
     def residual(self, z: Array) -> Array | None:
         """Residual (r,) at z (q,) without derivatives; None if infeasible."""
-        problem, part = self.problem_at(z), z[self.controller]
         try:
-            controller = self.law.controller(problem, part, None, self.correction)
+            problem = self.problem_at(z)  # raises where no input stabilises the plant
+            controller = self.law.controller(problem, z[self.controller], None, self.correction)
         except ImpcError:
             return None
         residual, reason = controlled_residual(problem, controller, self.correction)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import control
 import numpy as np
 import pytest
 import scipy.linalg
@@ -15,8 +16,10 @@ from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import GainEstimate, gain_estimate
 from impc.files.plant_sources import plant_family_of, plant_source
+from impc.inverse.laws import GainLaw
 from impc.inverse.problem import noise_of_residual
 from impc.inverse.residuals import residual_only
+from impc.inverse.unknowns import Unknowns
 from tests.support import posed, regulator, slopes
 
 KNOWN = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
@@ -107,6 +110,26 @@ def test_intervals_hold_where_they_do_not_for_an_exact_body() -> None:
             held[name] += int(((found.low <= truth[0]) & (truth[0] <= found.high)).sum())
     assert held["stated"] == 8
     assert held["exact"] <= 4
+
+
+def test_a_search_stays_where_the_plant_can_be_stabilised() -> None:
+    """A free parameter whose plants no input stabilises from twice its nominal value."""
+
+    def made(values: Array) -> impc.Plant:
+        reach = max(0.0, 1 - values[0] / 2)
+        return impc.Plant(control.ss([[1.1]], [[reach]], [[1]], 0, 1))
+
+    known = impc.PlantFamily(made, ["loss"], [1.0])
+    plant = known.make(known.nominal)
+    law = regulator(plant, np.eye(1), 1.0, HORIZON)
+    trial = impc.Recording(plant, law.simulate([1.0], steps=30).x)
+    problem = posed(law, trial, family=known)
+    space = Unknowns(problem, GainLaw(problem, np.array(law.K), np.array(law.S)))
+    far = space.start.copy()
+    far[space.parameters] = np.log(3.0) / space.units
+    assert space.residual(far) is None
+    table = impc.fit(space.problem).intervals()
+    assert not table.loc["K.u[0].x[0]", "determined"]
 
 
 def test_an_uncertainty_of_zero_is_none() -> None:
