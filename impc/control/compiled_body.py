@@ -15,13 +15,13 @@ from numba.extending import intrinsic
 
 from impc.arrays import Buffer
 from impc.control.compiled_values import BodyTape
-from impc.jit import njit
+from impc.jit import inner, njit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-@njit(cache=True)
+@inner()
 def move_body(
     body: BodyTape,
     x: Buffer,
@@ -57,7 +57,7 @@ def move_body(
                 dahead[i, c] += slope * du[j, c]
 
 
-@njit(cache=True)
+@njit()
 def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahead: Buffer) -> None:
     """Compute the next state at every sample of a trajectory.
 
@@ -68,7 +68,7 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
         ahead[t] = body.found[: x.shape[1]]
 
 
-@njit(cache=True)
+@njit()
 def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes: Buffer) -> None:
     """Compute the derivatives of the next state at every sample of a trajectory.
 
@@ -79,7 +79,7 @@ def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes
         slopes[t] = body.slopes
 
 
-@njit(cache=True)
+@inner()
 def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
     n, m = len(x), len(u)
     for i in range(n):
