@@ -14,6 +14,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from impc.arrays import Buffer
+from impc.control.compiled_kernel import copy
 from impc.control.compiled_values import BodyTape
 from impc.jit import inner, njit
 
@@ -65,7 +66,7 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
     """
     for t in range(len(ahead)):
         _find(body, x[t], u[t], disturbance[t])
-        ahead[t] = body.found[: x.shape[1]]
+        copy(body.found, ahead[t])
 
 
 @njit()
@@ -76,7 +77,8 @@ def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes
     """
     for t in range(len(slopes)):
         _find(body, x[t], u[t], disturbance[t])
-        slopes[t] = body.slopes
+        for i in range(x.shape[1]):
+            copy(body.slopes[i], slopes[t, i])
 
 
 @inner()
