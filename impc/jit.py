@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 F = TypeVar("F", bound="Callable[..., Any]")
-_LOCATOR = "impc.cache_locator.ByModule"
 
 
 def njit(**options: Any) -> Callable[[F], F]:
@@ -40,7 +39,7 @@ def njit(**options: Any) -> Callable[[F], F]:
         make: Any = numba.njit
         config: Any = numba.core.config
         before = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
-        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = _compiled(), _LOCATOR
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = _compiled(), "impc.cache_locator.ByModule"
         try:
             found: F = make(**{**options, "cache": bool(config.CACHE_DIR)})(function)
         finally:

@@ -240,10 +240,7 @@ def run_loop(
 
 
 def _drive(prepared: PreparedLoop, given: Scenario, pushed: Array | None) -> _Drive:
-    """Arguments of `run` from the body to the state norm that ends a simulation.
-
-    The norm is 1e6 times the excitation, at least 1e6.
-    """
+    """Arguments of `run`; the last, 1e6 times the excitation, is the norm that ends it."""
     plant, d, E = prepared.controller.plant, np.array(given.disturbance), prepared.matrices.E
     width, largest = plant.n + plant.m + d.shape[1], float(np.max(np.abs(E @ d.T), initial=0))
     return (
