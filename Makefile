@@ -12,9 +12,12 @@ PYTHON ?= python3
 override VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check -qq
+# Bytecode of libraries is a sixth of the environment: Python writes that of what it imports.
+INSTALL := $(PIP) install --no-compile --require-hashes
 UV := $(shell command -v uv 2>/dev/null || echo $(VENV)/bin/uv)
 
-# Five stamps, each written last, so that a half-made environment is never taken as complete.
+# Six stamps, each written last, so that a half-made environment is never taken as complete.
+FITTING := $(VENV)/.stamp-fitting
 LOCKED := $(VENV)/.stamp-locked
 PROJECT := $(VENV)/.stamp-project
 POLYTOPE := $(VENV)/.stamp-polytope
@@ -22,9 +25,10 @@ COMPILED := $(VENV)/.stamp-compiled
 FILTER := $(VENV)/.stamp-filter
 POLYTOPE_LOG := $(VENV)/polytope-install.log
 
-# Bytecode is kept whatever the environment says: without it each of the processes that tests start
-# compiles the package for itself.
-PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# Bytecode is kept whatever the environment says: without it each process compiles all it imports.
+export PYTHONDONTWRITEBYTECODE :=
+
+PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
@@ -33,7 +37,7 @@ SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13)
 ifneq ($(origin PYTHON),file)
 VERSION := import sys; print(*sys.version_info[:2])
 ifneq ($(shell $(PYTHON) -c '$(VERSION)' 2>/dev/null),$(shell $(PY) -c '$(VERSION)' 2>/dev/null))
-$(LOCKED): remake
+$(FITTING): remake
 endif
 CANDIDATES := $(PYTHON)
 else
@@ -58,7 +62,7 @@ help:
 	@echo 'make search     new examples for the property tests, from a seed that is printed'
 	@echo 'make numerics   numerical tests on other processors and dependencies (an hour; needs uv)'
 	@echo 'make fuzz       160,000 mutated files, configurations and plants; FUZZ="--seed 1 --cases 1000"'
-	@echo 'make lock       compile both lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
+	@echo 'make lock       compile the lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
 	@echo 'make clean      remove caches and build products; .venv and results stay'
 	@echo 'Studies, with their results in experiments/README.md: make coverage, noisy-people, structures,'
 	@echo 'followers, plans, default-subjects, nonlinear, nonlinear-seat (minutes to hours each).'
@@ -66,7 +70,7 @@ help:
 	@echo 'python3.12, python3.11 with a version from 3.11 to 3.13.'
 
 # A person on a seat: three simulated trials, their fit, and the methods side by side.
-demo: env
+demo: $(COMPILED)
 	$(VENV)/bin/impc simulate seated-balance --out results/subject --formats csv
 	$(VENV)/bin/impc example
 	$(VENV)/bin/impc fit results/subject/trial_1.csv results/subject/trial_2.csv results/subject/trial_3.csv \
@@ -74,7 +78,7 @@ demo: env
 
 # Each test file runs in one process, longest folders first. The shared closed loop is compiled on one
 # core while the checks run on the other; no test here uses the filter of sensory noise.
-test: $(PROJECT) $(POLYTOPE)
+test: $(PROJECT) $(LOCKED) $(POLYTOPE)
 	@$(PY) -c 'from impc.studies.warm import compile_loop; compile_loop()' & compiled=$$!; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$compiled && exit $$checked
 	$(PYTEST) -m "not full and not slow"
@@ -82,7 +86,7 @@ test: $(PROJECT) $(POLYTOPE)
 full: env $(FILTER)
 	$(PYTEST) -m full
 
-check: $(PROJECT)
+check: $(PROJECT) $(LOCKED)
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy --strict impc plants experiments tests
@@ -197,10 +201,10 @@ bench: env
 fuzz: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.fuzz $(FUZZ)
 
-env: $(PROJECT) $(POLYTOPE) $(COMPILED)
+env: $(PROJECT) $(LOCKED) $(POLYTOPE) $(COMPILED)
 
 $(COMPILED): $(wildcard impc/*/compiled_*.py) $(PROJECT)
-	@echo 'Compiling, once: about a minute.'
+	@echo 'Compiling, once: half a minute.'
 	@OPENBLAS_NUM_THREADS=1 $(VENV)/bin/impc warm
 	@touch $@
 
@@ -209,7 +213,8 @@ $(FILTER): $(wildcard impc/*/compiled_*.py) $(PROJECT)
 	@OPENBLAS_NUM_THREADS=1 $(VENV)/bin/impc warm --sensory-noise
 	@touch $@
 
-$(LOCKED): requirements.lock
+# What a fit needs. A change of either lock makes the environment anew: nothing old stays in it.
+$(FITTING): requirements-demo.lock requirements.lock
 	@found=; for python in $(CANDIDATES); do \
 	  if "$$python" -c '$(SUPPORTED)' 2>/dev/null; then found=$$python; break; fi; \
 	done; \
@@ -218,17 +223,23 @@ $(LOCKED): requirements.lock
 	    "$$($(PYTHON) --version 2>/dev/null || echo 'not on the PATH'). Install one, or name it: make PYTHON=python3.12" >&2; \
 	  exit 1; \
 	fi; \
-	echo "Making $(VENV) with $$($$found --version): about a minute, and 1.5 GB."; \
+	echo "Making $(VENV) with $$($$found --version): half a minute, and 0.9 GB."; \
 	if ! "$$found" -m venv --clear $(VENV) >/dev/null 2>&1; then \
 	  echo "$$found cannot make a virtual environment. On Debian and Ubuntu:" \
 	    "apt install python$$($$found -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv" >&2; \
 	  exit 1; \
 	fi
-	@$(PIP) install --require-hashes -r requirements.lock
+	@$(INSTALL) -r requirements-demo.lock
+	@touch $@
+
+# The tools of developers, and every extra.
+$(LOCKED): $(FITTING)
+	@echo "Adding what checks and tests need: half a minute, and 0.4 GB."
+	@$(INSTALL) -r requirements.lock
 	@touch $@
 
 # setuptools comes from the lock: nothing that is not pinned enters by way of the build.
-$(PROJECT): pyproject.toml $(LOCKED)
+$(PROJECT): pyproject.toml $(FITTING)
 	@$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
@@ -256,6 +267,8 @@ lock:
 	@$(UV) --version >/dev/null 2>&1 || { echo 'make lock needs uv: pip install uv' >&2; exit 1; }
 	UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet $(UPGRADE) --universal --python-version 3.11 \
 	  --extra dev --generate-hashes pyproject.toml -o requirements.lock
+	echo setuptools | UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet --universal --python-version 3.11 \
+	  --constraints requirements.lock --no-annotate --generate-hashes pyproject.toml - -o requirements-demo.lock
 	pair=$$(sed -n 's/^polytope = \[\(.*\)\]$$/\1/p' pyproject.toml | tr -d '",') && test -n "$$pair" && \
 	  printf '%s\n' $$pair | UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet $(UPGRADE) --universal \
 	  --python-version 3.11 --no-deps --generate-hashes - -o requirements-polytope.lock

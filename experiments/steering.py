@@ -120,7 +120,7 @@ def scored(trials: list[Array], simulated: list[Array]) -> Array:
     return np.array([impc.vaf(own[first:, 1:3], run[first:]) for own, run in pairs])
 
 
-@njit(cache=True)
+@njit()
 def _feedback_loop(gains: Array, delay: int, start: float, push: Array, order: int) -> Array:
     """Simulate u = -kp y - ki (integral of y) - kd y', `delay` samples late (samples, 2)."""
     h, e = 1 / RATE, np.exp(-1 / RATE)

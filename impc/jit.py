@@ -3,9 +3,10 @@
 numba detects changes in the file of a function, but not in those of functions that it calls.
 Compiled code is therefore kept in a folder named by the digest of all compiled sources: in
 NUMBA_CACHE_DIR, else next to the package, or in the user's cache folder; if neither is writable, in
-a private temporary folder, or nowhere. Cached code is executed as it is read: a folder that another
-user could have made or can write to is never used, nor one named by a file of the working folder
-(docs/howto/speed.md).
+a private temporary folder, or nowhere. Below it, modules are found by name, so that a checkout can
+be copied or moved; numba compares the contents of their sources. Cached code is executed as it is
+read: a folder that another user could have made or can write to is never used, nor one named by a
+file of the working folder (docs/howto/speed.md).
 """
 
 from __future__ import annotations
@@ -37,14 +38,20 @@ def njit(**options: Any) -> Callable[[F], F]:
     def decorate(function: F) -> F:
         make: Any = numba.njit
         config: Any = numba.core.config
-        before, config.CACHE_DIR = config.CACHE_DIR, _compiled()
+        before = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = _compiled(), "impc.cache_locator.ByModule"
         try:
             found: F = make(**{**options, "cache": bool(config.CACHE_DIR)})(function)
         finally:
-            config.CACHE_DIR = before
+            config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = before
         return found
 
     return decorate
+
+
+def inner(**options: Any) -> Callable[[F], F]:
+    """`njit` of a function that only compiled code calls: nothing is compiled for Python."""
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
 def say_when_compiling(say: Callable[[str], None]) -> None:

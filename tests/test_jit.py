@@ -81,20 +81,28 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
     assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_loop.py")]
 
 
-def test_compiling_is_one_line_of_the_log_and_none_from_the_cache(tmp_path: Path) -> None:
-    (tmp_path / "sums.py").write_text(
+def test_compiling_is_one_line_of_the_log_and_none_after_a_move(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "sums.py").write_text(
         "import logging\n"
         "from impc.jit import njit\n"
         "logging.basicConfig(level='INFO', format='%(name)s: %(message)s')\n"
         "for one in (lambda x: x + 1, lambda x: x + 2):\n"
         "    njit(cache=True)(one)(1)\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
-    words = [sys.executable, str(tmp_path / "sums.py")]
-    said = [
-        subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stderr
-        for _ in range(2)
-    ]
-    assert said[0].startswith("impc: compiling once")
-    assert said[0].count("\n") == 1
-    assert said[1] == ""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def said(place: Path) -> str:
+        words = [sys.executable, str(place / "sums.py")]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+        return done.stderr
+
+    first = said(home)
+    assert first.startswith("impc: compiling once")
+    assert first.count("\n") == 1
+    moved = home.rename(tmp_path / "moved")
+    os.utime(moved / "sums.py", (0, 0))
+    assert said(moved) == ""
+    (moved / "sums.py").write_text((moved / "sums.py").read_text().replace("x + 2", "x + 3"))
+    assert said(moved) == first

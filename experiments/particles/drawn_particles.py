@@ -29,7 +29,7 @@ __all__ = ["particles"]
 _SHARE = 0.5
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def particles(
     regulator: ClippedRegulator,
     known: Gains,
@@ -93,7 +93,7 @@ def particles(
     return total + _logarithm_of_mean(weight)
 
 
-@njit(cache=True)
+@njit()
 def _average(P: Buffer, ahead: Twist, t: int) -> tuple[Buffer, Buffer, float]:
     """A, a and c of log E psi_t(z) = c - m'A m / 2 + a'm, z normal about m with covariance P."""
     L, a = ahead.L[t], ahead.a[t]
@@ -103,14 +103,14 @@ def _average(P: Buffer, ahead: Twist, t: int) -> tuple[Buffer, Buffer, float]:
     return (bend + bend.T) / 2, pulled, level
 
 
-@njit(cache=True)
+@njit()
 def _psi(bend: Buffer, pulled: Buffer, level: float, z: Buffer) -> Buffer:
     """Logarithm (count,) of the expected psi of all particles (z, count)."""
     found: Buffer = level + pulled @ z - np.sum(z * (bend @ z), axis=0) / 2
     return found
 
 
-@njit(cache=True)
+@njit()
 def _weigh_piece(
     ends: tuple[float, float],
     base: Buffer,
@@ -140,7 +140,7 @@ def _weigh_piece(
         mass[j] += _log_normal((ends[0] - top[j]) * root, (ends[1] - top[j]) * root)
 
 
-@njit(cache=True)
+@njit()
 def _log_normal(low: float, high: float) -> float:
     """Log-probability that a standard normal variable lies between two ends."""
     if low > 0:
@@ -149,7 +149,7 @@ def _log_normal(low: float, high: float) -> float:
     return math.log(share / 2) if share > 0 else -np.inf
 
 
-@njit(cache=True)
+@njit()
 def _logarithm_of_sum(values: Buffer) -> Buffer:
     """Log of the sum of the exponentials of three rows (3, count)."""
     top = np.maximum(np.maximum(values[0], values[1]), values[2])
@@ -159,20 +159,20 @@ def _logarithm_of_sum(values: Buffer) -> Buffer:
     return found
 
 
-@njit(cache=True)
+@njit()
 def _logarithm_of_mean(weight: Buffer) -> float:
     top = np.max(weight)
     return float(top + math.log(np.mean(np.exp(weight - top))))
 
 
-@njit(cache=True)
+@njit()
 def _effective(weight: Buffer) -> float:
     """Effective share of the particles: 1 if all weights are equal."""
     share = np.exp(weight - np.max(weight))
     return float(np.sum(share) ** 2 / np.sum(share**2) / len(share))
 
 
-@njit(cache=True)
+@njit()
 def _systematic(weight: Buffer) -> Buffer:
     """Indices of the particles kept by systematic resampling."""
     share = np.exp(weight - np.max(weight))
@@ -186,7 +186,7 @@ def _systematic(weight: Buffer) -> Buffer:
     return found
 
 
-@njit(cache=True)
+@njit()
 def _drawn(
     masses: Buffer,
     both: Buffer,
@@ -207,7 +207,7 @@ def _drawn(
     return g
 
 
-@njit(cache=True)
+@njit()
 def _normal_between(low: float, high: float) -> float:
     """Truncated standard normal variable, by rejection (Robert 1995)."""
     sign = 1.0

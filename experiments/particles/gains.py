@@ -46,7 +46,7 @@ class Gains(NamedTuple):
     spread: Buffer
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def gains(regulator: ClippedRegulator, samples: int) -> Gains:
     """Compute the gains of each sample.
 

@@ -39,7 +39,7 @@ class Twist(NamedTuple):
     a: Buffer
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def twist(
     regulator: ClippedRegulator, outputs: Buffer, disturbance: Buffer, start: Buffer, rounds: int
 ) -> Twist:
@@ -70,7 +70,7 @@ def twist(
     return found
 
 
-@njit(cache=True)
+@njit()
 def _line(regulator: ClippedRegulator, g: float, variance: float, line: Buffer) -> None:
     """Write offset, slope and residual variance of the linearised clipped command."""
     clip = Clip(True, regulator.low, regulator.high, regulator.unit)
@@ -78,7 +78,7 @@ def _line(regulator: ClippedRegulator, g: float, variance: float, line: Buffer) 
     line[0], line[1], line[2] = found.value - found.inside * g, found.inside, found.variance
 
 
-@njit(cache=True)
+@njit()
 def _expect(
     regulator: ClippedRegulator,
     outputs: Buffer,
@@ -106,7 +106,7 @@ def _expect(
         P = (P + P.T) / 2
 
 
-@njit(cache=True)
+@njit()
 def _look_back(
     regulator: ClippedRegulator, outputs: Buffer, disturbance: Buffer, lines: Buffer, found: Twist
 ) -> None:
@@ -132,7 +132,7 @@ def _look_back(
         found.L[t], found.a[t] = L, a
 
 
-@njit(cache=True)
+@njit()
 def _smooth(
     regulator: ClippedRegulator, means: Buffer, spreads: Buffer, found: Twist, lines: Buffer
 ) -> None:

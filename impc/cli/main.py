@@ -84,9 +84,9 @@ def main(context: click.Context) -> None:
 @click.command("warm")
 @click.option("--sensory-noise", is_flag=True, help="Also compile the filter of sensory noise.")
 def warm(sensory_noise: bool) -> None:
-    """Compile the inner loops of all commands once; takes about a minute.
+    """Compile the inner loops of all commands once; takes about half a minute.
 
-    `make env` calls it; after an installation by pip, call it yourself. Without it, the first
+    `make demo` calls it; after an installation by pip, call it yourself. Without it, the first
     command that needs compiled code compiles it and says so. So does the first fit with sensory
     noise: its filter is compiled here only with --sensory-noise.
     """

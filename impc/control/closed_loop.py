@@ -18,7 +18,7 @@ while the controller predicts with A and B (docs/howto/nonlinear.md).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -26,17 +26,23 @@ from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.control.aims import aim_of
 from impc.control.body_steps import body_tape, pushes
-from impc.control.compiled_kernel import answer_with, deviate, fill_slack, return_to, workspace
 from impc.control.compiled_loop import run
-from impc.control.compiled_values import TOO_SHORT, LoopMatrices, RowDirections, Trace
+from impc.control.compiled_values import (
+    TOO_SHORT,
+    LoopMatrices,
+    RowDirections,
+    Trace,
+    workspace,
+)
 from impc.control.constraint_rows import build_rows, differentiate_rows, directions
 from impc.control.named_solver import COMPILED, Program, active_set, build_program, excluded_row
 from impc.control.simulation import Sensitivity, Simulation, Status
 
 if TYPE_CHECKING:
-    from impc.control.compiled_values import Rows, Workspace
+    from impc.control.compiled_values import Aim, BodyTape, Rows
     from impc.control.constraint_rows import Directions
     from impc.control.controller import Controller
+    from impc.control.named_solver import ActiveSet
     from impc.control.simulation import Scenario
 
 # Longest horizon whose problem is solved as a whole at once, and number of its first stages with
@@ -44,6 +50,7 @@ if TYPE_CHECKING:
 _WHOLE, _STAGES = 100, 50
 # Solver that is tried where the compiled method finds no solution.
 _SECOND = "daqp"
+_Drive: TypeAlias = "tuple[BodyTape, Array, Array, Array, Aim, float]"
 
 
 @dataclass(frozen=True)
@@ -188,24 +195,16 @@ def run_loop(
     x, u = np.zeros((steps + 1, n)), np.zeros((steps, m))
     dx = np.zeros((steps + 1 if seen is None else 2, n, p))
     du = np.zeros((steps if inputs else 1, m, p))
-    observed = np.zeros((0, n)) if seen is None else np.ascontiguousarray(seen)
+    observed = np.zeros((0, n)) if seen is None else np.array(seen, order="C")
     dy = np.zeros((steps + 1, len(observed), p))
     status = np.full(steps, Status.NOT_REACHED, dtype=np.int8)
     x[0], dx[0] = given.x0, along.x0
     program, asked = prepared.program, prepared.program is not None
-    aim = aim_of(prepared.controller, given, along)
-    drive = (
-        body_tape(plant.body, n, n + m + given.disturbance.shape[1], moving=p > 0),
-        _pushes(prepared, given),
-        np.array(given.disturbance),
-        np.zeros((steps, 0, 0)) if pushed is None else np.ascontiguousarray(pushed),
-        *(aim, _divergence(prepared.matrices.E, given)),
-    )
+    drive = _drive(prepared, given, pushed)
     t, weakly_active, work = 0, 0, None
     while True:
         rows, moved = prepared.rows, prepared.row_directions
-        if work is None:
-            work = workspace(rows, moved, m)
+        work = workspace(rows, moved, m) if work is None else work
         loop = (prepared.matrices, prepared.matrix_directions, rows, moved, *drive)
         trace = Trace(x, u, dx, du, observed, dy, status, np.zeros(len(rows.limit)))
         weak, failed_row = run(*loop, prepared.unit, work, t, trace, asked, local)
@@ -221,16 +220,37 @@ def run_loop(
             continue
         if program is None:  # second solver for a sample that the compiled method did not solve
             program = build_program(_SECOND, rows)
-        away, daway, moved_u = x[t].copy(), dx[t % len(dx)].copy(), du[t % len(du)]
-        deviate(aim, rows, moved, work, t, away, daway)
-        status[t], weak, row = _ask_solver(prepared, program, work, away, daway, u[t], moved_u)
-        return_to(aim, t, u[t], moved_u)
-        weakly_active += weak
-        if status[t] > Status.SOFTENED:
-            failed_row = failed_row if row >= 0 and failed_row >= 0 else row
-            break
-    found = Simulation(plant, x, u, status, weakly_active, failed_row)
-    return found, Sensitivity(dx if seen is None else dy, du)
+        found = active_set(program, work.slack.copy())
+        if found is not None:
+            asking = work._replace(tight=found.tight, given_up=found.given_up)
+            weak, _ = run(*loop, prepared.unit, asking, t, trace, False, local)
+            if _agrees(prepared.controller, status[t], work.v, found):
+                weakly_active += weak
+                status[t] = min(status[t], Status.SOFTENED)  # the next pass finds what diverged
+                continue
+        row = excluded_row(rows, work.slack)
+        status[t] = Status.INFEASIBLE if row >= 0 else Status.UNSOLVED
+        failed_row = failed_row if row >= 0 and failed_row >= 0 else row
+        break
+    x[t + 1 :] = x[t]  # unless all samples are reached
+    if seen is None:
+        dx[t + 1 :] = 0.0
+    moves = Sensitivity(dx if seen is None else dy, du)
+    return Simulation(plant, x, u, status, weakly_active, failed_row), moves
+
+
+def _drive(prepared: PreparedLoop, given: Scenario, pushed: Array | None) -> _Drive:
+    """Arguments of `run`; the last, 1e6 times the excitation, is the norm that ends it."""
+    plant, d, E = prepared.controller.plant, np.array(given.disturbance), prepared.matrices.E
+    width, largest = plant.n + plant.m + d.shape[1], float(np.max(np.abs(E @ d.T), initial=0))
+    return (
+        body_tape(plant.body, plant.n, width, moving=prepared.along.count > 0),
+        _pushes(prepared, given),
+        d,
+        np.zeros((given.steps, 0, 0)) if pushed is None else np.array(pushed, order="C"),
+        aim_of(prepared.controller, given, prepared.along),
+        1e6 * max(1.0, float(np.max(np.abs(given.x0))), largest),
+    )
 
 
 def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
@@ -242,49 +262,14 @@ def _pushes(prepared: PreparedLoop, given: Scenario) -> Array:
     return pushes(along, run.x[:-1], run.u, given.disturbance)
 
 
-def _ask_solver(
-    prepared: PreparedLoop,
-    program: Program,
-    work: Workspace,
-    x: Array,
-    dx: Array,
-    u: Array,
-    du: Array,
-) -> tuple[Status, bool, int]:
-    """Write the input of one deviation, and its derivative, found by the CasADi solver."""
-    controller, rows = prepared.controller, prepared.rows
-    fill_slack(work, x)
-    slack = work.slack.copy()
-    found = active_set(program, slack)
-    if found is not None:
-        status, weak = answer_with(
-            prepared.matrices,
-            prepared.matrix_directions,
-            rows,
-            prepared.row_directions,
-            prepared.unit,
-            work,
-            found.tight,
-            found.given_up,
-            x,
-            dx,
-            u,
-            du,
-            np.empty(len(rows.b)),
-        )
-        w = (work.v.reshape(-1, 1, len(u)) @ np.linalg.cholesky(controller.metrics)).ravel()
-        if status <= Status.SOFTENED and np.max(np.abs(w - found.w)) <= found.agrees:
-            return Status(status), weak, -1
-    row = excluded_row(rows, slack)
-    return Status.INFEASIBLE if row >= 0 else Status.UNSOLVED, False, row
+def _agrees(controller: Controller, status: int, v: Array, found: ActiveSet) -> bool:
+    """Whether the solution `v` of an active set is that of the solver that found it."""
+    if status > Status.SOFTENED and status != Status.DIVERGED:
+        return False
+    w = (v.reshape(-1, 1, controller.plant.m) @ np.linalg.cholesky(controller.metrics)).ravel()
+    return bool(np.max(np.abs(w - found.w)) <= found.agrees)
 
 
 def _writable(*matrices: Array) -> LoopMatrices:
     """Writable copies: for numba read-only arrays are another type and would be recompiled."""
     return LoopMatrices(*(np.array(matrix, order="C") for matrix in matrices))
-
-
-def _divergence(E: Array, given: Scenario) -> float:
-    """State norm that ends a simulation: 1e6 times its excitation, at least 1e6."""
-    pushes = E @ given.disturbance.T
-    return 1e6 * max(1.0, float(np.max(np.abs(given.x0))), float(np.max(np.abs(pushes), initial=0)))

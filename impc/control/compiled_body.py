@@ -14,14 +14,15 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from impc.arrays import Buffer
+from impc.control.compiled_kernel import copy
 from impc.control.compiled_values import BodyTape
-from impc.jit import njit
+from impc.jit import inner, njit
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-@njit(cache=True)
+@inner()
 def move_body(
     body: BodyTape,
     x: Buffer,
@@ -57,7 +58,7 @@ def move_body(
                 dahead[i, c] += slope * du[j, c]
 
 
-@njit(cache=True)
+@njit()
 def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahead: Buffer) -> None:
     """Compute the next state at every sample of a trajectory.
 
@@ -65,10 +66,10 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
     """
     for t in range(len(ahead)):
         _find(body, x[t], u[t], disturbance[t])
-        ahead[t] = body.found[: x.shape[1]]
+        copy(body.found, ahead[t])
 
 
-@njit(cache=True)
+@njit()
 def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes: Buffer) -> None:
     """Compute the derivatives of the next state at every sample of a trajectory.
 
@@ -76,10 +77,11 @@ def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes
     """
     for t in range(len(slopes)):
         _find(body, x[t], u[t], disturbance[t])
-        slopes[t] = body.slopes
+        for i in range(x.shape[1]):
+            copy(body.slopes[i], slopes[t, i])
 
 
-@njit(cache=True)
+@inner()
 def _find(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer) -> None:
     n, m = len(x), len(u)
     for i in range(n):

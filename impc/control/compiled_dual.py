@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from impc.arrays import Buffer
-from impc.jit import njit
+from impc.jit import inner, njit
 
 #: Status of `solve_dual`: solution found, rows proved inconsistent, step limit reached.
 CONVERGED, INCONSISTENT, UNFINISHED = 0, 1, 2
@@ -36,7 +36,7 @@ _WORN = 20
 _ROUNDING = 1e-14
 
 
-@njit(cache=True)
+@njit(inline="always")
 def solve_dual(
     whitened: Buffer,
     reach: Buffer,
@@ -76,7 +76,7 @@ def solve_dual(
         for r in range(rows):
             slack[r] += line[r] * pull
     for _ in range(50 * (rows + 10)):
-        row, worst = -1, 0.0
+        row, worst = rows, 0.0
         noise = _ROUNDING * _largest_pull(lengths, lam)
         for r in range(rows):
             if is_free[r]:
@@ -87,7 +87,7 @@ def solve_dual(
                 distance = wrong / lengths[r] if lengths[r] > 0 else np.inf
                 if distance > worst:
                     row, worst = r, distance
-        if row < 0:
+        if row == rows:
             refine(gram, d, limit, at_limit, lam, free, count, factor)
             return CONVERGED, count
         sign = -1.0 if at_limit[row] else 1.0
@@ -101,7 +101,7 @@ def solve_dual(
             length = np.inf
             if new > DEPENDENT * lengths[row]:
                 length = -sign * slack[row] / new**2
-            blocked = -1
+            blocked = rows
             room = lam[row] if sign < 0 else limit[row] - lam[row]
             if room <= length:
                 length, blocked = room, count
@@ -123,7 +123,8 @@ def solve_dual(
                 return INCONSISTENT, row
             lam[row] += sign * length
             # Row by row of the symmetric matrix, the order of memory.
-            change[:] = gram[row]
+            for r in range(rows):
+                change[r] = gram[row, r]
             for i in range(count):
                 line, share = gram[free[i]], step[i]
                 for r in range(rows):
@@ -132,7 +133,7 @@ def solve_dual(
                 slack[r] += sign * length * change[r]
             for i in range(count):
                 lam[free[i]] -= sign * length * step[i]
-            if blocked < 0:
+            if blocked == rows:
                 accept_row(count, new, factor, basis)
                 free[count] = row
                 is_free[row], at_limit[row] = True, False
@@ -150,7 +151,7 @@ def solve_dual(
     return UNFINISHED, count
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _begun(
     whitened: Buffer,
     reach: Buffer,
@@ -179,7 +180,7 @@ def _begun(
         for i in range(count):
             right[i] = -d[free[i]]
         substitute(factor, count, right)
-        place, worst = -1, np.inf
+        place, worst = count, np.inf
         for i in range(count):
             if not right[i] <= limit[free[i]]:  # also false for NaN
                 return 0
@@ -193,7 +194,7 @@ def _begun(
     return 0
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
     """Largest multiplier times the length of its row."""
     largest = 0.0
@@ -202,7 +203,7 @@ def _largest_pull(lengths: Buffer, lam: Buffer) -> float:
     return largest
 
 
-@njit(cache=True)
+@inner()
 def _remove(
     reach: Buffer, free: Buffer, count: int, place: int, factor: Buffer, basis: Buffer, worn: Buffer
 ) -> int:
@@ -210,7 +211,8 @@ def _remove(
     width = furthest(reach, free, count)
     for i in range(place, count - 1):
         free[i] = free[i + 1]
-        factor[i, : i + 2] = factor[i + 1, : i + 2]
+        for k in range(i + 2):
+            factor[i, k] = factor[i + 1, k]
     for i in range(place, count - 1):
         length = np.hypot(factor[i, i], factor[i, i + 1])
         cosine, sine = factor[i, i] / length, factor[i, i + 1] / length
@@ -225,7 +227,7 @@ def _remove(
     return count - 1
 
 
-@njit(cache=True)
+@inner()
 def refine(
     gram: Buffer,
     d: Buffer,
@@ -253,7 +255,7 @@ def refine(
         lam[free[i]] = right[i]
 
 
-@njit(cache=True, fastmath={"reassoc"})  # sums in the order of the processor
+@inner(fastmath={"reassoc"})  # sums in the order of the processor
 def append_row(
     whitened: Buffer,
     reach: Buffer,
@@ -273,7 +275,8 @@ def append_row(
     """
     width = max(reach[row], furthest(reach, free, count))
     new = basis[count]
-    new[:] = whitened[row]
+    for k in range(len(new)):
+        new[k] = whitened[row, k]
     for i in range(count):
         factor[count, i] = 0.0
     for _ in range(2):
@@ -291,7 +294,7 @@ def append_row(
     return np.sqrt(length)  # type: ignore[no-any-return]
 
 
-@njit(cache=True)
+@inner()
 def furthest(reach: Buffer, free: Buffer, count: int) -> int:
     """Largest `reach` (r,) of the first `count` rows in `free` (a + 1,)."""
     width = 0
@@ -300,7 +303,7 @@ def furthest(reach: Buffer, free: Buffer, count: int) -> int:
     return width
 
 
-@njit(cache=True)
+@inner()
 def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None:
     """Accept the row of `append_row` into the basis.
 
@@ -311,7 +314,7 @@ def accept_row(count: int, length: float, factor: Buffer, basis: Buffer) -> None
         basis[count, k] /= length
 
 
-@njit(cache=True, fastmath={"reassoc"})  # sums in the order of the processor
+@inner(fastmath={"reassoc"})  # sums in the order of the processor
 def substitute(factor: Buffer, count: int, right: Buffer) -> None:
     """Solve L L' x = right in place; `factor` (count, count); `right` (count,)."""
     for i in range(count):
@@ -326,7 +329,7 @@ def substitute(factor: Buffer, count: int, right: Buffer) -> None:
         right[i] = total / factor[i, i]
 
 
-@njit(cache=True)
+@inner()
 def substitute_all(factor: Buffer, count: int, right: Buffer) -> None:
     """`substitute` for every column of `right` (count, c) at once, with the `factor` (a, a)."""
     for i in range(count):

@@ -11,6 +11,7 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.control.compiled_dual import (
+    CONVERGED,
     DEPENDENT,
     INCONSISTENT,
     UNFINISHED,
@@ -34,13 +35,10 @@ from impc.control.compiled_values import (
     Rows,
     Workspace,
 )
-from impc.jit import njit
+from impc.jit import inner, njit
 
 #: Largest entry of plant and estimate, of states and of predictions.
 LARGEST = 1e100
-# A row exceeded by less than this share of its bound is satisfied: 100 times the rounding of
-# T x + M v, so that the quadratic program is never solved because of rounding alone.
-_KEPT = 1e-13
 # Share of its bound within which a row is about to become active or inactive.
 _WEAK = 1e-8
 # A solution is accepted only if it satisfies every row, and determines the first input, to this
@@ -52,33 +50,7 @@ _ROW_ROUNDING = 1e-14
 _SUM_ROUNDING = 1e-15
 
 
-@njit(cache=True)
-def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
-    """Allocate the workspace of `law` for `m` inputs."""
-    count, width = rows.M.shape
-    p = drows.b.shape[1]
-    room = min(len(rows.limit), width) + 1
-    # T and M are stored by columns: sums over columns then run over all rows at once.
-    return Workspace(
-        rows.b.copy(),
-        drows.b.copy(),
-        np.empty(count),
-        _KEPT * rows.b,
-        np.empty(room, dtype=np.int64),
-        np.empty((room, room)),
-        np.zeros((room, width)),
-        np.zeros(width),
-        np.empty(width),
-        np.zeros((m, p)),
-        np.ascontiguousarray(rows.T.T),
-        np.ascontiguousarray(rows.M.T),
-        np.searchsorted(rows.stage, np.arange(width) // m),
-        np.zeros(1, dtype=np.int64),
-        np.zeros(1, dtype=np.int64),
-    )
-
-
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def dot(a: Buffer, b: Buffer) -> float:
     """Scalar product a'b (arrays of the same length)."""
     total = 0.0
@@ -87,7 +59,14 @@ def dot(a: Buffer, b: Buffer) -> float:
     return total
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
+def copy(values: Buffer, to: Buffer) -> None:
+    """Copy the first values to all of `to` (p,): `to[:] = ...` takes seconds to compile."""
+    for c in range(len(to)):
+        to[c] = values[c]
+
+
+@njit(inline="always")
 def add(share: float, changes: Buffer, total: Buffer) -> None:
     """Add share times `changes` (p,) to `total` (p,).
 
@@ -97,34 +76,37 @@ def add(share: float, changes: Buffer, total: Buffer) -> None:
         total[c] += share * changes[c]
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def deviate(
     aim: Aim, rows: Rows, drows: RowDirections, work: Workspace, t: int, x: Buffer, dx: Buffer
 ) -> None:
     """Convert a state `x` (n,) and `dx` (n, p) at sample t to deviations from the target."""
     if len(aim.x) == 0:
         return
-    x -= aim.x[t]
+    add(-1.0, aim.x[t], x)
     ahead = len(aim.taken) - len(aim.x)
     for r in range(len(work.right)):
         at, c = t + min(rows.stage[r], ahead), rows.family[r]
         work.right[r] = rows.b[r] - aim.taken[at, c] - aim.held[t, c]
         if len(aim.dx) and r < len(drows.b):
-            work.dright[r] = drows.b[r] - aim.dtaken[at, c] - aim.dheld[t, c]
+            for k in range(len(work.dright[r])):
+                work.dright[r, k] = drows.b[r, k] - aim.dtaken[at, c, k] - aim.dheld[t, c, k]
     if len(aim.dx):
-        dx -= aim.dx[t, :, : dx.shape[1]]
+        for i in range(len(dx)):
+            add(-1.0, aim.dx[t, i], dx[i])
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def return_to(aim: Aim, t: int, u: Buffer, du: Buffer) -> None:
     """Add the target's command to `u` (m,) and `du` (m, p) of the deviation."""
     if len(aim.x):
-        u += aim.u[t]
+        add(1.0, aim.u[t], u)
         if len(aim.dx):
-            du += aim.du[t, :, : du.shape[1]]
+            for i in range(len(du)):
+                add(1.0, aim.du[t, i], du[i])
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def law(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -160,7 +142,7 @@ def law(
     return status, near, -1
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _look(work: Workspace, b: Buffer, x: Buffer) -> tuple[bool, bool]:
     """Write the slack of the gain; whether a row is violated, and whether one nearly is."""
     broken, near, slack, kept = False, False, work.slack, work.kept
@@ -171,7 +153,7 @@ def _look(work: Workspace, b: Buffer, x: Buffer) -> tuple[bool, bool]:
     return broken, near
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def fill_slack(work: Workspace, x: Buffer) -> None:
     """Compute slack = right - T x (T stored by columns)."""
     slack, T = work.slack, work.T
@@ -183,7 +165,7 @@ def fill_slack(work: Workspace, x: Buffer) -> None:
         slack[r] = work.right[r] - slack[r]
 
 
-@njit(cache=True)
+@inner()
 def _solve(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -197,73 +179,55 @@ def _solve(
     begin: int,
 ) -> tuple[int, bool, int]:
     """Write v and dv0 of one sample; return status, whether it is weakly active, and a row."""
-    code, active = solve_dual(
-        rows.W,
-        rows.reach,
-        rows.gram,
-        work.slack[: len(lam)],
-        rows.limit,
-        work.kept[: len(lam)],
-        lam,
-        work.free,
-        work.factor,
-        work.basis,
-        work.worn,
-        begin,
-    )
+    given = len(work.given_up) > 0
+    if given:
+        code, active = _given(rows, work, lam)
+    else:
+        code, active = solve_dual(
+            rows.W,
+            rows.reach,
+            rows.gram,
+            work.slack[: len(lam)],
+            rows.limit,
+            work.kept[: len(lam)],
+            lam,
+            work.free,
+            work.factor,
+            work.basis,
+            work.worn,
+            begin,
+        )
     if code == INCONSISTENT:
         return INFEASIBLE, False, active
     if code == UNFINISHED:
         return UNSOLVED, False, -1
-    work.active[0] = active
+    work.active[0] = 0 if given else active
     status, near = answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
     return status, near, -1
 
 
-@njit(cache=True, nogil=True)
-def answer_with(
-    loop: LoopMatrices,
-    dloop: LoopMatrices,
-    rows: Rows,
-    drows: RowDirections,
-    unit: Buffer,
-    work: Workspace,
-    tight: Buffer,
-    given_up: Buffer,
-    x: Buffer,
-    dx: Buffer,
-    u: Buffer,
-    du: Buffer,
-    lam: Buffer,
-) -> tuple[int, bool]:
-    """Write the input of one sample and its derivative for a given active set.
-
-    `unit` (m,); `x` (n,); `dx` (n, p); `tight` (a,); `given_up` (r,); `u` (m,); `du` (m, p);
-    `lam` (r,). The workspace contains the right sides and receives v.
-    """
-    active = len(tight)
+@njit(inline="always")
+def _given(rows: Rows, work: Workspace, lam: Buffer) -> tuple[int, int]:
+    """Multipliers `lam` (r,) of the active set in the workspace; status as of `solve_dual`."""
+    tight, active = work.tight, len(work.tight)
     if active >= len(work.free):
-        return UNSOLVED, False
-    fill_slack(work, x)
+        return UNFINISHED, 0
     for i in range(active):
         work.free[i] = tight[i]
         new = append_row(rows.W, rows.reach, work.free, tight[i], i, work.factor, work.basis)
         if not new > DEPENDENT * np.sqrt(rows.gram[tight[i], tight[i]]):
-            return UNSOLVED, False
+            return UNFINISHED, 0
         accept_row(i, new, work.factor, work.basis)
     for r in range(len(lam)):
-        lam[r] = rows.limit[r] if given_up[r] else 0.0
-    refine(rows.gram, work.slack, rows.limit, given_up, lam, work.free, active, work.factor)
+        lam[r] = rows.limit[r] if work.given_up[r] else 0.0
+    refine(rows.gram, work.slack, rows.limit, work.given_up, lam, work.free, active, work.factor)
     for i in range(active):
         if lam[tight[i]] > rows.limit[tight[i]]:
-            return UNSOLVED, False
-    status, near = answer(loop, dloop, rows, drows, unit, work, x, dx, lam, active)
-    if status != UNSOLVED:
-        _apply(loop, dloop, work.v, work.dv0, x, dx, u, du)
-    return status, near
+            return UNFINISHED, 0
+    return CONVERGED, active
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _apply(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -277,13 +241,13 @@ def _apply(
     """Compute u = -K x + v_0 and its derivative."""
     for i in range(len(u)):
         u[i] = v[i] - dot(loop.K[i], x)
-        du[i] = dv0[i, : dx.shape[1]]
+        copy(dv0[i], du[i])
         for j in range(len(x)):
             add(-loop.K[i, j], dx[j], du[i])
             add(-x[j], dloop.K[i, j], du[i])
 
 
-@njit(cache=True)
+@njit(inline="always")
 def answer(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -301,10 +265,12 @@ def answer(
     `unit` (m,); `x` (n,); `dx` (n, p); `lam` (r,).
     """
     _recover(rows, lam, work)
-    soft, near, solved = _check(loop.K, rows, lam, work, active, x, unit)
-    if not solved:
-        _tighten(rows, work, active)
+    for attempt in range(2):
+        if attempt:
+            _tighten(rows, work, active)
         soft, near, solved = _check(loop.K, rows, lam, work, active, x, unit)
+        if solved:
+            break
     if not solved:
         return UNSOLVED, False
     if len(lam) < len(work.slack) and not _keeps_later(work, len(lam), rows.b):
@@ -314,17 +280,20 @@ def answer(
     return (SOFTENED if soft else ACTIVE), near
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _keeps_later(work: Workspace, head: int, b: Buffer) -> bool:
     """Whether v satisfies the rows behind the first `head`, none of them nearly active."""
     lefts = work.slack[head:].copy()
     for i in range(len(work.v)):
         if work.v[i] != 0.0:
             add(-work.v[i], work.M[i, head:], lefts)
-    return bool(np.all(lefts > _WEAK * b[head:]))
+    kept = True
+    for r in range(len(lefts)):
+        kept &= lefts[r] > _WEAK * b[head + r]
+    return kept
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
     """Compute v = -N' lam and its rounding error."""
     v, rounding = work.v, work.rounding
@@ -339,7 +308,7 @@ def _recover(rows: Rows, lam: Buffer, work: Workspace) -> None:
                 rounding[i] += _SUM_ROUNDING * abs(part)
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _tighten(rows: Rows, work: Workspace, active: int) -> None:
     """Correct v so that the tight rows are tight.
 
@@ -355,7 +324,7 @@ def _tighten(rows: Rows, work: Workspace, active: int) -> None:
             v[i] += column[a] * rows.N[free[a], i]
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _check(
     K: Buffer, rows: Rows, lam: Buffer, work: Workspace, active: int, x: Buffer, unit: Buffer
 ) -> tuple[bool, bool, bool]:
@@ -397,7 +366,7 @@ def _check(
         near |= abs(left) < _WEAK * bound and pulled < _WEAK * bound
     columns, moved = np.empty((active, m)), np.empty(len(v))
     for a in range(active):
-        columns[a] = rows.N[free[a], :m]
+        copy(rows.N[free[a]], columns[a])
     substitute_all(factor, active, columns)
     for i in range(m):
         error, size = 0.0, 0.0
@@ -417,7 +386,7 @@ def _check(
     return soft, near, True
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _differentiate(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -456,7 +425,7 @@ def _differentiate(
             add(-rows.N[free[a], i], dlam[a], dv0[i])
 
 
-@njit(cache=True)
+@njit(inline="always")
 def _add_pulls(rows: Rows, drows: RowDirections, lam: Buffer, q: Buffer) -> None:
     """Add dM' lam to q, and the effect of the penalty of soft rows."""
     for r in range(len(lam)):

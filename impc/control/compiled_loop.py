@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 
 from impc.arrays import Buffer
 from impc.control.compiled_body import move_body
-from impc.control.compiled_kernel import add, deviate, dot, law, return_to
+from impc.control.compiled_kernel import add, copy, deviate, dot, law, return_to
 from impc.control.compiled_values import (
     DIVERGED,
     SOFTENED,
@@ -72,7 +72,7 @@ _null: Any = cgutils.get_null_value
 _borrow: Callable[[Any], Any] = _make(_borrowed)
 
 
-@njit(cache=True, nogil=True)  # held-out trials are fitted in parallel threads
+@njit(nogil=True)  # held-out trials are fitted in parallel threads
 def run(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -103,17 +103,19 @@ def run(
     plant_moves = bool(np.any(dloop.A) or np.any(dloop.B) or np.any(dloop.E))
     weakly_active = 0
     away, daway = np.empty(x.shape[1]), np.empty(dx.shape[1:])
-    for t in range(first, len(u)):
+    last = first + 1 if len(work.given_up) else len(u)
+    for t in range(first, last):
         at, moved, ahead = dx[t % len(dx)], du[t % len(du)], dx[(t + 1) % len(dx)]
         _observe(seen, at, dy[t])
         if status[t] > SOFTENED:
-            away[:], daway[:] = x[t], at
+            copy(x[t], away)
+            for i in range(len(at)):
+                copy(at[i], daway[i])
             deviate(aim, rows, drows, work, t, away, daway)
             status[t], near, row = law(
                 loop, dloop, rows, drows, unit, work, away, daway, lam, gain_only, u[t], moved
             )
             if status[t] > SOFTENED:
-                _hold(x, dx, t)
                 return weakly_active, row
             return_to(aim, t, u[t], moved)
             weakly_active += near
@@ -126,18 +128,19 @@ def run(
         if plant_moves:
             _move_plant(dloop, disturbance[t], x[t], u[t], ahead)
         if len(pushes):
-            ahead += pushes[t]
+            for i in range(len(ahead)):
+                add(1.0, pushes[t, i], ahead[i])
         if local:
-            ahead[:] = dx[0]
+            for i in range(len(ahead)):
+                copy(dx[0, i], ahead[i])
         if not _largest(x[t + 1]) < divergence:
             status[t] = DIVERGED
-            _hold(x, dx, t)
             return weakly_active, -1
-    _observe(seen, dx[len(u) % len(dx)], dy[len(u)])
+    _observe(seen, dx[last % len(dx)], dy[last])
     return weakly_active, -1
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _largest(x: Buffer) -> float:
     """Largest magnitude of an entry, or NaN."""
     size = 0.0
@@ -147,7 +150,7 @@ def _largest(x: Buffer) -> float:
     return size
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _observe(seen: Buffer, dx: Buffer, dy: Buffer) -> None:
     """Compute dy = seen dx."""
     for i in range(len(seen)):
@@ -157,7 +160,7 @@ def _observe(seen: Buffer, dx: Buffer, dy: Buffer) -> None:
                 add(seen[i, j], dx[j], dy[i])
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _advance(
     loop: LoopMatrices,
     disturbance: Buffer,
@@ -181,7 +184,7 @@ def _advance(
             add(loop.B[i, j], du[j], ahead)
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _move_plant(
     dloop: LoopMatrices, disturbance: Buffer, x: Buffer, u: Buffer, dfollowing: Buffer
 ) -> None:
@@ -195,18 +198,10 @@ def _move_plant(
             add(disturbance[j], dloop.E[i, j], dfollowing[i])
 
 
-@njit(cache=True, inline="always")
+@njit(inline="always")
 def _push(slopes: Buffer, column: int, pushed: Buffer, dfollowing: Buffer) -> None:
     """Add slopes[:, column :] pushed, `pushed` (d, q), to the last q derivatives."""
     first = dfollowing.shape[1] - pushed.shape[1]
     for i in range(len(dfollowing)):
         for j in range(len(pushed)):
             add(slopes[i, column + j], pushed[j], dfollowing[i, first:])
-
-
-@njit(cache=True)
-def _hold(x: Buffer, dx: Buffer, t: int) -> None:
-    """Repeat the last state, so that samples that are not reached are finite."""
-    x[t + 1 :] = x[t]
-    if len(dx) == len(x):
-        dx[t + 1 :] = 0.0

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from impc.arrays import Array, Buffer, IntArray
 
 #: Values of `simulation.Status` that compiled code returns.
 FREE, ACTIVE, SOFTENED, INFEASIBLE, UNSOLVED, DIVERGED = 0, 1, 2, 3, 4, 5
 #: The solution of a shortened problem does not satisfy, or nearly violates, a later row.
 TOO_SHORT = 7
+# A row exceeded by less than this share of its bound is satisfied: 100 times the rounding of
+# T x + M v, so that the quadratic program is never solved because of rounding alone.
+_KEPT = 1e-13
 
 
 class Rows(NamedTuple):
@@ -85,6 +90,35 @@ class Workspace(NamedTuple):
     first: Buffer  # (N m,), first row with the column: rows are ordered by stage
     active: Buffer  # (1,), number of free rows at the last sample: warm start of the next problem
     worn: Buffer  # (1,), as in `solve_dual`
+    # active set of another solver, for one sample, or empty
+    tight: Buffer  # (a,), rows
+    given_up: Buffer  # (r,), whether a row is exceeded
+
+
+def workspace(rows: Rows, drows: RowDirections, m: int) -> Workspace:
+    """Allocate the workspace of a law with `m` inputs."""
+    count, width = rows.M.shape
+    room = min(len(rows.limit), width) + 1
+    # T and M are stored by columns: sums over columns then run over all rows at once.
+    return Workspace(
+        rows.b.copy(),
+        drows.b.copy(),
+        np.empty(count),
+        _KEPT * rows.b,
+        np.empty(room, dtype=np.int64),
+        np.empty((room, room)),
+        np.zeros((room, width)),
+        np.zeros(width),
+        np.empty(width),
+        np.zeros((m, drows.b.shape[1])),
+        np.ascontiguousarray(rows.T.T),
+        np.ascontiguousarray(rows.M.T),
+        np.searchsorted(rows.stage, np.arange(width) // m),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(0, dtype=np.int64),
+        np.zeros(0, dtype=np.bool_),
+    )
 
 
 class Trace(NamedTuple):

@@ -25,7 +25,7 @@ import numpy as np
 
 from impc.arrays import Buffer
 from impc.control.compiled_dual import substitute_all
-from impc.control.compiled_kernel import LARGEST, deviate, law, return_to, workspace
+from impc.control.compiled_kernel import LARGEST, deviate, law, return_to
 from impc.control.compiled_values import (
     DIVERGED,
     SOFTENED,
@@ -35,7 +35,7 @@ from impc.control.compiled_values import (
     Rows,
     Workspace,
 )
-from impc.jit import njit
+from impc.jit import inner, njit
 
 # The covariance counts as stationary if no entry differs by more than the first tolerance, in the
 # standard deviations of its row and column, and its derivative by no more than the second.
@@ -166,7 +166,7 @@ class _Weighed(NamedTuple):
     half: Buffer  # (k, k), tr(S^-1 dS S^-1 dS) / 2 for each pair of directions
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def run_filter(
     parts: FilterParts,
     outputs: Buffer,
@@ -175,6 +175,7 @@ def run_filter(
     belief: Belief,
     result: Likelihood,
     first: int,
+    work: Workspace,
 ) -> int:
     """Filter one trial from sample `first` on; return the sample at which it stops.
 
@@ -186,7 +187,7 @@ def run_filter(
     z, dz, P, dP = belief
     joint, djoint, at = parts.joint, parts.djoint, parts.at
     (m, n), q, k, rows = parts.loop.K.shape, dz.shape[1], len(dP), parts.rows
-    work, lam = workspace(rows, parts.drows, m), np.zeros(len(rows.b))
+    lam = np.zeros(len(rows.b))
     u, du = np.empty(m), np.empty((m, q))
     plain = np.ascontiguousarray(parts.dloop.K[:, :, :k].transpose((2, 0, 1)))
     settled, quiet = False, 0
@@ -229,14 +230,14 @@ def run_filter(
     return len(outputs)
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _times(changes: Buffer, vector: Buffer) -> Buffer:
     """Product of changes (k, i, j) with a vector (j,), as columns (i, k)."""
     k, i, j = changes.shape
     return (changes.reshape(k * i, j) @ vector).reshape(k, i).T
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _weigh(parts: FilterParts, P: Buffer, dP: Buffer) -> _Weighed:
     """Innovation covariance, gain and updated covariance from P (z, z) and dP (k, z, z)."""
     joint, djoint, C = parts.joint, parts.djoint, parts.joint.C
@@ -261,7 +262,7 @@ def _weigh(parts: FilterParts, P: Buffer, dP: Buffer) -> _Weighed:
     return _Weighed(S, inverse, volume, gain, P - gain @ CP, dPC, dS, weighed, half)
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _update(
     parts: FilterParts, known: _Weighed, output: Buffer, belief: Belief, result: Likelihood, t: int
 ) -> bool:
@@ -298,7 +299,7 @@ def _update(
     return True
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _slope_of_law(parts: FilterParts, work: Workspace, plain: Buffer) -> tuple[Buffer, Buffer]:
     """Slope of the command by the state (m, n) for the active rows, derivatives (k, m, n).
 
@@ -337,7 +338,7 @@ def _slope_of_law(parts: FilterParts, work: Workspace, plain: Buffer) -> tuple[B
     return slope, dslope
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _clip_command(
     parts: FilterParts, known: _Weighed, dP: Buffer, command: _Command
 ) -> tuple[int, bool]:
@@ -374,7 +375,7 @@ def _clip_command(
     return found.beyond, True
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _advance(parts: FilterParts, known: _Weighed, belief: Belief, command: _Command) -> None:
     """Predict P and dP for the next sample."""
     P, dP = belief.P, belief.dP
@@ -416,7 +417,7 @@ def _advance(parts: FilterParts, known: _Weighed, belief: Belief, command: _Comm
                 dP[c, j, i] = dP[c, i, j]
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _is_steady(parts: FilterParts, P: Buffer, dP: Buffer) -> bool:
     """Whether covariance and derivatives are stationary within tolerance."""
     deviations = np.sqrt(np.diag(parts.P))
@@ -426,7 +427,7 @@ def _is_steady(parts: FilterParts, P: Buffer, dP: Buffer) -> bool:
     return bool(np.all(np.abs(dP - parts.dP[: len(dP)]) <= _STEADY_SLOPE * unit))
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def clipped(clip: Clip, g: float, s: float) -> Clipped:
     """Moments of the clipped command with mean g and standard deviation s."""
     low, high = clip.low - g, clip.high - g
@@ -449,7 +450,7 @@ def clipped(clip: Clip, g: float, s: float) -> Clipped:
     )
 
 
-@njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+@inner()
 def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
     """For a standard normal number below a: probability, density, a density, s a p, (s a)^2 p."""
     if a == -np.inf:
@@ -459,7 +460,7 @@ def _tail(a: float, s: float) -> tuple[float, float, float, float, float]:
     return below, density, a * density, s * a * below, (s * a) ** 2 * below
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def run_noisy(
     loop: LoopMatrices,
     dloop: LoopMatrices,
@@ -471,10 +472,10 @@ def run_noisy(
     driven: tuple[Buffer, Buffer, Buffer],
     aim: Aim,
     trace: Trace,
+    work: Workspace,
 ) -> int:
     """Simulate from z[0]; `driven`: disturbance, noise, and noise in proportion to commands."""
     (z, u, status), (disturbance, noise, shared), n = trace, driven, loop.K.shape[1]
-    work = workspace(rows, drows, u.shape[1])
     lam, dx, du = np.zeros(len(rows.b)), np.zeros((n, 0)), np.zeros((u.shape[1], 0))
     for t in range(len(u)):
         x = z[t, at : at + n].copy()

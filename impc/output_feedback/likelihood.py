@@ -23,7 +23,7 @@ import numpy as np
 
 from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
-from impc.control.compiled_values import RowDirections, Rows
+from impc.control.compiled_values import RowDirections, Rows, workspace
 from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
@@ -120,7 +120,8 @@ def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likel
     P, dP, first = parts.joint.P0.copy(), parts.djoint.P0.copy(), 0
     while first < N and status[first] not in _FAILED:
         belief = Belief(z, dz, P, dP)
-        first = run_filter(parts, outputs, disturbance, aim, belief, result, first)
+        work = workspace(parts.rows, parts.drows, len(parts.unit))
+        first = run_filter(parts, outputs, disturbance, aim, belief, result, first, work)
         dz, dP = np.ascontiguousarray(dz[:, : parts.lasting]), dP[: parts.lasting]
     failed = np.flatnonzero(np.isin(status, _FAILED))
     if len(failed):

@@ -26,6 +26,7 @@ from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.control.aims import aim_of
 from impc.control.closed_loop import prepare_loop
+from impc.control.compiled_values import workspace
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Status, scenario
 from impc.model.riccati import lyapunov_series
@@ -194,7 +195,8 @@ def run_joint(
     trace = Trace(z, u, np.full(steps, Status.NOT_REACHED, dtype=np.int8))
     parts = law.matrices, law.matrix_directions, law.rows, law.row_directions, law.unit
     at = 0 if len(start) == n else n
-    reached = run_noisy(*parts, joint, at, (disturbance, *noise), aim, trace)
+    work = workspace(law.rows, law.row_directions, m)
+    reached = run_noisy(*parts, joint, at, (disturbance, *noise), aim, trace, work)
     z[reached + 1 :], u[reached:] = z[reached], u[max(reached - 1, 0)]
     return trace
 

@@ -1,7 +1,7 @@
 """Compile the numba code of simulations and fits in advance (docs/howto/speed.md).
 
-A cart is simulated in each way that has its own compiled code: with and without derivatives, with
-a named solver, with a nonlinear body, and with sensory noise.
+A cart is simulated in each way that has its own compiled code: with derivatives, along the
+trajectory of a nonlinear body, and with sensory noise.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import casadi as ca
 import control
 import numpy as np
 
-from impc.checking import replace
-from impc.control.closed_loop import simulate, simulate_and_differentiate
+from impc.control.body_steps import next_state, slopes_along
+from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
@@ -31,7 +31,6 @@ def compile_loop() -> None:
     """Compile the constrained controller and its closed loop."""
     law, drive = _cart()
     simulate_and_differentiate(law, drive, directions(law, 2, x0=np.eye(2)))
-    simulate(replace(law, solver="daqp"), drive)
 
 
 def compile_bodies() -> None:
@@ -39,7 +38,10 @@ def compile_bodies() -> None:
     x, w = ca.SX.sym("x", 2), ca.SX.sym("w", 2)
     moved = ca.vertcat(x[0] + 0.1 * ca.sin(x[1]), x[1] + 0.1 * (w[0] + w[1]))
     law, drive = _cart(ca.Function("body", [x, w], [moved]))
-    simulate_and_differentiate(law, drive, directions(law, 2, x0=np.eye(2)))
+    run, _ = simulate_and_differentiate(law, drive, directions(law, 2, x0=np.eye(2)))
+    given = run.x[:-1], run.u, drive.disturbance
+    next_state(law.plant, *(part[0] for part in given))
+    slopes_along(law.plant, *given)
 
 
 def compile_filter() -> None:

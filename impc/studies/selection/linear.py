@@ -83,7 +83,7 @@ def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
     return first, found[:, :size, size:] * length
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _with_derivatives(A: Any, B: Any, dA: Any, dB: Any, given: Any) -> Any:
     samples, n, d, count = len(given), A.shape[0], B.shape[1], len(dA)
     x = np.zeros((samples, n))
