@@ -276,7 +276,7 @@ def main() -> None:
     zero = shooting(first, nothing)
     euler = collocation(first, nothing, midpoint=False)
     (_FOLDER / "images/two_link_standing.svg").write_bytes(
-        on_paper(drawn(lambda _: _figure(groups), "svg"))
+        on_paper(drawn(lambda: _figure(groups), "svg"))
     )
     text = _page(groups, zero, euler) + _explained(groups) + "\n" + _biases(groups)
     (_FOLDER / "two_link_standing.md").write_text(_wrapped(text), encoding="utf-8")

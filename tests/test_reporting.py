@@ -112,8 +112,8 @@ class Texts(HTMLParser):
         self.found.append(data)
 
 
-def hostile(narrow: bool) -> Figure:
-    figure = new_figure(4 if narrow else 6, 3)
+def hostile() -> Figure:
+    figure = new_figure(6, 3)
     ax = figure.subplots()
     ax.set_axis_off()
     ax.set_title(f"{EVIL} $x^2$")
@@ -168,8 +168,8 @@ def test_every_block_is_escaped_and_there() -> None:
     shown.feed(page)
     # Window, kind, meta, headline, sentence, 4 of the key, 3 claims, 2 to copy, section; twice 4 of
     # an alert; 2 paragraphs, 2 lines, 2 of a term, caption, sentence, 2 cells, caption of the
-    # figure, its titles and texts in two drawings, quiet, 2 of a check, 2 of a fold.
-    assert sum(text.count(EVIL) for text in shown.found) == 15 + 8 + 2 + 2 + 2 + 4 + 1 + 4 + 1 + 4
+    # figure, its title and text, quiet, 2 of a check, 2 of a fold.
+    assert sum(text.count(EVIL) for text in shown.found) == 15 + 8 + 2 + 2 + 2 + 4 + 1 + 2 + 1 + 4
     assert 'href="#in-short"' in page
     assert 'id="in-short"' in page
 

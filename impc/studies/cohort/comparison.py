@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy.stats
+import scipy
 from statsmodels.stats.meta_analysis import combine_effects, effectsize_smd
 
 from impc.assess.covariance import TWO_SIDED
