@@ -17,7 +17,12 @@ import impc
 from tests.documents.blocks import ROOT
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-HEAVY = {"casadi", "matplotlib", "numba", "numpy", "scipy"}
+# Libraries that take a tenth of a second and more to load.
+HEAVY = {
+    "casadi", "control", "cvxpy", "h5py", "jinja2", "matplotlib", "numba", "openpyxl", "pandas",
+    "pint", "scipy.interpolate", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.stats",
+    "statsmodels", "sympy",
+}  # fmt: skip
 
 
 def test_there_are_at_most_sixty_names_and_each_is_there() -> None:
@@ -55,8 +60,34 @@ def test_importing_it_loads_no_other_library() -> None:
     assert {name for name in found - bare if name.split(".")[0] != "impc"} <= {
         name for name in found if name.split(".")[0] in sys.stdlib_module_names
     }
-    assert found.isdisjoint(HEAVY)
     assert {name for name in found if name.startswith("impc.")} == set()
+
+
+def run_command(*given: str) -> tuple[str, ...]:
+    """Lines that run a command of impc."""
+    return (
+        "import contextlib, io",
+        "from impc.cli.main import main",
+        "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):",
+        f"    main({list(given)})",
+    )
+
+
+@pytest.mark.parametrize(
+    ("lines", "needs"),
+    [
+        (run_command("--help"), set()),
+        (run_command("fit", "--help"), set()),
+        # It opens the recordings first.
+        (run_command("fit", "no.csv", "--plant", "cursor", "--config", "no.toml"), set()),
+        (("import impc.files.reading",), set()),
+        # matplotlib is loaded with the first figure, statsmodels with the first test of a cohort.
+        (("import impc.studies.cohort.report, impc.studies.fit.report, impc.nonlinear.page",),
+         HEAVY - {"control", "cvxpy", "h5py", "matplotlib", "openpyxl", "statsmodels", "sympy"}),
+    ],
+)  # fmt: skip
+def test_libraries_are_loaded_where_they_are_used(lines: tuple[str, ...], needs: set[str]) -> None:
+    assert loaded(*lines) & HEAVY <= needs
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from impc.files.spreadsheet import workbook_bytes
 from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
-from impc.reporting.style import drawn, inline, on_paper
+from impc.reporting.style import drawn, inline
 from impc.reporting.verdict import Alert, Key, Verdict
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class Report:
         }
         found = {item.name: item.data() for item in self.findings()}
         own = {"schema": SCHEMA, **self.provenance.data(), "verdict": self.verdict.data()}
-        figures = {f"figures/{name}.svg": on_paper(svg) for name, svg in self._drawn.items()}
+        figures = {f"figures/{name}.svg": svg for name, svg in self._drawn.items()}
         if pdf:
             figures |= {
                 f"figures/{name}.pdf": drawn(draw, "pdf") for name, draw in self.figures.items()

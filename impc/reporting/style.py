@@ -77,7 +77,6 @@ _RC: dict[Any, Any] = {
     "path.simplify_threshold": 0.3,
     "figure.facecolor": "none",
     "axes.facecolor": "none",
-    "savefig.facecolor": "none",
     # Override the user's settings for figures without a layout engine.
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
@@ -122,15 +121,9 @@ def plain_log(axis: Axis) -> None:
 
 
 def drawn(draw: Callable[[], Figure], kind: str) -> bytes:
-    """Figure as a "svg" or "pdf" file, without date or program name; the svg is transparent."""
+    """Figure as a "svg" or "pdf" file, without date or program name."""
     with page_style():
-        return render(draw(), kind, ground="none" if kind == "svg" else PAPER)
-
-
-def on_paper(svg: bytes) -> bytes:
-    """Figure of `drawn` on a white ground, for viewers with a dark one."""
-    head, _, rest = svg.partition(b"<defs>")
-    return head + f'<rect width="100%" height="100%" fill="{PAPER}"/>\n <defs>'.encode() + rest
+        return render(draw(), kind)
 
 
 def inline(figure: bytes, name: str, title: str) -> Markup:
@@ -158,7 +151,7 @@ def _font(found: re.Match[str]) -> str:
     return f"{weight}font-size: {found[2]}px"
 
 
-def render(figure: Figure, kind: str, ground: str = PAPER) -> bytes:
+def render(figure: Figure, kind: str) -> bytes:
     """Bytes of a figure as "svg", "pdf" or "png"; reproducible for the same figure."""
     import matplotlib as mpl  # noqa: PLC0415
 
@@ -166,7 +159,7 @@ def render(figure: Figure, kind: str, ground: str = PAPER) -> bytes:
     metadata = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
     stream = BytesIO()
     with mpl.rc_context({"svg.hashsalt": "impc"}):
-        figure.savefig(stream, format=kind, metadata=metadata.get(kind), dpi=200, facecolor=ground)
+        figure.savefig(stream, format=kind, metadata=metadata.get(kind), dpi=200, facecolor=PAPER)
     return stream.getvalue()
 
 
