@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 from impc.errors import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
@@ -105,6 +105,20 @@ def strip(ax: Axes, title: str) -> None:
     """Set the title of a panel and draw its zero line."""
     ax.set_title(title, pad=5)
     ax.axhline(0, color=RULE, linewidth=0.8, zorder=0)
+
+
+def panels(
+    signals: Sequence[tuple[str, Sequence[Any], Sequence[Any]]], step: float, label: str
+) -> Figure:
+    """Panels of signals (title, recorded, modelled) over time, one sample every `step`."""
+    figure = new_figure(HALF, 0.5 + 1.35 * len(signals))
+    axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (title, *curves) in zip(axes, signals, strict=True):
+        strip(ax, title)
+        for values, color, width in zip(curves, (RECORDED, BLUE), (4.5, 1.4), strict=True):
+            ax.plot([step * k for k in range(len(values))], values, color=color, linewidth=width)
+    axes[-1].set_xlabel(label)
+    return figure
 
 
 def plain_log(axis: Axis) -> None:

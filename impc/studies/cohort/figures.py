@@ -12,12 +12,11 @@ from impc.reporting.style import (
     HALF,
     INK,
     MUTED,
-    RECORDED,
     RULE,
     VERMILLION,
     new_figure,
+    panels,
     plain_log,
-    strip,
 )
 from impc.studies.cohort.comparison import mean_of
 from impc.studies.cohort.unit_result import LOGARITHM
@@ -91,13 +90,6 @@ def _mean(ax: Axes, ends: Array, at: float, rows: int, across: Any) -> None:
 
 def subject_figure(fit: Mapping[str, Any]) -> Figure:
     """Recorded and modelled outputs of a unit's first trial, from its stored `fit`."""
-    signals = fit["trajectory"]["signals"]
-    figure = new_figure(HALF, 0.5 + 1.35 * len(signals))
-    axes = np.ravel(figure.subplots(len(signals), 1, sharex=True, squeeze=False))
-    for ax, signal in zip(axes, signals, strict=True):
-        time = np.arange(len(signal["recorded"])) * fit["trajectory"]["dt"]
-        strip(ax, signal["label"])
-        ax.plot(time, signal["recorded"], color=RECORDED, linewidth=4.5)
-        ax.plot(time, signal["simulated"], color=BLUE)
-    axes[-1].set_xlabel("Time (s)")
-    return figure
+    run = fit["trajectory"]
+    signals = [(one["label"], one["recorded"], one["simulated"]) for one in run["signals"]]
+    return panels(signals, run["dt"], "Time (s)")
