@@ -121,17 +121,18 @@ def panels(
     return figure
 
 
-def plain_log(axis: Axis) -> None:
-    """Label a logarithmic axis whose ends are known with a few plain numbers, none overprinted."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator  # noqa: PLC0415
+def plain_log(*axes: Axis) -> None:
+    """Label logarithmic axes whose ends are known with a few plain numbers, none overprinted."""
+    from matplotlib.ticker import LogLocator, MaxNLocator  # noqa: PLC0415
 
-    low, high = axis.get_view_interval()
-    decades = math.log10(high / low)
-    subs = (1.0, 2.0, 5.0) if decades < _DECADES else (1.0,)
-    few = decades < _NO_DECADE
-    axis.set_major_locator(MaxNLocator(3) if few else LogLocator(subs=subs, numticks=5))
-    axis.minorticks_off()
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    for axis in axes:
+        low, high = axis.get_view_interval()
+        decades = math.log10(high / low)
+        subs = (1.0, 2.0, 5.0) if decades < _DECADES else (1.0,)
+        few = decades < _NO_DECADE
+        axis.set_major_locator(MaxNLocator(3) if few else LogLocator(subs=subs, numticks=5))
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.minorticks_off()
 
 
 def drawn(draw: Callable[[], Figure], kind: str) -> bytes:

@@ -178,14 +178,13 @@ def frequency_figure(result: FitResult, found: FrequencyResponse) -> Figure:
         coherence.plot(f, found.threshold, color=RULE, linestyle="--")
         coherence.set_ylim(0, 1.05)
         magnitude.set_yscale("log")
-        plain_log(magnitude.yaxis)
         words = signal_name(plant, name)
         unit = "no unit" if unit == per else f"{unit} per {per}"
         magnitude.set_title(f"{sentence_case(words)}, magnitude ({unit})")
         phase.set_title("Phase (°)")
         coherence.set_title("Coherence (no unit)")
         coherence.set_xscale("log")
-        plain_log(coherence.xaxis)
+        plain_log(magnitude.yaxis, coherence.xaxis)
         coherence.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend()
     return figure

@@ -115,8 +115,7 @@ def _trial(trials: Trials, result: Reliability) -> Figure:
         right.set_title(f"Power of {name} (({unit})²/Hz)")
         right.axvspan(result.band.low, result.band.high, color=FORBIDDEN, linewidth=0, zorder=0)
         right.loglog(frequency[inside], power[inside], ".-", color=BLUE, linewidth=0.6)
-        plain_log(right.xaxis)
-        plain_log(right.yaxis)
+        plain_log(right.xaxis, right.yaxis)
     axes[-1, -1].set_xlabel("Frequency (Hz)")
     axes[-1, 0].set_xlabel("Time (s)")
     return figure
@@ -143,8 +142,7 @@ def _responses(
             above.loglog(found.frequency, np.abs(response), **style)
             below.semilogx(found.frequency, phase, **style)
     for (above, below), name in zip(axes.T, outputs, strict=True):
-        plain_log(above.xaxis)
-        plain_log(above.yaxis)
+        plain_log(above.xaxis, above.yaxis)
         above.set_title(f"{sentence_case(name)}, magnitude ({trials.unit}/(N m))")
         below.set_title("Phase (°)")
         below.set_xlabel("Frequency (Hz)")
