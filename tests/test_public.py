@@ -18,8 +18,8 @@ from tests.documents.blocks import ROOT
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 # Libraries that are loaded for one purpose, such as a figure, a plant or a workbook.
-LATE = {"control", "cvxpy", "h5py", "matplotlib", "openpyxl", "statsmodels", "sympy"}
-HEAVY = LATE | {"casadi", "jinja2", "numba", "pandas", "pint", "scipy.linalg", "scipy.optimize",
+LATE = {"control", "cvxpy", "h5py", "jinja2", "matplotlib", "openpyxl", "statsmodels", "sympy"}
+HEAVY = LATE | {"casadi", "numba", "pandas", "pint", "scipy.linalg", "scipy.optimize",
                 "scipy.signal", "scipy.stats"}  # fmt: skip
 
 
