@@ -32,7 +32,7 @@ from experiments.two_link_peers import (
     standing_recording,
 )
 from impc.model.continuous_gain import held_gain
-from impc.reporting.style import BLUE, drawn, new_figure, on_paper
+from impc.reporting.style import BLUE, drawn, new_figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -275,9 +275,7 @@ def main() -> None:
     first, nothing = standing_recording(seeds[0], noisy=False), np.zeros((2, 4))
     zero = shooting(first, nothing)
     euler = collocation(first, nothing, midpoint=False)
-    (_FOLDER / "images/two_link_standing.svg").write_bytes(
-        on_paper(drawn(lambda _: _figure(groups), "svg"))
-    )
+    (_FOLDER / "images/two_link_standing.svg").write_bytes(drawn(lambda: _figure(groups), "svg"))
     text = _page(groups, zero, euler) + _explained(groups) + "\n" + _biases(groups)
     (_FOLDER / "two_link_standing.md").write_text(_wrapped(text), encoding="utf-8")
 

@@ -17,7 +17,10 @@ import impc
 from tests.documents.blocks import ROOT
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-HEAVY = {"casadi", "matplotlib", "numba", "numpy", "scipy"}
+# Libraries that are loaded for one purpose, such as a figure, a plant or a workbook.
+LATE = {"control", "cvxpy", "h5py", "jinja2", "matplotlib", "openpyxl", "statsmodels", "sympy"}
+HEAVY = LATE | {"casadi", "numba", "pandas", "pint", "scipy.linalg", "scipy.optimize",
+                "scipy.signal", "scipy.stats"}  # fmt: skip
 
 
 def test_there_are_at_most_sixty_names_and_each_is_there() -> None:
@@ -41,22 +44,38 @@ def test_a_type_checker_sees_the_same_names_in_the_same_modules() -> None:
     assert typed == {(name, module, name) for name, module in impc._MODULES.items()}
 
 
-def loaded(*lines: str) -> set[str]:
-    """Names of the modules that a fresh Python has after some lines."""
-    code = "\n".join((*lines, "import json, sys", "print(json.dumps(sorted(sys.modules)))"))
+def loaded(line: str) -> set[str]:
+    """Names of the modules that a fresh Python has after a line."""
+    said = "import atexit, json, sys; atexit.register(lambda: print(json.dumps([*sys.modules])))"
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return set(json.loads(done.stdout))
+        [sys.executable, "-c", f"{said}\n{line}"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
 
 
 def test_importing_it_loads_no_other_library() -> None:
-    bare, found = loaded(), loaded("import impc")
+    bare, found = loaded(""), loaded("import impc")
     assert {name for name in found - bare if name.split(".")[0] != "impc"} <= {
         name for name in found if name.split(".")[0] in sys.stdlib_module_names
     }
-    assert found.isdisjoint(HEAVY)
     assert {name for name in found if name.startswith("impc.")} == set()
+
+
+@pytest.mark.parametrize(
+    ("line", "absent"),
+    [
+        ("from impc.cli.main import main; main(['--help'])", HEAVY),
+        ("from impc.cli.main import main; main(['fit', '--help'])", HEAVY),
+        # It opens the recordings first.
+        ("from impc.cli.main import main; main('fit a.csv --plant a --config b'.split())", HEAVY),
+        ("import impc.files.reading", HEAVY),
+        ("import impc.studies.cohort.report, impc.studies.fit.report, impc.nonlinear.page", LATE),
+    ],
+)
+def test_libraries_are_loaded_where_they_are_used(line: str, absent: set[str]) -> None:
+    assert loaded(line).isdisjoint(absent)
 
 
 @pytest.mark.parametrize(

@@ -40,21 +40,6 @@ from impc.studies.example.cases import CaseResult
 from impc.studies.example.report import example_report
 
 
-@pytest.fixture(scope="module")
-def provenance() -> Provenance:
-    return Provenance("plants:yalmip_example")
-
-
-@pytest.fixture(scope="module")
-def report(case_a: CaseResult, provenance: Provenance) -> Report:
-    return example_report([case_a], provenance)
-
-
-@pytest.fixture(scope="module")
-def page(report: Report) -> str:
-    return report.page()
-
-
 def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
@@ -73,7 +58,8 @@ def without_scripts(page: str) -> str:
     return page
 
 
-def test_the_page_needs_nothing_else(page: str) -> None:
+def test_the_page_needs_nothing_else(case_a: CaseResult) -> None:
+    page = example_report([case_a], Provenance("plants:yalmip_example")).page()
     assert not re.search(
         r"https?:|fetch\(|XMLHttp|\beval|innerHTML", "".join(page.split("<script>")[1:])
     )
@@ -112,8 +98,8 @@ class Texts(HTMLParser):
         self.found.append(data)
 
 
-def hostile(narrow: bool) -> Figure:
-    figure = new_figure(4 if narrow else 6, 3)
+def hostile() -> Figure:
+    figure = new_figure(6, 3)
     ax = figure.subplots()
     ax.set_axis_off()
     ax.set_title(f"{EVIL} $x^2$")
@@ -168,8 +154,8 @@ def test_every_block_is_escaped_and_there() -> None:
     shown.feed(page)
     # Window, kind, meta, headline, sentence, 4 of the key, 3 claims, 2 to copy, section; twice 4 of
     # an alert; 2 paragraphs, 2 lines, 2 of a term, caption, sentence, 2 cells, caption of the
-    # figure, its titles and texts in two drawings, quiet, 2 of a check, 2 of a fold.
-    assert sum(text.count(EVIL) for text in shown.found) == 15 + 8 + 2 + 2 + 2 + 4 + 1 + 4 + 1 + 4
+    # figure, its title and text, quiet, 2 of a check, 2 of a fold.
+    assert sum(text.count(EVIL) for text in shown.found) == 15 + 8 + 2 + 2 + 2 + 4 + 1 + 2 + 1 + 4
     assert 'href="#in-short"' in page
     assert 'id="in-short"' in page
 
@@ -225,10 +211,8 @@ def test_no_heading_of_the_workbook_is_there_twice() -> None:
     finding = Finding("methods", table, labels=same, hidden=("held_out_vaf",))
     verdict = Verdict(Level.NOTE, "A", "b")
     files = Report("a", "A", verdict, [Section("One", [finding])]).files()
-    sheet = pd.read_excel(
-        io.BytesIO(files["tables.xlsx"]), "methods", header=None, engine="openpyxl"
-    )
-    assert sheet.iloc[0].tolist() == ["VAF (%)", "held_out_vaf"]
+    sheet = pd.read_excel(io.BytesIO(files["tables.xlsx"]), "methods", engine="openpyxl")
+    assert list(sheet.columns) == ["VAF (%)", "held_out_vaf"]
 
 
 def test_a_new_table_is_one_list_of_columns() -> None:

@@ -10,6 +10,7 @@ import click
 from impc.checking import replace
 from impc.cli.console import print_files, progress
 from impc.cli.options import out_option, page_options, subject_arguments
+from impc.cli.plant import KNOWN
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,7 +55,8 @@ def command(
     from impc.studies.fit.subject import fit_recordings, stages  # noqa: PLC0415
 
     require_writable(out)
-    if installed("impc.nonlinear") and _own_problem(files, plant_name, config, out, solver):
+    asked = files, plant_name, config, out, solver  # no known plant is an optimal control problem
+    if plant_name not in KNOWN and installed("impc.nonlinear") and _own_problem(*asked):
         return
     try:
         subject = read_subject("fit", files, plant_name, config, solver)

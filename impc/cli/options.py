@@ -84,7 +84,8 @@ def _command_name(context: click.Context) -> str:
 def subject_arguments(config: str) -> Callable[[F], F]:
     """Add FILES, --plant, --config (with the help text `config`), --solver and --yes."""
     options = (
-        click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path)),
+        click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path),
+                       callback=_recognised),
         click.option(
             "--plant",
             "plant_name",
@@ -95,8 +96,17 @@ def subject_arguments(config: str) -> Callable[[F], F]:
         click.option("--config", required=True, type=click.Path(path_type=Path), help=config),
         solver_option,
         yes_option,
-    )
+    )  # fmt: skip
     return lambda command: functools.reduce(lambda found, one: one(found), options[::-1], command)
+
+
+def _recognised(_: Context, __: Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Open all `files` before the libraries are loaded, which takes seconds."""
+    from impc.files.formats import recognised  # noqa: PLC0415
+
+    for path in files:
+        recognised(path)
+    return files
 
 
 def scheduler_options(command: F) -> F:

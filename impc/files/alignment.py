@@ -10,7 +10,7 @@ import re
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.interpolate
+import scipy
 
 from impc.errors import DataError
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.interpolate
+import scipy
 
 from impc.checking import replace
 from impc.errors import DataError, InputError

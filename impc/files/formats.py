@@ -90,10 +90,8 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
     {'t': [0.0, 0.01], 'tilt': [0.5, 0.6]}
     """
     source, path = str(path), Path(path)
-    suffix = _suffix(path, DataError)
-    head, form = _head(path, largest), FORMATS[suffix]
-    _require(source, form.begins(head), suffix, head)
-    if sheet and suffix not in _WORKBOOKS:
+    form = recognised(path, largest)
+    if sheet and path.suffix.lower() not in _WORKBOOKS:
         raise DataError(source, "has no sheets", "leave recording.sheet out")
     try:
         return form.read(path, largest, sheet) if sheet else form.read(path, largest)
@@ -105,6 +103,14 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
         ) from None
     except Exception as error:  # ValueError of our readers, anything of pandas
         raise damaged(source, error) from None
+
+
+def recognised(path: Path, largest: int = LARGEST) -> Format:
+    """Format of a file by its ending and first kilobyte; DataError if there is none."""
+    suffix = _suffix(path, DataError)
+    head, form = _head(path, largest), FORMATS[suffix]
+    _require(str(path), form.begins(head), suffix, head)
+    return form
 
 
 @checked

@@ -13,6 +13,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from impc.errors import DataError, OutputError
 from impc.files.table import make_table
@@ -75,8 +76,6 @@ def array_columns(name: str, array: Any) -> dict[str, Array] | str:
 
 def encode_matlab(table: Table) -> bytes:
     """Content of a v5 .mat file with one column vector per column; units are not stored."""
-    import scipy.io  # noqa: PLC0415  # takes a third of a second
-
     content = io.BytesIO()
     vectors = {name: values[:, None] for name, values in table.columns.items()}
     save: Any = scipy.io.savemat  # its stubs know paths only
@@ -103,7 +102,6 @@ def nested_columns(source: str, columns: Mapping[str, Array]) -> dict[str, Any]:
 
 def _variables(path: Path) -> dict[str, Any]:
     """Variables of a file by name, as scipy returns them."""
-    import scipy.io  # noqa: PLC0415  # only in the reader process
     from scipy.io.matlab import MatlabOpaque, MatReadWarning  # noqa: PLC0415
 
     with warnings.catch_warnings():
@@ -144,7 +142,6 @@ def _collect(
 
 def _unreadable(value: Any) -> str:
     """Reason why a MATLAB value is neither a numeric array nor a struct; empty if it is."""
-    import scipy.sparse  # noqa: PLC0415
     from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque  # noqa: PLC0415
 
     if isinstance(value, MatlabOpaque):

@@ -18,7 +18,7 @@ import math
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import scipy.signal
+import scipy
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

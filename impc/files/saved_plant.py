@@ -7,7 +7,6 @@ import math
 import zipfile
 from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 
 from impc.errors import ImpcError, InputError, brief
@@ -57,6 +56,8 @@ def read_matrices(path: Path) -> dict[str, Any]:
 
 def state_space(name: str, given: Mapping[str, Any]) -> Any:
     """`control.StateSpace` of the given matrices; `name` of the file, for messages."""
+    import control  # noqa: PLC0415  # a second; it imports matplotlib
+
     subject = f"plant {name}"
     unknown = [key for key in given if key not in (*_MATRICES, "dt", *_NAMES, "units")]
     if unknown:

@@ -13,7 +13,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.optimize
+import scipy
 
 if TYPE_CHECKING:
     from impc.arrays import Array, IntArray

@@ -15,8 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
+import scipy
 
 from impc.arrays import Array
 from impc.errors import InputError, PlantError

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from impc.arrays import Array, System, finite_array, frozen
 from impc.checking import Value, checked, replace

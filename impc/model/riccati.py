@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from impc.arrays import Array, Frozen, frozen, symmetric_matrix
 from impc.checking import checked

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from impc.arrays import Array, frozen
 from impc.checking import Value, checked

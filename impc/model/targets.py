@@ -16,9 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
-import scipy.signal
+import scipy
 
 from impc.arrays import Array, as_numbers
 from impc.checking import checked

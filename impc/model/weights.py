@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from impc.arrays import Array, frozen, symmetric_matrix
 from impc.checking import Value, checked, replace

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
-import scipy.stats
+import scipy
 
 from impc.arrays import Array, BoolArray, Frozen, IntArray
 

@@ -17,7 +17,7 @@ from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.shown_units import shown_as
-from impc.reporting.style import BLUE, HALF, PHONE, RECORDED, new_figure, strip
+from impc.reporting.style import panels
 from impc.reporting.verdict import Key
 
 if TYPE_CHECKING:
@@ -219,7 +219,7 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
         Picture("movement", "Recorded and modelled signals over time",
                 f"Grey: recorded; blue: model, from the first state only ({fit.trials[0]})."),
         keys,
-        {"movement": lambda narrow: _draw_movement(fit, narrow)},
+        {"movement": lambda: _draw_movement(fit)},
         Copy(methods, f"{fit.explained}. {values}.") if fit.usable
         else "There is no text to copy: no value may be reported.",
         beside=[_samples(fit), Finding("limits", limits, "Samples at a limit.")],
@@ -237,22 +237,19 @@ def _status(estimate: OptimalControlEstimate) -> Status:
     return Status.SETTLED if estimate.settled else Status.STOPPED
 
 
-def _draw_movement(fit: OptimalFit, narrow: bool) -> Figure:
+def _draw_movement(fit: OptimalFit) -> Figure:
     """Draw the first signals of the first recording over time."""
     problem, one, (x, u) = fit.estimate.problem, fit.estimate.recordings[0], fit.estimate.runs[0]
     pairs = [*zip(one.x.T, x.T, strict=True), *zip(one.u.T, u.T, strict=True)]
     names = (*problem.state_names, *problem.input_names)
-    drawn = [item for item in zip(names, pairs, strict=True) if np.any(np.isfinite(item[1][0]))]
-    figure = new_figure(PHONE if narrow else HALF, 0.6 + 1.2 * len(drawn[:_MOST_PANELS]))
-    axes = np.atleast_1d(figure.subplots(len(drawn[:_MOST_PANELS]), 1, sharex=True))
-    for ax, (name, pair) in zip(axes, drawn, strict=False):
-        factor, unit = shown_as(problem.units.get(name, "-"))
-        strip(ax, f"{sentence_case(_words(name))} ({unit})")
-        for values, color, width in zip(pair, (RECORDED, BLUE), (4.5, 1.4), strict=True):
-            time = (fit.dt or 1.0) * np.arange(len(values))
-            ax.plot(time, factor * values, color=color, linewidth=width)
-    axes[-1].set_xlabel("Sample (-)" if fit.dt is None else "Time (s)")
-    return figure
+    signals = []
+    for name, (recorded, modelled) in zip(names, pairs, strict=True):
+        if np.any(np.isfinite(recorded)):
+            factor, unit = shown_as(problem.units.get(name, "-"))
+            title = f"{sentence_case(_words(name))} ({unit})"
+            signals.append((title, factor * recorded, factor * modelled))
+    label = "Sample (-)" if fit.dt is None else "Time (s)"
+    return panels(signals[:_MOST_PANELS], fit.dt or 1.0, label)
 
 
 def _parameters(fit: OptimalFit) -> Finding:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-import scipy.sparse
+import scipy
 from scipy.sparse.linalg import splu
 
 from impc.arrays import Array, Frozen

@@ -10,19 +10,21 @@ import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from impc.files.results import SCHEMA
 from impc.files.spreadsheet import workbook_bytes
 from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
-from impc.reporting.style import drawn, inline, on_paper
+from impc.reporting.style import drawn, inline
 from impc.reporting.verdict import Alert, Key, Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,8 @@ class Copy:
     results: str
 
 
-#: Function that draws a figure; True: narrow version for phones.
-Draw = Callable[[bool], Figure]
+#: Function that draws a figure.
+Draw = Callable[[], "Figure"]
 
 
 @dataclass(frozen=True)
@@ -125,13 +127,11 @@ class Report:
 
     def picture(self, shown: Picture) -> Markup:
         """Inline SVG of a figure."""
-        draw = self.figures[shown.name]
-        narrow = drawn(draw, "svg", narrow=True) if shown.phone else None
-        return inline(self._wide[shown.name], narrow, shown.name, shown.alternative)
+        return inline(self._drawn[shown.name], shown.name, shown.alternative)
 
     @functools.cached_property
-    def _wide(self) -> dict[str, bytes]:
-        """Wide figures, drawn once for page and files."""
+    def _drawn(self) -> dict[str, bytes]:
+        """Figures, drawn once for page and files."""
         return {name: drawn(draw, "svg") for name, draw in self.figures.items()}
 
     def findings(self) -> list[Finding]:
@@ -160,7 +160,7 @@ class Report:
         }
         found = {item.name: item.data() for item in self.findings()}
         own = {"schema": SCHEMA, **self.provenance.data(), "verdict": self.verdict.data()}
-        figures = {f"figures/{name}.svg": on_paper(svg) for name, svg in self._wide.items()}
+        figures = {f"figures/{name}.svg": svg for name, svg in self._drawn.items()}
         if pdf:
             figures |= {
                 f"figures/{name}.pdf": drawn(draw, "pdf") for name, draw in self.figures.items()

@@ -39,7 +39,6 @@ class Picture:
     name: str  # Key among the report's figures
     alternative: str  # Text alternative for screen readers
     caption: str
-    phone: bool = True  # Whether there is a narrow version for phones
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from impc.reporting.glossary import Glossary
@@ -32,6 +31,8 @@ _ICONS = {
 
 def render_page(report: object, charts: bool) -> str:
     """Render the page of a `document.Report` by the template; all texts are escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
+
     environment = Environment(
         loader=FileSystemLoader(_HERE),
         autoescape=True,

@@ -1,7 +1,7 @@
 """Style of figures, and conversion to SVG for light mode, dark mode and print.
 
 In the SVG of a page each colour is replaced by the CSS variable of the same colour in style.css. No
-meaning depends on colour alone.
+meaning depends on colour alone. matplotlib is imported when the first figure is drawn.
 """
 
 from __future__ import annotations
@@ -12,20 +12,17 @@ from contextlib import contextmanager
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 from markupsafe import Markup, escape
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
-from matplotlib.ticker import FixedFormatter, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from impc.errors import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
     from matplotlib.ticker import Formatter
 
 #: Colours of text and axes; of secondary items; of grid lines; of the background.
@@ -46,8 +43,8 @@ _VARIABLES = {
     GREEN: "ok",
 }
 
-#: Width in inches of a figure over the whole page, next to text, and on a phone.
-WIDE, HALF, PHONE = 11.0, 7.2, 4.0
+#: Width in inches of a figure over the whole page, and next to text.
+WIDE, HALF = 11.0, 7.2
 
 # Decades of a logarithmic axis below which 1, 2 and 5 are labelled, and below which 1, 2 and 5 are
 # too far apart.
@@ -80,7 +77,6 @@ _RC: dict[Any, Any] = {
     "path.simplify_threshold": 0.3,
     "figure.facecolor": "none",
     "axes.facecolor": "none",
-    "savefig.facecolor": "none",
     # Override the user's settings for figures without a layout engine.
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,
@@ -90,6 +86,8 @@ _RC: dict[Any, Any] = {
 @contextmanager
 def page_style() -> Iterator[None]:
     """Apply the style inside the block and restore matplotlib's settings afterwards."""
+    import matplotlib as mpl  # noqa: PLC0415
+
     with mpl.rc_context():
         mpl.rcdefaults()  # drop the user's settings: text.usetex fails if TeX is missing
         mpl.rcParams.update(_RC)
@@ -98,9 +96,9 @@ def page_style() -> Iterator[None]:
 
 def new_figure(width: float, height: float) -> Figure:
     """Return a figure outside pyplot; width and height in inches."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def strip(ax: Axes, title: str) -> None:
@@ -109,38 +107,43 @@ def strip(ax: Axes, title: str) -> None:
     ax.axhline(0, color=RULE, linewidth=0.8, zorder=0)
 
 
-def plain_log(axis: Axis) -> None:
-    """Label a logarithmic axis whose ends are known with a few plain numbers, none overprinted."""
-    low, high = axis.get_view_interval()
-    decades = math.log10(high / low)
-    subs = (1.0, 2.0, 5.0) if decades < _DECADES else (1.0,)
-    few = decades < _NO_DECADE
-    axis.set_major_locator(MaxNLocator(4) if few else LogLocator(subs=subs, numticks=5))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+def panels(
+    signals: Sequence[tuple[str, Sequence[Any], Sequence[Any]]], step: float, label: str
+) -> Figure:
+    """Panels of signals (title, recorded, modelled) over time, one sample every `step`."""
+    figure = new_figure(HALF, 0.5 + 1.35 * len(signals))
+    axes = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (title, *curves) in zip(axes, signals, strict=True):
+        strip(ax, title)
+        for values, color, width in zip(curves, (RECORDED, BLUE), (4.5, 1.4), strict=True):
+            ax.plot([step * k for k in range(len(values))], values, color=color, linewidth=width)
+    axes[-1].set_xlabel(label)
+    return figure
 
 
-def drawn(draw: Callable[[bool], Figure], kind: str, *, narrow: bool = False) -> bytes:
-    """Figure as a "svg" or "pdf" file, without date or program name; the svg is transparent."""
+def plain_log(*axes: Axis) -> None:
+    """Label logarithmic axes whose ends are known with a few plain numbers, none overprinted."""
+    from matplotlib.ticker import LogLocator, MaxNLocator  # noqa: PLC0415
+
+    for axis in axes:
+        low, high = axis.get_view_interval()
+        decades = math.log10(high / low)
+        subs = (1.0, 2.0, 5.0) if decades < _DECADES else (1.0,)
+        few = decades < _NO_DECADE
+        axis.set_major_locator(MaxNLocator(3) if few else LogLocator(subs=subs, numticks=5))
+        axis.set_major_formatter(lambda value, _: f"{value:g}")
+        axis.minorticks_off()
+
+
+def drawn(draw: Callable[[], Figure], kind: str) -> bytes:
+    """Figure as a "svg" or "pdf" file, without date or program name."""
     with page_style():
-        return render(draw(narrow), kind, ground="none" if kind == "svg" else PAPER)
+        return render(draw(), kind)
 
 
-def on_paper(svg: bytes) -> bytes:
-    """Figure of `drawn` on a white ground, for viewers with a dark one."""
-    head, _, rest = svg.partition(b"<defs>")
-    return head + f'<rect width="100%" height="100%" fill="{PAPER}"/>\n <defs>'.encode() + rest
-
-
-def inline(wide: bytes, narrow: bytes | None, name: str, title: str) -> Markup:
-    """Inline SVG of a figure as `drawn`, and of a narrow version, between which CSS chooses."""
+def inline(figure: bytes, name: str, title: str) -> Markup:
+    """Inline SVG of a figure as `drawn`."""
     name = re.sub(r"\W+", "-", name)  # in ids of the page
-    if narrow is None:
-        return _svg(wide, f"{name}-w", title, "")
-    return _svg(wide, f"{name}-w", title, "w") + _svg(narrow, f"{name}-n", title, "n")
-
-
-def _svg(figure: bytes, name: str, title: str, kind: str) -> Markup:
     text = figure.decode()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text, flags=re.DOTALL)
@@ -149,13 +152,13 @@ def _svg(figure: bytes, name: str, title: str, kind: str) -> Markup:
     text = re.sub(r"font: (?:(\d+) )?([\d.]+)px [^;\"]+", _font, text)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, f"var(--{variable})")
-    head = (
-        rf'<svg class="{kind}" viewBox="\1" role="img" aria-labelledby="{name}-title">'
-        f'<title id="{name}-title">{{}}</title>'
-    )
     first, _, rest = text.partition(">")
-    first = re.sub(r'<svg [^>]*viewBox="([^"]+)".*', head, first, flags=re.DOTALL)
-    return Markup(first.replace("{}", str(escape(title))) + re.sub(r"\n\s*", "\n", rest))
+    box = re.findall(r'viewBox="([\d. ]+)"', first)[0]
+    head = (
+        f'<svg viewBox="{box}" style="--width: {box.split()[2]}" role="img" '
+        f'aria-labelledby="{name}-title"><title id="{name}-title">{escape(title)}</title>'
+    )
+    return Markup(head + re.sub(r"\n\s*", "\n", rest))
 
 
 def _font(found: re.Match[str]) -> str:
@@ -163,18 +166,23 @@ def _font(found: re.Match[str]) -> str:
     return f"{weight}font-size: {found[2]}px"
 
 
-def render(figure: Figure, kind: str, ground: str = PAPER) -> bytes:
+def render(figure: Figure, kind: str) -> bytes:
     """Bytes of a figure as "svg", "pdf" or "png"; reproducible for the same figure."""
+    import matplotlib as mpl  # noqa: PLC0415
+
     _set_literally(figure)
     metadata = {"svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
     stream = BytesIO()
     with mpl.rc_context({"svg.hashsalt": "impc"}):
-        figure.savefig(stream, format=kind, metadata=metadata.get(kind), dpi=200, facecolor=ground)
+        figure.savefig(stream, format=kind, metadata=metadata.get(kind), dpi=200, facecolor=PAPER)
     return stream.getvalue()
 
 
 def _set_literally(figure: Figure) -> None:
     """Disable mathematical markup in all texts except matplotlib's own tick labels."""
+    from matplotlib.text import Text  # noqa: PLC0415
+    from matplotlib.ticker import FixedFormatter, FuncFormatter  # noqa: PLC0415
+
     numbers: set[Text] = set()
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):

@@ -117,6 +117,6 @@ def _document(fit: MethodFit) -> Report:
         beside=page.beside[2:],
         meta=(label, *page.meta[2:]),
         hero=_PICTURE,
-        figures={"trial-1": lambda narrow: movement_figure(fit, 0, narrow)},
+        figures={"trial-1": lambda: movement_figure(fit, 0)},
         data={**page.data, "starts": problem.starts, "logarithms": problem.logarithms},
     )

@@ -6,20 +6,19 @@ import itertools
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from impc.assess.assessments import ASSESSMENTS
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.style import (
     BLUE,
     FORBIDDEN,
+    HALF,
     INK,
     MUTED,
-    PHONE,
     RULE,
     VERMILLION,
-    WIDE,
     new_figure,
+    plain_log,
 )
 from impc.studies.methods_table import method_label
 
@@ -75,24 +74,18 @@ def largest_commands(fit: MethodFit) -> tuple[float, float, str]:
     return factor * float(fit.largest_input[0]), factor * float(limits[0]), label
 
 
-def methods_figure(fits: Sequence[MethodFit], narrow: bool, width: float = WIDE) -> Figure:
+def methods_figure(fits: Sequence[MethodFit]) -> Figure:
     """Unexplained variance of each output (dots, log axis) and largest command (bars)."""
     shown = by_score(fits)
-    height = 0.9 + (0.55 if narrow else 0.42) * len(shown)
-    figure = new_figure(PHONE if narrow else width, 2 * height if narrow else height)
-    shape = (2, 1) if narrow else (1, 2)
-    left, right = figure.subplots(*shape, width_ratios=None if narrow else (1.5, 1))
-    labels = [method_label(fit.name) for fit in shown]
+    figure = new_figure(HALF, 0.9 + 0.42 * len(shown))
+    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    left.set_yticks(range(len(shown)), [method_label(fit.name) for fit in shown])
+    right.set_yticks([])
     for ax in (left, right):
         ax.set_ylim(len(shown) - 0.4, -0.6)
-        named = ax is left and not narrow
-        ax.set_yticks(range(len(shown)), labels if named else [""] * len(shown))
         ax.tick_params(axis="y", length=0, labelcolor=INK)
-        for row, label in enumerate(labels if narrow else ()):
-            place = ax.get_yaxis_transform()
-            ax.text(0.01, row - 0.35, label, transform=place, va="center", fontsize=9.5)
     _unexplained(left, shown)
-    _commands(right, shown, 0.3 if narrow else 0.42)
+    _commands(right, shown)
     if len(shown[0].estimate.problem.plant.outputs) > 1:
         figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4)
     return figure
@@ -116,12 +109,11 @@ def _unexplained(ax: Axes, fits: Sequence[MethodFit]) -> None:
         missing = "no prediction" if np.any(np.isnan(left[row])) else ""
         text = missing if np.isnan(fell) else f"stops at {fell:.1f} s"
         ax.text(0.02, row, text, transform=ax.get_yaxis_transform(), va="center", color=MUTED)
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.xaxis.set_minor_locator(NullLocator())
+    plain_log(ax.xaxis)
     ax.set_title("Variance not explained (%)", pad=18)
 
 
-def _commands(ax: Axes, fits: Sequence[MethodFit], thick: float) -> None:
+def _commands(ax: Axes, fits: Sequence[MethodFit]) -> None:
     rows = [largest_commands(fit) for fit in fits]
     limit, label = rows[0][1:]
     sizes = {k: row[0] for k, row in enumerate(rows) if np.isnan(first_fall(fits[k]))}
@@ -131,8 +123,8 @@ def _commands(ax: Axes, fits: Sequence[MethodFit], thick: float) -> None:
         ax.axvline(limit, color=VERMILLION, linewidth=1, linestyle="--")
         ax.text(limit, -0.55, " beyond the limit", color=VERMILLION, va="bottom", fontsize=10)
     for row, size in sizes.items():
-        ax.barh(row, size, thick, color=_colour(fits[row]), linewidth=0)
+        ax.barh(row, size, 0.42, color=_colour(fits[row]), linewidth=0)
         ax.annotate(f"{size:.3g}", (size, row), (5, 0), textcoords="offset points", va="center")
     ax.set_xlim(0, end)
-    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.locator_params(axis="x", nbins=4)
     ax.set_title(label, pad=18)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import casadi as ca
-import control
 import numpy as np
 
 from impc.control.body_steps import next_state, slopes_along
@@ -64,6 +63,8 @@ def compile_filter() -> None:
 
 def _cart(body: ca.Function | None = None) -> tuple[Controller, Scenario]:
     """A controlled cart, and a scenario in which its command reaches the limit."""
+    import control  # noqa: PLC0415  # takes a second
+
     system = control.ss(
         [[1, 0.1], [0, 1]],
         [[0, 0], [0.1, 0.1]],

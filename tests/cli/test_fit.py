@@ -158,7 +158,7 @@ def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None
     shown = re.sub("<[^>]*>", "", shown)
     for path in (fitted[1] / "figures").glob("*.svg"):
         assert path.stat().st_size > 5_000
-        assert f'id="{path.stem}-w-title"' in page
+        assert f'id="{path.stem}-title"' in page
     assert len(page) < 800_000
     assert not (fitted[1] / "fit-in-progress").exists()
     assert max(map(len, fitted[0].stdout.splitlines())) <= 100

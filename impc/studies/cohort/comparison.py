@@ -32,8 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
-import scipy.stats
-from statsmodels.stats.meta_analysis import combine_effects, effectsize_smd
+import scipy
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.several_tests import holm
@@ -106,6 +105,8 @@ def weighted_mean(given: pd.Series[float], squares: pd.Series[float]) -> Mean:
 
     Squares of zero give equal shares.
     """
+    from statsmodels.stats.meta_analysis import combine_effects  # noqa: PLC0415  # a second
+
     known = np.isfinite(given)
     values, variances = np.asarray(given[known]), np.asarray(squares[known])
     n = len(values)
@@ -220,6 +221,8 @@ def difference_of(units: pd.DataFrame, asked: Comparison, reference: str) -> Com
 
 def t_test(asked: Comparison, means: Sequence[Mean]) -> Comparison:
     """t-test of the difference between two means (the second minus the first), or of one mean."""
+    from statsmodels.stats.meta_analysis import effectsize_smd  # noqa: PLC0415  # a second
+
     squares = np.array([mean.error**2 for mean in means])
     notes = [mean.lacks for mean in means if mean.lacks]
     if notes or not squares.any():

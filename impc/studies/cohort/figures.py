@@ -12,12 +12,11 @@ from impc.reporting.style import (
     HALF,
     INK,
     MUTED,
-    PHONE,
-    RECORDED,
     RULE,
     VERMILLION,
     new_figure,
-    strip,
+    panels,
+    plain_log,
 )
 from impc.studies.cohort.comparison import mean_of
 from impc.studies.cohort.unit_result import LOGARITHM
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 _NAMED = 45  # Largest number of rows with names of subjects
 
 
-def forest(cohort: Cohort, narrow: bool) -> Figure:
+def forest(cohort: Cohort) -> Figure:
     """Forest plot: one row per unit with its interval, and the mean of each group or visit."""
     lead, units = cohort.lead, cohort.units.join(cohort.ends).assign(far=cohort.far)
     label = lead.question if lead is not None and lead.question in units else "group"
@@ -43,7 +42,7 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
         units = units[units["condition"] == lead.condition]
     blocks = units.sort_values("value", ascending=False).groupby(label)
     rows = len(units) + len(blocks)
-    figure = new_figure(PHONE if narrow else HALF, float(np.clip(0.9 + 0.16 * rows, 2.6, 6.4)))
+    figure = new_figure(HALF, float(np.clip(0.9 + 0.16 * rows, 2.6, 6.4)))
     ax, at = figure.subplots(), 0.0
     if cohort.measure.startswith(LOGARITHM):
         ax.set_xscale("log")
@@ -52,6 +51,8 @@ def forest(cohort: Cohort, narrow: bool) -> Figure:
     low, high = ax.xaxis.get_transform().transform([seen.min(), seen.max()])
     pad = 0.6 * (high - low) or 1.0  # wider intervals are cut off
     ax.set_xlim(*ax.xaxis.get_transform().inverted().transform([low - pad, high + pad]))
+    if ax.get_xscale() == "log":
+        plain_log(ax.xaxis)
     across: Any = {"transform": ax.get_yaxis_transform(), "va": "center"}
     for block, part in blocks:
         title = f"{label.capitalize()} {block!s}" if block else "All people"
@@ -87,17 +88,8 @@ def _mean(ax: Axes, ends: Array, at: float, rows: int, across: Any) -> None:
     ax.text(1, at, f"mean {number(value)} ({between(low, high)})", ha="right", **across)
 
 
-def subject_figure(fit: Mapping[str, Any], narrow: bool) -> Figure:
+def subject_figure(fit: Mapping[str, Any]) -> Figure:
     """Recorded and modelled outputs of a unit's first trial, from its stored `fit`."""
-    signals = fit["trajectory"]["signals"]
-    kept = slice(len(signals[0]["recorded"]) // (3 if narrow else 1))
-    figure = new_figure(PHONE if narrow else HALF, 0.5 + 1.35 * len(signals))
-    axes = np.ravel(figure.subplots(len(signals), 1, sharex=True, squeeze=False))
-    for ax, signal in zip(axes, signals, strict=True):
-        recorded, simulated = signal["recorded"][kept], signal["simulated"][kept]
-        time = np.arange(len(recorded)) * fit["trajectory"]["dt"]
-        strip(ax, signal["label"])
-        ax.plot(time, recorded, color=RECORDED, linewidth=4.5)
-        ax.plot(time, simulated, color=BLUE)
-    axes[-1].set_xlabel("Time (s)")
-    return figure
+    run = fit["trajectory"]
+    signals = [(one["label"], one["recorded"], one["simulated"]) for one in run["signals"]]
+    return panels(signals, run["dt"], "Time (s)")

@@ -11,7 +11,6 @@ from impc.inverse.estimates import Status
 from impc.reporting.document import Block, Check, Checks, Copy, Fold, Report, Section
 from impc.reporting.finding import Chart, Finding, Level, Picture
 from impc.reporting.rendering import number, sentence_case
-from impc.reporting.style import HALF
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
 from impc.studies.compare.verdict import RULES, Facts, name_of, needed, share
@@ -77,7 +76,7 @@ def compare_report(
             "axis)." + (" Blue: stays within the limit. Shaded: beyond it." if facts.limit else ""),
         ),
         keys=_keys(facts),
-        figures={"comparison": lambda narrow: methods_figure(compared, narrow, HALF)},
+        figures={"comparison": lambda: methods_figure(compared)},
         copy=verdict.sentence if verdict.level is Level.RED else _copy(facts, count),
         beside=[*controller_findings(compared), Finding("trajectories", sway, "Row: one sample.")],
         data=problem_data(problem, compared),

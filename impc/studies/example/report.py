@@ -13,7 +13,6 @@ from impc.model.weights import condition_number
 from impc.reporting.document import Block, Draw, Fold, Lines, Report, Section
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.style import HALF
 from impc.reporting.verdict import Key, Verdict
 from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights
 from impc.studies.fit.figures import movement_figure
@@ -68,7 +67,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     first = cases[0]
     figures: dict[str, Draw] = {}
     for case in cases:
-        figures[_name(case)] = partial(methods_figure, case.methods, width=HALF)
+        figures[_name(case)] = partial(methods_figure, case.methods)
         figures |= {_name(case, one): partial(movement_figure, case.method(one), 0)
                     for one in _DRAWN}  # fmt: skip
     return Report(

@@ -1,11 +1,10 @@
-"""Figures of a fit; `narrow` selects the version for phones."""
+"""Figures of a fit."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, NullLocator
 
 from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
@@ -15,12 +14,12 @@ from impc.reporting.style import (
     HALF,
     INK,
     MUTED,
-    PHONE,
     RECORDED,
     RULE,
     VERMILLION,
     WIDE,
     new_figure,
+    plain_log,
     strip,
 )
 
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from impc.model.bounds import Bounds
     from impc.studies.fit.result import FitResult
 
-_WINDOW, _PHONE_WINDOW = 10.0, 6.0  # s
+_WINDOW = 10.0  # s
 _LAGS = 1.0  # Largest lag of the autocorrelation, s
 # Largest number of signals of each kind; the interactive part shows all.
 _MOST = 3
@@ -42,14 +41,14 @@ _MOST_STATEMENTS = 12
 _POINT = 0.01
 
 
-def movement_figure(fit: MethodFit, index: int, narrow: bool) -> Figure:
+def movement_figure(fit: MethodFit, index: int) -> Figure:
     """Part of a trial: recorded and modelled outputs, and commands with their limits."""
     plant, trial = fit.estimate.problem.plant, fit.estimate.problem.recordings[index]
     run, bounds = fit.runs[index], _bounds(fit)
-    window = shown_window(fit, index, _PHONE_WINDOW if narrow else _WINDOW)
+    window = shown_window(fit, index)
     outputs, controls = plant.outputs[:_MOST], plant.controls[:_MOST]
     rows = len(outputs) + len(controls)
-    figure = new_figure(PHONE if narrow else HALF, 0.6 + 1.35 * rows)
+    figure = new_figure(HALF, 0.6 + 1.35 * rows)
     axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
     time = np.arange(window.start, window.stop) * plant.dt
     modelled = run.x @ plant.C.T
@@ -109,11 +108,11 @@ def _command(ax: Axes, fit: MethodFit, index: int, column: int, window: slice) -
     ax.set_ylim(-top, top)
 
 
-def shown_window(fit: MethodFit, index: int, seconds: float) -> slice:
+def shown_window(fit: MethodFit, index: int) -> slice:
     """Samples of a trial to draw: the window with most samples at the limit."""
     problem = fit.estimate.problem
     run, samples = fit.runs[index], problem.recordings[index].samples
-    length = min(round(seconds / problem.plant.dt), samples)
+    length = min(round(_WINDOW / problem.plant.dt), samples)
     high = np.asarray(problem.bounds.u_max)
     at = np.any(np.abs(run.u) >= (1 - 1e-6) * np.where(np.isfinite(high), high, np.inf), axis=1)
     counts = np.convolve(at.astype(float), np.ones(length), "valid")
@@ -121,7 +120,7 @@ def shown_window(fit: MethodFit, index: int, seconds: float) -> slice:
     return slice(max(first, 0), max(first, 0) + length)
 
 
-def residual_figure(fit: MethodFit, narrow: bool) -> Figure:
+def residual_figure(fit: MethodFit) -> Figure:
     """Residuals of the first output in each trial, and their autocorrelation."""
     plant, trials = fit.estimate.problem.plant, fit.estimate.problem.recordings
     factor, unit = shown_unit(plant, plant.outputs[0])
@@ -129,7 +128,7 @@ def residual_figure(fit: MethodFit, narrow: bool) -> Figure:
         factor * (trial.corrected - run.x @ plant.C.T)[:, 0]
         for trial, run in zip(trials, fit.runs, strict=True)
     ][:_MOST]
-    figure = new_figure(PHONE if narrow else 5.4, 3.5)
+    figure = new_figure(HALF, 3.5)
     above, below = figure.subplots(2, 1)
     name = signal_name(plant, plant.outputs[0])
     strip(above, f"{sentence_case(name)}, recorded minus model ({unit})")
@@ -151,21 +150,11 @@ def residual_figure(fit: MethodFit, narrow: bool) -> Figure:
     return figure
 
 
-def _plain_log(ax: Axes, axis: str) -> None:
-    """Label a logarithmic axis with plain numbers instead of powers."""
-    one = ax.yaxis if axis == "y" else ax.xaxis
-    one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    if len(one.get_majorticklocs()) > 3:
-        one.set_minor_locator(NullLocator())
-    else:
-        one.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def frequency_figure(result: FitResult, found: FrequencyResponse, narrow: bool) -> Figure:
+def frequency_figure(result: FitResult, found: FrequencyResponse) -> Figure:
     """Magnitude, phase and coherence: recorded as points, modelled as lines."""
     plant = result.given.plant
-    outputs = plant.outputs[: 1 if narrow else 2]
-    figure = new_figure(PHONE if narrow else WIDE, 5.4)
+    outputs = plant.outputs[:2]
+    figure = new_figure(WIDE, 5.4)
     axes = figure.subplots(3, len(outputs), sharex=True, squeeze=False, height_ratios=[2, 2, 1.2])
     drive, _ = shown_unit(plant, found.signal)
     for column, name in enumerate(outputs):
@@ -189,24 +178,23 @@ def frequency_figure(result: FitResult, found: FrequencyResponse, narrow: bool) 
         coherence.plot(f, found.threshold, color=RULE, linestyle="--")
         coherence.set_ylim(0, 1.05)
         magnitude.set_yscale("log")
-        _plain_log(magnitude, "y")
         words = signal_name(plant, name)
         unit = "no unit" if unit == per else f"{unit} per {per}"
         magnitude.set_title(f"{sentence_case(words)}, magnitude ({unit})")
         phase.set_title("Phase (°)")
         coherence.set_title("Coherence (no unit)")
         coherence.set_xscale("log")
-        _plain_log(coherence, "x")
+        plain_log(magnitude.yaxis, coherence.xaxis)
         coherence.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend()
     return figure
 
 
-def statements_figure(result: FitResult, narrow: bool) -> Figure:
+def statements_figure(result: FitResult) -> Figure:
     """Range of each difference in cost over all weights with the fitted gain."""
     plant = result.given.plant
     shown = sorted(result.compared, key=lambda item: not item.made)[:_MOST_STATEMENTS]
-    figure = new_figure(PHONE if narrow else WIDE, 1.4 + (0.5 if narrow else 0.3) * len(shown))
+    figure = new_figure(WIDE, 1.4 + 0.3 * len(shown))
     ax = figure.subplots()
     ends = np.array([[item.low, item.high] for item in shown])
     reach = 1.5 * float(np.max(np.abs(ends[np.isfinite(ends)]), initial=1.0))
@@ -221,23 +209,19 @@ def statements_figure(result: FitResult, narrow: bool) -> Figure:
         ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt",
                 marker="|" if high - low < _POINT * reach else "", markersize=12,
                 markeredgewidth=3)  # fmt: skip
-        if narrow:  # label above the bar for lack of space
-            ax.text(0, row - 0.22, labels[-1], transform=ax.get_yaxis_transform(), va="bottom",
-                    fontsize=10)  # fmt: skip
     ax.axvline(0, color=INK, linewidth=1)
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
     ax.set_xlim(-reach, reach)
     most = int(np.log10(reach))
-    powers = [10.0**k for k in range(0, most + 1, max(1, -(-most // (2 if narrow else 4))))]
+    powers = [10.0**k for k in range(0, most + 1, max(1, -(-most // 4)))]
     ticks = [*(-one for one in powers[::-1]), 0.0, *powers]
     ax.set_xticks(ticks, [f"{one:g}".replace("-", "\u2212") for one in ticks])
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.set_yticks(range(len(shown)), [""] * len(shown) if narrow else labels)
+    ax.xaxis.minorticks_off()
+    ax.set_yticks(range(len(shown)), labels)
     ax.tick_params(axis="y", length=0, labelcolor=INK)
-    ax.set_ylim(len(shown) - 0.4, -0.9 if narrow else -0.7)
+    ax.set_ylim(len(shown) - 0.4, -0.7)
     ax.spines["left"].set_visible(False)
-    words = "less  \u2190   \u2192  more" if narrow else "first costs less  \u2190   \u2192  more"
+    words = "first costs less  \u2190   \u2192  more"
     ax.text(0, 1.01, words, transform=ax.get_xaxis_transform(), ha="center", color=MUTED)
-    ax.set_xlabel("Difference (in costs of the first)" if narrow else
-                  "How much more the first costs (in multiples of its own cost)")  # fmt: skip
+    ax.set_xlabel("How much more the first costs (in multiples of its own cost)")
     return figure

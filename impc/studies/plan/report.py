@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.ticker import NullLocator
 
 from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import Block, Checks, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.shown_units import shown_unit
-from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, PHONE, RULE, new_figure, plain_log
+from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, RULE, new_figure, plain_log
 from impc.studies.fit.facts import one_of
 from impc.studies.plan.designs import gain_places, relative_errors
 from impc.studies.plan.sentences import (
@@ -73,16 +72,16 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
         ),
         hero=_TRIALS,
         keys=plan_keys(plan),
-        figures={"trials": lambda narrow: _trials_figure(plan, narrow)},
+        figures={"trials": lambda: _trials_figure(plan)},
         copy=plan_copy(plan),
         data=_data(plan),
         provenance=provenance,
     )
 
 
-def _trials_figure(plan: Plan, narrow: bool) -> Figure:
+def _trials_figure(plan: Plan) -> Figure:
     """Half width of each interval over the number of trials."""
-    figure = new_figure(PHONE if narrow else HALF, 3.6)
+    figure = new_figure(HALF, 3.6)
     ax = figure.subplots()
     counts, sides = widths(plan)
     shares = np.clip(100 * sides, 1e-3, None)
@@ -107,7 +106,7 @@ def _trials_figure(plan: Plan, narrow: bool) -> Figure:
                 color=MUTED)  # fmt: skip
     ax.set_xscale("log")
     ax.set_xticks(counts, [f"{count:g}" for count in counts], minor=False)
-    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.minorticks_off()
     ax.set_yscale("log")
     ax.set_ylim(math.exp(low), math.exp(high))
     plain_log(ax.yaxis)

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.optimize
-import scipy.signal
+import scipy
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED

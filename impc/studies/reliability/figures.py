@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.signal
+import scipy
 
 from impc.reporting.rendering import sentence_case
 from impc.reporting.style import (
@@ -17,11 +17,11 @@ from impc.reporting.style import (
     HALF,
     INK,
     MUTED,
-    PHONE,
     RULE,
     VERMILLION,
     WIDE,
     new_figure,
+    plain_log,
     strip,
 )
 from impc.studies.reliability.verdict import BANDS
@@ -51,10 +51,10 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
     return found
 
 
-def _icc(result: Reliability, narrow: bool) -> Figure:
+def _icc(result: Reliability) -> Figure:
     """All ICCs with their intervals over the bands from poor to excellent."""
-    items = [item for item in result.known if item.measure == "rms" or not narrow]
-    figure = new_figure(PHONE if narrow else HALF, 0.9 + 0.29 * len(items))
+    items = result.known
+    figure = new_figure(HALF, 0.9 + 0.29 * len(items))
     ax, labels, name = figure.subplots(), [], ""
     least = -0.5 if min(item.icc.low for item in items) < 0 else 0.0
     ends = [least, *(most for most, _ in BANDS[:-1]), 1.0]
@@ -62,7 +62,7 @@ def _icc(result: Reliability, narrow: bool) -> Figure:
         if place % 2 == 0:
             ax.axvspan(low, high, color=RULE, alpha=0.55, linewidth=0, zorder=0)
         ax.text((max(low, 0.0) + high) / 2, -0.9, BANDS[place][1], ha="center", color=MUTED,
-                fontsize=8.5 if narrow else 10)  # fmt: skip
+                fontsize=10)  # fmt: skip
     for at, item in enumerate(items):
         color, marker = (BLUE, "o") if item.measure == "rms" else (MUTED, "s")
         value, low, high = np.clip(item.icc[:3], least, 1.0)
@@ -78,12 +78,12 @@ def _icc(result: Reliability, narrow: bool) -> Figure:
     return figure
 
 
-def _bland_altman(result: Reliability, narrow: bool) -> Figure:
+def _bland_altman(result: Reliability) -> Figure:
     """Difference of last and first visit over their mean, one dot per person."""
     items = [item for item in result.known if item.measure == "rms"]
-    columns = 2 if narrow else max(len(result.conditions), 2)
+    columns = max(len(result.conditions), 2)
     rows = -(-len(items) // columns)
-    figure = new_figure(PHONE if narrow else WIDE, 0.5 + 1.7 * rows)
+    figure = new_figure(WIDE, 0.5 + 1.7 * rows)
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False, sharey="row"))
     for ax in axes[len(items) :]:
         ax.set_visible(False)
@@ -98,7 +98,7 @@ def _bland_altman(result: Reliability, narrow: bool) -> Figure:
     return figure
 
 
-def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
+def _trial(trials: Trials, result: Reliability) -> Figure:
     """Perturbation and outputs of one trial over time, and their power spectra."""
     torque, outputs = next(iter(trials.cells.values()))[0]
     signals = [("perturbation torque", torque, "N m")]
@@ -115,17 +115,18 @@ def _trial(trials: Trials, result: Reliability, _narrow: bool) -> Figure:
         right.set_title(f"Power of {name} (({unit})²/Hz)")
         right.axvspan(result.band.low, result.band.high, color=FORBIDDEN, linewidth=0, zorder=0)
         right.loglog(frequency[inside], power[inside], ".-", color=BLUE, linewidth=0.6)
+        plain_log(right.xaxis, right.yaxis)
     axes[-1, -1].set_xlabel("Frequency (Hz)")
     axes[-1, 0].set_xlabel("Time (s)")
     return figure
 
 
 def _responses(
-    trials: Trials, result: Reliability, cells: dict[str, tuple[str, str, str]], narrow: bool
+    trials: Trials, result: Reliability, cells: dict[str, tuple[str, str, str]]
 ) -> Figure:
     """Magnitude and phase of the averaged responses of up to four cells."""
-    outputs = list(trials.outputs.values())[: 1 if narrow else None]
-    figure = new_figure(PHONE if narrow else WIDE, 3.4)
+    outputs = list(trials.outputs.values())
+    figure = new_figure(WIDE, 3.4)
     axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False)
     for (color, line), (label, key) in zip(_LINES, cells.items(), strict=False):
         found = result.responses.get(key)
@@ -141,6 +142,7 @@ def _responses(
             above.loglog(found.frequency, np.abs(response), **style)
             below.semilogx(found.frequency, phase, **style)
     for (above, below), name in zip(axes.T, outputs, strict=True):
+        plain_log(above.xaxis, above.yaxis)
         above.set_title(f"{sentence_case(name)}, magnitude ({trials.unit}/(N m))")
         below.set_title("Phase (°)")
         below.set_xlabel("Frequency (Hz)")

@@ -32,7 +32,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy
 
 from impc.arrays import Array, frozen, percentiles
 from impc.errors import DataError

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.optimize
+import scipy
 
 from impc.arrays import Array, Frozen, IntArray, frozen
 from impc.assess.covariance import TWO_SIDED

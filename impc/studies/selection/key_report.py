@@ -11,7 +11,7 @@ from impc.reporting.document import Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
-from impc.reporting.style import BLUE, HALF, MUTED, PAPER, PHONE, new_figure
+from impc.reporting.style import BLUE, HALF, MUTED, PAPER, new_figure
 from impc.reporting.verdict import Key
 from impc.studies.reliability.icc import icc
 from impc.studies.selection.verdict import KEY_RULES, KeyFacts
@@ -124,8 +124,8 @@ def _mean_sd(values: Array, visit: str) -> dict[str, float]:
     return {f"mean{visit}": float(found.mean()), f"sd{visit}": float(found.std())}
 
 
-def _draw(found: KeyParameters, narrow: bool) -> Figure:
-    figure = new_figure(PHONE if narrow else HALF, 3.2)
+def _draw(found: KeyParameters) -> Figure:
+    figure = new_figure(HALF, 3.2)
     ax = figure.subplots()
     ax.set_title("Movement explained, mean VAF (%)")
     for item in found.candidates:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import scipy
 
 from impc.arrays import Array, IntArray
 from impc.jit import njit

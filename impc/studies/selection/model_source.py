@@ -23,7 +23,6 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import control
 import numpy as np
 
 from impc.errors import InputError
@@ -88,6 +87,8 @@ def model_source(name: str, arguments: Mapping[str, Any]) -> ModelSource:
 
 def read_trials(study: Study, source: ModelSource) -> dict[tuple[str, str], tuple[Trial, ...]]:
     """Trials of every subject and visit, over all conditions."""
+    import control  # noqa: PLC0415  # takes a second
+
     # A dummy plant: the reader takes the names of signals and the rate from it.
     d, p = len(source.inputs), len(source.outputs)
     names: dict[str, Any] = {"inputs": ["nothing", *source.inputs], "outputs": source.outputs}

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-import scipy.stats
+import scipy
 
 from impc.files.disk import truth_beside
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Level, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
-from impc.reporting.style import BLUE, HALF, MUTED, PHONE, RECORDED, RULE, new_figure
+from impc.reporting.style import BLUE, HALF, MUTED, RECORDED, RULE, new_figure
 from impc.reporting.verdict import Key
 from impc.studies.selection.fisher import unseen_scalings
 from impc.studies.selection.verdict import BIAS, SELECT_RULES, STUCK, SelectFacts
@@ -219,10 +219,10 @@ def _truth(table: pd.DataFrame) -> list[Check]:
     )]  # fmt: skip
 
 
-def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figure:
+def _forest(model: ParametricModel, found: StudySelection) -> Figure:
     """Forest plot of all parameters in their search ranges, identifiable ones first."""
     order, people = _ordered(model, found), len(found.chosen)
-    figure = new_figure(PHONE if narrow else HALF, 0.8 + (0.47 if narrow else 0.34) * len(order))
+    figure = new_figure(HALF, 0.8 + 0.34 * len(order))
     ax = figure.subplots()
     for row, index in enumerate(order):
         free, scale = index in found.free, 50 / model.gain[index]
@@ -241,8 +241,7 @@ def _forest(model: ParametricModel, found: StudySelection, narrow: bool) -> Figu
             ax.plot(ends, [height] * len(ends), color=BLUE)
             mark = "<" if x < _AT_LIMIT else ">" if x > 100 - _AT_LIMIT else "o"
             ax.plot(x, height, mark, color=colour, clip_on=False)
-        x, y, side = (0, row - 0.4, "left") if narrow else (-5, row, "right")
-        ax.text(x, y, model.word(index), color=colour, va="center", ha=side)
+        ax.text(-5, row, model.word(index), color=colour, va="center", ha="right")
     ax.vlines([0, 100], -0.5, len(order) - 0.5, color=RULE, linewidth=0.8, zorder=0)
     ax.set(xlim=(-4, 104), ylim=(len(order) - 0.5, -0.7), yticks=[])
     ax.set_xlabel("Position in the search range (%)")

@@ -110,7 +110,7 @@ def test_fits_far_from_their_group_are_named_and_tried_without() -> None:
     (alert,) = found.alerts
     assert alert.title == "2 of 20 fits are far from the others of their group"
     assert "3 (3.7 times), 15 (4.6 times)" in alert.found
-    (axes,) = forest(made, narrow=False).axes
+    (axes,) = forest(made).axes
     assert sum(line.get_marker() == "s" for line in axes.lines) == 2
     study = Study("", Configuration(RecordingTable(), {}), tuple(
         Unit(row["subject"], "0", "", (), row["group"])
@@ -171,11 +171,10 @@ def test_no_usable_fit_is_red() -> None:
 
 def test_people_whose_gain_is_not_determined_are_hollow() -> None:
     made = cohort(-139.0, wide=(0, 1))
-    for narrow in (False, True):
-        (axes,) = forest(made, narrow).axes
-        dots = [line for line in axes.lines if line.get_marker() == "o"]
-        hollow = [line for line in dots if line.get_markerfacecolor() == "none"]
-        assert (len(dots), len(hollow)) == (20, 2)
+    (axes,) = forest(made).axes
+    dots = [line for line in axes.lines if line.get_marker() == "o"]
+    hollow = [line for line in dots if line.get_markerfacecolor() == "none"]
+    assert (len(dots), len(hollow)) == (20, 2)
 
 
 def test_cost_weights_are_compared_as_ratios() -> None:

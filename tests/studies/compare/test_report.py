@@ -110,7 +110,7 @@ def test_a_model_that_falls_has_no_number(
     row = table.set_index("name").loc["feedback_gain"]
     assert row["first_fall"] == 5.14
     assert row[["vaf_x1", "held_out_vaf_x1", "largest_input_u", "beyond_bound"]].isna().all()
-    figure = methods_figure(fell, narrow=False)
+    figure = methods_figure(fell)
     texts = [text.get_text() for ax in figure.axes for text in ax.texts]
     assert "stops at 5.1 s" in texts
     assert len(figure.axes[1].containers) == len(by_score(fell)) - 1

@@ -175,10 +175,10 @@ def test_angles_are_shown_as_is_asked() -> None:
     shown = replace(own, estimate=replace(own.estimate, problem=problem))
     for angles, label, factor in (("degrees", "°", 180 / np.pi), ("radians", "rad", 1.0)):
         with angles_in(angles), page_style():
-            ax = movement_figure(shown, 0, narrow=False).axes[0]
+            ax = movement_figure(shown, 0).axes[0]
         assert ax.get_title(loc="left") == f"Place of the cart ({label})"
         line = next(line for line in ax.lines if line.get_label() == "recorded")
-        window = shown_window(shown, 0, 10.0)
+        window = shown_window(shown, 0)
         recorded = factor * result.given.recordings[0].outputs[window, 0]
         np.testing.assert_allclose(np.asarray(line.get_ydata()), recorded)
 
@@ -201,7 +201,7 @@ def test_curves_of_the_page_are_those_of_the_fit() -> None:
 
 def test_bars_are_the_ranges_of_the_comparisons() -> None:
     result = fitted(1.0)
-    (ax,) = statements_figure(result, narrow=False).axes
+    (ax,) = statements_figure(result).axes
     shown = sorted(result.compared, key=lambda item: not item.made)
     ends = [np.asarray(line.get_xdata()) for line in ax.lines]
     np.testing.assert_allclose(
@@ -214,7 +214,7 @@ def test_a_range_of_one_value_is_drawn() -> None:
     """With one output the first comparison is the same for all weights with the gain."""
     result = explained()
     at = [item.low for item in result.compared if item.high == pytest.approx(item.low)]
-    (ax,) = statements_figure(result, narrow=False).axes
+    (ax,) = statements_figure(result).axes
     marked = [line for line in ax.lines if line.get_marker() == "|"]
     assert [float(np.asarray(line.get_xdata())[0]) for line in marked] == at
     assert len(at) == 1
