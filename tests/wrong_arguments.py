@@ -50,7 +50,6 @@ def values() -> dict[str, Any]:
         "system": system, "plant": two, "bounds": box, "weights": pair, "controller": law,
         "scenario": drive, "simulation": run, "recording": trial, "problem": problem,
         "solution": solution, "fibre": fibre, "set": weights_set(fibre), "terminal": law.terminal,
-        "structured": replace(problem, structure=impc.Structure(two, "diagonal")),
         "point": impc.OptimalControlProblem(
             x, u, {"price": w}, x + u, w * x**2 + u**2, 2
         ),
@@ -170,7 +169,7 @@ def calls() -> list[Call]:
         *_of_files(),
         (impc.Structure, {"plant": two, "Q": "diagonal", "R": "full", "name": "one"}),
         (impc.expected_intervals, {
-            **problem, "gain": np.zeros((1, 3)), "deviation": 0.01, "metric": None, "root": 0.0,
+            **problem, "gain": v["controller"].K, "deviation": 0.01, "metric": None, "root": 0.0,
         }),
         (v["point"].plan, {"theta": {"price": 1.0}, "x0": [1.0], "solver": "ipopt", "mu": 1e-9}),
         (impc.fit_optimal_control, {

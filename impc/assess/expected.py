@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.arrays import Array, Frozen, finite_array, frozen, with_shape
+from impc.arrays import Array, Frozen, frozen, with_shape
 from impc.assess.covariance import (
     GainCovariance,
     gain_covariance,
@@ -22,6 +22,7 @@ from impc.assess.covariance import (
 )
 from impc.assess.long_run_covariance import ResidualNoise
 from impc.checking import checked, replace
+from impc.control.controller import Controller
 from impc.errors import InputError
 from impc.inverse.residuals import along_bounds
 from impc.model.bounds import bound_rows
@@ -96,7 +97,8 @@ def expected_intervals(
     Raises
     ------
     InputError
-        If a deviation is not positive, or root is not in [0, 0.999].
+        If a deviation is not positive, root is not in [0, 0.999], or the metric is not positive
+        definite.
 
     Examples
     --------
@@ -123,8 +125,9 @@ def expected_intervals(
             "root", f"expected 0 <= root <= {_LARGEST_ROOT}, got {root:g}", "pass 0 for white noise"
         )
     colour = ResidualNoise(frozen(np.full(p, root)), frozen((1 - root**2) * np.eye(p)[None]))
-    K = finite_array("gain", gain, (plant.m, plant.n))
-    S = np.eye(plant.m) if metric is None else finite_array("metric", metric, (plant.m, plant.m))
+    bounds, horizon = problem.bounds, problem.horizon
+    law = Controller.from_gain(plant, gain, bounds, horizon, metric=metric, terminal_set=False)
+    K, S = np.array(law.K), np.array(law.S)
 
     def found(problem: Problem, trials: float = 1.0) -> GainCovariance:
         # In units of the noise: its variance is one.
