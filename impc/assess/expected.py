@@ -134,10 +134,10 @@ def expected_intervals(
         scaled = replace(problem, output_scale=size / np.sqrt(trials))
         return gain_covariance(scaled, K, S, lambda *_: colour, curvature=True, scale=1.0)
 
-    fixed = problem.with_body_fixed()
+    fixed, by_trials = problem.with_body_fixed(), {one: found(problem, one) for one in MULTIPLES}
     return Expectation(
-        found(problem),
-        frozen([_individual(found(problem, trials)) for trials in MULTIPLES]),
+        by_trials[1.0],
+        frozen(list(map(_individual, by_trials.values()))),
         None if fixed is problem else frozen(_individual(found(fixed))),
         frozen(_limits(replace(problem, output_scale=size), K, S, colour)),
     )

@@ -124,7 +124,7 @@ class WeightsSummary:
     # members at the ends of the ranges, degrees; D = typical sizes of the states. Others may turn
     # further.
     widest_angle: float
-    drawn: int  # Number of drawn gains
+    drawn: int  # Number of drawn gains; 0 if no statement holds for the gain itself
 
 
 def summarise_weights(
@@ -132,10 +132,13 @@ def summarise_weights(
     gain: Array,
     metrics: Array,
     sizes: Array,
-    draws: tuple[LqrSolution, ...] = (),
+    draw: Callable[[], tuple[LqrSolution, ...]] = tuple,
     each: Callable[..., Iterable[BoolArray]] = map,
 ) -> WeightsSummary:
-    """Summarise the set of weights of a gain and of drawn gains, which `each` maps."""
+    """Summarise the set of weights of a gain.
+
+    If a statement holds for it, other gains are drawn, over which `each` maps the check.
+    """
     found = weights_set(gain_fibre(plant, gain, metrics), _RATIO)
     named = _shown(plant, found.least.weights, sizes)
     names = tuple(plant.states[index] for index in named)
@@ -154,7 +157,8 @@ def summarise_weights(
         for item in decided
     ]
     agreed = functools.partial(_agreed, plant, metrics, against)
-    if decided and draws:
+    draws = draw() if decided else ()
+    if draws:
         shares = dict(zip(decided, np.mean(list(each(agreed, draws)), axis=0), strict=True))
         statements = tuple(
             replace(item, confidence=float(shares[item])) if item in shares else item
@@ -172,12 +176,12 @@ def weights_summary_or_reason(
     gain: Array,
     metrics: Array,
     sizes: Array,
-    draws: tuple[LqrSolution, ...] = (),
+    draw: Callable[[], tuple[LqrSolution, ...]] = tuple,
     each: Callable[..., Iterable[BoolArray]] = map,
 ) -> tuple[WeightsSummary | None, str]:
     """Summary and "", or None and the reason."""
     try:
-        return summarise_weights(plant, gain, metrics, sizes, draws, each), ""
+        return summarise_weights(plant, gain, metrics, sizes, draw, each), ""
     except (WeightsError, SolverError) as error:
         return None, str(error)
 

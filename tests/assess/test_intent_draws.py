@@ -54,7 +54,7 @@ def test_a_statement_is_made_only_when_other_gains_agree(
     def drawn(deviations: Array) -> WeightsSummary:
         there = impc.replace(covariance, deviations=deviations)
         draws = drawn_gains(cart(), found.stage_weights, K, there)
-        return summarise_weights(cart(), K, metrics, SIZES, draws=draws)
+        return summarise_weights(cart(), K, metrics, SIZES, lambda: draws)
 
     identified, unknown = drawn(covariance.deviations), drawn(np.full(2, np.inf))
     for outcome in (identified, unknown):

@@ -317,10 +317,11 @@ def weight_findings(result: FitResult) -> list[Finding]:
     )
     caption = (
         "Low and high: range of the difference in cost, or of the cross weight, relative to the "
-        "cost of the state named first, at typical sizes, over all weights with the fitted gain. "
-        f"{summary.drawn} other gains were tried; a comparison is decided if at most one of them "
-        "disagrees."
+        "cost of the state named first, at typical sizes, over all weights with the fitted gain."
     )
+    if summary.drawn:
+        caption += f" {summary.drawn} other gains were tried; a comparison is decided if at most "
+        caption += "one of them disagrees."
     return [Finding("statements", table, caption), weight_finding(result)]
 
 

@@ -209,9 +209,10 @@ def _weights(
     elif not test.rejected:
         plant, K = fitted.problem.with_nuisance_fixed().plant, np.array(fitted.gain)
         drawn = functools.partial(estimate_draws, plant, fitted.stage_weights, estimate)
-        draws = progress.attempt("drawn gains", drawn, ()) if settings.intent_draws else ()
+        attempt = functools.partial(progress.attempt, "drawn gains", drawn, ())
         at = plant, K, np.array(fitted.metrics), np.array(found.sizes)
-        summary = weights_summary_or_reason(*at, draws, pool.map)
+        draw = attempt if settings.intent_draws else tuple
+        summary = weights_summary_or_reason(*at, draw, pool.map)
     progress.done("set of weights")
     return summary
 

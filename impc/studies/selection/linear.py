@@ -36,6 +36,7 @@ def linear_functions(
     derivative = ca.Function("derivative", [symbol], jacobians)
 
     def jacobian(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
+        given = np.ascontiguousarray(given)
         A, B, C = (item.full() for item in matrices(theta))
         dA, dB, dC = (
             # CasADi stacks columns; the first axis becomes the parameter.
@@ -43,20 +44,17 @@ def linear_functions(
             for item, part in zip(derivative(theta), (A, B, C), strict=True)
         )
         exponential, change = _exponentials(_joined(A, B) * dt, _joined(dA, dB) * dt)
-        n = len(A)
-        parts = (
-            exponential[:n, :n],
-            exponential[:n, n:],
-            change[:, :n, :n],
-            change[:, :n, n:],
-            given,
-        )
-        x, X = _with_derivatives(*map(np.ascontiguousarray, parts))
+        x, X = _with_derivatives(*_split(exponential, A), *_split(change, A), given)
         on_state, on_output = np.einsum("pn,skn->spk", C, X), np.einsum("kpn,sn->spk", dC, x)
         return np.asarray(x @ C.T), np.asarray(on_state + on_output)
 
     def simulate(theta: Array, given: Array) -> Array:
-        return jacobian(theta, given, np.zeros(0, dtype=np.int64))[0]
+        given = np.ascontiguousarray(given)
+        A, B, C = (item.full() for item in matrices(theta))
+        held = scipy.linalg.expm(_joined(A, B) * dt)
+        none = np.zeros((0, *held.shape))
+        x, _ = _with_derivatives(*_split(held, A), *_split(none, A), given)
+        return np.asarray(x @ C.T)
 
     return simulate, jacobian
 
@@ -65,6 +63,12 @@ def _joined(A: Array, B: Array) -> Array:
     """[A B; 0 0], with the leading axes of A and B."""
     wide = np.concatenate([A, B], axis=-1)
     return np.pad(wide, [(0, 0)] * (wide.ndim - 2) + [(0, B.shape[-1]), (0, 0)])
+
+
+def _split(held: Array, A: Array) -> tuple[Array, Array]:
+    """Blocks [A B] of held matrices (..., N, N), contiguous."""
+    n = len(A)
+    return np.ascontiguousarray(held[..., :n, :n]), np.ascontiguousarray(held[..., :n, n:])
 
 
 def _exponentials(M: Array, along: Array) -> tuple[Array, Array]:
