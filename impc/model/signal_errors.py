@@ -30,7 +30,7 @@ KINDS = {
     "drift": ("a drift", " /s", 1, -1),
     "scale": ("an error of scale", "%", 100, 0),
     "shift": ("a time shift", "ms", 1000, 1),
-    "clock": ("an error of its clock", "%", 100, 0),
+    "clock": ("a clock error", "%", 100, 0),
 }
 OFFSET, DRIFT, SCALE, SHIFT, CLOCK = range(len(KINDS))
 # Scale of a relative error in a search.

@@ -139,7 +139,9 @@ def remedy_words(result: FitResult, error: ModelError) -> str:
     size = number(factor * float(np.mean(values[kind, name])), 3)
     if kind == "offset":
         return f"If the zero of the sensor is off, add {size} {unit} to offset in [signals.{name}]."
-    return f"Correct the signal by its {kind} of {size} {unit}, in the file or at the device."
+    signal = signal_name(result.given.plant, name)
+    error = f"{KINDS[kind][0]} of {size} {unit}"
+    return f"Correct the {signal} for {error}, in the file or at the device."
 
 
 def _size_words(plant: Plant, kind: str, name: str, size: float, deviation: float) -> str:
