@@ -12,6 +12,7 @@ from msgspec import Meta
 from impc.errors import InputError, brief
 from impc.files.units import si_unit
 from impc.model.plant import UNKNOWN
+from impc.model.riccati import stabilises
 from impc.studies.fit.settings import read_settings
 
 if TYPE_CHECKING:
@@ -113,7 +114,10 @@ def assumed_gain(plant: Plant, settings: PlanSettings) -> Array:
             f"has rows of {', '.join(map(str, rows)) or 'no'} numbers",
             f"give {plant.m} of {plant.n}, for {', '.join(plant.states)}",
         )
-    return np.array(settings.gain)
+    K = np.array(settings.gain)
+    if not stabilises(plant, K):
+        raise InputError("[plan] gain", "does not stabilise the plant", "check signs: u = -K x")
+    return K
 
 
 def noise_deviations(plant: Plant, settings: PlanSettings) -> Array:

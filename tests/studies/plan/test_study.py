@@ -253,6 +253,8 @@ def test_gain_and_noise_fit_the_plant() -> None:
     for wrong in ([[1.0]], [], [[1.0, 2.0]] * 2):
         with pytest.raises(InputError, match="give 1 of 2, for x"):
             assumed_gain(plant, replace(SETTINGS, gain=wrong))
+    with pytest.raises(InputError, match="does not stabilise"):  # of u = +Kx
+        assumed_gain(plant, replace(SETTINGS, gain=[[-2.0, -2.0]]))
     with pytest.raises(InputError, match="lacks position1"):
         noise_deviations(plant, replace(SETTINGS, noise={}))
     with pytest.raises(InputError, match="is not an output"):
