@@ -140,8 +140,8 @@ def remedy_words(result: FitResult, error: ModelError) -> str:
     if kind == "offset":
         return f"If the zero of the sensor is off, add {size} {unit} to offset in [signals.{name}]."
     signal = signal_name(result.given.plant, name)
-    error = f"{KINDS[kind][0]} of {size} {unit}"
-    return f"Correct the {signal} for {error}, in the file or at the device."
+    what = f"{KINDS[kind][0]} of {size} {unit}"
+    return f"Correct the {signal} for {what}, in the file or at the device."
 
 
 def _size_words(plant: Plant, kind: str, name: str, size: float, deviation: float) -> str:
