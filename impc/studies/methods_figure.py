@@ -78,7 +78,7 @@ def methods_figure(fits: Sequence[MethodFit]) -> Figure:
     """Unexplained variance of each output (dots, log axis) and largest command (bars)."""
     shown = by_score(fits)
     figure = new_figure(HALF, 0.9 + 0.42 * len(shown))
-    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
     left.set_yticks(range(len(shown)), [method_label(fit.name) for fit in shown])
     right.set_yticks([])
     for ax in (left, right):
@@ -117,11 +117,13 @@ def _commands(ax: Axes, fits: Sequence[MethodFit]) -> None:
     rows = [largest_commands(fit) for fit in fits]
     limit, label = rows[0][1:]
     sizes = {k: row[0] for k, row in enumerate(rows) if np.isnan(first_fall(fits[k]))}
-    end = 1.2 * max([*sizes.values(), limit if np.isfinite(limit) else 0.0, 1e-12])
+    end = 1.3 * max([*sizes.values(), limit if np.isfinite(limit) else 0.0, 1e-12])
     if np.isfinite(limit):
         ax.axvspan(limit, end, color=FORBIDDEN, linewidth=0, zorder=0)
         ax.axvline(limit, color=VERMILLION, linewidth=1, linestyle="--")
-        ax.text(limit, -0.55, " beyond the limit", color=VERMILLION, va="bottom", fontsize=10)
+        side = "left" if limit < end / 2 else "right"
+        ax.text(limit if side == "left" else end, -0.55, " beyond the limit", ha=side,
+                color=VERMILLION, va="bottom", fontsize=10)  # fmt: skip
     for row, size in sizes.items():
         ax.barh(row, size, 0.42, color=_colour(fits[row]), linewidth=0)
         ax.annotate(f"{size:.3g}", (size, row), (5, 0), textcoords="offset points", va="center")

@@ -104,7 +104,9 @@ def _command(ax: Axes, fit: MethodFit, index: int, column: int, window: slice) -
         if np.isfinite(limit):
             ax.axhline(limit, color=VERMILLION, linewidth=0.9, linestyle=(0, (4, 3)))
             at = np.where(side * (u - limit) >= -1e-4 * abs(limit), u, np.nan)
-            ax.plot(time, at, color=VERMILLION, linewidth=4.5, solid_capstyle="butt")
+            # The marker shows a single sample, of which a line has nothing to draw.
+            ax.plot(time, at, "s", ls="-", color=VERMILLION, linewidth=4.5, markersize=4.5,
+                    markeredgewidth=0, solid_capstyle="butt")  # fmt: skip
     ax.set_ylim(-top, top)
 
 

@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.text import Text
 
 from impc.assess.assessments import MethodFit
 from impc.checking import replace
@@ -22,6 +23,7 @@ from impc.reporting.document import Checks, Copy, Report
 from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
+from impc.reporting.style import page_style
 from impc.studies.compare.report import compare_report
 from impc.studies.compare.subject import compare_recordings
 from impc.studies.methods_figure import by_score, methods_figure
@@ -116,6 +118,25 @@ def test_a_model_that_falls_has_no_number(
     assert len(figure.axes[1].containers) == len(by_score(fell)) - 1
     report = compare_report(problem, fell, PROVENANCE)
     assert "stops at 5.1 s" in shown(report)
+
+
+@pytest.mark.parametrize("largest", [1.2, 29.8])
+def test_nothing_of_the_figure_is_cut(compared: tuple[MethodFit, ...], largest: float) -> None:
+    fits = []
+    for fit in changed(compared, "feedback_gain", largest_input=np.array([largest])):
+        problem = fit.estimate.problem
+        plant = replace(problem.plant, units=(("u", "N m"),))
+        estimate = replace(fit.estimate, problem=replace(problem, plant=plant))
+        fits.append(replace(fit, estimate=estimate))
+    with page_style():
+        figure = methods_figure(fits)
+        figure.draw_without_rendering()
+        ticks = [tick for ax in figure.axes for tick in ax.get_xticklabels()]
+        texts = [one for one in figure.findobj(Text) if one.get_text() and one not in ticks]
+        ends = np.array([text.get_window_extent().extents for text in texts])
+    assert any("(N m)" in text.get_text() for text in texts)
+    assert np.all(ends[:, :2] >= -1)
+    assert np.all(ends[:, 2:] <= np.array(figure.bbox.max) + 1)
 
 
 def test_when_all_fall_nothing_is_said(problem: Problem, compared: tuple[MethodFit, ...]) -> None:

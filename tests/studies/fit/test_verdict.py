@@ -22,7 +22,7 @@ from impc.reporting.document import Copy
 from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import angles_in
-from impc.reporting.style import page_style
+from impc.reporting.style import VERMILLION, page_style
 from impc.studies.charts import trajectories
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.body_words import added_sentence
@@ -181,6 +181,15 @@ def test_angles_are_shown_as_is_asked() -> None:
         window = shown_window(shown, 0)
         recorded = factor * result.given.recordings[0].outputs[window, 0]
         np.testing.assert_allclose(np.asarray(line.get_ydata()), recorded)
+
+
+def test_a_single_sample_at_the_limit_is_seen() -> None:
+    """A line of one sample draws nothing: it needs a marker."""
+    own = fitted(1.0).inverse_mpc
+    at_limit = [one for one in movement_figure(own, 0).axes[1].lines
+                if one.get_color() == VERMILLION and one.get_linestyle() == "-"]  # fmt: skip
+    assert at_limit
+    assert all(one.get_marker() not in ("", "None") for one in at_limit)
 
 
 def test_curves_of_the_page_are_those_of_the_fit() -> None:
