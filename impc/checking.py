@@ -109,9 +109,19 @@ class Value(Frozen):
         self.__post_init__()
 
     def __post_init__(self) -> None:
+        self._check(())
+
+    def _check(self, known: Collection[str]) -> None:
+        """Check the fields; of those `known` to be right, only that their sizes agree."""
         sizes: dict[str, int] = {}
         for name, kind in _field_kinds(cast("Hashable", type(self))):
             value = getattr(self, name)
+            if name in known:
+                _require_sizes(name, value, sizes)
+                rule = self._rules.get(name)
+                if isinstance(rule, str) and value is not None:
+                    _require_shape(name, value, rule.lstrip("~").split(), sizes)
+                continue
             found = kind(name, value)
             _require_sizes(name, found, sizes)
             if found is not None and name in self._rules:
@@ -160,7 +170,9 @@ def replace(value: _V, **changes: Any) -> _V:
             type(value).__name__, f"has no field {', '.join(unknown)}", f"it has {known}"
         )
     made = object.__new__(type(value))
-    made._fill(**(fields | changes))
+    for name, each in (fields | changes).items():
+        object.__setattr__(made, name, each)
+    made._check(fields.keys() - changes.keys())
     return made
 
 
@@ -206,10 +218,15 @@ def _ruled(name: str, value: Any, rule: Rule, sizes: dict[str, int]) -> Any:
     value = with_shape(name, value, tuple(_size(symbol, sizes) for symbol in symbols))
     if not rule.startswith("~"):
         require_finite(name, value)
+    _require_shape(name, value, symbols, sizes)
+    return value
+
+
+def _require_shape(name: str, value: Any, symbols: list[str], sizes: dict[str, int]) -> None:
+    """Require that an array has the sizes of its symbols; notes those that are new."""
     for symbol, size in zip(symbols, value.shape, strict=True):
         if symbol != "*" and sizes.setdefault(symbol, size) != size:
             raise DataError(name, f"has shape {value.shape}", f"give ({', '.join(symbols)})")
-    return value
 
 
 def _size(symbol: str, sizes: dict[str, int]) -> int | None:

@@ -44,6 +44,7 @@ __all__ = [
     "mass_matrix",
     "nonlinear_dynamics",
     "seated_balance_plant",
+    "seated_balance_slopes",
 ]
 
 _BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
@@ -80,17 +81,35 @@ def seated_balance_plant(
         If the sample time or the order is out of range.
     """
     sample_time = finite_number("sample_time", sample_time, "give it in seconds", above=0.0)
-    plant = continuous_seated_balance_plant(parameters, delay_order)
-    n, m = plant.B.shape
+    parameters = parameters or SeatedBalanceParameters()
     # exp([A B; 0 0] T) = [Ad Bd; 0 I]: exact also for singular A.
-    held = scipy.linalg.expm(np.block([[plant.A, plant.B], [np.zeros((m, n + m))]]) * sample_time)
-    return _named(
-        held[:n, :n],
-        held[:n, n:],
-        sample_time,
-        "seated_balance",
-        parameters or SeatedBalanceParameters(),
-    )
+    held = scipy.linalg.expm(_augmented(*_matrices(parameters, delay_order)) * sample_time)
+    n = len(held) - len(_INPUTS)
+    return _named(held[:n, :n], held[:n, n:], sample_time, "seated_balance", parameters)
+
+
+def seated_balance_slopes(
+    parameters: SeatedBalanceParameters, sample_time: float, delay_order: int
+) -> dict[str, tuple[Any, Any]]:
+    """Return the derivatives of A and B of `seated_balance_plant` by each parameter, by name."""
+    A, B = _matrices(parameters, delay_order)
+    whole, known, n = _augmented(A, B), fields(parameters), len(A)
+    along = np.zeros((len(known), *whole.shape))
+    by_state, by_input = _slopes_at_rest(derivatives=True)(_values(parameters))
+    along[:, :4, :4] = by_state.full().T.reshape(-1, 4, 4).swapaxes(1, 2)
+    by = by_input.full().T.reshape(-1, 2, 4).swapaxes(1, 2)
+    along[:, :4, n - 1], along[:, :4, n + 1] = by[..., 0], by[..., 1]
+    # The rows of the delay are proportional to 1 / tau_d, that of the muscle to 1 / tau_m.
+    names = [each.name for each in known]
+    along[names.index("tau_d"), 4 : n - 1] = -whole[4 : n - 1] / parameters.tau_d
+    along[names.index("tau_m"), n - 1] = -whole[n - 1] / parameters.tau_m
+    # exp([M D; 0 M]) has the derivative of exp(M) along D beside exp(M).
+    size = len(whole)
+    both = np.zeros((len(known), 2 * size, 2 * size))
+    both[:, :size, :size] = both[:, size:, size:] = whole
+    both[:, :size, size:] = along
+    moved = scipy.linalg.expm(both * sample_time)[:, :n, size:]
+    return {name: (part[:, :n], part[:, n:]) for name, part in zip(names, moved, strict=True)}
 
 
 def continuous_seated_balance_plant(
@@ -116,26 +135,46 @@ def continuous_seated_balance_plant(
         If the order is out of range.
     """
     parameters = parameters or SeatedBalanceParameters()
+    A, B = _matrices(parameters, delay_order)
+    return _named(A, B, 0.0, "seated_balance_continuous", parameters)
+
+
+def _matrices(parameters: SeatedBalanceParameters, delay_order: int) -> tuple[Any, Any]:
+    """A and B in continuous time."""
     chain = delayed_muscle(parameters.tau_d, parameters.tau_m, delay_order)
-    values = [getattr(parameters, each.name) for each in fields(parameters)]
-    by_state, by_input = (part.full() for part in _slopes_at_rest()(values))
+    by_state, by_input = (part.full() for part in _slopes_at_rest()(_values(parameters)))
     n = 4 + len(chain.B)
     A, B = np.zeros((n, n)), np.zeros((n, 2))
     A[:4, :4], A[:4, -1], A[4:, 4:] = by_state, by_input[:, 0], chain.A
     B[:4, 1], B[4:, 0] = by_input[:, 1], chain.B
-    return _named(A, B, 0.0, "seated_balance_continuous", parameters)
+    return A, B
+
+
+def _augmented(A: Any, B: Any) -> Any:
+    """[A B; 0 0]."""
+    return np.block([[A, B], [np.zeros((B.shape[1], len(A) + B.shape[1]))]])
+
+
+def _values(parameters: SeatedBalanceParameters) -> list[float]:
+    return [getattr(parameters, each.name) for each in fields(parameters)]
 
 
 @functools.cache
-def _slopes_at_rest() -> ca.Function:
-    """Function from all parameters to the Jacobians of the body dynamics at rest."""
+def _slopes_at_rest(*, derivatives: bool = False) -> ca.Function:
+    """Function from all parameters to the Jacobians of the body dynamics at rest.
+
+    With `derivatives`, to those of their entries, column by column, by the parameters.
+    """
     known = fields(SeatedBalanceParameters)
     values, state, inputs = ca.SX.sym("p", len(known)), ca.SX.sym("x", 4), ca.SX.sym("u", 2)
     named = {each.name: values[place] for place, each in enumerate(known)}
     rate = _body_rate(SimpleNamespace(**named), state, inputs)
     slopes = ca.jacobian(rate, ca.vertcat(state, inputs))
     at_rest = ca.densify(ca.substitute(slopes, ca.vertcat(state, inputs), ca.DM.zeros(6)))
-    return ca.Function("slopes", [values], [at_rest[:, :4], at_rest[:, 4:]])
+    both = [at_rest[:, :4], at_rest[:, 4:]]
+    if derivatives:
+        both = [ca.densify(ca.jacobian(ca.vec(part), values)) for part in both]
+    return ca.Function("slopes", [values], both)
 
 
 def nonlinear_dynamics(

@@ -5,6 +5,7 @@ Body: `plants.anthropometry`, after de Leva 1996. Plant: `plants.seated_balance`
 
 from __future__ import annotations
 
+import functools
 from dataclasses import asdict, fields, replace
 from typing import Any
 
@@ -13,7 +14,7 @@ import casadi as ca
 from plants._units import with_uncertainty
 from plants.anthropometry import Sex, from_anthropometry
 from plants.integration import runge_kutta_step, with_linear_part
-from plants.seated_balance import nonlinear_dynamics, seated_balance_plant
+from plants.seated_balance import nonlinear_dynamics, seated_balance_plant, seated_balance_slopes
 from plants.seated_body import seated_balance_body
 from plants.seated_parameters import SeatedBalanceParameters
 
@@ -75,6 +76,7 @@ def seated_balance_for(
         return with_linear_part(step, system.A, system.B)
 
     system.body = body  # made only on demand: takes 0.05 s
+    system.slopes = functools.partial(seated_balance_slopes, found, sample_time, delay_order)
     return with_uncertainty(system, asdict(found), found.uncertainty)
 
 

@@ -251,6 +251,8 @@ def test_a_value_made_by_hand_is_checked_and_not_the_callers() -> None:
             replace(made, Q=wrong)
     with pytest.raises(InputError, match="B: expected shape"):
         replace(PLANT, B=np.ones((3, 1)))
+    with pytest.raises(DataError, match="B: has shape"):  # unchanged fields no longer agree
+        replace(PLANT, A=np.eye(3))
 
 
 def test_an_annotation_that_is_not_in_the_table_is_told_at_import() -> None:

@@ -28,7 +28,12 @@ import scipy.optimize
 from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.equivalent_weights import analytic_centre, inverse_factor, least_condition_weights
+from impc.inverse.equivalent_weights import (
+    analytic_centre,
+    inverse_factor,
+    least_condition_weights,
+    nearest_weights,
+)
 from impc.inverse.semidefinite import Cone, matrix_inequality, solve_each
 from impc.inverse.solution_set import pair_blocks, split_blocks
 
@@ -78,40 +83,67 @@ class WeightsSet(Frozen):
 
 
 @checked
-def weights_set(fibre: GainFibre, ratio: float = 10.0, *, rough: bool = False) -> WeightsSet:
+def weights_set(fibre: GainFibre, ratio: float = 10.0) -> WeightsSet:
     """Prepare the set of weights with condition number up to `ratio` times the least."""
     if not 1 < ratio < np.inf:
         raise InputError("ratio", f"expected a number above 1, got {ratio}", "pass e.g. ratio=10")
-    least = least_condition_weights(fibre, rough=rough)
-    n, m = fibre.plant.n, fibre.plant.m
+    least = least_condition_weights(fibre)
     try:
         centre = analytic_centre(fibre).weights
     except WeightsError:  # some combination of states has a free cost
         centre = None
     view = least.weights if centre is None else centre
     inverse = inverse_factor(fibre, view)
-    raw = pair_blocks(fibre.Q, fibre.R)
-    triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T, mode="r")
-    raw = np.tensordot(np.linalg.inv(triangle).T, raw, 1)
+    limit = ratio * (least.least or least.condition)
+    trace = None if centre is None else _largest_trace(fibre, inverse)
+    return _set_from(fibre, least, limit, view, inverse, trace)
+
+
+def set_near(found: WeightsSet, fibre: GainFibre) -> WeightsSet:
+    """Set of the weights of another gain, about those nearest to the least-condition member.
+
+    It needs no program: the limit is as many times the condition number of these weights.
+    """
+    least = nearest_weights(fibre, found.least.weights)
+    limit = found.limit / found.least.condition * least.condition
+    return _set_from(fibre, least, limit, least.weights, found.inverse)
+
+
+def _set_from(
+    fibre: GainFibre,
+    least: EquivalentWeights,
+    limit: float,
+    view: Weights,
+    inverse: Array,
+    trace: float | None = None,
+) -> WeightsSet:
+    """Set in the coordinates of `inverse`; `trace` bounds tr(L^-1 X L^-T) over it."""
+    n, m = fibre.plant.n, fibre.plant.m
+    raw = _orthonormal(fibre, inverse)
     traces = np.trace(raw[:, n:, n:], axis1=1, axis2=2)
     first = view.block * (m / np.trace(view.R))
     level = np.tensordot(scipy.linalg.null_space(traces[None]).T, raw, 1)
-    limit = ratio * (least.least or least.condition)
-    if centre is None:  # X <= limit I, since the least eigenvalue is at most that of R
+    if trace is None:  # X <= limit I, since the least eigenvalue is at most that of R
         trace = limit * float(np.linalg.norm(inverse)) ** 2
-    else:
-        trace = _largest_trace(fibre, inverse, raw)
     reach = trace + float(np.linalg.norm(inverse @ first @ inverse.T))
     return WeightsSet(fibre, least, limit, first, level, inverse, reach)
 
 
-def _largest_trace(fibre: GainFibre, inverse: Array, raw: Array) -> float:
-    """Largest tr(L^-1 X L^-T) of a semidefinite X with trace R = m; `raw` is orthonormal.
+def _orthonormal(fibre: GainFibre, inverse: Array) -> Array:
+    """Basis (k, n + m, n + m) of the space, orthonormal in the coordinates L^-1 X L^-T."""
+    raw = pair_blocks(fibre.Q, fibre.R)
+    triangle = np.linalg.qr((inverse @ raw @ inverse.T).reshape(len(raw), -1).T, mode="r")
+    return np.asarray(np.tensordot(np.linalg.inv(triangle).T, raw, 1))
 
-    At the analytic centre it is alpha tr(G'RG) for all X = sum c_k raw_k, up to an error e'c of the
-    centre; |c| is at most that trace again, and tr(G'RG) at most m times the largest value of GG'.
+
+def _largest_trace(fibre: GainFibre, inverse: Array) -> float:
+    """Largest tr(L^-1 X L^-T) of a semidefinite X with trace R = m.
+
+    At the analytic centre it is alpha tr(G'RG) for all X = sum c_k raw_k, `raw` orthonormal, up to
+    an error e'c of the centre; |c| is at most that trace again, and tr(G'RG) at most m times the
+    largest value of GG'.
     """
-    n, m = fibre.plant.n, fibre.plant.m
+    n, m, raw = fibre.plant.n, fibre.plant.m, _orthonormal(fibre, inverse)
     seen = np.trace(inverse @ raw @ inverse.T, axis1=1, axis2=2)
     scale = np.trace(fibre.G.T @ raw[:, n:, n:] @ fibre.G, axis1=1, axis2=2)
     alpha = float(seen @ scale) / float(scale @ scale)
@@ -158,20 +190,22 @@ class Range:
 
 
 @checked(directions="* n+m n+m")
-def linear_ranges(
-    found: WeightsSet, directions: Array, *, tolerance: float = _GAP
-) -> tuple[Range, ...]:
+def linear_ranges(found: WeightsSet, directions: Array) -> tuple[Range, ...]:
     """Range over the set of trace(direction X) for `directions` (k, n + m, n + m)."""
-    ends = _minima(found, np.concatenate([directions, -directions]), tolerance)
+    ends = _minima(found, np.concatenate([directions, -directions]))
     return tuple(map(Range, ends[: len(directions)], map(_negative, ends[len(directions) :])))
 
 
 @checked(directions="* n+m n+m")
-def linear_maxima(
-    found: WeightsSet, directions: Array, *, tolerance: float = _GAP
-) -> tuple[End, ...]:
+def linear_maxima(found: WeightsSet, directions: Array) -> tuple[End, ...]:
     """Largest value over the set of each trace(direction X)."""
-    return tuple(map(_negative, _minima(found, -directions, tolerance)))
+    return tuple(map(_negative, _minima(found, -directions)))
+
+
+@checked(directions="* n+m n+m")
+def all_negative(found: WeightsSet, directions: Array) -> tuple[bool, ...]:
+    """Whether each trace(direction X) is negative for every member."""
+    return tuple(end.value > 0 for end in _minima(found, -directions, signs=True))
 
 
 @checked
@@ -188,8 +222,11 @@ def entry_ranges(
     return dict(zip(pairs, linear_ranges(found, directions), strict=True))
 
 
-def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]:
-    """Members of least trace(direction X), for directions (k, n + m, n + m)."""
+def _minima(found: WeightsSet, directions: Array, *, signs: bool = False) -> list[End]:
+    """Members of least trace(direction X), for directions (k, n + m, n + m).
+
+    With `signs` only the sign of the value is right.
+    """
     constants = np.tensordot(directions, found.first, 2)
     slopes = np.tensordot(directions, found.level, ([1, 2], [1, 2]))
     scales = np.linalg.norm(slopes, axis=1)
@@ -202,7 +239,8 @@ def _minima(found: WeightsSet, directions: Array, tolerance: float) -> list[End]
         np.pad(slopes[identified] / scales[identified, None], ((0, 0), (0, 1))),
         found.cones,
         reach=np.full(len(found.level) + 1, found.reach),
-        tolerance=tolerance,
+        tolerance=_GAP,
+        above=-constants[identified] / scales[identified] if signs else None,
     )
     for index, solved in zip(identified, each, strict=True):
         X = _member(found, solved.y)

@@ -41,8 +41,9 @@ if TYPE_CHECKING:
 _LARGEST_ROOT = 0.97
 # Samples before the first in which noise still matters: 0.97^250 is 5e-4.
 _BEFORE = 250
-# Iterations of the correction for the fit, which depends on the estimated S.
-_ROUNDS = 3
+# Largest number of iterations of the correction for the fit, which depends on the estimated S, and
+# relative change below which the next one would change it by the square of this share.
+_ROUNDS, _CLOSE = 3, 0.02
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,12 @@ class ResidualNoise(Frozen):
 
     root: Array  # a of each output (p,)
     gammas: Array  # Tapered autocovariances of eps, from lag 0, (lags, p, p)
+
+    @property
+    def lasting(self) -> Array:
+        """Long-run covariance of e, from lag 0 on (p, p)."""
+        apart = 1 / (1 - np.asarray(self.root))
+        return np.asarray(np.sum(self.gammas, axis=0) * np.outer(apart, apart))
 
 
 def residual_noise(trials: list[Array], fitted: TrialSpan | None = None) -> ResidualNoise:
@@ -81,7 +88,11 @@ def _restored(
     found = model(trials, [])
     if fitted is not None:
         for _ in range(_ROUNDS):
-            found = model(trials, _taken(found, fitted, trials))
+            before, found = found, model(trials, _taken(found, fitted, trials))
+            if np.linalg.norm(found.lasting - before.lasting) <= _CLOSE * np.linalg.norm(
+                found.lasting
+            ):
+                break
     return found
 
 

@@ -28,8 +28,9 @@ from impc.model.plant import UNKNOWN, gain_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-    from impc.inverse.estimates import Estimate, Rival
+    from impc.inverse.estimates import Estimate, SearchEnd
     from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
     from impc.model.plant import Plant
 
 
@@ -61,13 +62,19 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
     Other ends of the search whose -2 log posterior is within a 95 % quantile of the lowest, times
     the ratio of long-run to white variance, are as good: intervals are the union of theirs.
     """
-    end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
-    problem, at = end.problem, (end.K, end.S)
+    if fitted.refitted is not None:
+        end: Fitted | SearchEnd = fitted.refitted
+        problem = fitted.refitted.problem(fitted.problem)
+    else:
+        end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
+        problem = end.problem
+    at = np.array(end.K), np.array(end.S)
     fixed = problem.with_body_fixed()
     found = GainEstimate(
         problem,
-        *at,
-        end.misfit,
+        end.K,
+        end.S,
+        misfit_or_reason(problem, *at)[0],
         gain_covariance(problem, *at, curvature=True),
         None if fixed is problem else gain_covariance(fixed, *at, curvature=True),
         end.ended,
@@ -85,7 +92,7 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
     )
 
 
-def _rival(problem: Problem, end: Rival) -> GainEstimate:
+def _rival(problem: Problem, end: SearchEnd) -> GainEstimate:
     """Another end of the search with its covariance."""
     K, S = np.array(end.K), np.array(end.S)
     misfit = misfit_or_reason(problem, K, S)[0]

@@ -22,9 +22,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 
-from impc.assess.bounded_weights import entry_ranges, linear_maxima, linear_ranges, weights_set
+from impc.assess.bounded_weights import (
+    all_negative,
+    entry_ranges,
+    linear_ranges,
+    set_near,
+    weights_set,
+)
 from impc.assess.intent import angle_between, dominant_direction
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
@@ -47,8 +52,6 @@ if TYPE_CHECKING:
 _RATIO = 10.0
 # Number of states shown: recorded ones, then those that cost most at their typical size.
 _NAMED = 4
-# Tolerance of the programs for a drawn gain: the range of 39 draws is itself approximate.
-_ROUGH = 1e-6
 # A range that ends this close to zero, relative to its width, leaves the sign undecided.
 _TOUCHES = 1e-6
 # 38 of 39 draws.
@@ -156,7 +159,7 @@ def summarise_weights(
         * statement_function(plant, sizes, item.kind, item.first, item.second)
         for item in decided
     ]
-    agreed = functools.partial(_agreed, plant, metrics, against)
+    agreed = functools.partial(_agreed, found, metrics, against)
     draws = draw() if decided else ()
     if draws:
         shares = dict(zip(decided, np.mean(list(each(agreed, draws)), axis=0), strict=True))
@@ -187,18 +190,17 @@ def weights_summary_or_reason(
 
 
 def _agreed(
-    plant: Plant, metrics: Array, against: Sequence[Array], solution: LqrSolution
+    fitted: WeightsSet, metrics: Array, against: Sequence[Array], solution: LqrSolution
 ) -> BoolArray:
     """Which functions are negative for all weights of a drawn gain; `metrics` (k, m, m)."""
     try:
         own = np.concatenate([np.array(solution.S)[None], metrics[1:]])
-        # Rough solutions suffice: only the extent of the set is needed.
-        found = weights_set(gain_fibre(plant, solution.K, own), _RATIO, rough=True)
+        found = set_near(fitted, gain_fibre(solution.plant, solution.K, own))
         functions, member = np.array(against), found.least.weights.block
         holds = np.tensordot(functions, member, ([1, 2], [0, 1])) < 0
         # A member that breaks a statement decides it without a program.
-        most = linear_maxima(found, functions[holds], tolerance=_ROUGH) if np.any(holds) else ()
-        holds[holds] = [end.value < 0 for end in most]
+        if np.any(holds):
+            holds[holds] = all_negative(found, functions[holds])
     except (WeightsError, SolverError):
         return np.zeros(len(against), dtype=bool)
     return holds
@@ -266,13 +268,15 @@ def drawn_gains(
     wrong = covariance.along(centre.K - gain) / deviations
     mean = -spread * values * (left.T @ wrong)[: len(values)]
 
-    def weights_at(a: Array) -> Weights:
-        step = np.tensordot((mean + a) * spread, basis, 1)
-        return split_blocks(factor @ scipy.linalg.expm(step) @ factor.T, n)
+    def block_at(a: Array) -> Array:
+        values, vectors = np.linalg.eigh(np.tensordot((mean + a) * spread, basis, 1))
+        root = factor @ vectors * np.exp(values / 2)
+        return np.asarray(root @ root.T)
 
     def excess(a: Array) -> float:
         """Log density relative to the linearised posterior, in which a ~ N(0, I)."""
-        K = _gain(plant, weights_at(a))
+        X = block_at(a)
+        K = _gain(plant, X[:n, :n], X[n:, n:])
         if K is None:
             return -np.inf
         off, far = covariance.along(K - gain) / deviations, (mean + a) * spread / _DECADE
@@ -284,7 +288,7 @@ def drawn_gains(
     for _ in range(count):
         for _ in range(_STEPS):
             a, here = _slice(a, here, excess, rng)
-        drawn.append(solve_lqr(plant, weights_at(a)))
+        drawn.append(solve_lqr(plant, split_blocks(block_at(a), n)))
     return tuple(drawn)
 
 
@@ -305,9 +309,9 @@ def _directions(
     return np.tensordot(rows, np.tensordot(moving, basis, 1), 1), left, values
 
 
-def _gain(plant: Plant, weights: Weights) -> Array | None:
+def _gain(plant: Plant, Q: Array, R: Array) -> Array | None:
     """K (m, n) to eight digits by doubling (Chu et al. 2004), or None: a third of the time."""
-    A, B, P, R = plant.A, plant.B, weights.Q, weights.R
+    A, B, P = plant.A, plant.B, Q
     G = B @ np.linalg.solve(R, B.T)
     n, unit = len(A), np.eye(len(A))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -26,7 +26,7 @@ from impc.model.continuous_gain import held_gain
 from impc.model.riccati import solve_finite_horizon, solve_lqr, stabilises, terminal_matrix
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from numpy.typing import ArrayLike
 
@@ -172,8 +172,8 @@ class Controller(Value):
         )
         self._fill(**vars(made) | {"stages": stages})
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def _check(self, known: Collection[str]) -> None:
+        super()._check(known)
         plant, made = self.plant, self.stages
         if made is not None:
             same = (made.plant.A, plant.A), (made.plant.B, plant.B), (made.K[0], self.K)

@@ -243,8 +243,22 @@ def plant_family_of(
         moved = (plant.A - plain.A, plant.B - plain.B, plant.E - plain.E)
         return replace(plant, body=plain.body.moved(*moved))
 
-    found = PlantFamily(make, names, values, stated)
+    def slopes(given: Array) -> dict[str, tuple[Array, Array, Array]]:
+        changed = {name: float(value) for name, value in zip(names, given, strict=True)}
+        return slopes_of(made_by(source, **changed), plain)
+
+    found = PlantFamily(make, names, values, stated, slopes)
     return found if found.names or found.limit_deviation else None
+
+
+def slopes_of(system: Any, plant: Plant) -> dict[str, tuple[Array, Array, Array]]:
+    """Derivatives of A, B and E of a `plant` by the parameters of which its system knows them."""
+    inputs = list(getattr(system, "input_labels", ()))
+    columns = [
+        [inputs.index(name) for name in part] for part in (plant.controls, plant.disturbances)
+    ]
+    known: dict[str, tuple[Array, Array]] = getattr(system, "slopes", dict)()
+    return {name: (A, B[:, columns[0]], B[:, columns[1]]) for name, (A, B) in known.items()}
 
 
 def _stated_uncertainty(source: PlantSource, offered: Any) -> dict[str, Any]:

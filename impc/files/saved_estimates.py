@@ -20,8 +20,9 @@ from impc.checking import checked, replace
 from impc.errors import DataError, ImpcError, InputError
 from impc.files.disk import unwritable, write_whole
 from impc.files.results import SCHEMA, ResultFile, read_content, read_result
-from impc.inverse.estimates import Estimate, Goodness, Rival, Status
+from impc.inverse.estimates import Estimate, Goodness, SearchEnd, Status
 from impc.inverse.methods import METHODS
+from impc.inverse.minimiser import Ended
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -147,7 +148,8 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
         "evaluations": int(kept["evaluations"]),
         "cost_weights": None if kept["cost_weights"] is None else frozen(kept["cost_weights"]),
         "problem": posed.at(*own),
-        "rivals": tuple(_rival(one, sizes) for one in kept["rivals"]),
+        "refitted": None if kept["refitted"] is None else _end(kept["refitted"], sizes),
+        "rivals": tuple(_end(one, sizes) for one in kept["rivals"]),
         "weights": None if weights is None else Weights(weights["Q"], weights["R"]),
         "metrics": frozen(np.reshape(kept["metrics"], (-1, m, m))),
         "status": Status(kept["status"]),
@@ -162,10 +164,11 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
     return Estimate(**{item.name: values[item.name] for item in fields(Estimate)})
 
 
-def _rival(kept: Mapping[str, Any], sizes: Mapping[str, tuple[int, int]]) -> Rival:
+def _end(kept: Mapping[str, Any], sizes: Mapping[str, tuple[int, int]]) -> SearchEnd:
     K, S = (frozen(finite_array(name, kept[name], size)) for name, size in sizes.items())
     starts, logarithms, errors = (frozen(kept[name]) for name in ("starts", "logarithms", "errors"))
-    return Rival(K, S, starts, logarithms, errors, float(kept["objective"]))
+    numbers = float(kept["objective"]), Ended(kept["ended"]), float(kept["promised"])
+    return SearchEnd(K, S, starts, logarithms, errors, *numbers)
 
 
 def _encode(value: Any) -> Any:

@@ -8,7 +8,8 @@ says little about its extent. The ends of searches from different starts do:
                 ->  initial states  ->  everything
 
 More starts are tried until enough ends agree: two where the gain is known well, more the less it
-is. All ends within noise of the lowest are kept (`Estimate.rivals`).
+is. All ends within noise of the lowest are kept (`Estimate.rivals`). Searches from other starts end
+early; one that ends lower is continued.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 _FIRST, _FAR = (1.0, 0.7, 1.4), (0.5, 2.0)
 # Shares of all trials that are fitted alone, and how many single trials.
 _PARTS, _SINGLE = ((0.5, 1.0), (0.0, 0.5)), 3
-# Promise at which a fit of a part ends.
-_ROUGH = 0.1
+# Decrease of F that counts as none in searches from other starts.
+_ROUGH = 0.5
 # Relative standard error of the gain up to which two ends and three have to agree.
 _KNOWN, _DOUBTFUL = 0.06, 0.1
 # The same from which some ends suffice, because the gain is not determined anyway.
@@ -45,15 +46,23 @@ _UNKNOWN, _ANYWAY = 0.3, 3
 
 def several_ends(problem: Problem, ends: list[Fitted]) -> list[Fitted]:
     """The `ends` and those of refits from other starts, the lowest first; `problem` is as posed."""
-    ends = list(ends)
+    first, ends = ends[0], list(ends)
     for start in _starts(problem):
         best, agreed = best_of(ends)
         if best.explained or agreed >= _enough(best, len(ends)):
             break
         with contextlib.suppress(ImpcError):  # it cannot be simulated: skip it
             begin, K, S = start(best)
-            ends.append(refit(begin, K, S))
+            ends.append(_rough(begin, K, S))
+    best, _ = best_of(ends)
+    if best is not first:
+        place = next(index for index, end in enumerate(ends) if end is best)
+        ends[place] = refit(best.problem, np.array(best.K), np.array(best.S))
     return sorted(ends, key=lambda end: end.objective)
+
+
+def _rough(problem: Problem, gain: Array, metric: Array) -> Fitted:
+    return refit(problem, gain, metric, _ROUGH, rounds=1)
 
 
 def _enough(end: Fitted, count: int) -> float:
@@ -99,7 +108,7 @@ def _scaled(problem: Problem, scale: float, best: Fitted) -> tuple[Problem, Arra
     K, S = scale * np.array(best.K), np.array(best.S)
     begin = with_fitted_starts(problem.with_body_fixed(), K, S)
     if np.any(problem.stated):
-        fixed = refit(begin, K, S)
+        fixed = _rough(begin, K, S)
         begin, K, S = fixed.problem, np.array(fixed.K), np.array(fixed.S)
     starts, errors = np.array(begin.starts), np.array(begin.errors)
     return problem.at(starts, np.array(problem.logarithms), errors), K, S
@@ -113,7 +122,7 @@ def _of_part(
     whole = [there.recordings[trial] for trial in trials]
     parts = tuple(cut(one, int(low * one.samples), int(high * one.samples)) for one in whole)
     alone = with_fitted_starts(replace(there, recordings=parts), K, S)
-    found = refit(alone, K, S, _ROUGH)
+    found = _rough(alone, K, S)
     K, S = np.array(found.K), np.array(found.S)
     body = np.array(found.problem.logarithms)
     begin = problem.at(np.array(there.starts), body, np.array(there.errors))

@@ -91,9 +91,7 @@ def weights_margin(fibre: GainFibre) -> WeightsMargin:
 
 
 @checked
-def least_condition_weights(
-    fibre: GainFibre, member: Weights | None = None, *, rough: bool = False
-) -> EquivalentWeights:
+def least_condition_weights(fibre: GainFibre, member: Weights | None = None) -> EquivalentWeights:
     """Return the weights of least condition number that have a given gain.
 
     Solves: minimise alpha subject to I <= X <= alpha I, X = blkdiag(Q, R) in the space of weights
@@ -111,9 +109,6 @@ def least_condition_weights(
         Space of the weights with the gain, from `gain_fibre`.
     member : Weights, optional
         Weights known to have the gain; the starting point if the program finds no definite member.
-    rough : bool, default False
-        If True, accept a least condition number proved to 1e-4 and skip the second scaling and the
-        tie-break; at least twice as fast.
 
     Returns
     -------
@@ -140,14 +135,13 @@ def least_condition_weights(
     """
     best = _interior(fibre, member)
     least, gap, status = condition_number(best), 1.0, ""
-    enough = _LARGEST_GAP if rough else _GAP
     for _ in range(4):
         before = least
-        found, bound, status = _centred_program(fibre, best, rough)
+        found, bound, status = _centred_program(fibre, best)
         if condition_number(found) < least:
             best, least = found, condition_number(found)
         gap = abs(1 - bound / least)  # a bound above the value is as wrong as one below
-        if gap < enough or before - least < _GAP * least:
+        if gap < _GAP or before - least < _GAP * least:
             break
     if not gap < _LARGEST_GAP:
         raise SolverError(
@@ -155,11 +149,21 @@ def least_condition_weights(
             f"condition number {least:.6g} proved only to {gap:.2g} (Clarabel: {status})",
             "use `analytic_centre`, or rescale the states (use other units)",
         )
-    if not rough:
-        chosen = _least_norm(fibre, best, (1 + SLACK) * least)
-        if condition_number(chosen) <= (1 + 2 * SLACK) * least:
-            best = chosen
+    chosen = _least_norm(fibre, best, (1 + SLACK) * least)
+    if condition_number(chosen) <= (1 + 2 * SLACK) * least:
+        best = chosen
     return _member(fibre, best, f"least condition number, Clarabel: {status}", least, gap)
+
+
+def nearest_weights(fibre: GainFibre, weights: Weights) -> EquivalentWeights:
+    """Member X nearest to weights LL', in |L^-1 X L^-T - I|_F."""
+    inverse, raw = inverse_factor(fibre, weights), pair_blocks(fibre.Q, fibre.R)
+    seen = (inverse @ raw @ inverse.T).reshape(len(raw), -1)
+    shares = np.linalg.lstsq(seen.T, np.eye(len(inverse)).ravel())[0]
+    X = np.tensordot(shares, raw, 1)
+    if np.linalg.eigvalsh(X)[0] <= 0:
+        raise WeightsError("gain", "has no weights near those given", "use `weights_margin`")
+    return _member(fibre, split_blocks(X, fibre.plant.n), "nearest to other weights")
 
 
 @checked
@@ -313,11 +317,11 @@ class _Centred:
         return split_blocks(np.tensordot(y, self.raw, 1), self.blocks[0].stop)
 
 
-def _centred_program(fibre: GainFibre, centre: Weights, scaled: bool) -> tuple[Weights, float, str]:
+def _centred_program(fibre: GainFibre, centre: Weights) -> tuple[Weights, float, str]:
     """One program of `least_condition_weights` scaled by a member: (found, bound, status)."""
     at = _Centred.about(fibre, centre)
     last = np.eye(len(at.raw) + 1)[-1]
-    found = solve_semidefinite(last, at.cones(None), scaled=scaled)
+    found = solve_semidefinite(last, at.cones(None))
     return at.member(found.y[:-1]), at.largest * found.bound, found.status
 
 

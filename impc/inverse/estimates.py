@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from impc.control.simulation import Simulation
+    from impc.inverse.minimiser import Ended
     from impc.inverse.problem import Problem
 
 
@@ -105,8 +106,8 @@ class OtherWeights:
 
 
 @dataclass(frozen=True)
-class Rival(Frozen):
-    """Another end of the search, from another start."""
+class SearchEnd(Frozen):
+    """End of a search along the directions of the gain that the recordings identify."""
 
     K: Array  # Gain (m, n) and metric (m, m)
     S: Array
@@ -114,6 +115,8 @@ class Rival(Frozen):
     logarithms: Array
     errors: Array
     objective: float  # -2 log posterior
+    ended: Ended  # How the search ended, and the decrease of `objective` that it still promises
+    promised: float
 
     def problem(self, posed: Problem) -> Problem:
         """A problem at the values of this end."""
@@ -173,7 +176,9 @@ class Estimate(Frozen):
     cost_weights : ndarray of shape (count,), or None
         Unknowns of the cost structure (logarithms of cost weights), if the method estimates them;
         minus infinity stands for a cost weight of zero.
-    rivals : tuple of Rival
+    refitted : SearchEnd or None
+        End of the search whose gain has the intervals; None if they need a search of their own.
+    rivals : tuple of SearchEnd
         Other ends of the search for the gain; intervals include those within noise of the best.
 
     Examples
@@ -211,7 +216,8 @@ class Estimate(Frozen):
     seconds: float
     fit: Goodness
     cost_weights: Array | None = None
-    rivals: tuple[Rival, ...] = ()
+    refitted: SearchEnd | None = None
+    rivals: tuple[SearchEnd, ...] = ()
 
     if TYPE_CHECKING:  # attached by `impc.attached_methods`
 

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger("impc")
 # Relative misfit by which weights may exceed the gain for which they were found.
 _AS_GOOD = 1e-3
+# Relative decrease at which the auxiliary problem ends: where the largest eigenvalue is a repeated
+# one, steps creep.
+_CREEPS = 1e-5
 
 
 @dataclass(frozen=True)
@@ -182,7 +185,8 @@ def _gradient(start: Estimate) -> Weights | None:
 def _auxiliary(start: Estimate) -> Weights:
     """Weights of the auxiliary problem (3.7)."""
     natural, target, centre, T, G = _coordinates(start)
-    return in_plant_units(auxiliary_weights(natural, target, centre).weights, T, G)
+    found = auxiliary_weights(natural, target, centre, tolerance=_CREEPS)
+    return in_plant_units(found.weights, T, G)
 
 
 def output_penalty(problem: Problem, start: Estimate, begin: Weights | None = None) -> Estimate:

@@ -37,8 +37,9 @@ _DAMPING, _LEAST, _UP, _DOWN, _GOOD, _POOR = 1e-3, 1e-12, 6.0, 0.2, 0.5, 0.1
 # Least damping after a rejected step that cost as much as derivatives.
 _SHORTENED = 0.1
 # A search is stuck after this many rejected steps in a row, or if this many accepted ones together
-# lower F by less than this share of what is still promised.
-_TRIES, _CREEPING, _DELIVERED = 14, 3, 0.03
+# lower F by less than this share of what is still promised, or by less than counts (`Stop.promise`)
+# and than a larger share.
+_TRIES, _CREEPING, _DELIVERED, _PART = 14, 3, 0.03, 0.25
 # The same share where a value costs as much as derivatives.
 _HURRIED = 0.1
 # Damping of the step that counts as undamped: directions that nothing identifies stay.
@@ -160,7 +161,9 @@ def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop)
             if _gained(model, prior, here, (u, v), (last.du, last.dv)) > 0:
                 u, v = u + last.du, v + last.dv
             return End(u, v, spent, Ended.CONVERGED, promised)
-        if sum(gains[-_CREEPING:]) <= (_HURRIED if stop.costly else _DELIVERED) * promised:
+        share = _HURRIED if stop.costly else _DELIVERED
+        little = max(share * promised, min(stop.promise, _PART * promised))
+        if sum(gains[-_CREEPING:]) <= little:
             return End(u, v, spent, Ended.STUCK, promised)
         if spent >= stop.evaluations:
             return End(u, v, spent, Ended.STOPPED, promised)

@@ -22,7 +22,7 @@ from impc.checking import replace
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.ends import several_ends
 from impc.inverse.equivalent_weights import least_condition_weights
-from impc.inverse.estimates import Estimate, Rival, simulated_estimate
+from impc.inverse.estimates import Estimate, SearchEnd, simulated_estimate
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.laws import GainLaw
@@ -69,8 +69,6 @@ if TYPE_CHECKING:
     from impc.model.weights import Weights
 
 
-# Promise at which a first search ends.
-_ROUGH = 0.1
 # Continue the search if the free gain fits better at this significance level (likelihood ratio).
 _RARE = 0.01
 # Largest relative misfit at which weights of an exact gain are accepted. If few samples identify S,
@@ -85,9 +83,7 @@ _BEGINNINGS = 3
 def first_end(problem: Problem) -> Fitted | None:
     """End of a first search, from which `fit_controller` can go on; None for exact recordings."""
     found = gain_ends(problem)[0]
-    if found.explained:
-        return None
-    return refit(found.problem, np.array(found.K), np.array(found.S), _ROUGH)
+    return None if found.explained else found
 
 
 def fit_controller(problem: Problem, start: Weights | tuple[Fitted, ...] | None = None) -> Estimate:
@@ -156,10 +152,12 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
             weights = behind.equivalent.weights
             return _finish(free, free.problem, weights, evaluations=0, converged=True)
     found, spent = _weights(free, start)
+    refitted = None
     if problem.recorded_numbers > FEW and not free.explained:
         first = refit(free.problem, np.array(found.solution.K), np.array(found.solution.S))
         ends = several_ends(problem, [first, *ends[1:]]) if start is None else [first]
         free = replace(ends[0], unconfirmed=start is None and best_of(ends)[1] == 1)
+        refitted = _end(free)
         found, again = _weights(free, found.weights)
         spent += again + sum(end.evaluations for end in ends)
     elif found.misfit < free.misfit:  # the free gain is in a local minimum
@@ -172,14 +170,14 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     one = _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
     if not one.explained:
-        one = replace(one, rivals=tuple(_rival(end) for end in ends[1:]))
+        one = replace(one, refitted=refitted, rivals=tuple(_end(end) for end in ends[1:]))
     return one if start is None else _not_worse(problem, free, one, start)
 
 
-def _rival(end: Fitted) -> Rival:
+def _end(end: Fitted) -> SearchEnd:
     """The values of an end."""
-    at = end.problem
-    return Rival(end.K, end.S, at.starts, at.logarithms, at.errors, end.objective)
+    own = end.problem.starts, end.problem.logarithms, end.problem.errors
+    return SearchEnd(end.K, end.S, *own, end.objective, end.ended, end.promised)
 
 
 def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) -> Estimate:

@@ -497,7 +497,7 @@ def modelled(problem: Problem, trial: Recording, run: Simulation) -> Array:
     outputs = run.x @ problem.plant.C.T
     errors = trial.errors[:, : outputs.shape[1]]
     if np.any(errors):
-        outputs = distorted(outputs, errors, held=False)[0]
+        outputs = distorted(outputs, errors, held=False)
     if len(problem.measured) == outputs.shape[1]:
         return np.asarray(outputs)
     return np.hstack([outputs, np.vstack([run.u, np.full((1, run.u.shape[1]), np.nan)])])
@@ -568,7 +568,7 @@ def drive_of(trial: Recording, x0: Array) -> Scenario:
     pushes = trial.disturbance[:-1]
     errors = trial.errors[:, trial.outputs.shape[1] :]
     if np.any(errors):
-        pushes = frozen(distorted(pushes, errors, held=True)[0])
+        pushes = frozen(distorted(pushes, errors, held=True))
     return Scenario(frozen(x0), pushes, trial.target, trial.signals)
 
 

@@ -240,7 +240,7 @@ _LARGEST_START_CONDITION = 1e6
 _STEPS, _NEAR = 60, 1e-4
 
 
-@checked(gain="m n", condition_weight=0)
+@checked(gain="m n", condition_weight=0, tolerance=0)
 def auxiliary_weights(
     plant: Plant,
     gain: Array,
@@ -248,6 +248,7 @@ def auxiliary_weights(
     *,
     metric: Array | None = None,
     condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
+    tolerance: float = 1e-11,
 ) -> ConditionedFit:
     """Auxiliary problem (3.7): well-conditioned weights with a gain near `gain` (m, n).
 
@@ -271,9 +272,8 @@ def auxiliary_weights(
         return Residual(np.append(beyond, m * S / np.trace(S) - target), along)
 
     begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
-    return conditioned_fit(
-        plant, Objective(distance, 1.0, condition_weight, squared=False), definite(begin)
-    )
+    objective = Objective(distance, 1.0, condition_weight, squared=False)
+    return conditioned_fit(plant, objective, definite(begin), tolerance=tolerance)
 
 
 def weights_near(

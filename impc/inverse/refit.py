@@ -24,7 +24,7 @@ import scipy.linalg
 from impc.arrays import Array
 from impc.checking import replace
 from impc.inverse.laws import GainLaw
-from impc.inverse.minimiser import PROMISE
+from impc.inverse.minimiser import PROMISE, Ended
 from impc.inverse.problem import explains, require_riccati
 from impc.inverse.search import stop_at
 from impc.inverse.unknowns import Unknowns
@@ -104,7 +104,7 @@ def _refitted(key: _Key, promise: float, rounds: int) -> Fitted:
         if not there.stabilises:  # no covariance there: keep the last gain
             break
         gained, end = end.objective - there.objective, there
-        if gained < _STAYS:
+        if gained < _STAYS or there.ended is Ended.STUCK:  # it would be stuck there again
             break
         law = GainLaw(end.problem, np.array(end.K), np.array(end.S))
         space = Unknowns(end.problem, law)

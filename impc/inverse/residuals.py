@@ -31,7 +31,7 @@ from impc.inverse.problem import (
 from impc.model.bounds import bound_rows
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import stabilises
-from impc.model.signal_errors import distorted, resampled
+from impc.model.signal_errors import distortion, resampled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -246,7 +246,7 @@ def _pushed(problem: Problem, trial: Recording) -> Array | None:
     p, places = len(problem.plant.outputs), problem.error_places
     if not any(column >= p for _, column in places):
         return None
-    slopes = distorted(trial.disturbance[:-1], trial.errors[:, p:], held=True)[1]
+    slopes = distortion(trial.disturbance[:-1], trial.errors[:, p:], held=True)
     found = np.zeros((*slopes.shape[:2], len(places)))
     for place, (kind, column) in enumerate(places):
         if column >= p:
@@ -303,7 +303,7 @@ def _table(
     slope = measured_slope(problem, trial, moved)
     if problem.signal_errors:
         outputs = run.x @ problem.plant.C.T
-        own = distorted(outputs, trial.errors[:, :p], held=False)[1]
+        own = distortion(outputs, trial.errors[:, :p], held=False)
         first = shared + problem.searched_states
         for place, (kind, column) in enumerate(problem.error_places):
             if column < p:

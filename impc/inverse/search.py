@@ -186,7 +186,7 @@ def with_fitted_starts(
         short = cut(trial, 0, trial.samples if samples is None else samples)
         one = replace(problem, recordings=(short,), unknown_start=True).with_parameters_fixed()
         space = Unknowns(one, FixedLaw(gain, metric))
-        end = space.search(space.start, stop_at(one, 1e-3 * PROMISE, _STATES), own=1.0)
+        end = space.search(space.start, stop_at(one, 0.1 * PROMISE, _STATES), own=1.0)
         (found,) = end.problem.recordings
         fitted.append(replace(trial, x0=found.x0, errors=found.errors))
     return replace(problem, recordings=tuple(fitted))

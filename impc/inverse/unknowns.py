@@ -14,7 +14,7 @@ the plant, extend its `PlantFamily`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -22,6 +22,7 @@ import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
+from impc.checking import replace
 from impc.errors import ImpcError
 from impc.inverse.columns import triangular_rows
 from impc.inverse.minimiser import Ended, Prior, Rows, log_square, minimise
@@ -456,17 +457,16 @@ def own_unit(problem: Problem, gain: Array) -> Array:
 def start_unit(problem: Problem, gain: Array) -> Array:
     """Unit of initial states (n, n): factor of the second moments of the states under `gain`.
 
-    Without excitation, or if the loop diverges: white noise at the inputs of the size of the
-    outputs.
+    Those of the trial with the largest outputs. Without excitation, or if the loop diverges: white
+    noise at the inputs of the size of the outputs.
     """
     plant = problem.plant
     if problem.terminal_weight is not None:  # there is no single gain
         return np.eye(plant.n)
-    runs = simulated(problem, gain, np.eye(plant.m))
-    x = np.concatenate([run.x for run in runs])
-    second = x.T @ x / len(x)
-    complete = all(run.complete for run in runs)
-    if complete and np.all(np.isfinite(second)) and np.all(np.diag(second) > 0):
+    largest = max(problem.recordings, key=lambda trial: float(np.nansum(trial.outputs**2)))
+    (run,) = simulated(replace(problem, recordings=(largest,)), gain, np.eye(plant.m))
+    second = run.x.T @ run.x / len(run.x)
+    if run.complete and np.all(np.isfinite(second)) and np.all(np.diag(second) > 0):
         return np.asarray(np.linalg.cholesky(floored_covariance(second, _START_FLOOR)))
     T, _ = natural_coordinates(plant, gain)
     natural = float(np.linalg.norm(problem.scaled_outputs @ T))

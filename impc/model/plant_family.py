@@ -2,9 +2,10 @@
 
 The parameters are positive (masses, lengths, stiffnesses, time constants); searches use the
 logarithms of their ratios to the nominal values. The plant's matrices are analytic functions of
-them. Derivatives are Richardson extrapolations of central differences with steps h and h/2 in the
-logarithm, with errors of order h^4 and rounding/h (both 1e-12 at h = 1e-3); the two differences
-also show whether the extrapolation can be trusted. See docs/howto/fit.md.
+them. A plant can offer its derivatives (`slopes`). Others are Richardson extrapolations of central
+differences with steps h and h/2 in the logarithm, with errors of order h^4 and rounding/h (both
+1e-12 at h = 1e-3); the two differences also show whether the extrapolation can be trusted. See
+docs/howto/fit.md.
 """
 
 from __future__ import annotations
@@ -56,6 +57,10 @@ class PlantFamily(Value):
         keeps such a parameter near its nominal value, and all intervals include its uncertainty. A
         parameter without one is free. Two more names are allowed: "extra_delay", an additional
         delay of the commands in s (at most two samples), and "u_max", the limits of the controls.
+    slopes : callable, optional
+        Function of parameter values (k,) that returns, by name, the derivatives of A (n, n), B
+        (n, m) and E (n, d) by a parameter; C and the nonlinear part of a body must not depend on
+        it. Others are found by differences.
 
     Attributes
     ----------
@@ -69,6 +74,8 @@ class PlantFamily(Value):
         Prior standard deviation of the logarithm of each parameter; infinite if it is free.
     limit_deviation : float
         Prior standard deviation of the logarithm of the control limits; 0 if they are known.
+    slopes : callable
+        Function of parameter values (k,): the derivatives that are known.
 
     Raises
     ------
@@ -96,6 +103,7 @@ class PlantFamily(Value):
     nominal: Array
     deviations: Array
     limit_deviation: float
+    slopes: Callable[[Array], Mapping[str, Sequence[Array]]]
 
     @checked
     def __init__(
@@ -104,6 +112,7 @@ class PlantFamily(Value):
         names: Sequence[str],
         nominal: Sequence[float],
         uncertainty: Mapping[str, Any] | None = None,
+        slopes: Callable[[Array], Mapping[str, Sequence[Array]]] = lambda _: {},
     ) -> None:
         if len(names) != len(nominal):
             raise InputError(
@@ -131,6 +140,7 @@ class PlantFamily(Value):
             nominal=frozen(nominal),
             deviations=frozen(found),
             limit_deviation=limit,
+            slopes=slopes,
         )
         if 0.0 in found:  # zero uncertainty: fixed
             uncertain = np.array(found) > 0
@@ -161,16 +171,17 @@ class PlantFamily(Value):
 
     def part(self, chosen: BoolArray, logarithms: Array) -> PlantFamily:
         """Family of the `chosen` parameters (k,) only; the others fixed at `logarithms` (k,)."""
-        whole, made = self.nominal * np.exp(logarithms), self.make
+        whole, made, known = self.nominal * np.exp(logarithms), self.make, self.slopes
 
-        def make(values: Array) -> Plant:
+        def among(values: Array) -> Array:
             moved = np.array(whole)
             moved[chosen] = values
-            return made(moved)
+            return moved
 
         return replace(
             self,
-            make=make,
+            make=lambda values: made(among(values)),
+            slopes=lambda values: known(among(values)),
             names=tuple(np.array(self.names)[chosen].tolist()),
             nominal=frozen(self.nominal[chosen]),
             deviations=frozen(self.deviations[chosen]),
@@ -181,13 +192,19 @@ class PlantFamily(Value):
         names: Sequence[str],
         nominal: Sequence[float],
         deviations: Sequence[float],
-        change: Callable[[Plant, Array], Plant] = lambda plant, _: plant,
+        change: Callable[[Plant, Array], Plant] | None = None,
     ) -> PlantFamily:
         """Return the family with more parameters; `change` maps plant and their values (more,)."""
-        count, make = len(self.names), self.make
+        count, made, known = len(self.names), self.make, self.slopes
+
+        def make(values: Array) -> Plant:
+            plant = made(values[:count])
+            return plant if change is None else change(plant, values[count:])
+
         return replace(
             self,
-            make=lambda values: change(make(values[:count]), values[count:]),
+            make=make,
+            slopes=lambda values: known(values[:count]) if change is None else {},
             names=(*self.names, *names),
             nominal=frozen([*self.nominal, *nominal]),
             deviations=frozen([*self.deviations, *deviations]),
@@ -283,7 +300,12 @@ class PlantDifferential(NamedTuple):
 
 def plant_at(family: PlantFamily, logarithms: Array) -> Plant:
     """Plant at nominal * exp(logarithms), logarithms (k,)."""
-    return family.make(family.nominal * np.exp(logarithms))
+    return _plant(family, frozen(logarithms).tobytes())
+
+
+@functools.lru_cache(maxsize=4)  # the same point is requested repeatedly
+def _plant(family: PlantFamily, point: bytes) -> Plant:
+    return family.make(family.nominal * np.exp(np.frombuffer(point)))
 
 
 def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferential:
@@ -291,13 +313,19 @@ def plant_differential(family: PlantFamily, logarithms: Array) -> PlantDifferent
     return _differential(family, frozen(logarithms).tobytes())
 
 
-@functools.lru_cache(maxsize=4)  # the same point is requested repeatedly
+@functools.lru_cache(maxsize=4)
 def _differential(family: PlantFamily, point: bytes) -> PlantDifferential:
     logarithms = np.frombuffer(point)
     parts: list[tuple[Array, ...]] = []
     bodies: list[tuple[tuple[float, Body], ...]] = []
-    here = plant_at(family, logarithms)
+    here, values = plant_at(family, logarithms), family.nominal * np.exp(logarithms)
+    known = family.slopes(values)
     for index, name in enumerate(family.names):
+        if name in known:
+            slopes = [values[index] * np.asarray(part) for part in known[name]]
+            parts.append((*slopes, np.zeros(here.C.shape), np.zeros(len(here.observer))))
+            bodies.append(())
+            continue
         if family.stated[index]:  # accurate to 1e-6, which suffices for the prior parameters
             parts.append(_forward(family, logarithms, index, here))
             bodies.append(())

@@ -42,13 +42,21 @@ def search_unit(kind: int, size: float, samples: int) -> float:
     return (size, size / samples, _SCALE, 1.0, 1 / samples)[kind]
 
 
-def distorted(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array]:
-    """Signal (samples, c) with `errors` (kinds, c), and its derivatives (samples, c, kinds)."""
+def distorted(signal: Array, errors: Array, *, held: bool) -> Array:
+    """Signal (samples, c) with `errors` (kinds, c)."""
+    moved, time = signal, np.arange(len(signal))[:, None] + held / 2
+    if np.any(errors[[SHIFT, CLOCK]]):
+        moved, _, _ = _moved(signal, errors, held=held)
+    return np.asarray((1 + errors[SCALE]) * moved + errors[OFFSET] + errors[DRIFT] * time)
+
+
+def distortion(signal: Array, errors: Array, *, held: bool) -> Array:
+    """Derivatives (samples, c, kinds) of a signal (samples, c) with `errors` (kinds, c)."""
     moved, by_shift, by_clock = _moved(signal, errors, held=held)
     time = np.broadcast_to(np.arange(len(signal))[:, None] + held / 2, moved.shape)
     gain = 1 + errors[SCALE]
     slopes = np.ones_like(moved), time, moved, gain * by_shift, gain * by_clock
-    return gain * moved + errors[OFFSET] + errors[DRIFT] * time, np.stack(slopes, axis=2)
+    return np.stack(slopes, axis=2)
 
 
 def undistorted(signal: Array, errors: Array) -> Array:

@@ -96,7 +96,7 @@ def test_profile_against_brute_force(root: float) -> None:
     """D at one value against a grid search over the other entry, initial state refitted."""
     fitted = cart_fit(SEED, root=root)
     problem = impc.replace(fitted.problem, unknown_start=False)
-    known = printed_gain.gain_estimate(impc.replace(fitted, problem=problem))
+    known = printed_gain.gain_estimate(impc.replace(fitted, problem=problem, refitted=None))
     name, K, S = printed_gain.entry_names(problem.plant)[0], np.array(known.K)[0], np.array(known.S)
     curve = FitCurve(problem, np.array(known.K), S, name)
     away = 2 * known.covariance.entries[0, 0]

@@ -12,7 +12,8 @@ from experiments.uncertain_body import cart_person
 from impc.arrays import frozen
 from impc.assess.printed_gain import GainEstimate, covariance_intervals, gain_estimate
 from impc.inverse.ends import relative_error, several_ends
-from impc.inverse.estimates import Estimate, Rival
+from impc.inverse.estimates import Estimate, SearchEnd
+from impc.inverse.minimiser import Ended
 from impc.inverse.refit import refit
 
 
@@ -28,8 +29,8 @@ def with_rivals(found: Estimate, *rises: tuple[float, float]) -> GainEstimate:
     at = found.problem
     lowest = refit(at, found.gain, found.metric).objective
     rivals = tuple(
-        Rival(frozen(scale * found.gain), frozen(found.metric), at.starts, at.logarithms,
-              at.errors, lowest + rise)
+        SearchEnd(frozen(scale * found.gain), frozen(found.metric), at.starts, at.logarithms,
+                  at.errors, lowest + rise, Ended.CONVERGED, 0.0)
         for scale, rise in rises
     )  # fmt: skip
     return gain_estimate(impc.replace(found, rivals=rivals))

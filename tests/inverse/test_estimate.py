@@ -102,10 +102,10 @@ def test_a_saved_estimate_is_the_same(found: impc.Estimate, tmp_path: Path, kind
 def test_the_moments_of_gravity_are_saved(tmp_path: Path) -> None:
     plant = impc.Plant(plants.seated_balance_plant(), ["command"])
     assert dict(plant.gravity).keys() == {"theta1", "theta2"}
-    law = impc.Controller(plant, impc.Weights(np.eye(plant.n), 1), impc.Bounds(plant), 3)
-    outputs = law.simulate(0.01 * np.ones(plant.n), steps=30).outputs
-    problem = impc.Problem(plant, impc.Bounds(plant), 3, [impc.Recording(plant, outputs)])
-    found = impc.fit(impc.replace(problem, unknown_start=True), "feedback_gain")
+    weights, start = impc.Weights(np.eye(plant.n), 1), 0.01 * np.ones(plant.n)
+    law = impc.Controller(plant, weights, impc.Bounds(plant), 3)
+    trial = impc.Recording(plant, law.simulate(start, steps=30).outputs, x0=start)
+    found = impc.fit(impc.Problem(plant, impc.Bounds(plant), 3, [trial]), start=weights)
     again = impc.load(found.save(tmp_path / "found.json"))
     assert isinstance(again, impc.Estimate)
     assert again.problem.plant.gravity == plant.gravity

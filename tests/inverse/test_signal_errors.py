@@ -43,10 +43,10 @@ def recorded(
     for kind, names in errors.items():
         row = list(KINDS).index(kind)
         truth[row, [["angle", "rate", "push"].index(name) for name in names]] = SIZES[row]
-    acting, _ = distorted(push, truth[:, 2:], held=True)
+    acting = distorted(push, truth[:, 2:], held=True)
     run = law.simulate([0.05, 0.0], disturbance=acting)
     assert np.any(np.abs(run.u) > 2.4 - 1e-9)
-    y = distorted(run.x, truth[:, :2], held=False)[0]
+    y = distorted(run.x, truth[:, :2], held=False)
     trial = impc.Recording(law.plant, y + noise * rng.standard_normal(y.shape), push)
     given = {"signal_errors": errors, "unknown_start": True, "terminal_set": False}
     return posed(law, trial, **given), truth
@@ -57,10 +57,10 @@ def test_a_shift_and_back_is_the_mean_of_neighbours_and_none_changes_nothing() -
     signal = np.random.default_rng(1).standard_normal((50, 1))
     none = np.zeros((len(KINDS), 1))
     for held in (False, True):
-        np.testing.assert_allclose(distorted(signal, none, held=held)[0], signal, atol=1e-14)
+        np.testing.assert_allclose(distorted(signal, none, held=held), signal, atol=1e-14)
     late = none.copy()
     late[3] = 0.25  # a quarter of a sample later
-    found = distorted(signal, late, held=True)[0]
+    found = distorted(signal, late, held=True)
     np.testing.assert_allclose(found[1:], 0.75 * signal[1:] + 0.25 * signal[:-1])
 
 
@@ -68,7 +68,7 @@ def test_what_is_compared_has_no_errors() -> None:
     """A late, slow, wrongly scaled recording of a smooth signal is the signal again."""
     signal = np.sin(np.arange(200) / 15)[:, None]
     errors = np.array([0.1, 1e-3, 0.1, 4.6, 2e-3])[:, None]
-    found = undistorted(distorted(signal, errors, held=False)[0], errors)
+    found = undistorted(distorted(signal, errors, held=False), errors)
     known = np.isfinite(found)
     assert np.count_nonzero(~known) == 5  # the end has not been recorded
     assert found[known] == pytest.approx(signal[known], abs=2e-3)

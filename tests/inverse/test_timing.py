@@ -37,7 +37,7 @@ def timed(deviation: float, shift: float = LATE, trials: int = 2) -> Timed:
         push = np.repeat(rng.choice([-2.0, 2.0], SAMPLES // 10), 10)[:, None]
         errors = np.zeros((5, 1))
         errors[SHIFT] = shift
-        run = law.simulate([0.05, 0.0], disturbance=distorted(push, errors, held=True)[0])
+        run = law.simulate([0.05, 0.0], disturbance=distorted(push, errors, held=True))
         y = run.x + 0.005 * rng.standard_normal(run.x.shape)
         recordings.append(
             impc.Recording(law.plant, y, push, timing={"push": deviation} if deviation else None)

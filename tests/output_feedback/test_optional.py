@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 # Script that runs in a package without the subpackage; each printed line is compared.
 TRIED = """
@@ -31,6 +33,7 @@ def fit(**others):
 """
 
 
+@pytest.mark.full  # another set of sources is compiled anew
 def test_the_rest_works_without_it(tmp_path: Path) -> None:
     shutil.copytree(
         ROOT / "impc", tmp_path / "impc", ignore=shutil.ignore_patterns("output_feedback")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import casadi as ca
@@ -20,6 +20,7 @@ from plants import (
     seated_balance_plant,
     ternary_torque,
 )
+from plants.seated_balance import seated_balance_slopes
 
 
 def random_numbers() -> np.random.Generator:
@@ -34,6 +35,24 @@ def random_parameters(rng: np.random.Generator) -> SeatedBalanceParameters:
     return SeatedBalanceParameters(
         **{f.name: getattr(base, f.name) * x for f, x in zip(fields(base), factors, strict=True)}
     )
+
+
+def test_slopes_of_the_matrices_are_differences() -> None:
+    p = random_parameters(random_numbers())
+    found, h = seated_balance_slopes(p, 0.01, 5), 1e-4
+    for name, slopes in found.items():
+        value = getattr(p, name)
+        ends = [
+            seated_balance_plant(replace(p, **{name: value * (1 + step)}), 0.01, 5)
+            for step in (h, -h, h / 2, -h / 2)
+        ]
+        for letter, slope in zip("AB", slopes, strict=True):
+            far, near = (
+                (getattr(ends[k], letter) - getattr(ends[k + 1], letter)) / (2 * h * value)
+                for k in (0, 2)
+            )
+            differences = (8 * near - far) / 3  # errors of order h^4
+            np.testing.assert_allclose(slope, differences, atol=1e-6 * np.max(np.abs(slope)))
 
 
 def energies(p: SeatedBalanceParameters) -> tuple[ca.SX, ca.SX, ca.SX]:

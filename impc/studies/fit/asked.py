@@ -84,7 +84,7 @@ def asked_plant(
 
     nominal, free = [rates[name] for name in learned], [np.inf] * len(learned)
     bare = family or PlantFamily(lambda _: plain, [], [])
-    return plant, bare.wider(learned, nominal, free, dress)
+    return plant, bare.wider(learned, nominal, free, None if plant is plain else dress)
 
 
 def _observer_rates(settings: FitSettings) -> dict[str, float]:

@@ -88,7 +88,7 @@ def first_fits(
         fitted = progress.estimate("inverse_mpc", functools.partial(_whole_fit, problem, begins))
         estimate = gain_estimate(fitted)
         last = tested(estimate)
-        if cause is None:  # the first search raised no clear alarm
+        if cause is None and last is not None and last.alarm:
             end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
             cause = cause_of(end, last)
             if cause is not None and cause.problem is not None:
