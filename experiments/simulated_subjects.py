@@ -53,11 +53,13 @@ class Subject:
     directions: Array
 
 
-def noisy_recordings(limit: float, seed: int, ceiling: float) -> tuple[Recording, ...]:
+def noisy_recordings(
+    limit: float, seed: int, ceiling: float, seconds: float = 30.0
+) -> tuple[Recording, ...]:
     """Three noisy trials of the seat whose true controller has a VAF of `ceiling` (0 to 1)."""
     rng = np.random.default_rng(seed)
     trials = []
-    work = seat(3, 30.0, limit)
+    work = seat(3, seconds, limit)
     for trial in work.problem.recordings:
         size = np.sqrt((1 - ceiling) / ceiling * np.mean(trial.outputs**2, axis=0))
         noisy = trial.outputs + size * rng.standard_normal(trial.outputs.shape)

@@ -105,7 +105,12 @@ def late(values: Array, samples: float) -> Array:
 
 @pytest.mark.parametrize(
     ("name", "size"),
-    [("shift.pos", 0.5), ("shift.push", -0.7), ("scale.push", 0.15), ("drift.pos", 0.2)],
+    [
+        ("shift.pos", 0.5),
+        ("shift.push", -0.7),
+        pytest.param("scale.push", 0.15, marks=pytest.mark.full),
+        pytest.param("drift.pos", 0.2, marks=pytest.mark.full),
+    ],
 )
 def test_a_wrong_recording_is_named_and_mended(name: str, size: float) -> None:
     """The signal, and the size of what is the same in all trials; the second fit has no alarm."""

@@ -42,7 +42,7 @@ SEED = 4
 
 @pytest.fixture(scope="module")
 def noisy() -> FitResult:
-    trials = noisy_recordings(6.0, SEED, 0.9)
+    trials = noisy_recordings(6.0, SEED, 0.9, seconds=15.0)
     settings = FitSettings(u_max=6.0, feedback_states=FEEDBACK, intent_draws=False)
     return fit_recordings(fit_problem(seat().problem.plant, trials, settings), settings)
 
