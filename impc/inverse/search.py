@@ -263,10 +263,11 @@ def _starts(problem: Problem, few: bool) -> Iterator[tuple[Problem, LqrSolution]
 def _ranked(drawn: list[tuple[Problem, LqrSolution]]) -> list[tuple[Problem, LqrSolution]]:
     """Best starts by prediction misfit, initial states fitted to each."""
     ranked = []
+    filters = [correction(_predictable(drawn[0][0]), ratio) for ratio in _RATIOS]
     for place, (problem, regulator) in enumerate(drawn):
         known = _predictable(problem)
         law = FixedLaw(np.array(regulator.K), np.array(regulator.S))
-        space = Unknowns(known, law, correction(known, _RATIOS[place % 2]))
+        space = Unknowns(known, law, filters[place % 2])
         end = space.search(space.start, stop_at(known, _ROUGH * known.recorded_numbers, _QUICK),
                            own=_WEAK)  # fmt: skip
         there = problem.at(np.array(end.problem.starts), np.array(problem.logarithms))
