@@ -11,6 +11,9 @@ from experiments.benchmarks.peers import casadi_fit, casadi_loop, cvxpy_fit
 from experiments.benchmarks.table import Row, compare
 from experiments.benchmarks.timing import Timing, side_by_side
 from experiments.benchmarks.workloads import example, seat
+from experiments.simulated_subjects import noisy_recordings
+from impc.arrays import frozen
+from impc.checking import replace
 from impc.inverse.search import refine_gain
 from impc.inverse.table31 import (
     inverse_mpc,
@@ -19,6 +22,7 @@ from impc.inverse.table31 import (
 )
 from impc.model.riccati import solve_lqr
 from impc.model.weights import weight_error
+from impc.studies.fit.first import FitProgress, first_fits
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,7 +34,7 @@ __all__ = ["fit_rows"]
 
 def fit_rows(runs: int, _: Path) -> list[Row]:
     """Time the fits; each must reach the true gain, or for W1 the true weights."""
-    return [*_seat(runs), *_memory(), *_example(runs)]
+    return [*_seat(runs), *_wrong(runs), *_memory(), *_example(runs)]
 
 
 def _seat(runs: int) -> list[Row]:
@@ -80,6 +84,29 @@ def _seat(runs: int) -> list[Row]:
 def _check(found: Estimate, gain: np.ndarray) -> None:
     if found.weights is None or np.linalg.norm(found.gain - gain) > 1e-6 * np.linalg.norm(gain):
         raise AssertionError(f"the fit missed the true gain: misfit {found.misfit:.3g}")
+
+
+def _wrong(runs: int) -> list[Row]:
+    """Fits of the noisy seat with its tests, and of the same with the push 15 % too small."""
+    noisy = noisy_recordings(6.0, 1, 0.99, seconds=15.0)
+    right = replace(seat().problem, recordings=noisy, unknown_start=True)
+    trials = tuple(
+        replace(trial, disturbance=frozen(np.array(trial.disturbance) / 1.15))
+        for trial in right.recordings
+    )
+    wrong = replace(right, recordings=trials)
+    found = first_fits(wrong, FitProgress())[4][0]
+    if found is None or found.errors[0].name != "scale.push":
+        raise AssertionError("the wrong scale was not named")
+    timings = side_by_side(
+        {
+            "right": lambda: first_fits(right, FitProgress()),
+            "wrong": lambda: first_fits(wrong, FitProgress()),
+        },
+        runs,
+    )
+    what = "W2 fit, noise, a wrong scale of the push, which is named and fitted"
+    return [compare(what, "the same recorded right", timings["wrong"], timings["right"], None)]
 
 
 def _memory() -> list[Row]:

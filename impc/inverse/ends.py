@@ -62,7 +62,7 @@ def several_ends(problem: Problem, ends: list[Fitted]) -> list[Fitted]:
 
 
 def _rough(problem: Problem, gain: Array, metric: Array) -> Fitted:
-    return refit(problem, gain, metric, _ROUGH, rounds=1)
+    return refit(problem, gain, metric, _ROUGH)
 
 
 def _enough(end: Fitted, count: int) -> float:

@@ -42,7 +42,7 @@ from impc.inverse.problem import (
     with_or_without_set,
 )
 from impc.inverse.proximal_search import weights_near
-from impc.inverse.refit import refit
+from impc.inverse.refit import CREASE, refit
 from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
 from impc.inverse.search import (
     FEW,
@@ -69,6 +69,8 @@ if TYPE_CHECKING:
     from impc.model.weights import Weights
 
 
+# Promise at which a first search ends.
+_ROUGH = 0.1
 # Continue the search if the free gain fits better at this significance level (likelihood ratio).
 _RARE = 0.01
 # Largest relative misfit at which weights of an exact gain are accepted. If few samples identify S,
@@ -83,7 +85,11 @@ _BEGINNINGS = 3
 def first_end(problem: Problem) -> Fitted | None:
     """End of a first search, from which `fit_controller` can go on; None for exact recordings."""
     found = gain_ends(problem)[0]
-    return None if found.explained else found
+    if found.explained:
+        return None
+    if found.promised < CREASE:
+        return found
+    return refit(found.problem, np.array(found.K), np.array(found.S), _ROUGH)
 
 
 def fit_controller(problem: Problem, start: Weights | tuple[Fitted, ...] | None = None) -> Estimate:

@@ -14,8 +14,6 @@ directions of the new gain, until -2 log L stays.
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +34,9 @@ if TYPE_CHECKING:
 #: Largest standard error, in whitened units, of an identified direction. Beyond it the prior of the
 #: search and the curvature of the problem matter.
 IDENTIFIED = 0.2
+#: Decrease that a search often promises at a crease, where no step lowers the objective. One that
+#: is stuck although more is promised may go on from there.
+CREASE = 10.0
 # Prior SD of free parameters, and 1 / SD of initial states and errors, about the last end: states
 # that hardly move in the trials have tiny units.
 _SPREAD, _OWN = 3.0, 0.0033
@@ -57,30 +58,6 @@ def refit(
     A round ends where an undamped step promises a decrease of at most `promise` in the objective.
     """
     require_riccati(problem)
-    return _refitted(_Key(problem, gain.tobytes(), metric.tobytes()), promise, rounds)
-
-
-@dataclass(frozen=True)
-class _Key:
-    """A problem by identity, with gain and metric: fit, printed gain and profiles share a refit."""
-
-    problem: Problem
-    gain: bytes
-    metric: bytes
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, _Key) or self.problem is not other.problem:
-            return False
-        return (self.gain, self.metric) == (other.gain, other.metric)
-
-    def __hash__(self) -> int:
-        return hash((id(self.problem), self.gain, self.metric))
-
-
-@functools.lru_cache(maxsize=8)
-def _refitted(key: _Key, promise: float, rounds: int) -> Fitted:
-    problem, m = key.problem, key.problem.plant.m
-    gain, metric = np.frombuffer(key.gain).reshape(m, -1), np.frombuffer(key.metric).reshape(m, m)
     law = GainLaw(problem, gain, metric)
     space = Unknowns(problem, law)
     end, spent = space.ended(space.start), 0
@@ -104,7 +81,7 @@ def _refitted(key: _Key, promise: float, rounds: int) -> Fitted:
         if not there.stabilises:  # no covariance there: keep the last gain
             break
         gained, end = end.objective - there.objective, there
-        if gained < _STAYS or there.ended is Ended.STUCK:  # it would be stuck there again
+        if gained < _STAYS or (there.ended is Ended.STUCK and there.promised < CREASE):
             break
         law = GainLaw(end.problem, np.array(end.K), np.array(end.S))
         space = Unknowns(end.problem, law)
