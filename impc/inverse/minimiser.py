@@ -37,8 +37,8 @@ _DAMPING, _LEAST, _UP, _DOWN, _GOOD, _POOR = 1e-3, 1e-12, 6.0, 0.2, 0.5, 0.1
 # Least damping after a rejected step that cost as much as derivatives.
 _SHORTENED = 0.1
 # A search is stuck after this many rejected steps in a row, or if this many accepted ones together
-# lower F by less than this share of what is still promised, or by less than counts (`Stop.promise`)
-# and than a larger share.
+# lower F by less than this share of what is still promised; at a crease, also by less than counts
+# (`Stop.promise`) and than a larger share.
 _TRIES, _CREEPING, _DELIVERED, _PART = 14, 3, 0.03, 0.25
 # The same share where a value costs as much as derivatives.
 _HURRIED = 0.1
@@ -50,6 +50,9 @@ _FLOOR = 1e-6
 _PROBE, _BEND = 0.1, 0.375
 #: Decrease of F that counts as none.
 PROMISE = 0.01
+#: Decrease that a search often promises at a crease, where no step lowers F. One that is stuck
+#: although more is promised may go on from there.
+CREASE = 10.0
 
 
 class Ended(Enum):
@@ -162,7 +165,8 @@ def minimise(model: Model, prior: Prior, begin: tuple[Array, Array], stop: Stop)
                 u, v = u + last.du, v + last.dv
             return End(u, v, spent, Ended.CONVERGED, promised)
         share = _HURRIED if stop.costly else _DELIVERED
-        little = max(share * promised, min(stop.promise, _PART * promised))
+        counts = min(stop.promise, _PART * promised) if promised < CREASE else 0.0
+        little = max(share * promised, counts)
         if sum(gains[-_CREEPING:]) <= little:
             return End(u, v, spent, Ended.STUCK, promised)
         if spent >= stop.evaluations:

@@ -27,6 +27,7 @@ from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient
 from impc.inverse.laws import GainLaw
 from impc.inverse.metric_family import metric_family, unidentified_metrics
+from impc.inverse.minimiser import CREASE
 from impc.inverse.natural_search import (
     CONDITION_SHARE,
     best_conditioned,
@@ -42,7 +43,7 @@ from impc.inverse.problem import (
     with_or_without_set,
 )
 from impc.inverse.proximal_search import weights_near
-from impc.inverse.refit import CREASE, refit
+from impc.inverse.refit import refit
 from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
 from impc.inverse.search import (
     FEW,

@@ -22,7 +22,7 @@ import scipy.linalg
 from impc.arrays import Array
 from impc.checking import replace
 from impc.inverse.laws import GainLaw
-from impc.inverse.minimiser import PROMISE, Ended
+from impc.inverse.minimiser import CREASE, PROMISE, Ended
 from impc.inverse.problem import explains, require_riccati
 from impc.inverse.search import stop_at
 from impc.inverse.unknowns import Unknowns
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
 #: Largest standard error, in whitened units, of an identified direction. Beyond it the prior of the
 #: search and the curvature of the problem matter.
 IDENTIFIED = 0.2
-#: Decrease that a search often promises at a crease, where no step lowers the objective. One that
-#: is stuck although more is promised may go on from there.
-CREASE = 10.0
 # Prior SD of free parameters, and 1 / SD of initial states and errors, about the last end: states
 # that hardly move in the trials have tiny units.
 _SPREAD, _OWN = 3.0, 0.0033
