@@ -3,7 +3,7 @@
     tests (`lack_of_fit`)  ->  a mistake in the meaning of a signal, which predictions show at once:
                                signs, exchanged signals, sums and differences of signals
                            ->  else refits with each likely error as a further unknown,
-                               the two best again from the body as posed
+                               the two best again from the body as posed, a limit from a lower one
 
 A test is linear about a fit that has compensated for part of the error, so refits decide. The error
 of least -2 log L is named if no test rejects its fit, or if it explains more than the likeliest
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 #: Mistakes in the meaning of a signal.
 SIGN, EXCHANGED, SUM, DIFFERENCE = "sign", "exchanged", "sum", "difference"
 # Errors of signals that are refitted, decrease of -2 log L at which a refit ends, and the logarithm
-# of the second limit at which one begins.
+# of the limit from which a search begins: where a fit does without one, a refit does not find it.
 _REFITTED, _PROMISE, _LOWER = 4, 1.0, -0.5
 # Number of the best refits that begin anew.
 _AGAIN = 2
@@ -99,8 +99,10 @@ def _refits(problem: Problem, at: Fitted, found: LackOfFit) -> list[tuple[ModelE
     first = found.errors[0]
     likely = [one for one in found.errors if signal_of(one.name)][:_REFITTED]
     likely += [one for one in found.errors if one.name in _CURES]
-    pairs = ((one, end) for one in likely for end in _refitted(at, one.name))
-    ends = sorted(pairs, key=lambda pair: pair[1].objective)
+    pairs = ((one, _refitted(at, one.name)) for one in likely)
+    ends = sorted(
+        ((one, end) for one, end in pairs if end is not None), key=lambda pair: pair[1].objective
+    )
     again: dict[ModelError, Problem] = {}
     for one, end in ends:
         there = _freed(problem, one.name)
@@ -109,6 +111,12 @@ def _refits(problem: Problem, at: Fitted, found: LackOfFit) -> list[tuple[ModelE
             body[there.stated] = 0.0
             errors = np.array(end.problem.errors)
             again[one] = there.at(np.array(there.starts), body, errors)
+    for one in likely:
+        there = with_limit_unknown(problem) if one.name == LIMIT else None
+        if there is not None:
+            lower = np.array(there.logarithms)
+            lower[len(problem.logarithms) :] = _LOWER
+            again[one] = there.at(np.array(there.starts), lower, np.array(there.errors))
     displaced = {_like(first, name): other for name, other in _displaced(problem)}
     return [*ends, *_tried(again | displaced)]
 
@@ -131,23 +139,17 @@ def _like(first: ModelError, name: str) -> ModelError:
     return ModelError(name, first.probability, first.evidence, np.nan, np.nan)
 
 
-def _refitted(at: Fitted, name: str) -> list[Fitted]:
-    """Refits with one more unknown from a fit; a limit begins at two values."""
+def _refitted(at: Fitted, name: str) -> Fitted | None:
+    """Refit with one more unknown from a fit."""
     there = _freed(at.problem, name)
     if there is None:
-        return []
+        return None
     K, more = np.array(at.K), there.plant.n - at.problem.plant.n
     K = np.hstack([K, np.zeros((len(K), more))])
-    begins = [there]
-    if name == LIMIT:
-        lower = np.array(there.logarithms)
-        lower[len(at.problem.logarithms) :] = _LOWER
-        begins.append(there.at(np.array(there.starts), lower, np.array(there.errors)))
-    ends = []
-    for begin in begins:
-        with contextlib.suppress(ImpcError):  # it cannot be simulated: no candidate
-            ends.append(refit(begin, K, np.array(at.S), _PROMISE))
-    return ends
+    try:
+        return refit(there, K, np.array(at.S), _PROMISE)
+    except ImpcError:  # it cannot be simulated: no candidate
+        return None
 
 
 def _displaced(problem: Problem) -> Iterator[tuple[str, Problem]]:

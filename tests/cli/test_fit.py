@@ -301,7 +301,7 @@ def test_an_interrupted_command_says_what_it_kept(
     [
         ((1, 2), "", "Ready to report"),  # gain and body first end in a local minimum
         ((1, 2, 3), "seed", "Ready to report"),  # likewise, with a good fit and wrong gains
-        ((1, 2, 3), "12", "so do not report them yet"),  # the limit itself is not named
+        ((1, 2, 3), "12", "a limit of 12 N m is probably wrong"),
         ((1, 2, 3), "sign", "after a correction of a recorded signal"),
     ],
 )
