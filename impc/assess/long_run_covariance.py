@@ -89,9 +89,8 @@ def _restored(
     if fitted is not None:
         for _ in range(_ROUNDS):
             before, found = found, model(trials, _taken(found, fitted, trials))
-            if np.linalg.norm(found.lasting - before.lasting) <= _CLOSE * np.linalg.norm(
-                found.lasting
-            ):
+            change = np.linalg.norm(found.lasting - before.lasting)
+            if change <= _CLOSE * np.linalg.norm(found.lasting):
                 break
     return found
 

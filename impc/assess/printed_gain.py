@@ -19,6 +19,7 @@ from impc.assess.covariance import FOREIGN, TWO_SIDED, GainCovariance, gain_cova
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
 from impc.checking import checked, replace
 from impc.inverse.command_regression import regress_commands
+from impc.inverse.estimates import SearchEnd
 from impc.inverse.minimiser import Ended
 from impc.inverse.refit import refit
 from impc.inverse.residuals import misfit_or_reason
@@ -28,9 +29,8 @@ from impc.model.plant import UNKNOWN, gain_unit
 if TYPE_CHECKING:
     import pandas as pd
 
-    from impc.inverse.estimates import Estimate, SearchEnd
+    from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
     from impc.model.plant import Plant
 
 
@@ -45,8 +45,7 @@ class GainEstimate:
     covariance: GainCovariance  # HAC covariance with curvature
     # The same with stated uncertainties set to zero; None if there are none
     exact: GainCovariance | None = None
-    ended: Ended = Ended.CONVERGED  # How the search ended, and the decrease that it still promises
-    promised: float = 0.0
+    ended: Ended = Ended.CONVERGED  # How the search ended
     # Other ends of the search that are within noise of this one
     rivals: tuple[GainEstimate, ...] = ()
 
@@ -62,43 +61,25 @@ def gain_estimate(fitted: Estimate) -> GainEstimate:
     Other ends of the search whose -2 log posterior is within a 95 % quantile of the lowest, times
     the ratio of long-run to white variance, are as good: intervals are the union of theirs.
     """
-    if fitted.refitted is not None:
-        end: Fitted | SearchEnd = fitted.refitted
-        problem = fitted.refitted.problem(fitted.problem)
-    else:
-        end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
-        problem = end.problem
-    at = np.array(end.K), np.array(end.S)
-    fixed = problem.with_body_fixed()
-    found = GainEstimate(
-        problem,
-        end.K,
-        end.S,
-        misfit_or_reason(problem, *at)[0],
-        gain_covariance(problem, *at, curvature=True),
-        None if fixed is problem else gain_covariance(fixed, *at, curvature=True),
-        end.ended,
-        end.promised,
-    )
-    lowest = min([end.objective, *(one.objective for one in fitted.rivals)])
+    pair = np.array(fitted.gain), np.array(fitted.metric)
+    end = fitted.refitted or SearchEnd.of(refit(fitted.problem, *pair))
+    found = _with_covariance(end, fitted.problem)
+    fixed, exact = found.problem.with_body_fixed(), None
+    if fixed is not found.problem:
+        exact = gain_covariance(fixed, np.array(end.K), np.array(end.S), curvature=True)
+    lowest = min(one.objective for one in (end, *fitted.rivals))
     near = lowest + max(found.covariance.colour, 1.0) * TWO_SIDED**2
-    return replace(
-        found,
-        rivals=tuple(
-            _rival(one.problem(fitted.problem), one)
-            for one in fitted.rivals
-            if one.objective <= near
-        ),
-    )
+    rivals = (one for one in fitted.rivals if one.objective <= near)
+    others = tuple(_with_covariance(one, fitted.problem) for one in rivals)
+    return replace(found, exact=exact, rivals=others)
 
 
-def _rival(problem: Problem, end: SearchEnd) -> GainEstimate:
-    """Another end of the search with its covariance."""
-    K, S = np.array(end.K), np.array(end.S)
+def _with_covariance(end: SearchEnd, posed: Problem) -> GainEstimate:
+    """An end of a search of a problem, with its covariance."""
+    problem, K, S = end.problem(posed), np.array(end.K), np.array(end.S)
     misfit = misfit_or_reason(problem, K, S)[0]
-    return GainEstimate(
-        problem, end.K, end.S, misfit, gain_covariance(problem, K, S, curvature=True)
-    )
+    covariance = gain_covariance(problem, K, S, curvature=True)
+    return GainEstimate(problem, end.K, end.S, misfit, covariance, ended=end.ended)
 
 
 Item = TypeVar("Item", "Interval", "LastingResponse")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 #: Version of the files that are written now.
-SCHEMA = 9
+SCHEMA = 10
 
 Matrix = list[list[float]]
 

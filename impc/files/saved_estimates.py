@@ -167,8 +167,8 @@ def decode_estimate(seen: Problem, kept: Mapping[str, Any]) -> Estimate:
 def _end(kept: Mapping[str, Any], sizes: Mapping[str, tuple[int, int]]) -> SearchEnd:
     K, S = (frozen(finite_array(name, kept[name], size)) for name, size in sizes.items())
     starts, logarithms, errors = (frozen(kept[name]) for name in ("starts", "logarithms", "errors"))
-    numbers = float(kept["objective"]), Ended(kept["ended"]), float(kept["promised"])
-    return SearchEnd(K, S, starts, logarithms, errors, *numbers)
+    objective, ended = float(kept["objective"]), Ended(kept["ended"])
+    return SearchEnd(K, S, starts, logarithms, errors, objective, ended)
 
 
 def _encode(value: Any) -> Any:

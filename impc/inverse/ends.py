@@ -56,8 +56,8 @@ def several_ends(problem: Problem, ends: list[Fitted]) -> list[Fitted]:
             ends.append(_rough(begin, K, S))
     best, _ = best_of(ends)
     if best is not first:
-        place = next(index for index, end in enumerate(ends) if end is best)
-        ends[place] = refit(best.problem, np.array(best.K), np.array(best.S))
+        further = refit(best.problem, np.array(best.K), np.array(best.S))
+        ends = [further if end is best else end for end in ends]
     return sorted(ends, key=lambda end: end.objective)
 
 

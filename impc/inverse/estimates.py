@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from impc.control.simulation import Simulation
     from impc.inverse.minimiser import Ended
     from impc.inverse.problem import Problem
+    from impc.inverse.unknowns import Fitted
 
 
 class Status(Enum):
@@ -115,8 +116,13 @@ class SearchEnd(Frozen):
     logarithms: Array
     errors: Array
     objective: float  # -2 log posterior
-    ended: Ended  # How the search ended, and the decrease of `objective` that it still promises
-    promised: float
+    ended: Ended
+
+    @classmethod
+    def of(cls, end: Fitted) -> SearchEnd:
+        """Values of an end."""
+        at = end.problem
+        return cls(end.K, end.S, at.starts, at.logarithms, at.errors, end.objective, end.ended)
 
     def problem(self, posed: Problem) -> Problem:
         """A problem at the values of this end."""

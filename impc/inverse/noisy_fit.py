@@ -164,7 +164,7 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
         first = refit(free.problem, np.array(found.solution.K), np.array(found.solution.S))
         ends = several_ends(problem, [first, *ends[1:]]) if start is None else [first]
         free = replace(ends[0], unconfirmed=start is None and best_of(ends)[1] == 1)
-        refitted = _end(free)
+        refitted = SearchEnd.of(free)
         found, again = _weights(free, found.weights)
         spent += again + sum(end.evaluations for end in ends)
     elif found.misfit < free.misfit:  # the free gain is in a local minimum
@@ -177,14 +177,8 @@ def _fitted(problem: Problem, start: Weights | tuple[Fitted, ...] | None) -> Est
         settled = with_fitted_starts(free.problem, found.solution.K, found.solution.S)
     one = _finish(free, settled, found.weights, evaluations=spent, converged=found.converged)
     if not one.explained:
-        one = replace(one, refitted=refitted, rivals=tuple(_end(end) for end in ends[1:]))
+        one = replace(one, refitted=refitted, rivals=tuple(map(SearchEnd.of, ends[1:])))
     return one if start is None else _not_worse(problem, free, one, start)
-
-
-def _end(end: Fitted) -> SearchEnd:
-    """The values of an end."""
-    own = end.problem.starts, end.problem.logarithms, end.problem.errors
-    return SearchEnd(end.K, end.S, *own, end.objective, end.ended, end.promised)
 
 
 def _not_worse(problem: Problem, free: Fitted, one: Estimate, start: Weights) -> Estimate:

@@ -78,7 +78,8 @@ def refit(
         if not there.stabilises:  # no covariance there: keep the last gain
             break
         gained, end = end.objective - there.objective, there
-        if gained < _STAYS or (there.ended is Ended.STUCK and there.promised < CREASE):
+        crease = there.ended is Ended.STUCK and there.promised < CREASE
+        if gained < max(_STAYS, promise) or crease:
             break
         law = GainLaw(end.problem, np.array(end.K), np.array(end.S))
         space = Unknowns(end.problem, law)

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 import impc
+from experiments.benchmarks.workloads import seat
+from experiments.simulated_subjects import noisy_recordings
 from impc.arrays import Array, frozen
 from impc.assess.diagnosis import Diagnosis, diagnosed
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.inverse.refit import refit
+from impc.studies.fit.first import FitProgress, first_fits
 from tests.inverse.test_signal_errors import controller, recorded
 
 UNIT = np.eye(2)
@@ -65,3 +68,19 @@ def test_a_mistake_is_named_and_mended(
 
 def test_a_right_recording_has_no_cause(right: tuple[impc.Problem, Array]) -> None:
     assert cause_of(right[0]) is None
+
+
+@pytest.mark.full
+def test_a_wrong_scale_far_from_a_minimum_is_named() -> None:
+    """The first search is stuck with 10000 promised; what goes on from there names the scale."""
+    recordings = noisy_recordings(6.0, 1, 0.99, seconds=15.0)
+    trials = tuple(
+        impc.replace(trial, disturbance=trial.disturbance / 1.15) for trial in recordings
+    )
+    problem = impc.replace(seat().problem, recordings=trials, unknown_start=True)
+    posed, _, _, _, (first, last) = first_fits(problem, FitProgress())
+    assert posed.signal_errors == (("scale", "perturbation"),)
+    assert first is not None
+    assert first.errors[0].name == "scale.perturbation"
+    assert last is not None
+    assert not last.alarm

@@ -33,9 +33,9 @@ def test_what_a_report_writes_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("{}", "another version of impc (schema 1, not 9)"),
-        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 9"),
-        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 9"),
+        ("{}", "another version of impc (schema 1, not 10)"),
+        (json.dumps({"K": [[1.0]], "versions": {}, "made": ""}), "schema 1, not 10"),
+        (json.dumps(HEAD | {"schema": 99}), "schema 99, not 10"),
         (json.dumps(HEAD | {"versions": 3}), "is not a result file"),
         (json.dumps({"schema": SCHEMA}), "is not a result file"),
         (json.dumps(HEAD | {"methods": {"a": {"seconds": "x"}}}), "$.methods[...].seconds"),

@@ -30,7 +30,7 @@ def with_rivals(found: Estimate, *rises: tuple[float, float]) -> GainEstimate:
     lowest = refit(at, found.gain, found.metric).objective
     rivals = tuple(
         SearchEnd(frozen(scale * found.gain), frozen(found.metric), at.starts, at.logarithms,
-                  at.errors, lowest + rise, Ended.CONVERGED, 0.0)
+                  at.errors, lowest + rise, Ended.CONVERGED)
         for scale, rise in rises
     )  # fmt: skip
     return gain_estimate(impc.replace(found, rivals=rivals))

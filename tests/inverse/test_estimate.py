@@ -126,7 +126,7 @@ def test_a_search_goes_on_from_an_earlier_answer_and_is_silent(
     ("damage", "said"),
     [
         (lambda text: text[:-40], "is not a result file"),
-        (lambda text: text.replace('"schema": 9', '"schema": 3'), "another version"),
+        (lambda text: text.replace('"schema": 10', '"schema": 3'), "another version"),
         (lambda text: text.replace('"status": "settled"', '"status": "odd"'), "is damaged"),
         (lambda text: text.replace('"K": [[', '"K": [["x", '), "K: expected real numbers"),
         (lambda text: text.replace('"K": [[', '"K": [[1.0, '), "K: expected shape"),

@@ -89,8 +89,8 @@ def first_fits(
         estimate = gain_estimate(fitted)
         last = tested(estimate)
         if cause is None and last is not None and last.alarm:
-            end = refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric))
-            cause = cause_of(end, last)
+            at = np.array(estimate.K), np.array(estimate.S)
+            cause = cause_of(refit(estimate.problem, *at, rounds=0), last)
             if cause is not None and cause.problem is not None:
                 continue
         progress.done("inverse MPC")
