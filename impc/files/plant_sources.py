@@ -23,12 +23,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.arrays import finite_array
 from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError, PlantError, one_line
 from impc.files.configuration import FILL_IN
 from impc.files.saved_plant import SAVED, read_matrices, state_space
 from impc.model.plant import Plant
-from impc.model.plant_family import DELAY, LIMIT, PlantFamily
+from impc.model.plant_family import DELAY, LIMIT, PlantFamily, plant_differential
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -198,6 +199,8 @@ def made_by(source: PlantSource, **changed: float) -> Any:
         return source.make(**arguments)
 
 
+# Relative difference of a derivative from differences of the plant.
+_SAME = 1e-3
 _REFUSED = (TypeError, ValueError, np.exceptions.ComplexWarning)
 
 
@@ -243,22 +246,45 @@ def plant_family_of(
         moved = (plant.A - plain.A, plant.B - plain.B, plant.E - plain.E)
         return replace(plant, body=plain.body.moved(*moved))
 
-    def slopes(given: Array) -> dict[str, tuple[Array, Array, Array]]:
+    def slopes(given: Array) -> dict[str, tuple[Array, ...]]:
         changed = {name: float(value) for name, value in zip(names, given, strict=True)}
-        return slopes_of(made_by(source, **changed), plain)
+        return _slopes(source, plain, made_by(source, **changed))
 
     found = PlantFamily(make, names, values, stated, slopes)
+    _require_differences(source, found)
     return found if found.names or found.limit_deviation else None
 
 
-def slopes_of(system: Any, plant: Plant) -> dict[str, tuple[Array, Array, Array]]:
+def _slopes(source: PlantSource, plant: Plant, system: Any) -> dict[str, tuple[Array, ...]]:
     """Derivatives of A, B and E of a `plant` by the parameters of which its system knows them."""
-    inputs = list(getattr(system, "input_labels", ()))
-    columns = [
+    if not hasattr(system, "slopes"):
+        return {}
+    where, inputs = f"plant {source.name} slopes", list(system.input_labels)
+    controls, pushes = (
         [inputs.index(name) for name in part] for part in (plant.controls, plant.disturbances)
-    ]
-    known: dict[str, tuple[Array, Array]] = getattr(system, "slopes", dict)()
-    return {name: (A, B[:, columns[0]], B[:, columns[1]]) for name, (A, B) in known.items()}
+    )
+    found: dict[str, tuple[Array, ...]] = {}
+    with users_code(where):
+        for name, (A, B) in system.slopes().items():
+            dA = finite_array(f"{where} {name}", A, (plant.n, plant.n))
+            dB = finite_array(f"{where} {name}", B, (plant.n, len(inputs)))
+            found[name] = dA, dB[:, controls], dB[:, pushes]
+    return found
+
+
+def _require_differences(source: PlantSource, family: PlantFamily) -> None:
+    """Require that the derivatives that a plant offers are those of its matrices."""
+    if family.slopes(family.nominal).keys().isdisjoint(family.names):
+        return
+    at, differences = np.zeros(len(family.names)), replace(family, slopes=lambda _: {})
+    pair = plant_differential(family, at), plant_differential(differences, at)
+    for offered, own in zip(pair[0][:4], pair[1][:4], strict=True):
+        size = np.max(np.abs(own), initial=0.0, axis=(0, 1))
+        wrong = np.max(np.abs(offered - own), initial=0.0, axis=(0, 1)) > _SAME * size
+        if np.any(wrong):
+            name = family.names[int(np.argmax(wrong))]
+            problem = "is not the derivative of the plant's matrices"
+            raise InputError(f"plant {source.name} slopes {name}", problem, "correct system.slopes")
 
 
 def _stated_uncertainty(source: PlantSource, offered: Any) -> dict[str, Any]:

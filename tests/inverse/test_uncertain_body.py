@@ -15,11 +15,12 @@ from impc.arrays import Array
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import GainEstimate, gain_estimate
-from impc.files.plant_sources import plant_family_of, plant_source
+from impc.files.plant_sources import PlantSource, plant_family_of, plant_source
 from impc.inverse.laws import GainLaw
 from impc.inverse.problem import noise_of_residual
 from impc.inverse.residuals import residual_only
 from impc.inverse.unknowns import Unknowns
+from impc.model.plant_family import plant_differential
 from tests.support import posed, regulator, slopes
 
 KNOWN = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
@@ -184,6 +185,42 @@ def test_what_a_file_states_replaces_the_plants_own() -> None:
 def test_what_cannot_be_stated(stated: Any, said: str) -> None:
     with pytest.raises(impc.InputError, match=said):
         plant_family_of(plant_source(SEAT, {"uncertainty": stated}), ["perturbation"], [])
+
+
+def offering(offered: Any) -> PlantSource:
+    """Pushed mass on a spring, which offers its derivatives by the mass."""
+
+    def make(mass: float = 2.0) -> Any:
+        system = control.ss([[1.0, 0.1], [-0.1 / mass, 1.0]], [[0.0], [0.1 / mass]], np.eye(2), 0,
+                            0.1)  # fmt: skip
+        system.slopes = lambda: offered(mass)
+        return system
+
+    return PlantSource("offering", make, {"uncertainty": {"mass": "5 %"}})
+
+
+def test_derivatives_that_a_plant_offers_are_compared_with_its_matrices() -> None:
+    def right(mass: float) -> Any:
+        pull = 0.1 / mass**2
+        return {"mass": ([[0.0, 0.0], [pull, 0.0]], [[0.0], [-pull]])}
+
+    made = plant_family_of(offering(right), [], [])
+    assert made is not None
+    found = plant_differential(made, np.array([0.1]))
+    np.testing.assert_allclose(found.B[1, 0, 0], -0.1 / (2 * np.exp(0.1)))
+    wrong: list[tuple[Any, str]] = [
+        (lambda mass: {"mass": (right(mass)["mass"][0], [[0.0], [0.2]])}, "is not the derivative"),
+        (lambda _: {"mass": (np.zeros((3, 3)), np.zeros((2, 1)))}, "expected shape"),
+        (lambda _: {"mass": (np.full((2, 2), np.nan), np.zeros((2, 1)))}, "mass"),
+        (lambda _: {"mass": 1.0}, "TypeError"),
+        (lambda _: 1 / 0, "ZeroDivisionError"),
+        (lambda _: [], "AttributeError"),
+    ]
+    for offered, said in wrong:
+        with pytest.raises(impc.ImpcError, match=said) as caught:
+            plant_family_of(offering(offered), [], [])
+        assert "slopes" in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 def test_a_delay_needs_a_plant_that_can_have_one() -> None:
