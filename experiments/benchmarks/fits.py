@@ -96,7 +96,7 @@ def _wrong(runs: int) -> list[Row]:
     )
     wrong = replace(right, recordings=trials)
     found = first_fits(wrong, FitProgress())[4][0]
-    if found is None or found.errors[0].name != "scale.push":
+    if found is None or found.errors[0].name != "scale.perturbation":
         raise AssertionError("the wrong scale was not named")
     timings = side_by_side(
         {
