@@ -46,13 +46,14 @@ def distorted(signal: Array, errors: Array, *, held: bool) -> Array:
     """Signal (samples, c) with `errors` (kinds, c)."""
     moved, time = signal, np.arange(len(signal))[:, None] + held / 2
     if np.any(errors[[SHIFT, CLOCK]]):
-        moved, _, _ = _moved(signal, errors, held=held)
+        moved = _moved(signal, errors, held=held)
     return np.asarray((1 + errors[SCALE]) * moved + errors[OFFSET] + errors[DRIFT] * time)
 
 
 def distortion(signal: Array, errors: Array, *, held: bool) -> Array:
     """Derivatives (samples, c, kinds) of a signal (samples, c) with `errors` (kinds, c)."""
-    moved, by_shift, by_clock = _moved(signal, errors, held=held)
+    moved = _moved(signal, errors, held=held)
+    by_shift, by_clock = _slopes(signal, moved, errors, held=held)
     time = np.broadcast_to(np.arange(len(signal))[:, None] + held / 2, moved.shape)
     gain = 1 + errors[SCALE]
     slopes = np.ones_like(moved), time, moved, gain * by_shift, gain * by_clock
@@ -94,26 +95,41 @@ def _before(place: Array, samples: int) -> IntArray:
     return np.asarray(np.clip(np.floor(place).astype(np.int64), 0, samples - 2))
 
 
-def _moved(signal: Array, errors: Array, *, held: bool) -> tuple[Array, Array, Array]:
-    """Signal (samples, c) read at other times, and its derivatives by shift and clock."""
-    moved, by_shift, by_clock = (np.empty_like(signal) for _ in range(3))
+def _read(values: Array, places: Array) -> Array:
+    """Values (k,) at `places`, interpolated; at both ends the first and last lines continue."""
+    last = len(values) - 1
+    found = np.interp(places, np.arange(len(values)), values)
+    found += np.minimum(places, 0.0) * (values[1] - values[0])
+    return np.asarray(found + np.maximum(places - last, 0.0) * (values[last] - values[last - 1]))
+
+
+def _moved(signal: Array, errors: Array, *, held: bool) -> Array:
+    """Signal (samples, c) read at other times."""
+    moved = np.empty_like(signal)
+    for column, error in enumerate(errors.T):
+        values, places = signal[:, column], _places(len(signal), error)
+        if held:  # the integral of a held signal is piecewise linear
+            integral = _read(np.concatenate([[0.0], np.cumsum(values)]), places)
+            moved[:, column] = np.diff(integral) / np.diff(places)
+        else:
+            moved[:, column] = _read(values, places[:-1])
+    return moved
+
+
+def _slopes(signal: Array, moved: Array, errors: Array, *, held: bool) -> tuple[Array, Array]:
+    """Derivatives (samples, c) of a `moved` signal by shift and clock."""
+    by_shift, by_clock = np.empty_like(signal), np.empty_like(signal)
     count = np.arange(len(signal))
     for column, error in enumerate(errors.T):
         values, places = signal[:, column], _places(len(signal), error)
-        first, last = places[:-1], places[1:]
         if held:
-            # The integral of a held signal is piecewise linear.
-            sums = np.concatenate([[0.0], np.cumsum(values)])
-            low, high = _before(first, len(sums)), _before(last, len(sums))
-            width, v, w = last - first, values[low], values[high]
-            mean = (sums[high] + w * (last - high) - sums[low] - v * (first - low)) / width
-            moved[:, column] = mean
+            at = values[_before(places, len(values) + 1)]
+            v, w, width = at[:-1], at[1:], np.diff(places)
             by_shift[:, column] = (v - w) / width
-            by_clock[:, column] = (mean - (count + 1) * w + count * v) / width
+            by_clock[:, column] = (moved[:, column] - (count + 1) * w + count * v) / width
         else:
-            before = _before(first, len(values))
+            before = _before(places[:-1], len(values))
             step = values[before + 1] - values[before]
-            moved[:, column] = values[before] + (first - before) * step
             by_shift[:, column] = -step
             by_clock[:, column] = -count * step
-    return moved, by_shift, by_clock
+    return by_shift, by_clock

@@ -62,6 +62,10 @@ def test_a_shift_and_back_is_the_mean_of_neighbours_and_none_changes_nothing() -
     late[3] = 0.25  # a quarter of a sample later
     found = distorted(signal, late, held=True)
     np.testing.assert_allclose(found[1:], 0.75 * signal[1:] + 0.25 * signal[:-1])
+    late[3] = 2.5  # before its first sample a held signal keeps its value, a sampled one its slope
+    np.testing.assert_allclose(distorted(signal, late, held=True)[:2], signal[[0, 0]])
+    found = distorted(signal, late, held=False)
+    np.testing.assert_allclose(found[0], signal[0] - 2.5 * (signal[1] - signal[0]))
 
 
 def test_what_is_compared_has_no_errors() -> None:
