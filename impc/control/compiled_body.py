@@ -70,6 +70,17 @@ def states_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, ahea
 
 
 @njit()
+def states_from(body: BodyTape, u: Buffer, disturbance: Buffer, x: Buffer) -> None:
+    """Compute a trajectory `x` (steps + 1, n) from its first state.
+
+    `u` (steps, m); `disturbance` (steps, d).
+    """
+    for t in range(len(u)):
+        _find(body, x[t], u[t], disturbance[t])
+        copy(body.found, x[t + 1])
+
+
+@njit()
 def move_along(body: BodyTape, x: Buffer, u: Buffer, disturbance: Buffer, slopes: Buffer) -> None:
     """Compute the derivatives of the next state at every sample of a trajectory.
 

@@ -9,23 +9,28 @@ contains clock, outputs and disturbance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.assess.variance_accounted_for import saturated_share
+from impc.control.body_steps import body_tape
 from impc.control.closed_loop import prepare_loop, run_loop
+from impc.control.compiled_body import states_from
 from impc.control.constraint_rows import directions
 from impc.control.simulation import Scenario, Status
 from impc.errors import InputError
+from impc.model.body import read_body
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import casadi as ca
     from numpy.typing import ArrayLike
 
     from impc.control.controller import Controller
+    from impc.model.body import Body
     from impc.model.plant import Plant
     from impc.output_feedback.observer import Observer
 
@@ -47,7 +52,7 @@ class SubjectTrial(Frozen):
 
 def simulate_subject(
     controller: Controller,
-    step: Any,
+    step: ca.Function,
     disturbance: ArrayLike,
     *,
     rate: float = 1000.0,
@@ -73,7 +78,8 @@ def simulate_subject(
     if np.any(person.process):
         raise InputError("process", "process noise cannot be simulated", "set process=0")
     rng = np.random.default_rng(seed)
-    x, u, end = _moved(controller, step.mapaccum(within), d, within, person, rng, largest)
+    body = read_body(step, range(plant.m + d.shape[1]), plant.n)
+    x, u, end = _moved(controller, body, d, within, person, rng, largest)
     limits = controller.bounds
     sensed = np.asarray(sensor) * rng.standard_normal((len(d), len(plant.outputs)))
     return SubjectTrial(
@@ -89,7 +95,7 @@ def simulate_subject(
 
 def _moved(
     controller: Controller,
-    several: Any,
+    body: Body,
     d: Array,
     within: int,
     person: Observer,
@@ -100,8 +106,10 @@ def _moved(
     plant, samples = controller.plant, len(d)
     prepared = prepare_loop(controller, directions(controller, 0))
     observe = _filter(plant, person, rng) if person.estimates else None
-    still = np.zeros((1, plant.E.shape[1]))
+    width, still = d.shape[1], np.zeros((1, plant.E.shape[1]))
+    tape = body_tape(body, plant.n, plant.n + plant.m + width, moving=False)
     x, u = np.zeros((samples, plant.n)), np.zeros((samples, plant.m))
+    ahead = np.zeros((within + 1, plant.n))
     state: Array = np.zeros(plant.n)
     seen = state
     for first in range(0, samples, within):
@@ -112,12 +120,12 @@ def _moved(
             return x, u, first
         command = run.u[0]
         noise = np.hypot(person.motor, person.share * command) * rng.standard_normal(plant.m)
-        moved = np.tile(command + noise, (within, 1))
-        pushed = np.resize(d[first:last], (within, d.shape[1]))
-        ahead = np.asarray(several(state, np.hstack([moved, pushed]).T)).T
-        x[first:last] = np.vstack([state, ahead[:-1]])[: last - first]
+        pushed = np.resize(d[first:last], (within, width))
+        ahead[0] = state
+        states_from(tape, np.tile(command + noise, (within, 1)), pushed, ahead)
+        x[first:last] = ahead[: last - first]
         u[first:last] = command
-        before, state = state, ahead[-1]
+        before, state = state, ahead[-1].copy()
         seen = (
             state if observe is None else observe(before, command, np.mean(d[first:last], axis=0))
         )

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from impc.control.body_steps import next_state, slopes_along
+from impc.control.body_steps import body_tape, next_state, slopes_along
 from impc.control.closed_loop import simulate_and_differentiate
+from impc.control.compiled_body import states_from
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
@@ -41,6 +42,9 @@ def compile_bodies() -> None:
     given = run.x[:-1], run.u, drive.disturbance
     next_state(law.plant, *(part[0] for part in given))
     slopes_along(law.plant, *given)
+    if law.plant.body is not None:
+        tape = body_tape(law.plant.body, law.plant.n, 4, moving=False)
+        states_from(tape, np.array(run.u), np.array(drive.disturbance), np.array(run.x))
 
 
 def compile_filter() -> None:
