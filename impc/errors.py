@@ -7,6 +7,13 @@ worker processes can show them without parsing.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Self
+
 # Longest message; longer names and values are shortened in the middle.
 _LONGEST = 600
 _MANY_BITS = 128  # 39 digits
@@ -25,6 +32,13 @@ class ImpcError(Exception):
     remedy : str
         What to do.
 
+    Attributes
+    ----------
+    file : str
+        Recording or configuration at fault; empty if there is none.
+    place : tuple of str
+        TOML path at fault, such as ``("signals", "theta1", "unit")``; empty if there is none.
+
     Examples
     --------
     >>> import impc
@@ -35,12 +49,20 @@ class ImpcError(Exception):
     R | give every input a positive cost weight
     """
 
+    file: str = ""
+    place: tuple[str, ...] = ()
+
     def __init__(self, subject: str, problem: str, remedy: str) -> None:
         # All three go to Exception.__init__ so that the error can be pickled by workers.
         super().__init__(subject, problem, remedy)
         self.subject = subject
         self.problem = problem
         self.remedy = remedy
+
+    def at(self, file: str, *place: str) -> Self:
+        """Set the `file` and the TOML path (`place`) at fault unless they are set; return self."""
+        self.file, self.place = self.file or file, self.place or place
+        return self
 
     def __str__(self) -> str:
         return one_line(f"{self.subject}: {self.problem}; {self.remedy}")
@@ -168,6 +190,16 @@ class OutputError(ImpcError):
         ...
     impc.errors.OutputError: trial.docx: has the ending '.docx', not one of .csv, ...
     """
+
+
+@contextmanager
+def blamed(file: str, *place: str) -> Iterator[None]:
+    """Errors inside are `at` this file and TOML path, unless they name their own."""
+    try:
+        yield
+    except ImpcError as error:
+        error.at(file, *place)
+        raise
 
 
 def one_line(text: object, longest: int = _LONGEST) -> str:

@@ -99,7 +99,8 @@ def match_apart(subject: str, pattern: str, text: str) -> dict[str, str | None] 
         found: dict[str, str | None] | None = _asked(subject, "match", (pattern, text), 0)
     except DataError:
         problem = f"cannot be matched with {text[:80]!r} in {_SECONDS} s"
-        raise InputError(subject, problem, "remove nested repetitions such as (a+)+") from None
+        error = InputError(subject, problem, "remove nested repetitions such as (a+)+")
+        raise error.at("", *subject.split(".")) from None
     return found
 
 
@@ -109,7 +110,8 @@ def _read(path: Path, kind: str, *given: Any) -> Any:
         return _asked(str(path), kind, given, path.stat().st_size)
     except ImpcError as error:
         subject = error.subject.replace(str(path.absolute()), str(path), 1)
-        raise DataError(subject, brief(error.problem, 300), error.remedy) from None
+        said = DataError(subject, brief(error.problem, 300), error.remedy)
+        raise said.at(str(path), *error.place) from None
 
 
 def _asked(source: str, kind: str, given: tuple[Any, ...], size: int) -> Any:

@@ -1,21 +1,23 @@
 """Checks of a recorded channel, one function each.
 
-A check raises `DataError` if the channel cannot be used; otherwise it returns a sentence for the
-report, or "". Messages name file, signal and column, the number of samples, and the first of them.
+A check raises `DataError` if the channel cannot be used; otherwise it returns a finding or None.
+Messages name file, signal and column, the number of samples, and the first of them.
 """
 
 from __future__ import annotations
 
+import enum
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.errors import DataError, FallError
+from impc.errors import DataError, FallError, one_line
 
 if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray
+    from impc.errors import ImpcError
     from impc.files.units import Unit
 
 #: First words of the message about a fall.
@@ -41,6 +43,39 @@ _LARGEST, _SMALLEST = 1e50, 1e-50
 _SLOWER = 50
 
 
+class Level(enum.Enum):
+    """Whether a notice stops a fit."""
+
+    AMBER = "amber"  # A finding, or a fall
+    RED = "red"  # A fault that stops a fit
+
+
+@dataclass(frozen=True)
+class Notice:
+    """One fault or finding."""
+
+    level: Level
+    file: str  # Recording or configuration
+    place: tuple[str, ...]  # TOML path to look at; empty if there is none
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return one_line(f"{self.text}; {self.remedy}") if self.remedy else self.text
+
+
+def fault(error: ImpcError) -> Notice:
+    """The notice of an error; `impc fit` leaves out trials in which the subject fell."""
+    text = one_line(f"{error.subject}: {error.problem}")
+    level = Level.AMBER if isinstance(error, FallError) else Level.RED
+    return Notice(level, error.file, error.place, text, one_line(error.remedy))
+
+
+def finding(file: str, text: str, *place: str) -> Notice:
+    """A finding of a `file`, which its text begins with."""
+    return Notice(Level.AMBER, file, place, f"{file}: {text}")
+
+
 @dataclass(frozen=True)
 class Channel:
     """One recorded signal, before it is resampled."""
@@ -61,28 +96,34 @@ class Channel:
         """Number and time of a sample, for messages."""
         return f"sample {index + 1} ({self.time[index]:.6g} s)"
 
+    def key(self, name: str) -> tuple[str, str, str, str]:
+        """File and TOML path of a key of the signal."""
+        return self.source, "signals", self.signal, name
 
-def unit_of_the_file(channel: Channel, stated: Unit | None, overruled: bool) -> str:
+    def finding(self, text: str, key: str = "column") -> Notice:
+        """A finding about a key of the signal, by default its column."""
+        return Notice(Level.AMBER, self.source, self.key(key)[1:], f"{self.name}{text}")
+
+
+def unit_of_the_file(channel: Channel, stated: Unit | None, overruled: bool) -> Notice | None:
     """Require that the file's unit (if not "1") agrees with the configuration or is overruled."""
     if stated is None or (
         stated.base == channel.unit.base and np.isclose(stated.factor, channel.unit.factor)
     ):
-        return ""
+        return None
     key = f"signals.{channel.signal}"
     if overruled or (stated.base == "dimensionless" and stated.factor == 1):
-        return (
-            f"{channel.name}: read in {channel.unit.written!r} as {key} says; the file states "
-            f"{stated.written!r}"
-        )
+        said = f"read in {channel.unit.written!r} as {key} says; the file states {stated.written!r}"
+        return channel.finding(f": {said}", "unit")
     raise DataError(
         channel.name,
         f"has the unit {channel.unit.written!r} in the configuration and {stated.written!r} in "
         "the file",
         f"correct {key}.unit, or set {key}.overrule_unit = true if the file is wrong",
-    )
+    ).at(*channel.key("unit"))
 
 
-def measurable(channel: Channel) -> str:
+def measurable(channel: Channel) -> Notice | None:
     """Reject values that are implausibly large or small."""
     sizes = np.where(np.isfinite(channel.values), np.abs(channel.values), 0)
     first = int(np.argmax(sizes))
@@ -94,7 +135,7 @@ def measurable(channel: Channel) -> str:
             "is implausible",
             f"check the column, and offset and unit in signals.{channel.signal}",
         )
-    return ""
+    return None
 
 
 def comparable_rates(subject: str, period: float, dt: float) -> None:
@@ -104,7 +145,7 @@ def comparable_rates(subject: str, period: float, dt: float) -> None:
             subject,
             f"has a sample every {period:.4g} s, far slower than the plant (dt = {dt:.4g} s)",
             "correct recording.time_unit or rate, or use a plant with a longer dt",
-        )
+        ).at(subject, "recording", "time_unit")
 
 
 def gaps(channel: Channel, fill_gaps: float) -> BoolArray:
@@ -118,7 +159,7 @@ def gaps(channel: Channel, fill_gaps: float) -> BoolArray:
     return lost
 
 
-def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str:
+def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> Notice | None:
     """Report samples that are missing or not finite; gaps up to `fill_gaps` s may be filled.
 
     `keep`: whether longer gaps count as not measured; None if they never can.
@@ -126,7 +167,7 @@ def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str
     finite = np.isfinite(channel.values)
     lost = np.flatnonzero(~finite)
     if len(lost) == 0:
-        return ""
+        return None
     kept = np.flatnonzero(finite)
     found = (
         f"{len(lost)} of {len(finite)} samples are missing or not finite, the first "
@@ -138,7 +179,7 @@ def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str
             remedy = "leave the trial out: at most half of a signal may be missing"
             raise DataError(channel.name, f"{found}; {share:.0%} lie in long gaps", remedy)
         filled = "; the others filled by interpolation" if left.sum() < len(lost) else ""
-        return f"{channel.name}: {found}; {100 * share:.2g} % count as not measured{filled}"
+        return channel.finding(f": {found}; {100 * share:.2g} % count as not measured{filled}")
     remedy = "cut with recording.start and stop, or repair the file"
     remedy += ", or set recording.keep_gaps = true" if keep is False else ""
     if len(kept) == 0 or not finite[0] or not finite[-1]:
@@ -151,10 +192,10 @@ def missing(channel: Channel, fill_gaps: float, keep: bool | None = None) -> str
             f"{found}, the longest stretch {bridged.max():.4g} s",
             f"{remedy}, or raise recording.fill_gaps (now {fill_gaps:g} s)",
         )
-    return f"{channel.name}: {found}; filled by interpolation"
+    return channel.finding(f": {found}; filled by interpolation")
 
 
-def constant(channel: Channel) -> str:
+def constant(channel: Channel) -> Notice | None:
     """Reject a constant channel: unplugged sensor, or perturbation that never acted."""
     values = channel.values[np.isfinite(channel.values)]
     if np.ptp(values) <= 1e-12 * np.max(np.abs(values)):
@@ -163,10 +204,10 @@ def constant(channel: Channel) -> str:
             f"is constant at {values[0]:.6g} {channel.unit.written} in all {len(values)} samples",
             "name the right column, or leave out a disturbance that does not act",
         )
-    return ""
+    return None
 
 
-def clipped(channel: Channel) -> str:
+def clipped(channel: Channel) -> Notice | None:
     """Report a response that stays at its extreme values: amplifier or converter saturated."""
     finite = channel.values[np.isfinite(channel.values)]
     span = np.ptp(finite)
@@ -185,11 +226,11 @@ def clipped(channel: Channel) -> str:
         )
         if share > _TOO_CLIPPED:
             raise _fault(channel, abs(extreme), found, "record with a wider range")
-        return f"{channel.name} {found}"
-    return ""
+        return channel.finding(f" {found}")
+    return None
 
 
-def stretches(channel: Channel) -> str:
+def stretches(channel: Channel) -> Notice | None:
     """Report a response that freezes within its range, or repeatedly jumps to one value."""
     values, finite = channel.values, np.isfinite(channel.values)
     steps = np.abs(np.diff(values))
@@ -203,8 +244,8 @@ def stretches(channel: Channel) -> str:
     if len(gaps) and gaps[0] < _EPISODES and sizes[gaps[0]] >= _STILL:
         still = lengths >= sizes[gaps[0]]
         first, often = int(starts[np.argmax(still)]), "stretch" if still.sum() == 1 else "stretches"
-        return (
-            f"{channel.name} is constant in {still.sum()} {often}, {lengths[still].sum()} samples "
+        return channel.finding(
+            f" is constant in {still.sum()} {often}, {lengths[still].sum()} samples "
             f"in total, the first at {values[first]:.6g} {channel.unit.written} from "
             f"{channel.at(first)}: the sensor may have failed; cut it with recording.start and stop"
         )
@@ -214,21 +255,21 @@ def stretches(channel: Channel) -> str:
     jumps = np.minimum(into, out) > _JUMP * np.median(moves)
     found, times = np.unique(values[starts[inside][jumps]], return_counts=True)
     if len(found) == 0 or times.max() < _AGAIN:
-        return ""
+        return None
     value = found[np.argmax(times)]
     lost = values == value
-    return (
-        f"{channel.name} jumps to {value:.6g} {channel.unit.written} and back {times.max()} times, "
+    return channel.finding(
+        f" jumps to {value:.6g} {channel.unit.written} and back {times.max()} times, "
         f"in {lost.sum()} samples, the first {channel.at(int(np.argmax(lost)))}: if it marks lost "
         "samples, leave them empty in the file and set recording.fill_gaps"
     )
 
 
-def beyond_the_stop(channel: Channel, limit: float) -> str:
+def beyond_the_stop(channel: Channel, limit: float) -> Notice | None:
     """Reject values beyond the mechanical stop; `limit` in the channel's unit."""
     beyond = np.abs(channel.values) > limit * (1 + 1e-9)
     if not beyond.any():
-        return ""
+        return None
     largest = float(np.nanmax(np.abs(channel.values)))
     raise _fault(
         channel,
@@ -237,13 +278,13 @@ def beyond_the_stop(channel: Channel, limit: float) -> str:
         f"{len(beyond)} samples, the first {channel.at(int(np.argmax(beyond)))}, "
         f"at most {largest:.4g}",
         f"correct unit, offset or limit in signals.{channel.signal}",
-    )
+    ).at(*channel.key("limit"))
 
 
-def degrees_for_radians(channel: Channel) -> str:
+def degrees_for_radians(channel: Channel) -> Notice | None:
     """Check that an angle is neither too large for a posture nor too small for a movement."""
     if not channel.unit.angle:
-        return ""
+        return None
     finite = channel.values[np.isfinite(channel.values)] * channel.unit.factor
     span = float(np.ptp(finite))
     written = channel.unit.written
@@ -255,19 +296,20 @@ def degrees_for_radians(channel: Channel) -> str:
             f"spans {span / channel.unit.factor:.4g} {written}, more than half a turn, largest in "
             f"{where}",
             "correct its unit; the column may hold degrees instead of radians",
-        )
+        ).at(*channel.key("unit"))
     if channel.unit.factor < 1 and span < 2 * _TINY:
         raise DataError(
             channel.name,
             f"spans only {span / channel.unit.factor:.4g} {written}",
             'if the column holds radians, write unit = "rad"',
-        )
+        ).at(*channel.key("unit"))
     if span > _WIDE:
-        return (
-            f"{channel.name} spans {span / channel.unit.factor:.4g} {written} "
-            f"({np.rad2deg(span):.0f} degrees), largest in {where}: check its unit"
+        return channel.finding(
+            f" spans {span / channel.unit.factor:.4g} {written} ({np.rad2deg(span):.0f} degrees), "
+            f"largest in {where}: check its unit",
+            "unit",
         )
-    return ""
+    return None
 
 
 def _fault(channel: Channel, beyond: float, problem: str, remedy: str) -> DataError:
@@ -282,18 +324,17 @@ def _fault(channel: Channel, beyond: float, problem: str, remedy: str) -> DataEr
         channel.name,
         f"{FELL} at {when:.4g} s",
         f"leave the trial out, or cut it with recording.stop = {math.floor(10 * when) / 10:g}",
-    )
+    ).at(channel.source, "recording", "stop")
 
 
-def too_few(source: str, samples: int, needed: int) -> str:
+def too_few(source: str, samples: int, needed: int) -> None:
     """Require the `needed` number of samples at the plant's rate."""
     if samples < needed:
         raise DataError(
             source,
             f"has {samples} samples at the plant's rate, {needed} are needed",
             "record longer, or widen recording.start and stop",
-        )
-    return ""
+        ).at(source, "recording", "start")
 
 
 def _rests(resting: BoolArray) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from impc.checking import replace
-from impc.errors import DataError, InputError
+from impc.errors import DataError, InputError, blamed
 from impc.files.alignment import named_clock, rising
 from impc.files.units import si_unit
 
@@ -29,6 +29,7 @@ _UNITS = np.array([1, 60, 3600, 86400])  # of a clock, in s, times any power of 
 _UNEVEN = 0.05
 # Relative difference above which two statements of the rate contradict each other.
 _RATE = 1e-3
+_TIME_UNIT = ("recording", "time_unit")
 # Plausible: clocks below 30 000 years (1.7e9 s counts from 1970), periods in this range in s, and
 # at most this many uniform instants for each sample, where gaps may be filled.
 _LONGEST, _PERIODS, _GAPS = 1e12, (1e-9, 1e6), 10
@@ -56,15 +57,20 @@ class Clock:
 def read_clock(table: Table, recording: RecordingTable, dt: float = 0.0) -> Clock:
     """Read the clock, cut, require uniform sampling; by default gaps up to `dt` s are filled."""
     fill_gaps = dt if recording.fill_gaps is None else recording.fill_gaps
+    with blamed(table.source, "recording", "time"):
+        return _read(table, recording, fill_gaps)
+
+
+def _read(table: Table, recording: RecordingTable, fill_gaps: float) -> Clock:
     if recording.time is None:
         rate = _stated_rate(table, recording)
-        _require_period(table.source, 1 / rate)
+        _require_period(table.source, 1 / rate, "rate")
         time = np.arange(table.samples) / rate
         rows = _cut(table.source, time, recording)
         steps = np.arange(rows.stop - rows.start)
         clock = Clock(time[rows], rows, steps, float(time[rows.start]), 1 / rate, fill_gaps)
         return replace(clock, notes=_rows_lost(table, clock, None))
-    name, values = column_of(table, recording.time, "recording.time")
+    name, values = column_of(table, recording.time, ("recording", "time"))
     subject = f"{table.source}: clock {name!r}"
     days = not recording.time_unit and name not in table.units and counts_days(values)
     stated = recording.time_unit or table.units.get(name) or ("day" if days else "s")
@@ -72,14 +78,16 @@ def read_clock(table: Table, recording: RecordingTable, dt: float = 0.0) -> Cloc
         unit = si_unit(stated)
     except InputError as error:
         remedy = 'write recording.time_unit = "s" or "ms"'
-        raise DataError(subject, f"is in {error.subject}, which {error.problem}", remedy) from None
+        problem = f"is in {error.subject}, which {error.problem}"
+        raise DataError(subject, problem, remedy).at("", *_TIME_UNIT) from None
     if unit.base != "second":
-        raise DataError(subject, f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"')
+        problem, remedy = f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"'
+        raise DataError(subject, problem, remedy).at("", *_TIME_UNIT)
     _require_rising(subject, values)
     time = values * unit.factor
     if (furthest := float(max(abs(time[0]), abs(time[-1])))) > _LONGEST:
         remedy = "correct the clock, or recording.time_unit"
-        raise DataError(subject, f"reaches {furthest:.3g} s", remedy)
+        raise DataError(subject, f"reaches {furthest:.3g} s", remedy).at("", *_TIME_UNIT)
     rows = _cut(table.source, time, recording)
     notes = (f"{subject}: read as day numbers of a spreadsheet",) if days else ()
     longest = "a model sample" if recording.fill_gaps is None else f"{fill_gaps:g} s"
@@ -99,10 +107,10 @@ def counts_days(values: Array) -> bool:
     return (2e4 < first < 1e5 or 6e5 < first < 9e5) and 0 < last - first < 0.1
 
 
-def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
+def column_of(table: Table, name: str, place: tuple[str, ...]) -> tuple[str, Array]:
     """Name in the file and values (samples,) of column `name`, with or without its unit.
 
-    `place` is the configuration key that names the column, for messages.
+    `place` is the TOML path that names the column, for messages.
     """
     short = name.rpartition(" (")[0] or name.rpartition(" [")[0]
     for known in (name, short):
@@ -117,12 +125,16 @@ def column_of(table: Table, name: str, place: str) -> tuple[str, Array]:
         None,
     )
     if skipped is not None:
-        raise DataError(f"{table.source}: column {name!r}", "cannot be used", skipped)
+        raise DataError(f"{table.source}: column {name!r}", "cannot be used", skipped).at(
+            table.source, *place
+        )
     names = ", ".join(list(table.columns)[:12])
     more = ", ..." if len(table.columns) > 12 else ""
     raise DataError(
-        f"{table.source}: column {name!r}", "is not in the file", f"{place} may be {names}{more}"
-    )
+        f"{table.source}: column {name!r}",
+        "is not in the file",
+        f"{'.'.join(place)} may be {names}{more}",
+    ).at(table.source, *place)
 
 
 def on_even_instants(clock: Clock, values: Array) -> Array:
@@ -155,7 +167,7 @@ def _stated_rate(table: Table, recording: RecordingTable) -> float:
             table.source,
             f"states {table.rate:g} samples per second, but recording.rate is {rate:g}",
             "correct recording.rate or leave it out",
-        )
+        ).at("", "recording", "rate")
     return rate
 
 
@@ -178,7 +190,7 @@ def _rows_lost(table: Table, clock: Clock, chosen: str | None) -> tuple[str, ...
                     f"{table.source}: clock {name!r}",
                     f"has {rate / ratio[0, 0]:.4g} samples per second, but the rate is {rate:g}",
                     f"set recording.time = {name!r}, or correct the rate",
-                )
+                ).at("", "recording", "rate")
             if off.all() and (apart := abs(ratio[1, 0] - 1)) < _APART:
                 found.append(f"clocks {chosen!r} and {name!r} run {apart:.2%} apart")
             if off[0]:
@@ -224,7 +236,7 @@ def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
             source,
             f"has {len(kept)} samples between recording.start and stop",
             f"choose them within the recording ({time[0]:g} to {time[-1]:g} s)",
-        )
+        ).at("", "recording", "start")
     for key, wanted, reached in (
         ("start", recording.start, float(time[0])),
         ("stop", recording.stop, float(time[-1])),
@@ -238,7 +250,7 @@ def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
                 source,
                 f"recording.{key} = {wanted:g} s lies outside the recording",
                 f"choose a value between {time[0]:g} and {time[-1]:g} s",
-            )
+            ).at("", "recording", key)
     return slice(int(kept[0]), int(kept[-1]) + 1)
 
 
@@ -247,10 +259,11 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float, longest:
     intervals = np.diff(time)
     usual = intervals[intervals < _GAP * np.median(intervals)]
     rough = float(np.mean(usual))
-    _require_period(subject, rough)
+    _require_period(subject, rough, "time_unit")
     if (instants := (time[-1] - time[0]) / rough) > _GAPS * len(time):
         problem = f"has {len(time)} samples at {instants:.3g} uniform instants: the rest are gaps"
-        raise DataError(subject, problem, "cut with recording.start and stop")
+        remedy = "cut with recording.start and stop"
+        raise DataError(subject, problem, remedy).at("", "recording", "start")
     counts = np.rint(intervals / rough).astype(np.int64)
     if (counts == 0).any():
         first = int(np.argmax(counts == 0))
@@ -271,7 +284,7 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float, longest:
                 f"of {intervals[worst]:.4g} s at {time[worst]:.6g} s",
                 "cut with recording.start and stop, or raise recording.fill_gaps "
                 f"(now {fill_gaps:g} s)",
-            )
+            ).at("", "recording", "fill_gaps")
         rows_lost = steps[-1] + 1 - len(time)
         said = f"{rows_lost} rows missing, none for longer than {longest}: interpolated"
         findings.append(f"{subject}: {said}")
@@ -287,11 +300,11 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float, longest:
     return Clock(time, rows, steps, float(time[0]) + start, period, fill_gaps, tuple(findings))
 
 
-def _require_period(subject: str, period: float) -> None:
+def _require_period(subject: str, period: float, key: str) -> None:
     """Require a plausible sampling period in s."""
     if not _PERIODS[0] <= period <= _PERIODS[1]:
         raise DataError(
             subject,
             f"has a sample every {period:.3g} s",
             f"correct the rate or the clock's unit ({_PERIODS[0]:g} to {_PERIODS[1]:g} s)",
-        )
+        ).at("", "recording", key)

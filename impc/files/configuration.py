@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 import msgspec
 
 from impc.checking import checked
-from impc.errors import InputError, brief
+from impc.errors import InputError, blamed, brief
 from impc.files.disk import require_readable
 from impc.files.units import si_unit
 
@@ -168,6 +168,7 @@ class Configuration(msgspec.Struct, frozen=True):
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
     report: ReportTable = ReportTable()
+    source: str = ""  # file, for messages
 
     @property
     def recorded(self) -> tuple[str, ...]:
@@ -216,49 +217,62 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     (100.0, 'deg')
     """
     source = str(path)
-    content = _parsed(source, Path(path))
-    require_known(lambda key: f"{source}: {key}", content, (*_TABLES, *more), "is not known")
-    tables = {name: content.get(name, {}) for name in (*_TABLES, *_STUDY)}
-    for name, table in tables.items():
-        if not isinstance(table, dict):
-            raise InputError(f"{source}: {name}", "is not a table", f"write [{name}]")
-    written = {
-        key: str(value) if key in _LABELS and type(value) is int else value
-        for key, value in tables["recording"].items()
-    }
-    recording = _convert(source, "recording", written, RecordingTable)
-    _check_recording(source, recording)
-    signals = {}
-    for name, table in tables["signals"].items():
-        signals[name] = _convert(source, f"signals.{brief(name, 80)}", table, SignalTable)
-        if signals[name].unit != FILL_IN:
-            _unit(source, f"signals.{brief(name, 80)}.unit", signals[name].unit)
-    # A plan needs no signals: nothing is recorded yet.
-    if not signals and not tables["plan"]:
-        raise InputError(
-            f"{source}: signals", "contains no signal", "write a table [signals.NAME] for each"
-        )
-    plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", "plan", *_STUDY)}
-    report = _convert(source, "report", tables["report"], ReportTable)
-    return Configuration(recording, signals, report=report, **plain)
+    with blamed(source):
+        content = toml_content(_text(source, Path(path)), source)
+    return configuration(content, source, *more)
 
 
-def _parsed(source: str, path: Path) -> dict[str, Any]:
+def configuration(content: Mapping[str, Any], source: str, *more: str) -> Configuration:
+    """Validate the content of a configuration file called `source`; `more` names further tables."""
+    with blamed(source):
+        require_known(lambda key: f"{source}: {key}", content, (*_TABLES, *more), "is not known")
+        tables = {name: content.get(name, {}) for name in (*_TABLES, *_STUDY)}
+        for name, table in tables.items():
+            if not isinstance(table, dict):
+                error = InputError(f"{source}: {name}", "is not a table", f"write [{name}]")
+                raise error.at("", name)
+        written = {
+            key: str(value) if key in _LABELS and type(value) is int else value
+            for key, value in tables["recording"].items()
+        }
+        recording = _convert(source, ("recording",), written, RecordingTable)
+        _check_recording(source, recording)
+        signals = {}
+        for name, table in tables["signals"].items():
+            signals[name] = _convert(source, ("signals", name), table, SignalTable)
+            if signals[name].unit != FILL_IN:
+                _unit(source, ("signals", name, "unit"), signals[name].unit)
+        # A plan needs no signals: nothing is recorded yet.
+        if not signals and not tables["plan"]:
+            raise InputError(
+                f"{source}: signals", "contains no signal", "write a table [signals.NAME] for each"
+            ).at("", "signals")
+        plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", "plan", *_STUDY)}
+        report = _convert(source, ("report",), tables["report"], ReportTable)
+        return Configuration(recording, signals, report=report, source=source, **plain)
+
+
+def _text(source: str, path: Path) -> str:
     if not os.path.lexists(path):
         raise InputError(source, "does not exist", "create it with `impc inspect FILE --out`")
     require_readable(path, _LARGEST, InputError)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        # tomllib stores every prefix of a dotted key: one of 32 kB takes 1 GB.
-        content = {} if (dotted := _DOTTED.search(text)) else tomllib.loads(text)
-        if dotted or _deeper(content, _DEEPEST):
-            raise RecursionError
-        return content
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(source, f"cannot be opened ({reason})", "check the path") from None
     except UnicodeDecodeError:
         raise InputError(source, "is not UTF-8 text", "save it as UTF-8") from None
+
+
+def toml_content(text: str, source: str) -> dict[str, Any]:
+    """Content of a TOML `text`, which must not be nested deep; `source` names it in messages."""
+    try:
+        # tomllib stores every prefix of a dotted key: one of 32 kB takes 1 GB.
+        content = {} if (dotted := _DOTTED.search(text)) else tomllib.loads(text)
+        if dotted or _deeper(content, _DEEPEST):
+            raise RecursionError
+        return content
     except ValueError as error:  # an integer of 5000 digits raises no TOMLDecodeError
         raise InputError(
             source,
@@ -276,20 +290,22 @@ def _deeper(value: Any, levels: int) -> bool:
 
 
 def require_known(
-    where: Callable[[str], str], table: Mapping[str, Any], known: Iterable[str], problem: str
-) -> None:
+    where: Callable[[str], str], table: Mapping[str, Any], known: Iterable[str], problem: str,
+    place: tuple[str, ...] = (),
+) -> None:  # fmt: skip
     """Reject keys that are not `known`; `where` makes a message's subject from a key."""
     names = list(known)
     for key in table:
         if key not in names:
             near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
             remedy = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
-            raise InputError(where(brief(key, 80)), problem, remedy)
+            raise InputError(where(brief(key, 80)), problem, remedy).at("", *place, key)
 
 
 def converted(
-    where: Callable[[str], str], table: Mapping[str, Any], kind: type[T], see: str = "correct it"
-) -> T:
+    where: Callable[[str], str], table: Mapping[str, Any], kind: type[T], see: str = "correct it",
+    place: tuple[str, ...] = (),
+) -> T:  # fmt: skip
     """Convert `table` to type `kind` with msgspec, with error messages in this package's form.
 
     `where` makes the subject of a message from a path; `see` is the remedy for most faults.
@@ -299,9 +315,11 @@ def converted(
     except msgspec.ValidationError as error:
         said, _, path = str(error).partition(" - at `$")
     path = path.rstrip("`").lstrip(".")
+    place += tuple(part for part in re.findall(r"[^.\[\]]+", path) if not part.isdigit())
     unknown = re.fullmatch("Object contains unknown field `(.*)`", said)
     if unknown:
-        raise InputError(where(f"{path}.{unknown[1]}"), "is not a setting", see)
+        place = (*place, unknown[1])
+        raise InputError(where(f"{path}.{unknown[1]}"), "is not a setting", see).at("", *place)
     limit = re.fullmatch("Expected `(?:int|float)` ([<>]=?) (.*)", said)
     if limit and "..." not in path:
         found: Any = table
@@ -310,37 +328,42 @@ def converted(
         words = {">": "more than", ">=": "at least", "<": "less than", "<=": "at most"}
         raise InputError(
             where(path), f"got {brief(found)}", f"give {words[limit[1]]} {float(limit[2]):.6g}"
-        )
+        ).at("", *place)
     problem = said.replace("Object missing required field", "lacks").replace("`", "'")
     problem = problem.replace("Expected 'array' of length >= 1", "is empty")
     allowed = get_args(get_type_hints(kind).get(path)) if "enum" in said else ()
     if allowed:
         see = f"give {' or '.join(map(str, allowed))}"
-    raise InputError(where(path), problem, see)
+    raise InputError(where(path), problem, see).at("", *place)
 
 
-def _convert(source: str, place: str, table: Any, kind: type[S]) -> S:
+def _convert(source: str, place: tuple[str, ...], table: Any, kind: type[S]) -> S:
+    named = _named(place)
     if not isinstance(table, dict):
-        raise InputError(f"{source}: {place}", "is not a table", f"write [{place}]")
+        raise InputError(f"{source}: {named}", "is not a table", f"write [{named}]").at("", *place)
 
     def where(path: str) -> str:
-        return f"{source}: {place}.{path}" if path else f"{source}: {place}"
+        return f"{source}: {named}.{path}" if path else f"{source}: {named}"
 
-    require_known(where, table, kind.__struct_fields__, "is not known")
-    return converted(where, table, kind)
+    require_known(where, table, kind.__struct_fields__, "is not known", place)
+    return converted(where, table, kind, place=place)
+
+
+def _named(place: tuple[str, ...]) -> str:
+    return ".".join(brief(name, 80) for name in place)
 
 
 def _check_recording(source: str, table: RecordingTable) -> None:
     def refuse(key: str, problem: str, remedy: str) -> InputError:
-        return InputError(f"{source}: recording.{key}", problem, remedy)
+        error = InputError(f"{source}: recording.{key}", problem, remedy)
+        return error.at("", "recording", key)
 
     if table.time is not None and table.rate is not None:
         raise refuse("rate", "is given in addition to recording.time", "keep one of the two")
     if table.start is not None and table.stop is not None and table.stop <= table.start:
         raise refuse("stop", f"is {table.stop:g} s, start {table.start:g} s", "make it later")
-    if table.time_unit is not None and _unit(source, "recording.time_unit", table.time_unit) != (
-        "second"
-    ):
+    place = ("recording", "time_unit")
+    if table.time_unit is not None and _unit(source, place, table.time_unit) != "second":
         raise refuse(
             "time_unit",
             f"{brief(table.time_unit, 80)!r} is not a unit of time",
@@ -371,10 +394,11 @@ def _check_pattern(refuse: Any, table: RecordingTable, pattern: str) -> None:
             raise refuse(name, "is given here and in recording.pattern", "keep one of the two")
 
 
-def _unit(source: str, place: str, written: str) -> str:
+def _unit(source: str, place: tuple[str, ...], written: str) -> str:
     try:
         return si_unit(written).base
     except InputError as error:
-        raise InputError(
-            f"{source}: {place}", f"{error.subject} {error.problem}", error.remedy
+        problem = f"{error.subject} {error.problem}"
+        raise InputError(f"{source}: {_named(place)}", problem, error.remedy).at(
+            "", *place
         ) from None

@@ -90,19 +90,21 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
     {'t': [0.0, 0.01], 'tilt': [0.5, 0.6]}
     """
     source, path = str(path), Path(path)
-    form = recognised(path, largest)
-    if sheet and path.suffix.lower() not in _WORKBOOKS:
-        raise DataError(source, "has no sheets", "leave recording.sheet out")
     try:
+        form = recognised(path, largest)
+        if sheet and path.suffix.lower() not in _WORKBOOKS:
+            remedy = "leave recording.sheet out"
+            raise DataError(source, "has no sheets", remedy).at("", "recording", "sheet")
         return form.read(path, largest, sheet) if sheet else form.read(path, largest)
-    except ImpcError:
+    except ImpcError as error:
+        error.at(source)
         raise
     except MemoryError:
         raise DataError(
             source, "does not fit in memory", "save only the signals that are needed"
-        ) from None
+        ).at(source) from None
     except Exception as error:  # ValueError of our readers, anything of pandas
-        raise damaged(source, error) from None
+        raise damaged(source, error).at(source) from None
 
 
 def recognised(path: Path, largest: int = LARGEST) -> Format:

@@ -192,7 +192,8 @@ def made_by(source: PlantSource, **changed: float) -> Any:
     arguments.pop(UNCERTAINTY, None)
     for key, value in arguments.items():
         if isinstance(value, str) and value == FILL_IN:
-            raise InputError(f"[plant] {key}", f"is still {FILL_IN!r}", "fill it in")
+            problem = f"is still {FILL_IN!r}"
+            raise InputError(f"[plant] {key}", problem, "fill it in").at("", "plant", key)
     name = f"plant {source.name}"
     with _refused_arguments(name), users_code(name, *_REFUSED), warnings.catch_warnings():
         warnings.simplefilter("error", np.exceptions.ComplexWarning)
@@ -216,7 +217,7 @@ def _refused_arguments(name: str) -> Iterator[None]:
     except (TypeError, ValueError) as error:
         raise InputError(
             name, f"refuses its arguments ({one_line(error)})", "correct the [plant] table"
-        ) from None
+        ).at("", "plant") from None
 
 
 def plant_family_of(
@@ -289,13 +290,14 @@ def _require_differences(source: PlantSource, family: PlantFamily) -> None:
 
 def _stated_uncertainty(source: PlantSource, offered: Any) -> dict[str, Any]:
     """Standard deviations by name: the plant's own, overridden by [plant.uncertainty]."""
-    given = source.arguments.get(UNCERTAINTY, {})
+    given, place = source.arguments.get(UNCERTAINTY, {}), ("plant", UNCERTAINTY)
     if not isinstance(given, dict):
         remedy = 'write a table [plant.uncertainty], for example mass = "3 %"'
-        raise InputError(f"[plant] {UNCERTAINTY}", "is not a table", remedy)
+        raise InputError(f"[plant] {UNCERTAINTY}", "is not a table", remedy).at("", *place)
     for name, value in given.items():
         if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-            raise InputError(f"[plant.{UNCERTAINTY}] {name}", f"got {value!r}", 'give "5 %"')
+            where = f"[plant.{UNCERTAINTY}] {name}"
+            raise InputError(where, f"got {value!r}", 'give "5 %"').at("", *place, name)
     given, known = dict(given), dict(getattr(offered, UNCERTAINTY, {}))
     if _ALL in given:
         known = dict.fromkeys(known, given.pop(_ALL))
@@ -309,5 +311,6 @@ def _nominal(source: PlantSource, name: str) -> float:
         parameter = inspect.signature(source.make).parameters.get(name)
         value = None if parameter is None else parameter.default
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"parameter {name}", "has no nominal value", "set it in [plant]")
+        remedy = "set it in [plant]"
+        raise InputError(f"parameter {name}", "has no nominal value", remedy).at("", "plant", name)
     return float(value)

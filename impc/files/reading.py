@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.checking import checked, replace
-from impc.errors import DataError, FallError, InputError
+from impc.errors import DataError, FallError, InputError, blamed
 from impc.files import checks
 from impc.files.apart import match_apart
 from impc.files.causality import departures, misaligned, rows_later
+from impc.files.checks import Level, Notice, finding
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest
@@ -35,7 +36,7 @@ from impc.model.plant import UNKNOWN
 from impc.model.recordings import Label, Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterator, Sequence
 
     from impc.arrays import Array
     from impc.files.clock import Clock
@@ -110,59 +111,79 @@ def read_unit(
 ) -> tuple[tuple[Recording, ...], tuple[FallError, ...]]:
     """Trials in which the subject did not fall, and the falls by file."""
     plant.require_discrete()
-    _require_names(configuration, plant)  # before the slow reading of files
+    for fault in faults_of(configuration, plant):  # before the slow reading of files
+        raise fault
     require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one file")
     sheet = configuration.recording.sheet
     tables = (read_table(path, sheet=sheet) for path in paths)
-    read: list[tuple[Path, Recording]] = []
+    read: list[tuple[str, Recording]] = []
     fallen: list[FallError] = []
     for path, table in zip(paths, tables, strict=True):
         try:
-            read.append((path, recording_of(table, configuration, plant)))
+            read.append((str(path), recording_of(table, configuration, plant)))
         except FallError as fall:
             fallen.append(fall)
-    if not read:
-        return (), tuple(fallen)
-    longest = max(trial.samples for _, trial in read)
-    trials = [trial for _, trial in read]
-    for place, (path, trial) in enumerate(read):
-        if trial.samples < longest:
-            said = f"unequal length: {trial.samples} samples, the longest has {longest}"
-            found = (*trial.findings, f"{path}: trials of {said}")
-            trials[place] = replace(trial, findings=found)
-    return tuple(trials), tuple(fallen)
+    trials = dict(read)
+    for one in unequal(read):
+        found = (*trials[one.file].findings, one.text)
+        trials[one.file] = replace(trials[one.file], findings=found)
+    return tuple(trials.values()), tuple(fallen)
 
 
-def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Recording:
-    """Make the trial of one table: checks, uniform clock, plant's rate."""
-    _require_names(configuration, plant)
-    entry = configuration.recording
-    label = label_of(table.source, entry)
-    clock = read_clock(table, entry, plant.dt)
-    checks.comparable_rates(table.source, clock.period, plant.dt)
-    samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
-    checks.too_few(table.source, samples, _SAMPLES_A_STATE * physical_states(plant))
-    findings = [*(f"{table.source}: {note}" for note in table.notes), *clock.findings]
-    findings += clock.notes
+def unequal(trials: Sequence[tuple[str, Recording]]) -> list[Notice]:
+    """Findings on trials, given by file, that are shorter than the longest."""
+    longest = max((trial.samples for _, trial in trials), default=0)
+    said = "trials of unequal length: {} samples, the longest has {}"
+    return [finding(source, said.format(trial.samples, longest))
+            for source, trial in trials if trial.samples < longest]  # fmt: skip
+
+
+def names_of(configuration: Configuration, plant: Plant) -> tuple[str, ...]:
+    """Names of the signals that are read: outputs, then recorded disturbances and commands."""
     inputs = (*plant.disturbances, *(plant.commands or plant.controls))
-    names = (*plant.outputs, *(name for name in inputs if name in configuration.signals))
-    series, lost, targets, finer, found = _clocked(table, clock, configuration, plant, names)
-    findings += found
+    return (*plant.outputs, *(name for name in inputs if name in configuration.signals))
+
+
+def clock_of(
+    table: Table, configuration: Configuration, plant: Plant, findings: list[Notice]
+) -> Clock:
+    """Clock of a recording that is fast and long enough for the plant."""
+    clock, source = read_clock(table, configuration.recording, plant.dt), table.source
+    checks.comparable_rates(source, clock.period, plant.dt)
+    samples = resampled_samples(int(clock.steps[-1]) + 1, clock.period, plant.dt)
+    checks.too_few(source, samples, _SAMPLES_A_STATE * physical_states(plant))
+    findings += [finding(source, note) for note in table.notes]
+    said, place = (*clock.findings, *clock.notes), ("recording", "time")
+    findings += [Notice(Level.AMBER, source, place, text) for text in said]
+    return clock
+
+
+def recording_of(
+    table: Table, configuration: Configuration, plant: Plant, findings: list[Notice] | None = None
+) -> Recording:
+    """Make the trial of one table: checks, uniform clock, plant's rate; append to `findings`."""
+    for fault in faults_of(configuration, plant):
+        raise fault
+    label = label_of(table.source, configuration.recording)
+    findings = [] if findings is None else findings
+    clock, names = clock_of(table, configuration, plant, findings), names_of(configuration, plant)
+    series, lost, targets, finer = _clocked(table, clock, configuration, plant, names, findings)
     samples = len(series[plant.outputs[0]])
     if clock.period > plant.dt and not same_rate(len(clock.time), clock.period, plant.dt):
-        findings.append(
-            f"{table.source}: recorded at {1 / clock.period:.4g} samples per second and analysed "
+        said = (
+            f"recorded at {1 / clock.period:.4g} samples per second and analysed "
             f"at {1 / plant.dt:.4g}: it contains nothing above {0.5 / clock.period:.4g} Hz"
         )
+        findings.append(finding(table.source, said))
     findings += _departing(table.source, series, targets, configuration, plant)
     disturbance = np.zeros((samples, physical_disturbances(plant)))
     for index, name in enumerate(plant.disturbances):
         if name in series:
             disturbance[:, index] = series[name]
             findings += [
-                f"{table.source}: {output} {reason} ({name})"
+                finding(table.source, f"{output} {reason} ({name})", "signals", name, "shift")
                 for output in plant.outputs
                 if (reason := misaligned(series[name], series[output], plant.dt))
             ]
@@ -190,32 +211,43 @@ def recording_of(table: Table, configuration: Configuration, plant: Plant) -> Re
         finer=other,
         timing=_timing(clock, configuration, plant),
         label=label,
-        findings=tuple(findings),
+        findings=tuple(one.text for one in findings),
     )
 
 
+def signal_of(
+    table: Table, clock: Clock, name: str, configuration: Configuration, plant: Plant,
+    findings: list[Notice],
+) -> dict[str, Array]:  # fmt: skip
+    """Checked series of a signal at uniform instants by kind: "", "lost", "target"."""
+    entry, keep = configuration.signals[name], configuration.recording.keep_gaps
+    _shift(table.source, clock, name, entry)
+    with blamed(table.source, "signals", name, "column"):
+        channel = channel_of(table, clock, name, entry)
+        response, gap = name in plant.outputs, None if name in plant.disturbances else keep
+        findings += _checked(table, channel, entry, clock, response, gap)
+    found = {"": on_even_instants(clock, channel.values * channel.unit.factor)}
+    if gap and (gaps := checks.gaps(channel, clock.fill_gaps)).any():
+        values, known = found[""], np.isfinite(found[""])
+        found[""] = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+        found["lost"] = np.zeros(len(values))
+        found["lost"][clock.steps] = gaps
+    if isinstance(entry.target, str):
+        with blamed(table.source, "signals", name, "target"):
+            found["target"] = _target(table, clock, name, entry, findings)
+    return found
+
+
 def _clocked(
-    table: Table, clock: Clock, configuration: Configuration, plant: Plant, names: Sequence[str]
-) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], dict[str, Array], list[str]]:
-    """Signals, their missing share, targets and finer pushes, at the plant's rate; findings."""
-    recorded, signals, findings = configuration.recording, configuration.signals, list[str]()
+    table: Table, clock: Clock, configuration: Configuration, plant: Plant, names: Sequence[str],
+    findings: list[Notice],
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array], dict[str, Array]]:  # fmt: skip
+    """Signals, their missing share, targets and finer pushes, at the plant's rate."""
+    signals, given = configuration.signals, (configuration, plant, findings)
     acting = [name for name in plant.disturbances if name in names]
-    even: dict[tuple[str, str], Array] = {}  # by signal and kind: "", "lost" or "target"
-    for name in names:
-        channel = channel_of(table, clock, name, signals[name])
-        response, keep = name in plant.outputs, None if name in acting else recorded.keep_gaps
-        findings += _checked(table, channel, signals[name], clock, response, keep)
-        values = on_even_instants(clock, channel.values * channel.unit.factor)
-        if keep and (gaps := checks.gaps(channel, clock.fill_gaps)).any():
-            known = np.isfinite(values)
-            values = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-            even[name, "lost"] = np.zeros(len(values))
-            even[name, "lost"][clock.steps] = gaps
-        even[name, ""] = values
-        if isinstance(signals[name].target, str):
-            even[name, "target"], found = _target(table, clock, name, configuration)
-            findings += found
-    shifts = _shifts(table.source, clock, configuration, (name for name, _ in even))
+    even = {(name, kind): values for name in names
+            for kind, values in signal_of(table, clock, name, *given).items()}  # fmt: skip
+    shifts = {name: _shift(table.source, clock, name, signals[name]) for name in names}
     late = {key: 0.0 if key[1] == "target" else shifts[key[0]] for key in even}
     first, jumps = first_common(late), {name: steps_of(even[name, ""]) for name in acting}
     even = shifted(even, late)
@@ -231,7 +263,8 @@ def _clocked(
         steps = steps.delayed(shifts[name] - first)
         finer[name] = held_means(values, clock.period, plant.dt, steps)
         switches = f"{name} switches every {steps.dwell * clock.period:.4g} s"
-        findings.append(f"{table.source}: {switches}; its edges are placed between samples")
+        placed = f"{switches}; its edges are placed between samples"
+        findings.append(finding(table.source, placed, "signals", name, "shift"))
     targets = clocked["target"]
     samples = len(clocked[""][names[0]])
     for name in configuration.aimed:
@@ -239,14 +272,13 @@ def _clocked(
         if isinstance(at, float | int):
             size = signals[name].sign * si_unit(signals[name].unit).factor
             targets[name] = np.full(samples, size * (at - signals[name].offset))
-    return clocked[""], clocked["lost"], targets, finer, findings
+    return clocked[""], clocked["lost"], targets, finer
 
 
 def _target(
-    table: Table, clock: Clock, name: str, configuration: Configuration
-) -> tuple[Array, list[str]]:
-    """Target of a signal at uniform instants (last recorded value), and findings."""
-    entry = configuration.signals[name]
+    table: Table, clock: Clock, name: str, entry: SignalTable, findings: list[Notice]
+) -> Array:
+    """Target of a signal at uniform instants (last recorded value)."""
     channel = channel_of(table, clock, name, entry, "target")
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
@@ -256,39 +288,41 @@ def _target(
     finite = np.isfinite(channel.values)
     instant = np.arange(clock.steps[-1] + 1)
     places = np.searchsorted(clock.steps[finite], instant, side="right") - 1
-    values = channel.unit.factor * channel.values[finite][places]
-    return values, [finding for finding in found if finding]
+    findings += filter(None, found)
+    return np.asarray(channel.unit.factor * channel.values[finite][places])
 
 
 def require_whole(recordings: Sequence[Recording], command: str) -> None:
     """Refuse missing samples for a `command` that needs every sample."""
     if any(trial.has_gaps for trial in recordings):
         problem = f"leaves gaps, but impc {command} needs every sample"
-        raise InputError("recording.keep_gaps", problem, "remove it, or set fill_gaps")
+        remedy = "remove it, or set fill_gaps"
+        raise InputError("recording.keep_gaps", problem, remedy).at("", "recording", "keep_gaps")
 
 
 def disturbances_of(table: Table, configuration: Configuration, plant: Plant) -> Array:
     """Perturbations of a table at the plant's rate (samples, d), in SI base units."""
+    source = configuration.source
     for name in plant.disturbances:
         if name not in configuration.signals:
-            raise InputError(f"signals.{name}", "is missing", "name the column of the file")
-        require_kind(name, configuration.signals[name].unit, plant.unit(name))
+            remedy, place = "name the column of the file", ("signals", name)
+            raise InputError(f"signals.{name}", "is missing", remedy).at(source, *place)
+        for fault in unit_faults(name, configuration.signals[name], plant.unit(name), source):
+            raise fault
     clock = read_clock(table, configuration.recording, plant.dt)
     checks.comparable_rates(table.source, clock.period, plant.dt)
-    series, *_ = _clocked(table, clock, configuration, plant, plant.disturbances)
+    series, *_ = _clocked(table, clock, configuration, plant, plant.disturbances, [])
     return np.column_stack([series[name] for name in plant.disturbances])
 
 
-def _shifts(
-    source: str, clock: Clock, configuration: Configuration, names: Iterable[str]
-) -> dict[str, float]:
-    """Shift of each signal in samples of the recording; integers count samples, floats s."""
-    rows = {name: configuration.signals[name].delay(clock.period)[0] for name in names}
-    for name, shift in rows.items():
-        if abs(shift) > (len(clock.time) - 1) / 2:
-            problem = f"moves the signal by {shift:.4g} of {len(clock.time)} samples"
-            raise DataError(f"{source}: signals.{name}.shift", problem, "use a smaller shift")
-    return rows
+def _shift(source: str, clock: Clock, name: str, entry: SignalTable) -> float:
+    """Shift of a signal in samples of the recording; integers count samples, floats s."""
+    shift = entry.delay(clock.period)[0]
+    if abs(shift) > (len(clock.time) - 1) / 2:
+        where, place = f"{source}: signals.{name}.shift", ("signals", name, "shift")
+        problem = f"moves the signal by {shift:.4g} of {len(clock.time)} samples"
+        raise DataError(where, problem, "use a smaller shift").at(source, *place)
+    return shift
 
 
 def _timing(clock: Clock, configuration: Configuration, plant: Plant) -> dict[str, float]:
@@ -310,9 +344,9 @@ def _departing(
     targets: dict[str, Array],
     configuration: Configuration,
     plant: Plant,
-) -> list[str]:
+) -> list[Notice]:
     """Report offsets and drifts that are large compared with the motion."""
-    found: list[str] = []
+    found: list[Notice] = []
     if any(np.ptp(values) == 0 for values in targets.values()):
         return found  # a constant target moves the equilibrium away from zero
     acting = [series[name] for name in plant.disturbances if name in series]
@@ -327,14 +361,16 @@ def _departing(
         key = f"signals.{name}.offset = {round(entry.offset + offset, digits):g}"
         if abs(drift) > _DRIFT * motion:
             remedy = "remove the drift of the sensor from the file"
-            found.append(f"{source}: {name} drifts by about {drift:.2g} {moves}: {remedy}")
+            said = f"drifts by about {drift:.2g} {moves}: {remedy}"
         elif abs(offset) > _OFFSET * motion:
-            remedy = f"if the sensor's zero is off, set {key}"
-            found.append(f"{source}: {name} is off by about {offset:.2g} {moves}: {remedy}")
+            said = f"is off by about {offset:.2g} {moves}: if the sensor's zero is off, set {key}"
+        else:
+            continue
+        found.append(finding(source, f"{name} {said}", "signals", name, "offset"))
     return found
 
 
-def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) -> list[str]:
+def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) -> list[Notice]:
     """Report a disturbance that acts earlier or later than in the plant."""
     found = []
     for index, name in enumerate(plant.disturbances):
@@ -345,60 +381,59 @@ def _later(source: str, outputs: Array, series: dict[str, Array], plant: Plant) 
         rows = rows_later(outputs, series[name], effects)
         if rows:
             how = f"{abs(rows)} sample{'s' * (abs(rows) > 1)} {'later' if rows > 0 else 'earlier'}"
-            found.append(
-                f"{source}: {name} acts {how} than recorded: try signals.{name}.shift = {rows}"
-            )
+            said = f"{name} acts {how} than recorded: try signals.{name}.shift = {rows}"
+            found.append(finding(source, said, "signals", name, "shift"))
     return found
 
 
-def _require_names(configuration: Configuration, plant: Plant) -> None:
+def faults_of(configuration: Configuration, plant: Plant) -> Iterator[InputError]:
+    """Every fault of the signals of a configuration for a plant."""
+    controls, source = plant.commands or plant.controls, configuration.source
     for name, entry in configuration.signals.items():
-        controls = plant.commands or plant.controls
+        place = source, "signals", name
         known = controls if entry.command else (*plant.outputs, *plant.disturbances)
         if entry.target is not None and name not in plant.outputs:
             remedy = f"set it for one of {', '.join(plant.outputs)}"
-            raise InputError(f"signals.{name}.target", "is allowed for outputs only", remedy)
+            error = InputError(f"signals.{name}.target", "is allowed for outputs only", remedy)
+            yield error.at(*place, "target")
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             remedy = f"did you mean {near[0]}?" if near else f"the plant has {', '.join(known)}"
             what = "command" if entry.command else "output or disturbance"
-            raise InputError(f"signals.{name}", f"is no {what} of the plant", remedy)
-    absent = [name for name in plant.outputs if name not in configuration.signals]
-    if absent:
-        raise InputError(
-            f"signals.{absent[0]}",
-            f"is missing: the plant's outputs are {', '.join(plant.outputs)}",
-            "write a table [signals.NAME] for each",
-        )
+            yield InputError(f"signals.{name}", f"is no {what} of the plant", remedy).at(*place)
+    for name in plant.outputs:
+        if name not in configuration.signals:
+            yield InputError(
+                f"signals.{name}",
+                f"is missing: the plant's outputs are {', '.join(plant.outputs)}",
+                "write a table [signals.NAME] for each",
+            ).at(source, "signals", name)
     for name, entry in configuration.signals.items():
-        require_filled_in(name, entry)
-        require_kind(name, entry.unit, plant.unit(name))
+        if name in (*plant.outputs, *plant.disturbances, *controls):
+            yield from unit_faults(name, entry, plant.unit(name), source)
 
 
-def require_filled_in(name: str, entry: SignalTable) -> None:
-    """Require that column and unit of signal `name` are filled in."""
+def unit_faults(name: str, entry: SignalTable, expected: str, file: str) -> Iterator[InputError]:
+    """Column and unit of signal `name` that are not filled in, or a unit unlike `expected`."""
     for key, meant in (("column", "its name in the file"), ("unit", "the column's unit")):
         if getattr(entry, key) == FILL_IN:
-            raise InputError(f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}")
-
-
-def require_kind(name: str, written: str, expected: str) -> None:
-    """Require that unit `written` is of the kind `expected` for signal `name`, or has none."""
-    if expected == UNKNOWN:
+            error = InputError(f"signals.{name}.{key}", f"is still {FILL_IN!r}", f"fill in {meant}")
+            yield error.at(file, "signals", name, key)
+    if expected == UNKNOWN or entry.unit == FILL_IN:
         return
     unit = si_unit(expected)
     if unit.factor != 1:
-        raise InputError(
+        yield InputError(
             f"plant.units {name}",
             f"is {expected!r}, not an SI base unit",
             "make the plant in SI units",
         )
-    if si_unit(written).base not in (unit.base, "dimensionless"):
-        raise InputError(
+    if si_unit(entry.unit).base not in (unit.base, "dimensionless"):
+        yield InputError(
             f"signals.{name}.unit",
-            f"is {written!r}, but the plant has {name} in {expected}",
+            f"is {entry.unit!r}, but the plant has {name} in {expected}",
             "correct the unit or the column",
-        )
+        ).at(file, "signals", name, "unit")
 
 
 def require_distinct(paths: Sequence[Path]) -> None:
@@ -409,7 +444,8 @@ def require_distinct(paths: Sequence[Path]) -> None:
         place = os.path.realpath(path)  # Path.resolve raises for circular links
         if place in places:
             same = "" if str(places[place]) == str(path) else f", also as {places[place]}"
-            raise InputError(str(path), f"is given twice{same}", "name each trial once")
+            error = InputError(str(path), f"is given twice{same}", "name each trial once")
+            raise error.at(str(path))
         places[place] = Path(path)
         if os.path.isfile(place):
             sizes.setdefault(os.path.getsize(place), []).append(Path(path))
@@ -420,7 +456,7 @@ def require_distinct(paths: Sequence[Path]) -> None:
             if other is not path:
                 raise InputError(
                     str(path), f"is a copy of {other}, byte for byte", "name each trial once"
-                )
+                ).at(str(path))
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:
@@ -435,7 +471,7 @@ def label_of(source: str, entry: RecordingTable) -> Label:
                 source,
                 f"the name {stem!r} does not match recording.pattern {entry.pattern!r}",
                 "rename the file or correct the pattern",
-            )
+            ).at(source, "recording", "pattern")
         groups = found
     return Label(
         subject=groups.get("subject") or entry.subject,
@@ -449,7 +485,7 @@ def channel_of(
     table: Table, clock: Clock, name: str, entry: SignalTable, key: str = "column"
 ) -> checks.Channel:
     """Column of signal `name`, or of its target, in its own unit, after offset and sign."""
-    column, values = column_of(table, getattr(entry, key), f"signals.{name}.{key}")
+    column, values = column_of(table, getattr(entry, key), ("signals", name, key))
     # Overflow and signalling NaN become values that are not finite, reported below.
     with np.errstate(over="ignore", invalid="ignore"):
         used = entry.sign * (values[clock.rows] - entry.offset)
@@ -463,20 +499,20 @@ def _checked(
     clock: Clock,
     response: bool,
     keep: bool | None,
-) -> list[str]:
+) -> list[Notice]:
     """All checks of a channel; faults that explain others come first."""
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
         checks.missing(channel, clock.fill_gaps, keep),
         checks.constant(channel),
-        checks.degrees_for_radians(channel) if response else "",
-        "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
+        checks.degrees_for_radians(channel) if response else None,
+        None if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
         # A perturbation of two or three levels stays at its extremes by design.
-        checks.clipped(channel) if response else "",
-        checks.stretches(channel) if response else "",
+        checks.clipped(channel) if response else None,
+        checks.stretches(channel) if response else None,
     ]
-    return [finding for finding in found if finding]
+    return [one for one in found if one]
 
 
 def stated_unit(table: Table, column: str) -> Unit | None:

@@ -59,7 +59,8 @@ def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
     sheets = list(_sheets(path, largest))
     if sheet and sheet not in [item.name for item in sheets]:
         named = ", ".join(item.name for item in sheets[:12])
-        raise DataError(source, f"has no sheet {sheet!r}", f"set recording.sheet to {named}")
+        remedy = f"set recording.sheet to {named}"
+        raise DataError(source, f"has no sheet {sheet!r}", remedy).at("", "recording", "sheet")
     found = [
         (item, block)
         for item in sheets

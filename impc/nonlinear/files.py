@@ -26,9 +26,8 @@ from impc.files.reading import (
     channel_of,
     label_of,
     require_distinct,
-    require_filled_in,
-    require_kind,
     stated_unit,
+    unit_faults,
 )
 from impc.files.resampling import held_means, instants, same_rate
 from impc.files.units import si_unit
@@ -166,7 +165,9 @@ def require_signals(configuration: Configuration, problem: OptimalControlProblem
     known = (*problem.state_names, *problem.input_names, *problem.disturbance_names)
     require_known("signals.{}".format, configuration.signals, known, "is no signal of the problem")
     for name, entry in configuration.signals.items():
-        require_filled_in(name, entry)
+        expected = problem.units.get(name, UNKNOWN)
+        for fault in unit_faults(name, entry, expected, configuration.source):
+            raise fault
         for key, given, remedy in (
             ("shift", entry.shift != 0, "shift the column in the file"),
             ("target", entry.target is not None, "make it a disturbance that the cost uses"),
@@ -174,7 +175,6 @@ def require_signals(configuration: Configuration, problem: OptimalControlProblem
             if given:
                 unused = "is not used by an optimal control problem"
                 raise InputError(f"signals.{name}.{key}", unused, remedy)
-        require_kind(name, entry.unit, problem.units.get(name, UNKNOWN))
     for name in problem.disturbance_names:
         if name not in configuration.signals:
             raise InputError(f"signals.{name}", "is missing", "record every disturbance")
@@ -227,7 +227,7 @@ def _series(
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
-        "" if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
+        None if entry.limit is None else checks.beyond_the_stop(channel, entry.limit),
     ]
     values = channel.values * channel.unit.factor
     if clock.even and same_rate(len(values), clock.period, dt):
@@ -235,15 +235,13 @@ def _series(
         values = np.where(np.isfinite(values), values, np.nan)
         if np.any(lost):
             first = channel.at(int(np.argmax(lost)))
-            found.append(
-                f"{channel.name}: {int(lost.sum())} samples are missing, the first {first}; they "
-                "count as not measured"
-            )
+            said = f"{int(lost.sum())} samples are missing, the first {first}"
+            found.append(channel.finding(f": {said}; they count as not measured"))
     else:
         found.append(checks.missing(channel, clock.fill_gaps))
         resample = held_means if held else instants
         values = resample(on_even_instants(clock, values), clock.period, dt)
-    return values, [finding for finding in found if finding]
+    return values, [finding.text for finding in found if finding]
 
 
 def fit_files(

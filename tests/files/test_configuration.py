@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import tracemalloc
 from pathlib import Path
 
@@ -101,6 +102,7 @@ def test_every_key(tmp_path: Path) -> None:
         ('column = "seat"', "", "signals.theta1: lacks 'column'"),
         ('unit = "Nm"', 'unit = "g"', "signals.perturbation.unit: unit 'g' is ambiguous"),
         ("[signals.theta1]", "[signals.theta1]\n[signals.theta1]", "is not TOML"),
+        ("[signals.theta1]", '[signals."b. ü"]\na = 1\n[signals.theta1]', "signals.b. ü.a: is not"),
         ("[recording]", "plant = 3\n[recording]", "plant: is not a table"),
         ("[recording]", "signals.x = 3\n[recording]", "signals.x: is not a table"),
     ],
@@ -108,10 +110,15 @@ def test_every_key(tmp_path: Path) -> None:
 def test_one_line_with_the_path_of_the_fault(
     tmp_path: Path, old: str, new: str, phrase: str
 ) -> None:
+    path = written(tmp_path, settings((old, new)))
     with pytest.raises(InputError) as caught:
-        read_configuration(written(tmp_path, settings((old, new))))
+        read_configuration(path)
     assert phrase in str(caught.value)
     assert "\n" not in str(caught.value)
+    error = pickle.loads(pickle.dumps(caught.value))
+    assert (error.file, str(error)) == (str(path), str(caught.value))
+    assert error.subject == (f"{path}: {'.'.join(error.place)}" if error.place else str(path))
+    assert bool(error.place) == (phrase != "is not TOML")
 
 
 @pytest.mark.parametrize(

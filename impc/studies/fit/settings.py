@@ -233,8 +233,8 @@ def read_settings(name: str, kind: type[T], table: Mapping[str, Any]) -> T:
         return f"[{'.'.join((name, *tables))}] {key}".rstrip()
 
     known = (item.name for item in fields(kind))  # type: ignore[arg-type]
-    require_known(where, table, known, "is not a setting")
-    return converted(where, table, kind, f"see {_PAGE}")
+    require_known(where, table, known, "is not a setting", (name,))
+    return converted(where, table, kind, f"see {_PAGE}", (name,))
 
 
 def fit_settings(table: Mapping[str, Any]) -> FitSettings:
@@ -243,7 +243,7 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
         if value == FILL_IN:
             raise InputError(
                 f"[fit] {name}", f"is still {FILL_IN!r}", "fill it in, or remove the line"
-            )
+            ).at("", "fit", name)
     settings = read_settings("fit", FitSettings, table)
     if 0 < settings.replicates < _FEWEST:
         raise InputError(
