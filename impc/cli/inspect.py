@@ -29,9 +29,9 @@ from impc.cli.plant import KNOWN, find_plant
 def command(file: Path, plant_name: str | None, out: Path | None, config: Path | None) -> None:
     """Show what a recording holds and write a commented configuration for it."""
     from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
+    from impc.files.draft import drafted  # noqa: PLC0415
     from impc.files.formats import read_table, write_file  # noqa: PLC0415
-    from impc.files.inspection import draft_configuration, open_places, summary  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant  # noqa: PLC0415
+    from impc.files.inspection import summary  # noqa: PLC0415
 
     if config is not None:
         _check(file, config, plant_name)
@@ -39,35 +39,39 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
     if out is not None and out.exists():
         raise OutputError(str(out), "already exists", "choose another name, or remove it")
     table = read_table(file)
-    plant, arguments = None, {}
-    if plant_name is not None:
-        source = find_plant(plant_name, {})
-        plant, arguments = make_plant(source, ()), source.defaults()
-    text = draft_configuration(table, plant, arguments)
-    click.echo(summary(table, plant.dt if plant else None))
+    draft = drafted(table, None if plant_name is None else find_plant(plant_name, {}))
+    click.echo(summary(table, draft.plant.dt if draft.plant else None))
     if out is None:
-        click.echo("\n" + text, nl=False)
+        click.echo("\n" + draft.toml(), nl=False)
     else:
-        write_file(out, text.encode())
-        guesses, places = open_places(text)
-        click.echo(
-            f'\nWritten to {out}: {places} places with "?" to fill in, {guesses} guesses to check; '
-            "then run impc fit with it."
-        )
+        write_file(out, draft.toml().encode())
+        counts = f'{draft.places} places with "?" to fill in, {draft.guesses} guesses to check'
+        click.echo(f"\nWritten to {out}: {counts}; then run impc fit with it.")
 
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:
     """Read the file as `impc fit` does, and print what the checks found."""
     from impc.errors import InputError  # noqa: PLC0415
+    from impc.files.checks import fault  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.examination import examine  # noqa: PLC0415
+    from impc.files.formats import read_table  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
-    from impc.files.reading import read_recordings  # noqa: PLC0415
+    from impc.files.reading import recording_of  # noqa: PLC0415
 
     if plant_name is None:
         raise InputError("--config", "is given without --plant", "add --plant NAME")
     configuration = read_configuration(config)
     plant = make_plant(find_plant(plant_name, configuration.plant), configuration.recorded)
-    (trial,) = read_recordings([file], configuration, plant)
+    plant.require_discrete()
+    table = read_table(file, sheet=configuration.recording.sheet)
+    try:
+        trial = recording_of(table, configuration, plant)
+    except InputError as error:
+        for notice in examine([table], configuration, plant):
+            if notice != fault(error):
+                click.echo(notice)
+        raise
     click.echo(f"{trial.label}: {trial.samples} samples at {1 / plant.dt:g} per second")
     for finding in trial.findings or ("The checks found no problems.",):
         click.echo(finding)

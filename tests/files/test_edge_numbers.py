@@ -14,8 +14,9 @@ from impc.cli.plant import find_plant
 from impc.errors import InputError
 from impc.files import apart
 from impc.files.configuration import read_configuration
+from impc.files.draft import draft
 from impc.files.formats import read_table
-from impc.files.inspection import draft_configuration, summary
+from impc.files.inspection import summary
 from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings, recording_of
 from impc.files.table import make_table
@@ -54,7 +55,7 @@ def reason(
     table = make_table("trial.csv", {**BASE, **columns}, None, rate)
     shown, *_ = summary(table).split("\ntrial.csv: clock")
     assert shown.count("\n") == len(table.columns) + (rate is not None)
-    draft_configuration(table)
+    draft(table).toml()
     with pytest.raises(InputError) as caught:
         recording_of(table, read_configuration(folder / "subject.toml"), seat)
     assert "\n" not in str(caught.value)
@@ -130,7 +131,7 @@ def test_a_gap_of_years_that_may_be_filled(tmp_path: Path, seat: Plant) -> None:
 )
 def test_the_guess_of_a_clocks_unit(step: float, unit: str) -> None:
     table = make_table("trial.csv", {"time": step * np.arange(50.0), "seat": np.arange(50.0) ** 2})
-    assert f'time_unit = "{unit}"' in draft_configuration(table)
+    assert f'time_unit = "{unit}"' in draft(table).toml()
 
 
 def test_a_pattern_that_never_ends(

@@ -13,8 +13,9 @@ import pytest
 from impc.errors import DataError
 from impc.files import apart
 from impc.files.configuration import read_configuration
+from impc.files.draft import draft
 from impc.files.formats import read_table, write_table
-from impc.files.inspection import draft_configuration, summary
+from impc.files.inspection import summary
 from impc.files.table import make_table
 from tests.files.hostile_files import HOSTILE
 from tests.files.samples import hdf5_mat
@@ -74,7 +75,7 @@ def test_names_of_columns_cannot_write_toml(tmp_path: Path) -> None:
     table = make_table("trial", {name: np.arange(9.0), "y": np.arange(9.0) ** 2}, {"y": 'm"\nz=1'})
     assert "\x1b" not in summary(table)
     path = tmp_path / "subject.toml"
-    path.write_text(draft_configuration(table), encoding="utf-8")
+    path.write_text(draft(table).toml(), encoding="utf-8")
     configuration = read_configuration(path)
     assert configuration.plant == {}
     assert list(configuration.signals) == ["y"]

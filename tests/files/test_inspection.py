@@ -46,7 +46,8 @@ def test_units_of_other_languages_are_to_be_filled_in(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("Zeit (Sek);theta1 (Grad);push (Ellen)\n0;1;2\n0,1;2;3\n")
     text = inspect(path).stdout
-    assert re.search(r'unit = "\?" +# the file states .Grad., which is not known', text)
+    remedy = "is ambiguous: write deg for degrees, gon otherwise"
+    assert re.search(rf'unit = "\?" +# the file states .Grad., which {remedy}', text)
     assert '[signals."push (Ellen)"]' in text  # no unit that is known
 
 

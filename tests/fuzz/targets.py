@@ -15,8 +15,9 @@ import numpy as np
 
 from impc.errors import ImpcError
 from impc.files.configuration import read_configuration
+from impc.files.draft import draft
 from impc.files.formats import FORMATS, read_table, write_table
-from impc.files.inspection import draft_configuration, summary
+from impc.files.inspection import summary
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
 from impc.files.table import make_table
@@ -87,7 +88,7 @@ class Fuzzer:
         def read() -> None:
             table = read_table(path)
             summary(table)
-            draft_configuration(table)
+            draft(table).toml()
             recording_of(table, read_configuration(self.config), self.plant)
 
         return path, read
