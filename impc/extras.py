@@ -19,6 +19,9 @@ EXTRAS = {
     "nptdms": "tdms",
     "python_calamine": "excel",
     "pytope": "polytope",
+    "starlette": "app",
+    "tomlkit": "app",
+    "uvicorn": "app",
 }
 
 

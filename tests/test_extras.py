@@ -115,6 +115,10 @@ def test_every_module_loads_without_the_extras(tmp_path: Path) -> None:
             "C3D: needs the package c3d; install it: pip install 'impc[c3d]'",
         ),
         (
+            "from impc.files.edited import edited\nedited('', {})",
+            "configuration: needs the package tomlkit; install it: pip install 'impc[app]'",
+        ),
+        (
             "from impc.studies.scheduler import Cluster, connected\n"
             "connected(Cluster('tcp://127.0.0.1:9')).__enter__()",
             "scheduler tcp://127.0.0.1:9: needs the package distributed; "
