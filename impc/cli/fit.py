@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -116,8 +117,9 @@ def _own_problem(
         fit = fit_files(problem, files, configuration, solver)
         done("search")
         names = tuple(path.name for path in files)
-        line = f"impc fit {' '.join(names)} --plant {plant_name} --config {config.name}"
-        line += "" if solver is None else f" --solver {solver}"
+        chosen = [] if solver is None else ["--solver", solver]
+        words = ["impc", "fit", *names, "--plant", plant_name, "--config", config.name, *chosen]
+        line = shlex.join(words)
         inputs = gather_inputs(files, config, source.name, source.arguments)
         provenance = Provenance(source.name, line, dict(source.arguments), names, inputs)
         with angles_in(configuration.report.angles):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,7 @@ def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
                 f"[plant] {key}",
                 f"is a {kind} that result.json cannot hold",
                 "use numbers below 2^63, texts, lists or tables",
-            )
+            ).at("", "plant", key)
     return plant_source(KNOWN.get(name, name), arguments)
 
 
@@ -123,8 +124,9 @@ def read_subject(
     falls = tuple(f"{one.subject.partition(':')[0]}: {one.problem}" for one in fallen)
     inputs = gather_inputs(files, config, source.name, source.arguments)
     names = tuple(path.name for path in files)
-    line = f"impc {command} {' '.join(names)} --plant {plant_name} --config {config.name}"
-    line += "" if solver is None else f" --solver {solver}"
+    chosen = [] if solver is None else ["--solver", solver]
+    words = ["impc", command, *names, "--plant", plant_name, "--config", config.name, *chosen]
+    line = shlex.join(words)
     if not recordings:
         arguments = dict(source.arguments)
         raise AllFellError(falls, Provenance(source.name, line, arguments, names, inputs))

@@ -6,6 +6,7 @@ import html
 import json
 import os
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from click.testing import CliRunner, Result
 
 from impc.checking import replace
 from impc.cli.main import main
+from impc.cli.plant import read_subject
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
@@ -325,3 +327,12 @@ def test_errors_of_users_end_in_the_verdict_that_names_them(
                "--out", str(tmp_path / "fit"))  # fmt: skip
     assert done.exit_code == 0, done.stderr
     assert word in " ".join(done.stdout.split())
+
+
+def test_the_command_of_a_report_can_be_pasted(subject: Path, tmp_path: Path) -> None:
+    path = shutil.copy(subject / "trial_1.csv", tmp_path / "Jürgen's 1.csv")
+    config = tmp_path / "meine Person.toml"
+    config.write_text(re.sub("(?m)^pattern.*$", "", (subject / "subject.toml").read_text()))
+    command = read_subject("fit", [Path(path)], "seated-balance", config).command
+    assert shlex.split(command) == ["impc", "fit", "Jürgen's 1.csv", "--plant", "seated-balance",
+                                    "--config", "meine Person.toml"]  # fmt: skip
