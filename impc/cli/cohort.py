@@ -109,9 +109,7 @@ def _run(
             if cluster.scheduler:  # the memory of other machines is unknown
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)
-        return run_study(
-            study, tasks, store, pool, lambda one: tell(one.task.name, found=one.found)
-        )
+        return run_study(study, tasks, store, pool, tell)
 
 
 @click.command("reliability")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -46,6 +47,29 @@ def test_lines_stand_in_a_pipe_every_ten_seconds(
         "3 of 8 stages (step 3), about 30 s left",
         "6 of 8 stages (step 6), about 10 s left",
     ]
+
+
+def test_a_program_reads_a_line_for_each_step(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where the user has asked for quiet; simulated clock, 4 s per step."""
+    monkeypatch.setenv("IMPC_PROGRESS", "json")
+    monkeypatch.setenv("IMPC_QUIET", "1")
+    times = iter(range(0, 1000, 4))
+    monkeypatch.setattr("impc.cli.console.time.monotonic", lambda: next(times))
+    with progress(4, "stage") as done:
+        first = capsys.readouterr().err
+        done("a", found=True)
+        done("b")
+        done("ü, c")
+    lines = [json.loads(line) for line in (first + capsys.readouterr().err).splitlines()]
+    assert [tuple(line.values()) for line in lines] == [
+        (0, 4, "", None, False),
+        (1, 4, "a", None, True),
+        (2, 4, "b", None, False),
+        (3, 4, "ü, c", 6.0, False),
+    ]
+    assert [*lines[0]] == ["done", "total", "title", "left", "found"]
 
 
 def test_nothing_is_said_where_quiet_is_asked_for(
