@@ -8,6 +8,7 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from impc.checking import replace
+from impc.errors import DataError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +29,6 @@ KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor
 
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """The plant of a short name, an import path ``module:function`` or a file."""
-    from impc.errors import InputError  # noqa: PLC0415
     from impc.files.plant_sources import plant_source  # noqa: PLC0415
 
     for key, value in arguments.items():
@@ -69,11 +69,11 @@ def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool
     return find_plant(name, study.configuration.plant)
 
 
-class AllFellError(Exception):
+class AllFellError(DataError):
     """All trials ended in a fall: nothing is left to fit."""
 
     def __init__(self, falls: tuple[str, ...], provenance: Provenance) -> None:
-        super().__init__("; ".join(falls))
+        super().__init__("recordings", f"end in a fall: {'; '.join(falls)}", "add one without")
         self.falls, self.provenance = falls, provenance
 
 
@@ -111,7 +111,6 @@ def asked_subject(
     allowed: bool = False,
 ) -> Asked:
     """What to fit, if the command line consents to running the plant (`consented_name`)."""
-    from impc.errors import InputError  # noqa: PLC0415
     from impc.files.configuration import read_configuration, require_inside  # noqa: PLC0415
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
     from impc.files.saved_plant import SAVED  # noqa: PLC0415

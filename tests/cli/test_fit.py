@@ -232,6 +232,24 @@ def test_fits_of_a_folder_are_a_table(fitted: tuple[Result, Path], tmp_path: Pat
     assert "no result.json" in run("results", str(tmp_path / "none")).stderr
 
 
+def test_a_subject_who_falls_in_every_trial_is_a_result(subject: Path, tmp_path: Path) -> None:
+    lines = (subject / "trial_1.csv").read_text().splitlines()
+    for row in range(-200, 0):  # the last 0.2 s
+        time, angle, rest = lines[row].split(",", 2)
+        lines[row] = f"{time},{float(angle) + 25 * (row / 200 + 1) ** 2},{rest}"
+    (tmp_path / "trial_1.csv").write_text("\n".join(lines))
+    text = (subject / "subject.toml").read_text().replace(', "trial_2.csv", "trial_3.csv"', "")
+    (tmp_path / "subject.toml").write_text(text)
+    words = "--config", str(tmp_path / "subject.toml"), "--out"
+    assert run("fit", *words, str(tmp_path / "fit")).exit_code == 0
+    (found,) = results(tmp_path).to_dict("records")
+    assert (found["trials"], found["verdict"], found["note"]) == (0, "red", "")
+    assert found["reason"] == found["headline"] == "The person fell in every trial."
+    compared = run("compare", *words, str(tmp_path / "compare"))
+    assert compared.exit_code == 2
+    assert compared.stderr.startswith("impc: error: recordings: end in a fall: ")
+
+
 def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None:
     found = json.loads((fitted[1] / "result.json").read_text())
     page = (fitted[1] / "report.html").read_text()
