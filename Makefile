@@ -73,8 +73,7 @@ help:
 demo: $(COMPILED)
 	$(VENV)/bin/impc simulate seated-balance --out results/subject --formats csv
 	$(VENV)/bin/impc example
-	$(VENV)/bin/impc fit results/subject/trial_1.csv results/subject/trial_2.csv results/subject/trial_3.csv \
-	  --plant seated-balance --config results/subject/subject.toml --out results/fit
+	$(VENV)/bin/impc fit --config results/subject/subject.toml --out results/fit
 
 # Each test file runs in one process, longest folders first. The shared closed loop is compiled on one
 # core while the checks run on the other; no test here uses the filter of sensory noise.

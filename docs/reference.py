@@ -21,7 +21,7 @@ from numpydoc.docscrape import ClassDoc
 import impc
 from impc import errors
 from impc.cli.main import main
-from impc.files.configuration import RecordingTable, ReportTable, SignalTable
+from impc.files.configuration import RecordingTable, ReportTable, SignalTable, SubjectTable
 from impc.files.results import MethodRecord, ResultFile
 from impc.nonlinear.files import OptimalFitSettings, ParameterSettings
 from impc.studies.cohort.study import StudyTable
@@ -32,6 +32,7 @@ from impc.studies.selection.settings import SelectSettings
 
 #: Heading -> class whose attributes are the keys of that TOML table.
 SETTINGS = {
+    "[subject]": SubjectTable,
     "[recording]": RecordingTable,
     "[signals.NAME]": SignalTable,
     "[fit]": FitSettings,

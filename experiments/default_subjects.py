@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from impc.assess.printed_gain import covariance_intervals, gain_estimate
-from impc.cli.plant import read_subject
+from impc.cli.plant import asked_subject, read_subject
 from impc.cli.simulate import command
 from impc.inverse.noisy_fit import fit_controller
 
@@ -63,7 +63,7 @@ def fitted_subject(files: tuple[Path, ...], body: str) -> Found:
     config.write_text(
         (folder / "subject.toml").read_text().replace("[fit]", f'[fit]\nbody = "{body}"')
     )
-    subject = read_subject("fit", files, "seated-balance", config)
+    subject = read_subject(asked_subject("fit", files, "seated-balance", config))
     begun = time.process_time()
     fitted = fit_controller(subject.problem)
     estimate = gain_estimate(fitted)

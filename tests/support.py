@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import io
+import json
 import os
+import re
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
@@ -199,11 +201,9 @@ def kept_names(steps: Steps) -> set[str]:
     """Names of the results that a folder keeps for these steps."""
     found = set()
     for path in steps.cache.folder.rglob("*.json"):
-        name = path.relative_to(steps.cache.folder).with_suffix("").as_posix()
-        # A name with a space has a file without one.
-        for known in (name, name.replace("-", " ")):
-            if steps.cache.find(known, steps.digest) is not None:
-                found.add(known)
+        name = re.search(rb'"name": ("[^"]*")}$', path.read_bytes().strip())
+        if name and steps.cache.find(json.loads(name[1]), steps.digest) is not None:
+            found.add(json.loads(name[1]))
     return found
 
 

@@ -33,6 +33,7 @@ from impc.reporting.document import (
 )
 from impc.reporting.finding import Chart, Finding, Level, Picture, table_of
 from impc.reporting.provenance import Provenance
+from impc.reporting.rendering import report_script_hashes
 from impc.reporting.style import new_figure
 from impc.reporting.verdict import Alert, Claim, Key, Verdict
 from impc.reporting.writer import require_writable, write_files
@@ -53,6 +54,7 @@ def without_scripts(page: str) -> str:
     policy = re.findall(r"script-src ([^\"]*)", page)[0].split()
     seals = [base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in found]
     assert policy == [f"'sha256-{seal}'" for seal in seals]
+    assert {*seals} == {*report_script_hashes()[: len(seals)]}
     for one in found:
         page = page.replace(f"<script>{one}</script>", "")
     return page

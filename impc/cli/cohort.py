@@ -1,4 +1,4 @@
-"""`impc cohort` and `impc reliability`: studies of many subjects."""
+"""`impc cohort`, `impc reliability` and `impc results`: many subjects."""
 
 from __future__ import annotations
 
@@ -109,9 +109,52 @@ def _run(
             if cluster.scheduler:  # the memory of other machines is unknown
                 effort = replace(effort, gigabytes=0.0)
             require_consent(effort, yes)
-        return run_study(
-            study, tasks, store, pool, lambda one: tell(one.task.name, found=one.found)
+        return run_study(study, tasks, store, pool, tell)
+
+
+@click.command("results")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Write all columns to this .xlsx file, with command, versions and SHA-256 of the inputs "
+    "in a second sheet, or to this .csv file; never overwrites a file.",
+)
+def results_command(folder: Path, out: Path | None) -> None:
+    """Show the fits in a folder and below, one row each, newest first.
+
+    Gains that the page of a fit forbids to report are empty; the column reason says why.
+    """
+    from impc.errors import InputError, OutputError, one_line  # noqa: PLC0415
+    from impc.files.formats import write_file  # noqa: PLC0415
+    from impc.files.results import results_and_origins  # noqa: PLC0415
+    from impc.files.spreadsheet import as_data, workbook_bytes  # noqa: PLC0415
+    from impc.reporting.finding import Finding, csv_bytes  # noqa: PLC0415
+
+    if out is not None and out.suffix not in (".xlsx", ".csv"):
+        raise InputError("--out", f"got {out.name}", "end it in .xlsx or .csv")
+    if out is not None and out.exists():
+        raise OutputError(str(out), "already exists", "choose another name, or remove it")
+    table, origins = results_and_origins(folder)
+    if not len(table):
+        raise InputError(
+            str(folder), "has no result.json below it", "run impc fit, or name another"
         )
+    if out is not None:
+        sheets = {"fits": table, "provenance": origins}
+        write_file(out, workbook_bytes(sheets) if out.suffix == ".xlsx" else csv_bytes(table))
+    fits, others = (table[one] for one in (table["note"] == "", table["note"] != ""))
+    # A terminal has room for the first output and the first gain.
+    names = list(map(str, table))
+    vaf = [name for name in names if name.startswith("vaf.")][:1]
+    gain = [name for name in names if f"{name}_unit" in names][:1]
+    ends = {f"{name}_{end}": end for name in gain for end in ("low", "high")}
+    heads = {name: f"VAF {one_line(name[4:], 20)} (%)" for name in vaf} | ends
+    heads |= {name: one_line(fits[f"{name}_unit"].iloc[0], 30) for name in gain}
+    shown = fits.reindex(columns=["folder", "subject", "verdict", *vaf, *gain, *ends])
+    click.echo(Finding("fits", as_data(shown), labels=heads).text())
+    for place, note in zip(others["folder"], others["note"], strict=True):
+        click.echo(f"{one_line(place)}: {one_line(note)}", err=True)
 
 
 @click.command("reliability")

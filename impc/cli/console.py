@@ -1,10 +1,12 @@
 """Terminal output of commands: confirmation prompt, progress bar, list of written files.
 
-If stderr is not a terminal, lines replace the bar. IMPC_QUIET=1 in the environment hides both.
+If stderr is not a terminal, lines replace the bar. IMPC_QUIET=1 in the environment hides both, and
+IMPC_PROGRESS=json replaces both by one JSON line for each step.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import sys
@@ -65,37 +67,49 @@ _TICK = 1.0
 def progress(
     total: int, unit: str, kept: Callable[[int], str] | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Show a bar during the block; yield a function to call with the name of each done step.
+    """Show a bar during the block; yield a function to call with the title of each done step.
 
     Pass it `found=True` for a step that an earlier run did. `kept(count)` is the message that an
     interruption prints.
     """
+    machine = os.environ.get("IMPC_PROGRESS", "") == "json"
     quiet = os.environ.get("IMPC_QUIET", "") not in ("", "0")
     count = begun = 0  # a disabled bar does not count
     began = said = time.monotonic()
     # disable=None: no bar where stderr is a file.
     with (
-        tqdm(total=total, unit=unit, file=sys.stderr, disable=quiet or None, leave=False) as bar,
+        tqdm(
+            total=total, unit=unit, file=sys.stderr, disable=machine or quiet or None, leave=False
+        ) as bar,
         _ticking(bar),
     ):
 
-        def done(name: str, *, found: bool = False) -> None:
+        def say(title: str, left: float | None, found: bool) -> None:
+            event = {"done": count, "total": total, "title": title, "left": left, "found": found}
+            print(json.dumps(event), file=sys.stderr, flush=True)
+
+        def done(title: str, *, found: bool = False) -> None:
             nonlocal count, begun, said
             count, begun = count + 1, begun + found
-            bar.set_postfix_str(name, refresh=False)
+            bar.set_postfix_str(title, refresh=False)
             if found and not bar.disable:
                 bar.initial += 1  # not part of the rate
             bar.update()
             now = time.monotonic()
-            if bar.disable and not quiet and now - said >= _PAUSE:
+            # No estimate from the first step: it may include compilation.
+            known = count - begun > 1
+            left = (now - began) * (total - count) / (count - begun) if known else None
+            if machine:
+                say(title, left, found)
+            elif bar.disable and not quiet and now - said >= _PAUSE:
                 said = now
-                left = (now - began) * (total - count) / max(count - begun, 1)
-                # No estimate from the first step: it may include compilation.
-                time_left = f", about {left:.0f} s left" if count - begun > 1 else ""
-                which = f" ({name})" if name else ""
+                time_left = "" if left is None else f", about {left:.0f} s left"
+                which = f" ({title})" if title else ""
                 line = f"{count} of {total} {unit}s{which}{time_left}"
                 print(line, file=sys.stderr, flush=True)
 
+        if machine:
+            say("", None, False)
         try:
             yield done
         except KeyboardInterrupt:

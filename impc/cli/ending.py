@@ -82,8 +82,9 @@ def _frames(error: BaseException) -> list[tuple[str, int]]:
 def own_process() -> Iterator[None]:
     """Process-wide settings of the `impc` program; not for commands called from Python.
 
-    The first interruption stops the work cleanly, a second one ends the process at once. Library
-    messages about threads and about objects being deleted are hidden.
+    The first interruption stops the work cleanly, a second one ends the process at once. With
+    IMPC_STOP_WITH_INPUT=1 the end of stdin is one: a program that starts impc holds a pipe, and no
+    run outlives it. Library messages about threads and about objects being deleted are hidden.
     """
     import threading  # noqa: PLC0415
 
@@ -96,6 +97,8 @@ def own_process() -> Iterator[None]:
         signal.signal(signal.SIGINT, _interrupt)
         # Ignored during exit: Python would otherwise die of the signal instead of returning 130.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+        if os.environ.get("IMPC_STOP_WITH_INPUT", "") == "1":
+            threading.Thread(target=_interrupt_with_input, daemon=True).start()
     yield
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stdout.flush()
@@ -103,6 +106,17 @@ def own_process() -> Iterator[None]:
     # Otherwise the interpreter flushes again at exit and prints the failure.
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupt_with_input() -> None:
+    """Wait for the end of stdin, then interrupt."""
+    with contextlib.suppress(OSError):  # no stdin
+        while os.read(0, 1):  # not sys.stdin: its lock would block the exit
+            pass
+    if os.name == "posix":  # to the process: also ends a system call that waits
+        os.kill(os.getpid(), signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)
 
 
 def _interrupt(_signum: int, _frame: object) -> None:

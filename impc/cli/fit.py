@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -17,25 +16,19 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from impc.arrays import Array
+    from impc.cli.plant import Asked
     from impc.reporting.verdict import Verdict
-    from impc.studies.fit.memory import FitMemory
     from impc.studies.fit.result import FitResult
+
+# Title of the last stage.
+_PAGE = "report and figures"
 
 
 @click.command("fit")
 @subject_arguments("Meaning of the columns, and settings; `impc inspect FILE` drafts this file.")
 @out_option("fit", "report.html, result.json, tables and the figures")
 @page_options
-def command(
-    files: tuple[Path, ...],
-    plant_name: str,
-    config: Path,
-    out: Path,
-    solver: str | None,
-    yes: bool,
-    pdf: bool,
-    open_page: bool,
-) -> None:
+def command(asked: Asked, out: Path, yes: bool, pdf: bool, open_page: bool) -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
     If you interrupt it, the same command continues from the last finished step. If the plant is an
@@ -49,18 +42,17 @@ def command(
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
     from impc.studies.effort import fit_effort  # noqa: PLC0415
     from impc.studies.fit.findings import read_truth  # noqa: PLC0415
-    from impc.studies.fit.first import FitProgress  # noqa: PLC0415
     from impc.studies.fit.memory import open_memory  # noqa: PLC0415
     from impc.studies.fit.report import fallen_report, fit_report  # noqa: PLC0415
     from impc.studies.fit.settings import missing  # noqa: PLC0415
     from impc.studies.fit.subject import fit_recordings, stages  # noqa: PLC0415
 
     require_writable(out)
-    asked = files, plant_name, config, out, solver  # no known plant is an optimal control problem
-    if plant_name not in KNOWN and installed("impc.nonlinear") and _own_problem(*asked):
+    # No known plant is an optimal control problem.
+    if asked.plant not in KNOWN and installed("impc.nonlinear") and _own_problem(asked, out):
         return
     try:
-        subject = read_subject("fit", files, plant_name, config, solver)
+        subject = read_subject(asked)
     except AllFellError as fallen:
         report = fallen_report(fallen.falls, fallen.provenance)
         click.echo(report.verdict.text())
@@ -72,20 +64,16 @@ def command(
     if unknown:
         click.echo(unknown, err=True)
     memory = open_memory(out, problem, settings, "fit", subject.inputs.digest)
-    truth = read_truth(files, problem.plant)
+    truth = read_truth(asked.files, problem.plant)
     # One more stage: the report with its figures takes ten seconds.
-    with progress(stages(problem, settings) + 1, "stage", lambda _: memory.kept()) as done:
-
-        def remembered(memory: FitMemory) -> FitProgress:
-            kept = (memory.estimate, memory.replicate, memory.get)
-            return FitProgress(done, *kept, lambda further: remembered(memory.about(further)))
-
-        result = fit_recordings(problem, settings, remembered(memory))
+    count = len(stages(problem, settings)) + 1
+    with progress(count, "stage", lambda _: memory.kept()) as done:
+        result = fit_recordings(problem, settings, memory.progress(done))
         result = replace(result, falls=subject.falls)
         with angles_in(subject.angles):
             report = fit_report(result, subject.provenance, truth, unknown)
             content = report.files(pdf=pdf)
-        done("page")
+        done(_PAGE)
     written = write_files(out, content)
     memory.cache.forget()
     with angles_in(subject.angles):
@@ -93,39 +81,29 @@ def command(
     print_files(out, written, open_page)
 
 
-def _own_problem(
-    files: tuple[Path, ...], plant_name: str, config: Path, out: Path, solver: str | None
-) -> bool:
+def _own_problem(asked: Asked, out: Path) -> bool:
     """Fit, write and print if the plant is an optimal control problem; return whether it is."""
     from impc.cli.plant import find_plant  # noqa: PLC0415
-    from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.plant_sources import made_by  # noqa: PLC0415
     from impc.nonlinear.files import fit_files  # noqa: PLC0415
     from impc.nonlinear.page import optimal_report  # noqa: PLC0415
     from impc.nonlinear.problem import OptimalControlProblem  # noqa: PLC0415
-    from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import write_files  # noqa: PLC0415
 
-    configuration = read_configuration(config)
-    source = find_plant(plant_name, configuration.plant)
+    configuration = asked.configuration
+    source = find_plant(asked.plant, configuration.plant)
     problem = made_by(source) if ":" in source.name else None  # files hold matrices only
     if not isinstance(problem, OptimalControlProblem):
         return False
     with progress(2, "stage") as done:
-        fit = fit_files(problem, files, configuration, solver)
+        fit = fit_files(problem, asked.files, configuration, asked.solver)
         done("search")
-        names = tuple(path.name for path in files)
-        chosen = [] if solver is None else ["--solver", solver]
-        words = ["impc", "fit", *names, "--plant", plant_name, "--config", config.name, *chosen]
-        line = shlex.join(words)
-        inputs = gather_inputs(files, config, source.name, source.arguments)
-        provenance = Provenance(source.name, line, dict(source.arguments), names, inputs)
+        provenance = asked.provenance(source, asked.inputs(source))
         with angles_in(configuration.report.angles):
             report = optimal_report(fit, provenance)
             content = report.files()
-        done("page")
+        done(_PAGE)
     written = write_files(out, content)
     click.echo(report.verdict.text())
     print_files(out, written)
@@ -151,16 +129,7 @@ def _print(result: FitResult, verdict: Verdict, truth: Array | None) -> None:
 @subject_arguments("Meaning of the columns, and settings, as for `impc fit`.")
 @out_option("compare", "report.html, result.json, tables and the figure")
 @page_options
-def compare_command(
-    files: tuple[Path, ...],
-    plant_name: str,
-    config: Path,
-    out: Path,
-    solver: str | None,
-    yes: bool,
-    pdf: bool,
-    open_page: bool,
-) -> None:
+def compare_command(asked: Asked, out: Path, yes: bool, pdf: bool, open_page: bool) -> None:
     """Compare feedback gain, inverse LQR and inverse MPC, one file a trial.
 
     Each method is fitted to all trials, and once without each trial. If you interrupt it, the same
@@ -179,13 +148,13 @@ def compare_command(
     from impc.studies.methods_table import methods_finding  # noqa: PLC0415
 
     require_writable(out)
-    subject = read_subject("compare", files, plant_name, config, solver)
+    subject = read_subject(asked)
     problem, settings = subject.problem, subject.settings
     require_used(settings, (), "compare")
     require_consent(fit_effort(problem, settings), yes)
     memory = open_memory(out, problem, settings, "compare", subject.inputs.digest)
     held_out = settings.held_out
-    count = stages(len(problem.recordings), held_out=held_out)
+    count = len(stages(len(problem.recordings), held_out=held_out))
     with progress(count, "estimate", lambda _: memory.kept()) as done:
         remember = replace(memory, done=done).estimate
         compared = compare_recordings(problem, settings.settle, remember, held_out=held_out)

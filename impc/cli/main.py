@@ -23,6 +23,7 @@ _COMMANDS = {
     "key-parameters": ("impc.cli.select", "key_command"),
     "plan": ("impc.cli.plan", "command"),
     "reliability": ("impc.cli.cohort", "reliability_command"),
+    "results": ("impc.cli.cohort", "results_command"),
     "select": ("impc.cli.select", "command"),
     "simulate": ("impc.cli.simulate", "command"),
     "warm": (__name__, "warm"),

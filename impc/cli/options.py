@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
-from impc.cli.plant import KNOWN
+from impc.cli.plant import KNOWN, asked_subject
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,31 +82,31 @@ def _command_name(context: click.Context) -> str:
 
 
 def subject_arguments(config: str) -> Callable[[F], F]:
-    """Add FILES, --plant, --config (with the help text `config`), --solver and --yes."""
+    """Add FILES and options of a fit, --config with the help `config`; passed on as `asked`."""
+    path, words = click.Path(path_type=Path), ("files", "plant_name", "allowed", "config", "solver")
     options = (
-        click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path),
-                       callback=_recognised),
-        click.option(
-            "--plant",
-            "plant_name",
-            required=True,
-            help=f"{', '.join(KNOWN)}; your own module:function; or a .mat, .npz or .json file "
-            "with a state-space model.",
-        ),
-        click.option("--config", required=True, type=click.Path(path_type=Path), help=config),
+        click.argument("files", nargs=-1, type=path),
+        code_options("plant", "configuration", f": {', '.join(KNOWN)}; your own module:function; "
+                     "or a .mat, .npz or .json file with a state-space model"),
+        click.option("--config", required=True, type=path, help=config),
         solver_option,
         yes_option,
     )  # fmt: skip
-    return lambda command: functools.reduce(lambda found, one: one(found), options[::-1], command)
 
+    def added(command: F) -> F:
+        @functools.wraps(command)
+        def asking(*given: Any, **named: Any) -> Any:
+            from impc.files.formats import recognised  # noqa: PLC0415
 
-def _recognised(_: Context, __: Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Open all `files` before the libraries are loaded, which takes seconds."""
-    from impc.files.formats import recognised  # noqa: PLC0415
+            for file in named["files"]:  # before the libraries are loaded, which takes seconds
+                recognised(file)
+            name = _command_name(click.get_current_context())
+            asked = asked_subject(name, **{word: named.pop(word) for word in words})
+            return command(*given, asked=asked, **named)
 
-    for path in files:
-        recognised(path)
-    return files
+        return functools.reduce(lambda found, one: one(found), options[::-1], cast("F", asking))
+
+    return added
 
 
 def scheduler_options(command: F) -> F:
@@ -144,16 +144,16 @@ def scheduler_options(command: F) -> F:
     return functools.reduce(lambda found, one: one(found), options[::-1], cast("F", connecting))
 
 
-def code_options(kind: str) -> Callable[[F], F]:
-    """Add --plant and --allow-plant (or --model ...): consent to run code that a file names."""
+def code_options(kind: str, file: str = "study", names: str = "") -> Callable[[F], F]:
+    """Add --plant and --allow-plant (or --model ...): consent to run code that a `file` names."""
     name = click.option(
-        f"--{kind}", f"{kind}_name", help=f"Replaces the {kind} that the study names."
+        f"--{kind}", f"{kind}_name", help=f"Replaces the {kind} that the {file} names{names}."
     )
     allow = click.option(
         f"--allow-{kind}",
         "allowed",
         is_flag=True,
-        help=f"Allow running the code that the study names as its {kind}.",
+        help=f"Allow running the code that the {file} names as its {kind}.",
     )
     return lambda command: name(allow(command))
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from impc.checking import replace
+from impc.errors import DataError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from impc.files.configuration import Configuration
     from impc.files.digests import Inputs
     from impc.files.plant_sources import PlantSource
     from impc.inverse.problem import Problem
@@ -26,7 +29,6 @@ KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor
 
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
     """The plant of a short name, an import path ``module:function`` or a file."""
-    from impc.errors import InputError  # noqa: PLC0415
     from impc.files.plant_sources import plant_source  # noqa: PLC0415
 
     for key, value in arguments.items():
@@ -67,12 +69,67 @@ def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool
     return find_plant(name, study.configuration.plant)
 
 
-class AllFellError(Exception):
+class AllFellError(DataError):
     """All trials ended in a fall: nothing is left to fit."""
 
     def __init__(self, falls: tuple[str, ...], provenance: Provenance) -> None:
-        super().__init__("; ".join(falls))
+        super().__init__("recordings", f"end in a fall: {'; '.join(falls)}", "add one without")
         self.falls, self.provenance = falls, provenance
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What `impc fit` or `impc compare` is to fit: by the command line, else by [subject]."""
+
+    files: tuple[Path, ...]
+    plant: str
+    config: Path
+    configuration: Configuration
+    solver: str | None
+    line: str  # The command line, without folders
+
+    def inputs(self, source: PlantSource) -> Inputs:
+        """Digests of all input files."""
+        from impc.files.digests import gather_inputs  # noqa: PLC0415
+
+        return gather_inputs(self.files, self.config, source.name, source.arguments)
+
+    def provenance(self, source: PlantSource, inputs: Inputs) -> Provenance:
+        """Provenance of a result that is made now."""
+        from impc.reporting.provenance import Provenance  # noqa: PLC0415
+
+        names = tuple(path.name for path in self.files)
+        return Provenance(source.name, self.line, dict(source.arguments), names, inputs)
+
+
+def asked_subject(
+    command: str,
+    files: Sequence[Path],
+    plant_name: str | None,
+    config: Path,
+    solver: str | None = None,
+    allowed: bool = False,
+) -> Asked:
+    """What to fit, if the command line consents to running the plant (`consented_name`)."""
+    from impc.files.configuration import read_configuration, require_inside  # noqa: PLC0415
+    from impc.files.plant_sources import consented_name  # noqa: PLC0415
+    from impc.files.saved_plant import SAVED  # noqa: PLC0415
+
+    configuration = read_configuration(config)
+    named, where = configuration.subject, f"{config}: subject"
+    known = tuple(KNOWN)
+    plant = consented_name(f"{where}.plant", named.plant, plant_name, allowed, "plant", known)
+    if plant_name is None and PurePath(plant).suffix in SAVED:
+        require_inside(f"{where}.plant", plant)
+        plant = str(config.parent / plant)
+    found = tuple(files) or tuple(config.parent / name for name in named.files)
+    if not found:
+        raise InputError(f"{where}.files", "names no recording", "name them, or pass FILES")
+    options = {"--plant": plant_name, "--config": config.name, "--solver": solver}
+    given = [word for pair in options.items() if pair[1] is not None for word in pair]
+    given += ["--allow-plant"] if allowed else []
+    line = shlex.join(["impc", command, *(path.name for path in files), *map(str, given)])
+    return Asked(found, plant, config, configuration, solver, line)
 
 
 @dataclass(frozen=True)
@@ -83,53 +140,37 @@ class Subject:
     settings: FitSettings
     source: PlantSource
     inputs: Inputs  # Digests of all input files
-    command: str  # The command line, without folders
-    files: tuple[str, ...]  # Names of the recordings
-    angles: str = "degrees"  # Unit on pages, [report] angles: "degrees" or "radians"
+    asked: Asked
     falls: tuple[str, ...] = ()  # Trials that ended in a fall, with the time
+
+    @property
+    def angles(self) -> str:
+        """Unit of angles on pages."""
+        return self.asked.configuration.report.angles
 
     @property
     def provenance(self) -> Provenance:
         """Provenance of a result that is made now."""
-        from impc.reporting.provenance import Provenance  # noqa: PLC0415
-
-        source = self.source
-        arguments = dict(source.arguments)
-        return Provenance(source.name, self.command, arguments, self.files, self.inputs)
+        return self.asked.provenance(self.source, self.inputs)
 
 
-def read_subject(
-    command: str,
-    files: Sequence[Path],
-    plant_name: str,
-    config: Path,
-    solver: str | None = None,
-) -> Subject:
+def read_subject(asked: Asked) -> Subject:
     """Read the trials that did not end in a fall; AllFellError if there are none."""
     from impc.control.named_solver import require_solver  # noqa: PLC0415
-    from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.files.reading import read_unit  # noqa: PLC0415
-    from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.studies.fit.asked import asked_plant, fit_problem  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
 
-    configuration = read_configuration(config)
+    configuration = asked.configuration
     settings = fit_settings(configuration.fit)
-    if solver is not None:
-        settings = replace(settings, solver=require_solver(solver))
-    source = find_plant(plant_name, configuration.plant)
+    if asked.solver is not None:
+        settings = replace(settings, solver=require_solver(asked.solver))
+    source = find_plant(asked.plant, configuration.plant)
     plant, family = asked_plant(source, configuration.recorded, settings, configuration.aimed)
-    recordings, fallen = read_unit(files, configuration, plant)
+    recordings, fallen = read_unit(asked.files, configuration, plant)
     falls = tuple(f"{one.subject.partition(':')[0]}: {one.problem}" for one in fallen)
-    inputs = gather_inputs(files, config, source.name, source.arguments)
-    names = tuple(path.name for path in files)
-    chosen = [] if solver is None else ["--solver", solver]
-    words = ["impc", command, *names, "--plant", plant_name, "--config", config.name, *chosen]
-    line = shlex.join(words)
+    inputs = asked.inputs(source)
     if not recordings:
-        arguments = dict(source.arguments)
-        raise AllFellError(falls, Provenance(source.name, line, arguments, names, inputs))
+        raise AllFellError(falls, asked.provenance(source, inputs))
     problem = fit_problem(plant, recordings, settings, family)
-    angles = configuration.report.angles
-    return Subject(problem, settings, source, inputs, line, names, angles, falls)
+    return Subject(problem, settings, source, inputs, asked, falls)

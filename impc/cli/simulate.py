@@ -116,7 +116,9 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
     person = {key: given[key] for key in ("mass", "height", "sex")}
     controller = seat_controller(person, given["torque_limit"])
     trials = _trials(controller, person, given)
-    files: dict[str, bytes] = {"subject.toml": _configuration(person, given).encode()}
+    # One format: the trials are the same in all.
+    names = [f"trial_{number}.{wanted[0]}" for number in range(1, len(trials) + 1)]
+    files: dict[str, bytes] = {"subject.toml": _configuration(person, given, names).encode()}
     files["truth.json"] = (json.dumps(_truth(controller, given), indent=1) + "\n").encode()
     for number, trial in enumerate(trials, 1):
         files |= _encoded(f"trial_{number}", trial, wanted)
@@ -126,9 +128,7 @@ def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
         share = 100 * trial.saturated
         click.echo(f"trial {number}: at the torque limit for {share:.1f} % of the time{fell}")
     print_files(out, written)
-    # One format: the trials are the same in all.
-    fit = "impc fit {} --plant seated-balance --config {}"
-    print_next(fit, out, f"trial_*.{wanted[0]}", "subject.toml")
+    print_next("impc fit --config {}", out, "subject.toml")
 
 
 def _wanted(formats: str | None) -> tuple[str, ...]:
@@ -225,10 +225,14 @@ def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _configuration(person: dict[str, Any], given: dict[str, Any]) -> str:
+def _configuration(person: dict[str, Any], given: dict[str, Any], files: list[str]) -> str:
     """Text of subject.toml, which `impc fit` reads."""
     return f"""\
 # A simulated subject: meaning of the columns of its recordings. truth.json holds the true values.
+[subject]
+plant = "seated-balance"
+files = {json.dumps(files)}
+
 [recording]
 time = "time"
 subject = "simulated"

@@ -1,8 +1,8 @@
 """Read and validate the TOML file that describes the columns of a recording.
 
-[recording] has clock or rate, label and cut; [signals.NAME], one table for each signal of the
-plant, has column, unit, mechanical stop, offset and sign. [plant], [fit] and [plan] are passed on
-and not interpreted here.
+[subject] has plant and files of a fit; [recording] has clock or rate, label and cut;
+[signals.NAME], one table for each signal of the plant, has column, unit, mechanical stop, offset
+and sign. [plant], [fit] and [plan] are passed on and not interpreted here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import re
 import sys
 import tomllib
 import warnings
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 
 import msgspec
@@ -33,7 +33,7 @@ _LARGEST = 1_000_000
 _DEEPEST = 16  # nested tables
 _DOTTED = re.compile(rf"""(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{_DEEPEST}}}""")
 _LABELS = ("subject", "visit", "condition", "trial")
-_TABLES = ("recording", "signals", "plant", "fit", "plan", "report")
+_TABLES = ("subject", "recording", "signals", "plant", "fit", "plan", "report")
 _STUDY = ("study", "model", "select")
 
 # A delay with its standard deviation, such as "0 ± 2 ms" or "-0.02 +- 0.001 s".
@@ -44,6 +44,21 @@ Finite = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=_MOST)]
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
+
+
+class SubjectTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The [subject] table: what `impc fit --config FILE` and `impc compare --config FILE` fit.
+
+    Attributes
+    ----------
+    plant : str, optional
+        Plant as for `--plant`, which replaces it; a file of matrices is relative to this file.
+    files : list of str, optional
+        Recordings, one for each trial, relative to this file; FILES of the command replace them.
+    """
+
+    plant: str = ""
+    files: tuple[str, ...] = ()
 
 
 class RecordingTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -168,6 +183,7 @@ class Configuration(msgspec.Struct, frozen=True):
     model: dict[str, Any] = {}
     select: dict[str, Any] = {}
     report: ReportTable = ReportTable()
+    subject: SubjectTable = SubjectTable()
     source: str = ""  # file, for messages
 
     @property
@@ -222,6 +238,15 @@ def read_configuration(path: Path | str, *more: str) -> Configuration:
     return configuration(content, source, *more)
 
 
+def require_inside(where: str, name: str) -> None:
+    """Reject a path that leaves the folder it is relative to, on any system."""
+    path = PureWindowsPath(name)  # either slash separates
+    if not path.name or path.anchor or ".." in path.parts or not name.isprintable():
+        raise InputError(
+            where, f"{brief(name, 80)!a} is no path below its folder", "name a file in that folder"
+        )
+
+
 def configuration(content: Mapping[str, Any], source: str, *more: str) -> Configuration:
     """Validate the content of a configuration file called `source`; `more` names further tables."""
     with blamed(source):
@@ -249,7 +274,12 @@ def configuration(content: Mapping[str, Any], source: str, *more: str) -> Config
             ).at("", "signals")
         plain: dict[str, Any] = {name: tables[name] for name in ("plant", "fit", "plan", *_STUDY)}
         report = _convert(source, ("report",), tables["report"], ReportTable)
-        return Configuration(recording, signals, report=report, source=source, **plain)
+        subject = _convert(source, ("subject",), tables["subject"], SubjectTable)
+        for name in subject.files:
+            require_inside(f"{source}: subject.files", name)
+        return Configuration(
+            recording, signals, report=report, subject=subject, source=source, **plain
+        )
 
 
 def _text(source: str, path: Path) -> str:

@@ -75,7 +75,7 @@ def consented_name(
     """
     name = given or named
     if not name:
-        raise InputError(where, "is missing", f'write {option} = "module:function"')
+        raise InputError(where, "is missing", f"name it, or pass --{option}")
     module = name.partition(":")[0]
     data = option == "plant" and Path(name).suffix in SAVED  # a model is never data
     if name in known or data or module == "plants" or ":" not in name:

@@ -1,4 +1,4 @@
-"""Read and validate result.json (docs/ref/results.md); `impc.reporting.document` writes it.
+"""Read result.json (docs/ref/results.md), one or many; `impc.reporting.document` writes it.
 
 `schema` increases when a key changes its meaning, so that programs can detect it.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -15,14 +16,15 @@ from impc.errors import DataError
 from impc.files.disk import require_ordinary
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import pandas as pd
 
 #: Version of the files that are written now.
 SCHEMA = 10
 
 Matrix = list[list[float]]
+# Columns around those of each fit in a table of fits (`summary` in impc/studies/fit/data.py).
+_FIRST = ("subject", "visit", "condition", "trials", "verdict", "headline")
+_LAST = ("reason", "made", "folder", "note")
 
 
 class MethodRecord(msgspec.Struct, frozen=True):
@@ -143,6 +145,36 @@ def read_result(place: Path) -> ResultFile:
         return msgspec.convert({**content, "content": content}, ResultFile)
     except msgspec.ValidationError as error:
         raise _refused(file, f"is not a result file ({error})") from None
+
+
+def results(root: Path | str) -> pd.DataFrame:
+    """Table of the fits in a folder and below, newest first; `note` says why a row is empty."""
+    return results_and_origins(root)[0]
+
+
+def results_and_origins(root: Path | str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The table `results`, and one with command, versions and SHA-256 of the inputs of each fit."""
+    import pandas as pd  # noqa: PLC0415  # takes a third of a second
+
+    rows, origins = list[dict[str, Any]](), list[dict[str, Any]]()
+    for file in sorted(Path(root).rglob("result.json")):
+        place = {"folder": file.parent.relative_to(root).as_posix()}
+        try:
+            found = read_result(file)
+            row = msgspec.convert(found.content.get("summary"), dict[str, str | float | None])
+            row = {name: float("nan") if one is None else one for name, one in row.items()}
+        except DataError as error:
+            rows.append(place | {"made": "", "note": error.problem})
+        except msgspec.ValidationError:  # of another command
+            rows.append(place | {"made": found.made, "note": f"no fit, but {found.command}"})
+        else:
+            rows.append(row | {"made": found.made, "note": ""} | place)
+            names = ("made", "command", "versions", "sha256")
+            origins.append(place | {name: getattr(found, name) for name in names})
+    rows.sort(key=lambda row: (row["note"] == "", row["made"]), reverse=True)
+    heads = dict.fromkeys([*_FIRST, *(name for row in rows for name in row if name not in _LAST)])
+    made_of = pd.json_normalize(origins, sep=" ").astype(str)
+    return pd.DataFrame(rows, columns=[*heads, *_LAST]), made_of
 
 
 def _refused(file: Path, problem: str) -> DataError:

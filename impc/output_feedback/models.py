@@ -242,7 +242,7 @@ def person_report(
             ahead=ahead,
             errors=frozen(prediction_errors(fit, ahead)),
         )
-    done("intervals of the person")
+    done("intervals")
     return report
 
 

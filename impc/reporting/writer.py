@@ -135,22 +135,27 @@ def _missing(folder: Path) -> list[Path]:
     return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
-def _listed(folder: Path, command: str) -> dict[str, str]:
-    """Files that an earlier run of the `command` wrote to the folder: SHA-256 by name."""
+def written(folder: Path) -> Mapping[str, str]:
+    """Files that a run wrote to the folder, by its list: SHA-256 by name; empty without a list."""
+    return _listed(folder, None)
+
+
+def _listed(folder: Path, command: str | None) -> dict[str, str]:
+    """Files that an earlier run of the `command` (None: any) wrote: SHA-256 by name."""
     try:
         require_ordinary(folder / _LIST)
         owner, *lines = (folder / _LIST).read_text(encoding="utf-8").splitlines()
         found = dict(msgspec.json.decode(line, type=tuple[str, str]) for line in lines)
     except FileNotFoundError:
         telling = [name for name in _TELLING if (folder / name).exists()]
-        if telling:
+        if telling and command is not None:
             raise OutputError(
                 f"folder {folder}", f"contains {telling[0]}, not written by this version", _REMEDY
             ) from None
         return {}
     except (OSError, ValueError, RecursionError):
         raise OutputError(f"folder {folder}", f"its list {_LIST} is damaged", _REMEDY) from None
-    if owner != command:
+    if command not in (None, owner):
         raise OutputError(f"folder {folder}", f"contains results of impc {owner}", _REMEDY)
     return {name: seal for name, seal in found.items() if _is_inside(Path(name))}
 

@@ -105,8 +105,10 @@ class Steps:
 
     cache: Cache
     digest: str
-    done: Callable[[str], None] = lambda _: None  # Called with the name of each available result
-    names: list[str] = field(default_factory=list)  # Names of the available results
+    # Called with the name of each available result, and `found=` whether it was stored
+    done: Callable[..., None] = lambda _, *, found: None
+    # Names of the available results, and whether each was stored
+    names: dict[str, bool] = field(default_factory=dict)
 
     def get(
         self,
@@ -122,13 +124,13 @@ class Steps:
             self.cache.keep(name, self.digest, encode(found))
         else:
             found = decode(content)
-        self.names.append(name)
-        self.done(name)
+        self.names[name] = content is not None
+        self.done(name, found=self.names[name])
         return found
 
     def kept(self) -> str:
         """Message after an interruption."""
         if not self.names:
             return "no step was finished"
-        done = ", ".join(self.names)
+        done = "; ".join(self.names)
         return f"kept in {self.cache.folder}: {done}; the same command continues from there"

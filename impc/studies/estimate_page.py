@@ -97,7 +97,8 @@ def report(
     if settings is None:
         document = _document(evaluate_method(estimate, estimate.problem.bounds))
     else:
-        kept = FitProgress(estimate=lambda name, make: estimate if name == _OURS else make())
+        label = method_label(_OURS)
+        kept = FitProgress(estimate=lambda name, make: estimate if name == label else make())
         result = fit_recordings(estimate.problem, settings, kept)
         document = fit_report(result, Provenance(_CALLER))
     with owned(place, "report"):

@@ -8,7 +8,11 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import openpyxl
@@ -22,12 +26,13 @@ from impc.cli.plant import read_subject
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
-from impc.files.results import read_result
+from impc.files.results import read_result, results
 from impc.studies.fit.asked import asked_plant, fit_problem
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_recordings
 from tests.support import easier_seat
 
+ROOT, WHOLE = Path(__file__).parents[2], "With limit, inverse MPC"
 OWN_PLANT = """
 import control
 
@@ -147,6 +152,104 @@ def test_result_json_is_the_fit(fitted: tuple[Result, Path], subject: Path, quic
     assert abs(np.dot(found["intent"]["dominant"], found["intent"]["vectors"])[-1]) > 1 - 1e-9
     assert found["identifiability"]["rank"] == result.identifiability.rank
     assert [trial["trial"] for trial in found["trials"]] == ["1", "2", "3"]
+
+
+def test_the_configuration_alone_suffices(
+    fitted: tuple[Result, Path], subject: Path, quick: Path, tmp_path: Path
+) -> None:
+    """The same result as by FILES and --plant, though the recordings are links elsewhere."""
+    for name in ("trial_1.csv", "trial_2.csv", "trial_3.csv", "truth.json"):
+        (tmp_path / name).symlink_to(subject / name)
+    shutil.copy(quick, tmp_path)
+    done = run("fit", "--config", str(tmp_path / quick.name), "--out", str(tmp_path / "fit"))
+    assert done.exit_code == 0, done.stderr
+    folders = fitted[1], tmp_path / "fit"
+    by_hand, alone = ((folder / "result.json").read_text() for folder in folders)
+    assert json.loads(alone)["command"] == "impc fit --config quick.toml"
+    files = "trial_1.csv trial_2.csv trial_3.csv"
+    typed = f"impc fit {files} --plant seated-balance --config quick.toml"
+    assert json.loads(by_hand)["command"] == typed
+    for name in ("command", "made", "seconds"):  # text or number, or a list of numbers
+        each = rf'"{name}": ("[^"]*"|\[[^]]*\]|[^,\s]*)'
+        by_hand, alone = (re.sub(each, "", text) for text in (by_hand, alone))
+    assert alone.replace(str(tmp_path), str(subject)) == by_hand
+
+
+def test_the_end_of_the_input_is_an_interruption(quick: Path, tmp_path: Path) -> None:
+    """Input itself is not; the same command continues, and says which stages it found."""
+    words = [sys.executable, "-m", "impc", "fit", "--config", str(quick), "--out", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "IMPC_PROGRESS": "json"}
+
+    def stages(lines: Iterable[str]) -> Iterator[dict[str, Any]]:
+        return (json.loads(line) for line in lines if line.startswith("{"))
+
+    with subprocess.Popen(
+        words, env=environment | {"IMPC_STOP_WITH_INPUT": "1"}, stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    ) as first:  # fmt: skip
+        assert first.stdin is not None
+        assert first.stderr is not None
+        first.stdin.write("no end\n")
+        first.stdin.flush()
+        begun = [one["title"] for one, _ in zip(stages(first.stderr), range(2), strict=False)]
+        first.stdin.close()
+        rest = first.stderr.read()
+    assert (first.returncode, begun) == (130, ["", WHOLE])
+    assert rest.count(WHOLE) == rest.count("the same command continues") == 1
+    assert {path.name for path in tmp_path.iterdir()} == {".impc", "fit-in-progress"}
+    again = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
+    done = [*stages(again.stderr.splitlines())]
+    assert [one["done"] for one in done] == list(range(done[0]["total"] + 1))
+    assert {one["title"]: one["found"] for one in done}[WHOLE]
+    assert (done[-1]["title"], done[-1]["found"]) == ("report and figures", False)
+    assert (tmp_path / "report.html").exists()
+    assert not (tmp_path / "fit-in-progress").exists()
+
+
+def test_fits_of_a_folder_are_a_table(fitted: tuple[Result, Path], tmp_path: Path) -> None:
+    """What is no fit is named, and nothing of other people runs; test_verdict.py has the gains."""
+    found = json.loads((fitted[1] / "result.json").read_text())
+    unit = read_result(fitted[1]).table("gain_per_unit")["for_every"]
+    other = found | {"made": "1999", "summary": found["summary"] | {"subject": "=1+1\x1b[31m"}}
+    for name, content in {"new": found, "old": other, "b/c": [1]}.items():
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "result.json").write_text(json.dumps(content))
+    table = results(tmp_path)
+    assert table["folder"].tolist() == ["new", "old", "b/c"]
+    first = table.iloc[0]
+    assert (first["subject"], first["trials"], first["limit"]) == ("simulated", 3, 6.0)
+    assert first["headline"] == found["verdict"]["headline"]
+    assert first["vaf.theta2"] == found["vaf"]["theta2"]
+    assert first[f"gain.{found['controls'][0]}.theta1_unit"] == f"N m for {unit[0]}"
+    words = "results", str(tmp_path), "--out", str(tmp_path / "all.xlsx")
+    done = run(*words)
+    assert (done.exit_code, done.stderr.partition(":")[0]) == (0, "b/c")
+    assert "\x1b" not in done.output
+    assert max(map(len, done.stdout.splitlines())) <= 100
+    book = openpyxl.load_workbook(tmp_path / "all.xlsx")
+    (heads, _, fit, *_), (made, origin, _) = (book[name].values for name in ("fits", "provenance"))
+    assert dict(zip(heads, fit, strict=True))["subject"] == r"'=1+1\x1b[31m"
+    assert dict(zip(made, origin, strict=True))["sha256 all"] == found["sha256"]["all"]
+    assert "already exists" in run(*words).stderr
+    assert "no result.json" in run("results", str(tmp_path / "none")).stderr
+
+
+def test_a_subject_who_falls_in_every_trial_is_a_result(subject: Path, tmp_path: Path) -> None:
+    lines = (subject / "trial_1.csv").read_text().splitlines()
+    for row in range(-200, 0):  # the last 0.2 s
+        time, angle, rest = lines[row].split(",", 2)
+        lines[row] = f"{time},{float(angle) + 25 * (row / 200 + 1) ** 2},{rest}"
+    (tmp_path / "trial_1.csv").write_text("\n".join(lines))
+    text = (subject / "subject.toml").read_text().replace(', "trial_2.csv", "trial_3.csv"', "")
+    (tmp_path / "subject.toml").write_text(text)
+    words = "--config", str(tmp_path / "subject.toml"), "--out"
+    assert run("fit", *words, str(tmp_path / "fit")).exit_code == 0
+    (found,) = results(tmp_path).to_dict("records")
+    assert (found["trials"], found["verdict"], found["note"]) == (0, "red", "")
+    assert found["reason"] == found["headline"] == "The person fell in every trial."
+    compared = run("compare", *words, str(tmp_path / "compare"))
+    assert compared.exit_code == 2
+    assert compared.stderr.startswith("impc: error: recordings: end in a fall: ")
 
 
 def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None:
@@ -271,30 +374,6 @@ def test_a_configuration_that_cannot_be(
     assert done.stderr.count("\n") == 1
     assert says in done.stderr
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.full
-@pytest.mark.usefixtures("blank_figures")
-def test_an_interrupted_command_says_what_it_kept(
-    subject: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    arguments = ("fit", *[str(subject / f"trial_{n}.csv") for n in (1, 2)], "--plant",
-                 "seated-balance", "--config", str(quick), "--out",
-                 str(tmp_path / "out"))  # fmt: skip
-    with monkeypatch.context() as patch:
-        patch.setattr("impc.studies.fit.subject.cross_checked", interrupt)
-        stopped = run(*arguments)
-    assert stopped.exit_code == 130
-    assert "fit" in stopped.stderr
-    assert "the same command continues" in stopped.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {".impc", "fit-in-progress"}
-    done = run(*arguments)
-    assert done.exit_code == 0, done.stderr
-    assert (tmp_path / "out" / "report.html").exists()
-    assert not (tmp_path / "out" / "fit-in-progress").exists()
 
 
 @pytest.mark.full

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
@@ -14,7 +15,7 @@ from click.testing import CliRunner
 
 from impc.cli.options import out_option
 from impc.errors import OutputError
-from impc.reporting.writer import owned, write_files
+from impc.reporting.writer import owned, write_files, written
 
 ROOT = Path(__file__).parents[2]
 PAGE = {"report.html": b"1", "result.json": b"1"}
@@ -39,6 +40,20 @@ def test_a_run_replaces_the_one_before_whole(tmp_path: Path) -> None:
     assert names(folder) == {*mine, "new.png", "sub/x.csv", ".impc"}
     assert not (folder / "deep").exists()
     assert not (folder / ".impc-new").exists()
+
+
+def test_what_a_run_wrote_is_listed(tmp_path: Path) -> None:
+    assert written(tmp_path) == {}
+    (tmp_path / "result.json").write_text("of another program")
+    assert written(tmp_path) == {}
+    with owned(tmp_path / "out", "fit"):
+        write_files(tmp_path / "out", PAGE)
+    assert dict(written(tmp_path / "out")) == {
+        name: hashlib.sha256(b"1").hexdigest() for name in PAGE
+    }
+    (tmp_path / "out" / ".impc").write_text("fit\n[")
+    with pytest.raises(OutputError, match=r"its list \.impc is damaged"):
+        written(tmp_path / "out")
 
 
 def test_no_list_removes_through_a_link(tmp_path: Path) -> None:

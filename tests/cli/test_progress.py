@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -45,6 +46,27 @@ def test_lines_stand_in_a_pipe_every_ten_seconds(
     assert capsys.readouterr().err.splitlines() == [
         "3 of 8 stages (step 3), about 30 s left",
         "6 of 8 stages (step 6), about 10 s left",
+    ]
+
+
+def test_a_program_reads_a_line_for_each_step(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where the user has asked for quiet; simulated clock, 4 s per step."""
+    monkeypatch.setenv("IMPC_PROGRESS", "json")
+    monkeypatch.setenv("IMPC_QUIET", "1")
+    times = iter(range(0, 1000, 4))
+    monkeypatch.setattr("impc.cli.console.time.monotonic", lambda: next(times))
+    with progress(4, "stage") as done:
+        first = capsys.readouterr().err
+        done("a", found=True)
+        done("b")
+        done("ü, c")
+    heard = [json.loads(line) for line in (first + capsys.readouterr().err).splitlines()]
+    steps = [("", None, False), ("a", None, True), ("b", None, False), ("ü, c", 6.0, False)]
+    assert heard == [
+        {"done": count, "total": 4, "title": title, "left": left, "found": found}
+        for count, (title, left, found) in enumerate(steps)
     ]
 
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 import impc
 from impc.arrays import Array
 from impc.cli.main import main
-from impc.cli.plant import read_subject
+from impc.cli.plant import asked_subject, read_subject
 from impc.files.configuration import read_configuration
 from impc.files.reading import read_recordings, require_whole
 from impc.studies.fit.asked import fit_problem
@@ -138,7 +138,7 @@ def test_rates_and_preview_make_the_plant(law: impc.Controller, tmp_path: Path) 
     trial, config = written(tmp_path, columns(law, [0.5, 0.0]), text)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
-        problem = read_subject("fit", [trial], "tracked_cart:cart", config).problem
+        problem = read_subject(asked_subject("fit", [trial], "tracked_cart:cart", config)).problem
     plant = problem.plant
     assert plant.states == ("x", "v", "push", "x step 1", "x step 2", "x step 3")
     assert plant.observer[0] == np.inf
@@ -205,7 +205,7 @@ def test_what_cannot_be(
     assert old in text
     trial, config = written(tmp_path, table, text.replace(old, new))
     with pytest.raises(impc.ImpcError, match=says):
-        read_subject("fit", [trial], "tracked_cart:cart", config)
+        read_subject(asked_subject("fit", [trial], "tracked_cart:cart", config))
 
 
 def test_gaps_and_settings_are_refused_where_nothing_knows_them() -> None:

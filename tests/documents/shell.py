@@ -21,6 +21,7 @@ from pathlib import Path
 from click.testing import CliRunner
 
 from impc.cli.main import main
+from impc.files.configuration import read_configuration
 
 __all__ = ["run_line", "working_in"]
 
@@ -80,7 +81,10 @@ def _once(arguments: list[str], kept: Path) -> str:
     where = arguments.index("--out")
     out = Path(arguments[where + 1])
     rest = arguments[:where] + arguments[where + 2 :]
-    key = *rest, *(_digest(Path(word)) for word in rest if Path(word).is_file())
+    files = [Path(word) for word in rest if Path(word).is_file()]
+    for path in [one for one in files if one.suffix == ".toml"]:
+        files += [path.parent / name for name in read_configuration(path).subject.files]
+    key = *rest, *map(_digest, files)
     if key not in _MADE:
         made = kept / f"made-{len(_MADE)}"
         _MADE[key] = made, _impc([*rest, "--out", str(made)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import tracemalloc
 from pathlib import Path
@@ -105,6 +106,8 @@ def test_every_key(tmp_path: Path) -> None:
         ("[signals.theta1]", '[signals."b. ü"]\na = 1\n[signals.theta1]', "signals.b. ü.a: is not"),
         ("[recording]", "plant = 3\n[recording]", "plant: is not a table"),
         ("[recording]", "signals.x = 3\n[recording]", "signals.x: is not a table"),
+        ("[recording]", "subject.files = 'a.csv'\n[recording]", "subject.files: Expected 'array'"),
+        ("[recording]", "subject.file = 'a.csv'\n[recording]", "subject.file: is not known"),
     ],
 )
 def test_one_line_with_the_path_of_the_fault(
@@ -119,6 +122,21 @@ def test_one_line_with_the_path_of_the_fault(
     assert (error.file, str(error)) == (str(path), str(caught.value))
     assert error.subject == (f"{path}: {'.'.join(error.place)}" if error.place else str(path))
     assert bool(error.place) == (phrase != "is not TOML")
+
+
+def test_recordings_of_a_subject_are_in_its_folder(tmp_path: Path) -> None:
+    """On every system, whichever the file was written on."""
+
+    def named(name: str) -> tuple[str, ...]:
+        text = f"[subject]\nfiles = {json.dumps([name])}\n"
+        return read_configuration(written(tmp_path, text + settings())).subject.files
+
+    assert named("day 1/b..xlsx") == ("day 1/b..xlsx",)
+    for name in ("../a.csv", "a/../../b.csv", "..\\a.csv", "/a.csv", "\\a.csv", "C:\\a.csv",
+                 "C:a.csv", "\\\\host\\share\\a.csv", "//host/share/a.csv", "", ".", "..",
+                 "a\n.csv", "\0"):  # fmt: skip
+        with pytest.raises(InputError, match=r"subject\.files: .* is no path below its folder"):
+            named(name)
 
 
 @pytest.mark.parametrize(

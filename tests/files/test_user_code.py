@@ -71,3 +71,28 @@ def test_no_command_runs_it_without_consent(
     assert len(done.stderr.strip().splitlines()) == 1
     assert not Path("evil").exists()
     assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("command", ["fit", "compare"])
+@pytest.mark.parametrize(
+    ("plant", "more", "says"),
+    [
+        ("os:system", (), "s.toml: subject.plant: names code that would be run"),
+        ("os:system", ("1.csv",), "s.toml: subject.plant: names code that would be run"),
+        ("../p.mat", (), "s.toml: subject.plant: '../p.mat' is no path below its folder"),
+        ("", (), "s.toml: subject.plant: is missing; name it, or pass --plant"),
+        ("os:system", ("--allow-plant",), "system: expected a control.StateSpace"),
+    ],
+)
+def test_a_subject_runs_no_code_without_consent(
+    command: str, plant: str, more: tuple[str, ...], says: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("1.csv").write_text("y\n1\n")
+    text = f'[subject]\nplant = "{plant}"\nfiles = ["1.csv"]\n[signals'
+    Path("s.toml").write_text(text + HOSTILE.partition("[signals")[2].partition("[model]")[0])
+    done = CliRunner().invoke(main, [command, "--config", "s.toml", "--out", "out", *more])
+    assert done.exit_code == 2, done.output
+    assert done.stderr.startswith(f"impc: error: {says}")
+    assert Path("evil").exists() == ("--allow-plant" in more)

@@ -67,8 +67,8 @@ def reported(*, profiles: bool = False) -> tuple[PersonReport, list[str]]:
     problem, heard = fit_problem(cart(), trials(), settings), list[str]()
     report = fit_recordings(problem, settings, FitProgress(heard.append)).person
     assert report is not None
-    assert len(heard) == stages(problem, settings)
-    assert len(heard) - stages(problem, without) == len(report.models) + 1
+    assert tuple(heard) == stages(problem, settings)
+    assert len(heard) - len(stages(problem, without)) == len(report.models) + 1
     return report, heard
 
 

@@ -55,8 +55,12 @@ def counted(seed: int, made: list[int]) -> Callable[[], Found]:
     [("nothing", []), ("other digest", [1, 2]), ("cut", [1]), ("flipped", [1]), ("copied", [1])],
 )
 def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list[int]) -> None:
-    kept, stated, made = Cache(tmp_path / "kept"), list[str](), list[int]()
-    first = Steps(kept, "digest", stated.append)
+    kept, stated, made = Cache(tmp_path / "kept"), list[tuple[str, bool]](), list[int]()
+
+    def state(name: str, *, found: bool) -> None:
+        stated.append((name, found))
+
+    first = Steps(kept, "digest", state)
     assert first.kept() == "no step was finished"
     for seed in (1, 2):
         same(found(seed), first.get(f"step {seed}", counted(seed, made), decode))
@@ -70,12 +74,13 @@ def test_what_is_kept_is_not_done_again(tmp_path: Path, damage: str, again: list
         path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
     elif damage == "copied":
         path.write_bytes(kept.path("step 2").read_bytes())
-    other = Steps(kept, "another" if damage == "other digest" else "digest", stated.append)
+    other = Steps(kept, "another" if damage == "other digest" else "digest", state)
     made.clear()
     for seed in (1, 2):
         same(found(seed), other.get(f"step {seed}", counted(seed, made), decode))
     assert made == again
-    assert stated == ["step 1", "step 2"] * 2
+    assert stated[:2] == [("step 1", False), ("step 2", False)]
+    assert stated[2:] == [(f"step {seed}", seed not in again) for seed in (1, 2)]
     assert "step 1" in other.kept()
     kept.forget()
     assert not kept.folder.exists()
@@ -85,7 +90,7 @@ def test_a_step_that_fails_is_not_kept(tmp_path: Path) -> None:
     steps = Steps(Cache(tmp_path), "digest")
     with pytest.raises(ZeroDivisionError):
         steps.get("step", lambda: 1 / 0, decode)
-    assert steps.names == []
+    assert steps.names == {}
     assert list(tmp_path.iterdir()) == []
 
 

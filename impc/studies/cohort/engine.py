@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from impc.studies.cohort.study import Study
     from impc.studies.cohort.tasks import FitTask
-    from impc.studies.pool import Pool, Result
+    from impc.studies.pool import Pool
 
 # Entries of a fit that its replicates need.
 _NEEDED = ("starts", "logarithms", "errors", "added", "K", "S")
@@ -118,9 +118,9 @@ def run_study(
     tasks: Mapping[str, FitTask],
     store: Store,
     pool: Pool,
-    done: Callable[[Result], None] = lambda _: None,
+    done: Callable[..., None] = lambda _, *, found: None,
 ) -> Failures:
-    """Run the remaining tasks of a study."""
+    """Run the remaining tasks of a study; `done` hears the title of each, and `found=`."""
     store.log(f"run of {len(study.units)} units on {pool.threads} threads")
     failures = Failures()
     queue = deque(Task(_name(unit), task.digest, fit_unit, (task,)) for unit, task in tasks.items())
@@ -147,5 +147,6 @@ def run_study(
                 Task(_name(unit, k), task.digest, replicate_unit, (*task.given, needed, k))
                 for k in reversed(range(study.replicates))
             )
-        done(result)
+        title = "fit" if index is None else f"bootstrap replicate {index + 1}"
+        done(f"{unit}, {title}", found=result.found)
     return failures

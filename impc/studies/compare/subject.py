@@ -17,6 +17,7 @@ from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
 from impc.inverse.methods import METHODS, fit
+from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -25,21 +26,28 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-    #: (stage, compute) -> the estimate, stored or computed.
+    #: (title, compute) -> the estimate, stored or computed.
     Remember = Callable[[str, Callable[[], Estimate]], Estimate]
 
 # Excluded: needs `feedback_states`; is compared in its two branches; needs a structure.
-_LEFT_OUT = ("preliminary", "inverse_lqr", "structured")
+_NOT_COMPARED = ("preliminary", "inverse_lqr", "structured")
+# What follows the method in a title; `impc.studies.fit.memory` reads it.
+_LEFT_OUT = ", trial {} left out"
 
 
 def compared_methods() -> tuple[str, ...]:
     """Names of the compared methods, in the order of the registry."""
-    return tuple(name for name in METHODS if name not in _LEFT_OUT)
+    return tuple(name for name in METHODS if name not in _NOT_COMPARED)
 
 
-def stages(trials: int, *, held_out: bool = True) -> int:
-    """Number of estimates that `compare_recordings` computes for `trials`."""
-    return len(compared_methods()) * (1 + (trials if held_out and trials > 1 else 0))
+def stages(trials: int, *, held_out: bool = True) -> tuple[str, ...]:
+    """Titles of the estimates that `compare_recordings` computes for `trials`, in order."""
+    names = sorted(compared_methods(), key=lambda name: name != "inverse_mpc")
+    parts = [
+        "",
+        *(_LEFT_OUT.format(k + 1) for k in range(trials if held_out and trials > 1 else 0)),
+    ]
+    return tuple(f"{method_label(name)}{part}" for part in parts for name in names)
 
 
 def compare_recordings(
@@ -51,12 +59,12 @@ def compare_recordings(
 ) -> tuple[MethodFit, ...]:
     """Fit every method to all trials, then to all trials except each one."""
     count, names = len(problem.recordings), compared_methods()
-    whole = cross_checked(problem, _all(problem, names, "all", remember))
+    whole = cross_checked(problem, _all(problem, names, "", remember))
     parts = []
     for index in range(count if held_out and count > 1 else 0):
-        stage, others = f"without {index + 1}", problem.leaving_out(index)
+        part, others = _LEFT_OUT.format(index + 1), problem.leaving_out(index)
         try:
-            parts.append(_all(others, names, stage, remember))
+            parts.append(_all(others, names, part, remember))
         except (WeightsError, SolverError):  # no fit of these trials: NaN in the table
             parts.append({})
     return tuple(
@@ -69,16 +77,16 @@ def compare_recordings(
 
 
 def _all(
-    problem: Problem, names: Sequence[str], stage: str, remember: Remember
+    problem: Problem, names: Sequence[str], part: str, remember: Remember
 ) -> dict[str, Estimate]:
-    """Fit every method to one set of trials, in the order of the names."""
-    start = remember(f"{stage}/inverse_mpc", functools.partial(fit, problem))
-    return {
-        name: start
-        if name == "inverse_mpc"
-        else remember(f"{stage}/{name}", functools.partial(METHODS[name].estimate, problem, start))
-        for name in names
-    }
+    """Fit every method to the trials without those of `part`, in the order of the names."""
+    start = remember(f"{method_label('inverse_mpc')}{part}", functools.partial(fit, problem))
+    found = {}
+    for name in names:
+        compute = functools.partial(METHODS[name].estimate, problem, start)
+        own = name == "inverse_mpc"
+        found[name] = start if own else remember(f"{method_label(name)}{part}", compute)
+    return found
 
 
 def _held_out(problem: Problem, estimates: list[Estimate | None], settle: float) -> Array:

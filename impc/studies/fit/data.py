@@ -33,6 +33,7 @@
                                              errors of signals (SI), recorded commands
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           as in every result
+    summary.<column>                         row of impc results; null where the page forbids a gain
     truth                                    K of a truth.json next to the recordings, or null
     plant, settings, files, versions, made
 
@@ -50,9 +51,12 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.assess.intent import dominant_sentence
 from impc.assess.printed_gain import lasting_responses
 from impc.model.riccati import solve_lqr
+from impc.reporting.shown_units import shown_unit
 from impc.studies.fit.aim import aim_data
+from impc.studies.fit.facts import named_gains
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
+from impc.studies.fit.verdict import GAIN, fit_verdict, reason
 from impc.studies.methods_table import problem_data
 
 if TYPE_CHECKING:
@@ -89,9 +93,37 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
             **{name: getattr(plant, name) for name in ("A", "B", "E", "C", "dt")},
         },
         "settings": plain_settings(result.settings),
+        "summary": _summary(result),
         "ceiling": None if result.ceiling is None else asdict(result.ceiling),
         "seconds": result.seconds,
     }
+
+
+def _summary(result: FitResult) -> dict[str, Any]:
+    """Row of the fit in a table of fits, in shown units; gains that the page forbids are None."""
+    plant, verdict = result.given.plant, fit_verdict(result)
+    label, why = result.given.recordings[0].label, reason(result, GAIN)
+    vaf = map(float, result.inverse_mpc.vaf)
+    row: dict[str, Any] = {
+        **{name: str(getattr(label, name)) for name in ("subject", "visit", "condition")},
+        "trials": len(result.trials),
+        "verdict": verdict.level.value,
+        "headline": verdict.headline,
+        **{f"vaf.{name}": one for name, one in zip(plant.outputs, vaf, strict=True)},
+    }
+    for name, limit in zip(plant.controls, result.given.bounds.u_max, strict=True):
+        head = "limit" if plant.m == 1 else f"limit.{name}"
+        row[head] = float(shown_unit(plant, name)[0] * limit)
+    unknown = []
+    for name, gain in named_gains(result):
+        reported = not why and gain.determined
+        unknown += [] if reported else [name]
+        head = f"gain{gain.interval.name[1:]}"  # after K: control and state
+        for end, value in (("", gain.value), ("_low", gain.low), ("_high", gain.high)):
+            row[f"{head}{end}"] = float(value) if reported else None
+        row[f"{head}_unit"] = f"{gain.unit} for {gain.per}"
+    left = f"Not known to within half of its value: {', '.join(unknown)}" if unknown else ""
+    return row | {"reason": why or left}
 
 
 def _controller(result: FitResult) -> dict[str, Any]:

@@ -18,12 +18,12 @@ from impc.inverse.methods import fit
 from impc.inverse.noisy_fit import first_end, fit_controller
 from impc.inverse.refit import refit
 from impc.inverse.search import FEW
+from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from impc.assess.printed_gain import GainEstimate
-    from impc.assess.resampling import Replicate
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
     from impc.inverse.unknowns import Fitted
@@ -36,12 +36,10 @@ _PLAIN = 50.0
 class FitProgress:
     """Callbacks that report progress and return stored results of an interrupted fit."""
 
-    done: Callable[[str], None] = lambda _: None  # Called with the name of each completed stage
-    # (name of stage, compute) -> estimate, stored (`impc.studies.fit.memory`) or computed
+    done: Callable[[str], None] = lambda _: None  # Called with the title of each completed stage
+    # (title of stage, compute) -> estimate, stored (`impc.studies.fit.memory`) or computed
     estimate: Callable[[str, Callable[[], Estimate]], Estimate] = lambda _, compute: compute()
-    # (name of stage, compute) -> bootstrap replicate, stored or computed
-    replicate: Callable[[str, Callable[[], Replicate]], Replicate] = lambda _, compute: compute()
-    # (name of stage, compute, decode, encode) -> result of an optional subpackage
+    # (title of stage, compute, decode, encode) -> any other result, stored or computed
     part: Callable[..., Any] = lambda _name, compute, _decode, _encode: compute()
     # Callbacks for a problem with one more unknown; None if nothing is stored
     about: Callable[[Problem], FitProgress] | None = None
@@ -65,7 +63,7 @@ def first_fits(
     problem: Problem, progress: FitProgress
 ) -> tuple[Problem, FitProgress, Estimate, GainEstimate, tuple[LackOfFit | None, ...]]:
     """Inverse MPC, with one more unknown if tests of a first search or of the fit point to it."""
-    attempt = progress.attempt
+    attempt, title = progress.attempt, method_label("inverse_mpc")
 
     def tested(at: GainEstimate | Fitted) -> LackOfFit | None:
         found: LackOfFit | None
@@ -85,7 +83,7 @@ def first_fits(
         if cause is not None and cause.problem is not None:
             problem, begins = cause.problem, cause.ends
             progress = progress.anew(problem)
-        fitted = progress.estimate("inverse_mpc", functools.partial(_whole_fit, problem, begins))
+        fitted = progress.estimate(title, functools.partial(_whole_fit, problem, begins))
         estimate = gain_estimate(fitted)
         last = tested(estimate)
         if cause is None and last is not None and last.alarm:
@@ -93,7 +91,7 @@ def first_fits(
             cause = cause_of(refit(estimate.problem, *at, rounds=0), last)
             if cause is not None and cause.problem is not None:
                 continue
-        progress.done("inverse MPC")
+        progress.done(title)
         freed = cause is not None and cause.problem is not None
         before = (cause.found,) if cause is not None and freed else ()
         return problem, progress, fitted, estimate, (*before, last)

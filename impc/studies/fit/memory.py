@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impc.assess.resampling import Replicate
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.saved_estimates import decode_estimate, encode_estimate
 from impc.inverse.methods import METHODS, Method
-from impc.studies.cache import Cache, Steps, from_json
+from impc.studies.cache import Cache, Steps
+from impc.studies.fit.first import FitProgress
+from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
     from impc.inverse.problem import Problem
     from impc.studies.fit.settings import FitSettings
 
-# Names of stages that decide which problem an estimate belongs to.
-_WHOLE = "inverse_mpc"
-_LEFT_OUT = re.compile(r"without (\d+)")
+# What follows the method in the title of an estimate without one trial.
+_LEFT_OUT = re.compile(r", trial (\d+) left out$")
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,16 @@ class FitMemory(Steps):
     """Stored steps of `impc fit` and `impc compare`."""
 
     problem: Problem = field(kw_only=True)  # As posed
+
+    def progress(self, done: Callable[..., None]) -> FitProgress:
+        """Callbacks of a fit; `done` hears the title of each stage, and `found=`."""
+
+        def said(title: str) -> None:
+            done(title, found=self.names.get(title, False))
+
+        return FitProgress(
+            said, self.estimate, self.get, lambda problem: self.about(problem).progress(done)
+        )
 
     def about(self, problem: Problem) -> FitMemory:
         """Store for another problem of the same recordings, with one more unknown."""
@@ -46,20 +56,19 @@ class FitMemory(Steps):
         """Stored estimate of the stage `name`, or the result of `compute`."""
 
         def decode(kept: dict[str, Any]) -> Estimate:
-            posed = self.problem
-            whole = None if name == _WHOLE else self.cache.find(_WHOLE, self.digest)
+            posed, left_out = self.problem, _LEFT_OUT.search(name)
+            if left_out:
+                posed = posed.leaving_out(int(left_out[1]) - 1)
+            first = method_label("inverse_mpc") + (left_out[0] if left_out else "")
+            whole = None if name == first else self.cache.find(first, self.digest)
             if whole is not None and posed.family is not None:  # the fitted body
                 found = np.array(whole["logarithms"], dtype=float)
                 posed = posed.at(np.array(posed.starts), found, np.array(posed.errors))
             if len(kept["logarithms"]) < len(posed.logarithms):
                 posed = posed.with_body_fixed()
-            return decode_estimate(_seen(posed, name, METHODS[kept["method"]]), kept)
+            return decode_estimate(_seen(posed, METHODS[kept["method"]]), kept)
 
         return self.get(name, compute, decode, encode_estimate)
-
-    def replicate(self, name: str, compute: Callable[[], Replicate]) -> Replicate:
-        """Stored bootstrap replicate of the stage `name`, or the result of `compute`."""
-        return self.get(name, compute, lambda kept: from_json(kept, Replicate))
 
 
 def open_memory(
@@ -72,10 +81,8 @@ def open_memory(
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
 
 
-def _seen(problem: Problem, stage: str, method: Method) -> Problem:
-    """The problem that the method of a stage solves."""
-    left_out = _LEFT_OUT.match(stage)
-    posed = problem.leaving_out(int(left_out[1]) - 1) if left_out else problem
+def _seen(posed: Problem, method: Method) -> Problem:
+    """The problem that a method solves."""
     if method.name in ("inverse_mpc", "structured"):
         return posed
     return method.restrict(posed.with_nuisance_fixed())

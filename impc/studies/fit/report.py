@@ -113,7 +113,9 @@ def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
     verdict = fallen_verdict(falls)
     made = Section("Provenance", [Terms(provenance.terms)])
     sections = [Section("Falls", [Lines(falls)]), made]
-    data = {"falls": falls}
+    words = dict.fromkeys(("headline", "reason"), verdict.headline)
+    row = {"trials": 0, "verdict": verdict.level.value, **words}
+    data = {"falls": falls, "summary": row}
     return Report("Fit report", "fit report", verdict, sections, data=data, provenance=provenance)
 
 

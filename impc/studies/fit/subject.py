@@ -32,7 +32,8 @@ from impc.inverse.structured import fit_structured
 from impc.studies.fit.asked import fit_structures, output_feedback
 from impc.studies.fit.first import FitProgress, first_fits
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
-from impc.studies.fit.uncertainty import assess
+from impc.studies.fit.uncertainty import analyses, assess
+from impc.studies.methods_table import method_label
 from impc.studies.pool import threads
 
 if TYPE_CHECKING:
@@ -54,21 +55,23 @@ if TYPE_CHECKING:
     from impc.studies.fit.settings import FitSettings, ObserverSettings
 
 _THREADS = 2
+# Titles of stages. The number and not the name of a structure: stored results have these names.
+_EQUAL = "cost weights that fit equally well"
+_STRUCTURE, _NOISE = "cost weights within structure {}", "noise in the loop: {}"
 _UNUSABLE = "the controller explains less than half of a recorded signal (VAF below 50 %)."
 
 
-def stages(problem: Problem, settings: FitSettings) -> int:
-    """Number of stages that `fit_recordings` reports."""
-    count = 2 + len(_beside(settings)) + _leaves_out(problem, settings)  # 2: fit, set of weights
-    count += (settings.structure is not None) + len(settings.structures)
+def stages(problem: Problem, settings: FitSettings) -> tuple[str, ...]:
+    """Titles of the stages that `fit_recordings` reports, in order."""
+    names = ["inverse_mpc", *_beside(settings)]
+    found = [*map(method_label, names), _EQUAL, *_left_out_titles(problem, settings)]
+    count = (settings.structure is not None) + len(settings.structures)
+    found += [_STRUCTURE.format(index + 1) for index in range(count)]
+    found += analyses(problem, settings)
     if settings.observer is not None:
-        feedback = output_feedback()
-        count += len(feedback.persons(problem, *_asked(problem, settings.observer))) + 1
-    count += settings.replicates + len(settings.profiles)
-    count += problem.plant.m if settings.unknown_limit else 0
-    others = [length for length in settings.horizons if length != problem.horizon]
-    limited = int(np.any(np.isfinite(problem.bounds.u_max)))
-    return count + (1 + limited + len(others) if settings.horizons else 0)
+        persons = output_feedback().persons(problem, *_asked(problem, settings.observer))
+        found += [_NOISE.format(name) for name in (*(name for name, *_ in persons), "intervals")]
+    return tuple(found)
 
 
 def _beside(settings: FitSettings) -> tuple[str, ...]:
@@ -77,10 +80,11 @@ def _beside(settings: FitSettings) -> tuple[str, ...]:
     return (*first, *settings.methods)
 
 
-def _leaves_out(problem: Problem, settings: FitSettings) -> int:
-    """Number of trials that are predicted by a fit to the others."""
+def _left_out_titles(problem: Problem, settings: FitSettings) -> list[str]:
+    """Titles of the trials that are predicted by a fit to the others."""
     trials = len(problem.recordings)
-    return trials if settings.held_out and trials > 1 else 0
+    count = trials if settings.held_out and trials > 1 else 0
+    return [f"Trial {k + 1} left out" for k in range(count)]
 
 
 def fit_alone(problem: Problem, settings: FitSettings) -> FitResult:
@@ -111,7 +115,7 @@ def fit_recordings(
     fitted = found["inverse_mpc"]
     *others, own = [evaluate_method(one, problem.bounds) for one in found.values()]
     for other in others:
-        progress.done(other.name)
+        progress.done(method_label(other.name))
     known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
     pair = np.array(fitted.gain), np.array(fitted.metrics)
     intended = intent(known.plant, *pair, state_sizes(own.runs), weights)
@@ -155,7 +159,7 @@ def _estimates(
 
     def estimate(name: str) -> Estimate:
         compute = functools.partial(METHODS[name].estimate, problem, fitted)
-        return progress.estimate(name, compute)
+        return progress.estimate(method_label(name), compute)
 
     names = _beside(settings)
     with threads(_THREADS) as pool:
@@ -174,7 +178,7 @@ def _left_out(
 ) -> Callable[[], Array]:
     """Submit the predictions of trials from the others; call the result for their VAF (., p)."""
     predict = functools.partial(left_out, fitted, estimate, settle=settings.settle, free=free)
-    names = [f"without trial {k + 1}" for k in range(_leaves_out(fitted.problem, settings))]
+    names = _left_out_titles(fitted.problem, settings)
     pending = [
         pool.submit(progress.attempt, name, functools.partial(predict, k), None)
         for k, name in enumerate(names)
@@ -213,7 +217,7 @@ def _weights(
         at = plant, K, np.array(fitted.metrics), np.array(found.sizes)
         draw = attempt if settings.intent_draws else tuple
         summary = weights_summary_or_reason(*at, draw, pool.map)
-    progress.done("set of weights")
+    progress.done(_EQUAL)
     return summary
 
 
@@ -228,8 +232,8 @@ def _person(
         replace(fitted, problem=fitted.problem.with_body_fixed()),
         *_asked(problem, asked),
         profiled=asked.profiles,
-        done=progress.done,
-        remember=progress.part,
+        done=lambda name: progress.done(_NOISE.format(name)),
+        remember=lambda name, *how: progress.part(_NOISE.format(name), *how),
     )
     return report
 
@@ -253,9 +257,9 @@ def _structures(
     alone: bool,
 ) -> tuple[StructureFit, ...]:
     """Fits of all structures in the settings, started at the unrestricted weights."""
-    found, held_out = [], not alone and _leaves_out(problem, settings) > 0
+    found, held_out = [], not alone and bool(_left_out_titles(problem, settings))
     for index, structure in enumerate(fit_structures(problem.plant, settings)):
-        stage = f"structure {index + 1}"
+        stage = _STRUCTURE.format(index + 1)
         fit = functools.partial(fit_structured, problem, structure, fitted)
         try:
             one = progress.estimate(stage, fit)

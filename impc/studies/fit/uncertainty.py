@@ -16,7 +16,7 @@ import numpy as np
 from impc.assess.input_limits import input_limit
 from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals, gain_estimate
 from impc.assess.profiles import profile_likelihood, require_numbers
-from impc.assess.resampling import bootstrap_intervals, replicate
+from impc.assess.resampling import Replicate, bootstrap_intervals, replicate
 from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
@@ -25,6 +25,8 @@ from impc.assess.variance_accounted_for import (
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.noisy_fit import fit_controller
+from impc.reporting.shown_units import signal_name
+from impc.studies.cache import from_json, to_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -50,6 +52,22 @@ class Uncertainty:
     alternatives: tuple[Alternative, ...]
 
 
+# Titles of stages.
+_PROFILE, _LIMIT, _REPLICATE = "profile of {}", "limit of {}", "bootstrap replicate {}"
+_OTHER = "other horizons: {}"
+
+
+def analyses(problem: Problem, settings: FitSettings) -> list[str]:
+    """Titles of the stages that `assess` reports, in order."""
+    plant = problem.plant
+    found = list(map(_PROFILE.format, settings.profiles))
+    if settings.unknown_limit:
+        found += [_LIMIT.format(signal_name(plant, name)) for name in plant.controls]
+    if settings.horizons:
+        found += [_OTHER.format(name) for name, _ in _alternatives(problem, settings.horizons)]
+    return found + [_REPLICATE.format(index + 1) for index in range(settings.replicates)]
+
+
 def assess(
     problem: Problem,
     fitted: Estimate,
@@ -63,21 +81,22 @@ def assess(
     intervals = list(covariance_intervals(estimate, estimate.covariance, "sandwich"))
     require_numbers(estimate, settings.profiles)
     for name in settings.profiles:
-        stage = f"profile of {name}"
+        stage = _PROFILE.format(name)
         profile = attempt(stage, functools.partial(profile_likelihood, estimate, name), None)
         intervals += [] if profile is None else [profile]
         done(stage)
     for control in range(problem.plant.m if settings.unknown_limit else 0):
         name = problem.plant.controls[control]
-        limit = attempt(f"limit of {name}", functools.partial(input_limit, fitted, control), None)
+        stage = _LIMIT.format(signal_name(problem.plant, name))
+        limit = attempt(stage, functools.partial(input_limit, fitted, control), None)
         if limit is not None:
             ends = limit.value, limit.low, limit.high
             intervals.append(Interval(f"u_max.{name}", "profile", LEVEL, *ends))
-        done(f"limit of {name}")
+        done(stage)
     alternatives: tuple[Alternative, ...] = ()
     if settings.horizons:
-        given = problem, fitted, settings.horizons, settings.settle, done
-        others = functools.partial(fit_alternatives, *given)
+        given = problem, fitted, settings.horizons, settings.settle
+        others = functools.partial(fit_alternatives, *given, lambda name: done(_OTHER.format(name)))
         alternatives = attempt("other horizons", others, ())
     replicates = functools.partial(_bootstrap, estimate, settings, progress)
     intervals += attempt("bootstrap", replicates, ())
@@ -91,11 +110,12 @@ def _bootstrap(
 ) -> tuple[Interval, ...]:
     if not settings.replicates:
         return ()
+    decode = functools.partial(from_json, kind=Replicate)
     found, at = [], (estimate.problem, np.array(estimate.K), np.array(estimate.S))
     for index in range(settings.replicates):
-        name = f"replicate {index + 1}"
+        name = _REPLICATE.format(index + 1)
         compute = functools.partial(replicate, *at, index, settings.seed)
-        found.append(progress.replicate(name, compute))
+        found.append(progress.part(name, compute, decode, to_json))
         progress.done(name)
     return bootstrap_intervals(estimate, found, "block", LEVEL)
 
@@ -120,21 +140,25 @@ def fit_alternatives(
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[Alternative, ...]:
     """Refit without the limit, if there is one, and with each other horizon."""
-    posed = [("as fitted", problem)]
-    if np.any(np.isfinite(problem.bounds.u_max)):
-        posed.append(("no limit", problem.without_bounds()))
-    posed += [
-        (f"horizon {length}", replace(problem, horizon=length))
-        for length in horizons
-        if length != problem.horizon
-    ]
     roots = innovation_roots(fitted)
     found = []
-    for name, other in posed:
+    for name, other in _alternatives(problem, horizons):
         found.append(_fit(name, other, fitted, settle, roots))
         progress(name)
     least = min(item.aic for item in found)
     return tuple(replace(item, aic=item.aic - least) for item in found)
+
+
+def _alternatives(problem: Problem, horizons: Sequence[int]) -> list[tuple[str, Problem]]:
+    """The problems to fit, with their names."""
+    posed = [("as fitted", problem)]
+    if np.any(np.isfinite(problem.bounds.u_max)):
+        posed.append(("no limit", problem.without_bounds()))
+    return posed + [
+        (f"horizon {length}", replace(problem, horizon=length))
+        for length in horizons
+        if length != problem.horizon
+    ]
 
 
 def _fit(name: str, problem: Problem, fitted: Estimate, settle: float, roots: Array) -> Alternative:

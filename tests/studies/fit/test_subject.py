@@ -37,7 +37,7 @@ from impc.studies.fit.subject import fit_recordings, stages
 from tests.support import kept_names
 
 FEEDBACK = ["theta1", "theta2", "theta1_rate", "theta2_rate"]
-SEED = 4
+SEED, WHOLE = 4, "With limit, inverse MPC"
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def small() -> tuple[Problem, FitSettings]:
 def test_a_plant_of_ones_own_with_one_output(small: tuple[Problem, FitSettings]) -> None:
     heard: list[str] = []
     result = fit_recordings(*small, FitProgress(heard.append))
-    assert len(heard) == stages(small[0], small[1])
+    assert tuple(heard) == stages(small[0], small[1])
     # With noise of 20 %, the largest possible VAF is 1 / 1.04.
     assert np.all(np.abs(result.inverse_mpc.vaf - 100 / 1.04) < 1.5)
     assert result.identifiability.rank == 2
@@ -171,14 +171,14 @@ def test_an_interrupted_fit_goes_on(
     memory = open_memory(tmp_path / "out", *small)
 
     def interrupt(stage: str) -> None:
-        if stage == "feedback_gain":
+        if stage == "No limit, gain only":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fit_recordings(*small, FitProgress(interrupt, memory.estimate))
     again = open_memory(tmp_path / "out", *small)
     done = kept_names(again)
-    assert "inverse_mpc" in done
+    assert WHOLE in done
 
     def fitted_again(*_: object) -> None:
         raise AssertionError
@@ -196,12 +196,12 @@ def test_a_memory_of_another_fit_is_not_used(
 ) -> None:
     problem, settings = small
     found = fit_controller(problem)
-    open_memory(tmp_path, problem, settings).estimate("inverse_mpc", lambda: found)
-    assert kept_names(open_memory(tmp_path, problem, settings)) == {"inverse_mpc"}
+    open_memory(tmp_path, problem, settings).estimate(WHOLE, lambda: found)
+    assert kept_names(open_memory(tmp_path, problem, settings)) == {WHOLE}
     assert not kept_names(open_memory(tmp_path, problem, replace(settings, settle=2.0)))
     other = replace(problem, recordings=problem.recordings[:2])
     assert not kept_names(open_memory(tmp_path, other, settings))
-    path = tmp_path / "fit-in-progress" / "inverse_mpc.json"
+    path = tmp_path / "fit-in-progress" / "With-limit--inverse-MPC.json"
     whole = path.read_text()
     for text in ("", "{", "[]", json.dumps({"digest": 3}), whole.replace("1", "2", 1)):
         path.write_text(text)
@@ -263,7 +263,7 @@ def test_what_is_kept_has_the_body_that_was_found(tmp_path: Path) -> None:
 
     first = stages_of(open_memory(tmp_path, person.problem, settings))
     again = stages_of(open_memory(tmp_path, person.problem, settings))
-    assert set(first) == {"inverse_mpc", "feedback_gain"}
+    assert set(first) == {WHOLE, "No limit, gain only"}
     for name, one in first.items():
         assert not np.array_equal(one.problem.plant.A, person.problem.plant.A)
         np.testing.assert_array_equal(again[name].problem.plant.A, one.problem.plant.A)

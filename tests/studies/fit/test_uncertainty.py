@@ -36,7 +36,7 @@ def result() -> FitResult:
     heard: list[str] = []
     problem = fit_problem(cart(), trials, EXTRAS)
     found = fit_recordings(problem, EXTRAS, FitProgress(heard.append))
-    assert len(heard) == stages(problem, EXTRAS)
+    assert tuple(heard) == stages(problem, EXTRAS)
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -61,7 +62,7 @@ def fitted(limit: float) -> FitResult:
     heard: list[str] = []
     problem = fit_problem(plant, [Recording(plant, outputs, push)], settings)
     result = fit_recordings(problem, settings, FitProgress(heard.append))
-    assert len(heard) == stages(problem, settings)
+    assert tuple(heard) == stages(problem, settings)
     return result
 
 
@@ -82,6 +83,8 @@ def test_a_fit_that_nothing_speaks_against() -> None:
     assert share in report.copy.results
     for row in (row for _, row in named_gains(result) if row.determined):
         assert row.ends in report.copy.results
+        summary = report.data["summary"]
+        assert summary[f"gain{row.interval.name[1:]}"] == row.value
     assert max(map(len, verdict.text().splitlines())) <= 100
 
 
@@ -96,6 +99,9 @@ def test_an_error_of_the_model_forbids_gains() -> None:
     report = fit_report(result, Provenance())
     assert isinstance(report.copy, Copy)
     assert "Gains are not reported: the residual depends" in report.copy.results
+    summary = dict(report.data["summary"])
+    assert summary["reason"] == verdict.alerts[0].title
+    assert {one for name, one in summary.items() if re.search("^gain.*(?<!_unit)$", name)} == {None}
     page = report.page()
     # The numbers are only in a folded part that says so.
     assert "(do not report)" in page.partition('id="feedback-gain"')[2][:900]
