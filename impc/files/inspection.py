@@ -73,7 +73,7 @@ def draft_configuration(
         lines += ["", "# Rename each table [signals.NAME] to an output or disturbance of the"]
         lines += ["# plant; remove columns that are neither."]
         for column in rest:
-            lines += ["", *_signal_lines(table, column, column, _span(table, column), "")]
+            lines += ["", *_signal_lines(table, column, column, _span(table, column), "", "")]
         lines += ["", "[plant]", "# arguments of the plant's function", ""]
         return "\n".join([*lines, "[fit]", "# settings of the fit"]) + "\n"
     signals = (*plant.outputs, *plant.controls[1:])
@@ -82,7 +82,7 @@ def draft_configuration(
         column, why = chosen.get(signal, (FILL_IN, "no remaining column fits: enter its name"))
         acts = signal in plant.controls
         kind = _INPUT if acts else _span(table, column)
-        lines += ["", *_signal_lines(table, signal, column, kind, why)]
+        lines += ["", *_signal_lines(table, signal, column, kind, why, plant.direction(signal))]
     unused = [name for name in rest if name not in [column for column, _ in chosen.values()]]
     if unused:
         named = ", ".join(_stated(table, name) for name in unused)
@@ -290,7 +290,9 @@ def _idle(table: Table, column: str) -> str:
     return "" if _rate(values) is None else "a clock or counter"
 
 
-def _signal_lines(table: Table, signal: str, column: str, kind: str, why: str) -> list[str]:
+def _signal_lines(
+    table: Table, signal: str, column: str, kind: str, why: str, way: str
+) -> list[str]:
     unit, how = _column_unit(table, column)
     key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
     return [
@@ -299,7 +301,10 @@ def _signal_lines(table: Table, signal: str, column: str, kind: str, why: str) -
         _line(f"unit = {_quoted(unit)}", how or "fill in: deg, rad, N*m, ..."),
         _line("# limit = 12.0", "mechanical stop, in this unit"),
         _line("# offset = 0.0", "subtracted, in this unit"),
-        _line("# sign = -1", "if the sensor counts in the opposite direction"),
+        _line(
+            "# sign = -1",
+            f"if the sensor counts in the opposite direction{way and f'; positive {way}'}",
+        ),
     ]
 
 
