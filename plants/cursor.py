@@ -35,6 +35,13 @@ from plants.actuation import delayed_muscle
 
 __all__ = ["cursor_plant", "pursuit_plant"]
 
+_ARGUMENTS = {
+    "delay": ("visuomotor delay", "s"),
+    "lag": ("lag of the hand", "s"),
+    "sample_time": ("sample time", "s"),
+    "length": ("unit of the recorded error", ""),
+}
+
 
 def cursor_plant(
     delay: float = 0.15,
@@ -85,7 +92,9 @@ def cursor_plant(
     command = f"{length}/s^2", "acceleration that the person asks for"
     matrices = held[:n, :n], held[:n, n:]
     system = _tracking("cursor", matrices, sample_time, length, stages, command)
-    return with_uncertainty(system, {"delay": delay, "lag": lag}, {"delay": 0.03, "lag": "40 %"})
+    known: dict[str, float | str] = {"delay": 0.03, "lag": "40 %"}
+    arguments = {**_ARGUMENTS, "delay_order": ("order of the approximation of the delay", "")}
+    return with_uncertainty(system, {"delay": delay, "lag": lag}, known, arguments)
 
 
 def pursuit_plant(
@@ -132,7 +141,8 @@ def pursuit_plant(
     stages = {name: f"command of the hand in {k} samples" for k, name in enumerate(commands)}
     command = f"{length}/s", "velocity that the person asks for"
     system = _tracking("pursuit", (A, B), sample_time, length, stages, command)
-    return with_uncertainty(system, {"lag": lag}, {"lag": "40 %"})
+    arguments = {**_ARGUMENTS, "delay": ("visuomotor delay in samples", "")}
+    return with_uncertainty(system, {"lag": lag}, {"lag": "40 %"}, arguments)
 
 
 def _tracking(
@@ -168,4 +178,11 @@ def _tracking(
         "command": asked,
         "target_rate": "target velocity",
     }
-    return with_units(system, {**units, **dict.fromkeys(stages, unit)}, {**words, **stages})
+    directions = {
+        "error": "if the cursor is on the positive side of the target",
+        "velocity": "if the cursor moves to the positive side",
+        "command": "if it drives the cursor to the positive side",
+        "target_rate": "if the target moves to the positive side",
+    }
+    units = {**units, **dict.fromkeys(stages, unit)}
+    return with_units(system, units, {**words, **stages}, directions)

@@ -2,8 +2,9 @@
 
 Both angles are absolute, from the vertical and in the same sense: theta1 of the lower body and
 seat, theta2 of the upper body. The lumbar torque u turns the upper body towards +theta2 and reacts
-on the lower body; d is the perturbation torque of the robot on the seat. With h = m2 l12 l2 and
-x = theta1 - theta2,
+on the lower body; d is the perturbation torque of the robot on the seat. All are positive to the
+right, seen from behind; the plant is symmetric, so that all may be positive to the left instead.
+With h = m2 l12 l2 and x = theta1 - theta2,
 
     (J1 + m1 l1^2 + m2 l12^2) theta1'' + h cos(x) theta2'' = - h sin(x) theta2'^2
         + (m1 l1 + m2 l12) g sin(theta1) - k_r theta1 - c_r theta1' - k_h x - c_h x' + d - u
@@ -34,6 +35,7 @@ import scipy.linalg
 from plants._checks import finite_number
 from plants._units import with_units
 from plants.actuation import delayed_muscle
+from plants.seated_drawing import seated_lines
 from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
 
 __all__ = [
@@ -51,6 +53,15 @@ _BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _INPUTS = ("command", "perturbation")
 _BODY_WORDS = ("seat tilt", "trunk tilt", "seat velocity", "trunk velocity")
 _INPUT_WORDS = ("commanded torque", "perturbation torque")
+_DIRECTIONS = {
+    "theta1": "to the right: the right edge of the seat goes down",
+    "theta2": "to the right: the head goes to the right",
+    "theta1_rate": "to the right",
+    "theta2_rate": "to the right",
+    "muscle_torque": "to the right: it turns the trunk to the right and the seat to the left",
+    "command": "to the right: it turns the trunk to the right and the seat to the left",
+    "perturbation": "to the right: it turns the right edge of the seat down",
+}
 
 
 def seated_balance_plant(
@@ -304,4 +315,5 @@ def _named(A: Any, B: Any, sample_time: float, name: str, p: SeatedBalanceParame
         "theta1": p.gravity * (p.m1 * p.l1 + p.m2 * p.l12),
         "theta2": p.gravity * p.m2 * p.l2,
     }
-    return with_units(system, units, words)
+    system.drawing = functools.partial(seated_lines, p)
+    return with_units(system, units, words, _DIRECTIONS)

@@ -15,16 +15,15 @@ __all__ = ["Quantities", "SeatedBalanceLimits", "SeatedBalanceParameters", "quan
 
 
 def quantity(
-    default: float, unit: str, origin: str, known: float | str = 0.0, **limit: float
+    default: float, unit: str, origin: str, known: Any = 0.0, words: str = "", **limit: float
 ) -> Any:
-    """Declare a dataclass field with unit, origin, uncertainty and limits in its metadata.
+    """Declare a dataclass field with unit, origin, uncertainty, words and limits in its metadata.
 
     `known` is the standard deviation between persons, in the unit or as "5 %"; `limit` has the
     bounds ``least``, ``above`` and ``most`` of `plants._checks.finite_number`.
     """
-    return field(
-        default=default, metadata={"unit": unit, "origin": origin, "known": known, "limit": limit}
-    )
+    about = {"unit": unit, "origin": origin, "known": known, "words": words, "limit": limit}
+    return field(default=default, metadata=about)
 
 
 class Quantities:
@@ -107,20 +106,24 @@ class SeatedBalanceParameters(Quantities):
         stiffness, damping and gravity are not negative.
     """
 
-    m1: float = quantity(60.6, "kg", "regressed", "3 %", above=0.0)
-    m2: float = quantity(39.1, "kg", "regressed", "4 %", above=0.0)
-    l1: float = quantity(0.058, "m", "regressed", 0.015)
-    l2: float = quantity(0.263, "m", "regressed", "5 %", above=0.0)
-    l12: float = quantity(0.279, "m", "regressed", "5 %", above=0.0)
-    J1: float = quantity(2.53, "kg m^2", "regressed", "12 %", above=0.0)
-    J2: float = quantity(1.34, "kg m^2", "regressed", "12 %", above=0.0)
-    k_h: float = quantity(30.0, "Nm/rad", "measured", "35 %", least=0.0)
-    c_h: float = quantity(2.5, "Nms/rad", "chosen", "50 %", least=0.0)
-    k_r: float = quantity(120.0, "Nm/rad", "chosen", "2 %", least=0.0)
-    c_r: float = quantity(5.0, "Nms/rad", "chosen", "5 %", least=0.0)
-    tau_d: float = quantity(0.08, "s", "chosen", 0.01, above=0.0)
-    tau_m: float = quantity(0.06, "s", "chosen", "25 %", above=0.0)
-    gravity: float = quantity(9.81, "m/s^2", "chosen", least=0.0)
+    m1: float = quantity(60.6, "kg", "regressed", "3 %", "mass of pelvis, legs and seat", above=0.0)
+    m2: float = quantity(39.1, "kg", "regressed", "4 %", "mass of trunk, head and arms", above=0.0)
+    l1: float = quantity(
+        0.058, "m", "regressed", 0.015, "centre of mass of the lower body above the pivot"
+    )
+    l2: float = quantity(
+        0.263, "m", "regressed", "5 %", "centre of the trunk above the joint", above=0.0
+    )
+    l12: float = quantity(0.279, "m", "regressed", "5 %", "lumbar joint above the pivot", above=0.0)
+    J1: float = quantity(2.53, "kg m²", "regressed", "12 %", "inertia of the lower body", above=0.0)
+    J2: float = quantity(1.34, "kg m²", "regressed", "12 %", "inertia of the upper body", above=0.0)
+    k_h: float = quantity(30.0, "N m/rad", "measured", "35 %", "lumbar stiffness", least=0.0)
+    c_h: float = quantity(2.5, "N m s/rad", "chosen", "50 %", "lumbar damping", least=0.0)
+    k_r: float = quantity(120.0, "N m/rad", "chosen", "2 %", "stiffness of the seat", least=0.0)
+    c_r: float = quantity(5.0, "N m s/rad", "chosen", "5 %", "damping of the seat", least=0.0)
+    tau_d: float = quantity(0.08, "s", "chosen", 0.01, "delay from command to muscle", above=0.0)
+    tau_m: float = quantity(0.06, "s", "chosen", "25 %", "time constant of the muscle", above=0.0)
+    gravity: float = quantity(9.81, "m/s²", "chosen", 0.0, "acceleration of gravity", least=0.0)
 
 
 @dataclass(frozen=True)
@@ -150,4 +153,4 @@ class SeatedBalanceLimits(Quantities):
     theta2: float = quantity(math.radians(15.0), "rad", "chosen", above=0.0)
     theta1_rate: float = quantity(1.5, "rad/s", "chosen", above=0.0)
     theta2_rate: float = quantity(1.5, "rad/s", "chosen", above=0.0)
-    command: float = quantity(70.0, "Nm", "chosen", above=0.0)
+    command: float = quantity(70.0, "N m", "chosen", above=0.0)

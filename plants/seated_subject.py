@@ -12,13 +12,25 @@ from typing import Any
 import casadi as ca
 
 from plants._units import with_uncertainty
-from plants.anthropometry import Sex, from_anthropometry
+from plants.anthropometry import DE_LEVA, Sex, from_anthropometry
 from plants.integration import runge_kutta_step, with_linear_part
 from plants.seated_balance import nonlinear_dynamics, seated_balance_plant, seated_balance_slopes
 from plants.seated_body import seated_balance_body
 from plants.seated_parameters import SeatedBalanceParameters
 
 __all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_for"]
+
+_ARGUMENTS = {
+    "mass": ("body mass", "kg"),
+    "height": ("body height", "m"),
+    "sex": ("sex of the sample of body segments", "", *DE_LEVA),
+    "sample_time": ("sample time", "s"),
+    "delay_order": ("order of the approximation of the delay", ""),
+    **{
+        each.name: (each.metadata["words"], each.metadata["unit"])
+        for each in fields(SeatedBalanceParameters)
+    },
+}
 
 
 def seated_parameters_for(
@@ -77,7 +89,7 @@ def seated_balance_for(
 
     system.body = body  # made only on demand: takes 0.05 s
     system.slopes = functools.partial(seated_balance_slopes, found, sample_time, delay_order)
-    return with_uncertainty(system, asdict(found), found.uncertainty)
+    return with_uncertainty(system, asdict(found), found.uncertainty, _ARGUMENTS)
 
 
 def seated_balance_step_for(

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.special
 
-from impc.arrays import Array, Frozen, frozen
+from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise
 from impc.checking import checked, replace
@@ -163,8 +163,13 @@ def agreement(
 @checked(u="i m", u_min="~m", u_max="~m")
 def saturated_share(u: Array, u_min: Array, u_max: Array) -> float:
     """Share of samples with an input at its bound, to 1e-6 of it."""
+    return float(np.count_nonzero(at_limit(u, u_min, u_max)) / max(len(u), 1))
+
+
+def at_limit(u: Array, u_min: Array, u_max: Array) -> BoolArray:
+    """Whether any input is at its bound (samples,), to 1e-6 of it; `u` (samples, m)."""
     near = (u >= u_max * (1 - 1e-6)) | (u <= u_min * (1 - 1e-6))  # the origin is strictly inside
-    return float(np.count_nonzero(np.any(near, axis=1)) / max(len(u), 1))
+    return np.asarray(np.any(near, axis=1))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from impc.files.alignment import named_clock, rising
 from impc.files.clock import counts_days
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN, make_plant
+from impc.files.pulse import pulse
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -84,10 +85,27 @@ class Draft:
         found += sum(name in OWN or value == FILL_IN for name, value in self.arguments.items())
         return found + (self.plant is not None)
 
+    @property
+    def start(self) -> tuple[float, str] | None:
+        """Time in s of the only pulse of a column without a use, and the question about it."""
+        for column in self.unused:
+            found = pulse(self.table.columns[column])
+            if found and (self.clock or self.table.rate):
+                place, height = found
+                time = place / (self.table.rate or 1.0)
+                if self.clock:
+                    unit = si_unit(self.clock.unit).factor
+                    time = float(self.table.columns[self.clock.column][place]) * unit
+                high = f"{height:.2g} {self.table.units.get(column, '')}".strip()
+                where = f"one pulse of {high} in {column!r} at {time:.6g} s"
+                return time, f"{where}: does the trial begin there?"
+        return None
+
     @np.errstate(all="ignore")
     def toml(self) -> str:
         """Text of a commented configuration (docs/howto/recordings.md)."""
         table, plant, name = self.table, self.plant, Path(self.table.source).name
+        start = self.start
         lines = [
             f"# Meaning of the columns of {name!r}. Check every line; replace each",
             f'# "{FILL_IN}", which neither the file nor the plant determines.',
@@ -96,6 +114,8 @@ class Draft:
             *_clock_lines(table, self.clock),
             _line('subject = ""', "code of the subject"),
             *_OPTIONS,
+            _START if start is None else _line(f"# start = {start[0]:.6g}", start[1]),
+            *_MORE,
         ]
         if plant is None:
             lines += ["", "# Rename each table [signals.NAME] to an output or disturbance of the"]
@@ -103,7 +123,7 @@ class Draft:
         for signal, guess in self.signals.items():
             acts = plant is not None and signal in plant.controls
             kind = _INPUT if acts else _span(table, guess.column)
-            lines += ["", *_signal_lines(signal, guess, kind)]
+            lines += ["", *_signal_lines(signal, guess, kind, plant)]
         if self.unused:
             named = ", ".join(_stated(table, name) for name in self.unused)
             lines += ["", f"# Columns that are not used: {named}"]
@@ -225,7 +245,9 @@ _OPTIONS = (
     _line('# trial = "1"', "by default the name of the file"),
     "# pattern = '(?P<subject>[^_]+)_(?P<trial>[0-9]+)'  # or the label from the file's name",
     _line("# fill_gaps = 0.05", "s, longest gap to interpolate; default: a model sample"),
-    _line("# start = 0.0", "s, cut on the file's clock"),
+)
+_START = _line("# start = 0.0", "s, cut on the file's clock")
+_MORE = (
     "# stop = 30.0",
     _line('# sheet = "Data"', "of a workbook; by default the first with rows of numbers"),
 )
@@ -306,16 +328,18 @@ def _idle(table: Table, column: str) -> str:
     return "" if rate_of(values) is None else "a clock or counter"
 
 
-def _signal_lines(signal: str, guess: Guess, kind: str) -> list[str]:
+def _signal_lines(signal: str, guess: Guess, kind: str, plant: Plant | None) -> list[str]:
     key = signal if signal.isidentifier() and signal.isascii() else _quoted(signal)
     column = f"column = {_quoted(guess.column)}"
+    positive = "" if plant is None else plant.direction(signal)
+    positive = f"; positive {positive}" if positive else ""
     return [
         _line(f"[signals.{key}]", kind),
         _line(column, guess.why) if guess.why else column,
         _line(f"unit = {_quoted(guess.unit)}", guess.origin),
         _line("# limit = 12.0", "mechanical stop, in this unit"),
         _line("# offset = 0.0", "subtracted, in this unit"),
-        _line("# sign = -1", "if the sensor counts in the opposite direction"),
+        _line("# sign = -1", f"if the sensor counts in the opposite direction{positive}"),
     ]
 
 

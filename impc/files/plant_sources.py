@@ -16,11 +16,13 @@ import inspect
 import os
 import sys
 import warnings
+from collections.abc import Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import numpy as np
 
 from impc.arrays import finite_array
@@ -32,7 +34,7 @@ from impc.model.plant import Plant
 from impc.model.plant_family import DELAY, LIMIT, PlantFamily, plant_differential
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from impc.arrays import Array
 
@@ -40,6 +42,22 @@ if TYPE_CHECKING:
 OWN = ("mass", "height")
 #: Table in [plant] with the uncertainty of its parameters, and its key for all of them.
 UNCERTAINTY, _ALL = "uncertainty", "all"
+# Largest number of parameters of a plant, and texts about them.
+_MOST = 200
+_Text = Annotated[str, msgspec.Meta(max_length=_MOST)]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An argument or a physical parameter of a plant."""
+
+    name: str
+    words: str  # the name if the plant has none
+    unit: str
+    value: object  # default
+    deviation: str | float | None  # standard deviation as stated: in the unit, or "5 %"
+    choices: tuple[str, ...]  # allowed texts; empty if any
+    own: bool  # measured for every subject
 
 
 @dataclass(frozen=True)
@@ -58,11 +76,37 @@ class PlantSource:
                 found[name] = FILL_IN if item.default is item.empty else item.default
         return found
 
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Arguments, then physical parameters, as the plant itself describes them."""
+        system, found = made_by(replace(self, arguments={})), []
+        words: dict[str, list[str]] = _stated(self.name, system, "arguments", list[_Text])
+        known = _stated(self.name, system, UNCERTAINTY, float | _Text)
+        values = self.defaults() | _stated(self.name, system, "parameters", float)
+        for name, value in values.items():
+            said, unit, *more = [*words.get(name, [name]), "", ""]
+            choices = tuple(filter(None, more))
+            found.append(Parameter(name, said, unit, value, known.get(name), choices, name in OWN))
+        return tuple(found)
+
     def assumed(self) -> dict[str, object]:
         """Arguments of the subject (`OWN`) that keep the plant's typical value."""
         defaults = {} if Path(self.name).suffix in SAVED else self.defaults()
         left = (name for name in OWN if name in defaults and name not in self.arguments)
         return {name: defaults[name] for name in left if defaults[name] != FILL_IN}
+
+
+def _stated(source: str, system: Any, kind: str, wanted: Any) -> Any:
+    """What a system states of its parameters (`kind`), by name; of the type `wanted`."""
+    where, remedy = f"plant {source} {kind}", f"correct system.{kind}"
+    with users_code(where):
+        given = getattr(system, kind, {})
+        if not isinstance(given, Mapping) or len(given) > _MOST:
+            raise InputError(where, f"is not a mapping of at most {_MOST} names", remedy)
+        try:
+            plain = msgspec.to_builtins(dict(given), enc_hook=lambda one: one.item())  # of numpy
+            return msgspec.convert(plain, dict[_Text, wanted])
+        except msgspec.ValidationError as error:
+            raise InputError(where, f"is wrong: {one_line(error)}", remedy) from None
 
 
 def consented_name(

@@ -23,6 +23,7 @@ from impc.arrays import Array, System, finite_array, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import PlantError, brief
 from impc.model.body import Body, read_body
+from impc.model.drawing import lines_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -61,6 +62,8 @@ class Plant(Value):
         Pairs of signal and unit; `unit` looks one up.
     words : tuple of (str, str)
         Pairs of signal and description; `word` looks one up.
+    directions : tuple of (str, str)
+        Pairs of signal and what is positive, from `system.directions`; `direction` looks one up.
     gravity : tuple of (str, float)
         Pairs of an angle and m g h, the moment of gravity in N m/rad, from `system.gravity`; the
         report gives gains in multiples of it.
@@ -113,6 +116,7 @@ class Plant(Value):
     outputs: tuple[str, ...]
     units: tuple[tuple[str, str], ...]
     words: tuple[tuple[str, str], ...]
+    directions: tuple[tuple[str, str], ...]
     gravity: tuple[tuple[str, float], ...]
     body: Body | None
     observer: Array
@@ -159,13 +163,17 @@ class Plant(Value):
             outputs=tuple(system.output_labels),
             units=_texts(system, "units", units, 'unit, as in {"angle": "rad"}'),
             words=_texts(system, "words", words, 'text, as in {"angle": "tilt of the seat"}'),
+            directions=_texts(system, "directions", None, 'text, as in {"angle": "to the right"}'),
             gravity=_gravity(system),
             body=None if moves is None else read_body(moves, order, len(matrices["A"])),
             observer=frozen(np.zeros(len(rest))),
             ahead=0,
             previewed=(),
             commands=(),
+            # Function and its number of states: no field, and so neither compared nor sent.
+            _drawing=(getattr(system, "drawing", None), len(matrices["A"])),
         )
+        self.drawing(np.zeros((1, self.n)))
         _require_stabilisable(self)
         if moves is not None:
             _require_linearisation(self.require_discrete(), moves, matrices["B"])
@@ -197,6 +205,18 @@ class Plant(Value):
         """Description of signal `name`; empty if the plant has none."""
         return dict(self.words).get(name, "")
 
+    def direction(self, name: str) -> str:
+        """What is positive in signal `name`, in words; empty if the plant has none."""
+        return dict(self.directions).get(name, "")
+
+    def drawing(self, states: Array) -> tuple[Array, ...]:
+        """Lines (samples, points, 2) in m of the body at `states` (samples, n); y is up.
+
+        They come from `system.drawing`, state (n,) -> lines (points, 2); a plant without has none.
+        """
+        draw, n = getattr(self, "_drawing", (None, 0))
+        return () if draw is None else lines_at(draw, states[:, :n])
+
     @property
     def discrete(self) -> bool:
         """Whether the plant is sampled."""
@@ -224,7 +244,7 @@ def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
     """Return the linear plant in z = T^-1 x and v = G^-1 u, T (n, n), G (m, m); same names."""
     back = np.linalg.inv(T)
     inputs = np.eye(plant.m) if G is None else G
-    return replace(
+    moved = replace(
         plant,
         A=frozen(back @ plant.A @ T),
         B=frozen(back @ plant.B @ inputs),
@@ -232,6 +252,8 @@ def change_coordinates(plant: Plant, T: Array, G: Array | None = None) -> Plant:
         C=frozen(plant.C @ T),
         body=None,
     )
+    vars(moved).pop("_drawing", None)  # it is of the other states
+    return moved
 
 
 def _matrices(system: Any) -> dict[str, Array]:

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from impc.files.results import SCHEMA
 from impc.files.spreadsheet import workbook_bytes
-from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Picture, csv_bytes
+from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Moving, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
 from impc.reporting.style import drawn, inline
@@ -73,7 +73,7 @@ class Fold:
 
 
 #: Content of a section; a str is a paragraph.
-Block = str | Finding | Picture | Chart | Lines | Terms | Quiet | Checks | Alert | Fold
+Block = str | Finding | Picture | Chart | Moving | Lines | Terms | Quiet | Checks | Alert | Fold
 
 
 @dataclass(frozen=True)

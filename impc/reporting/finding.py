@@ -49,6 +49,16 @@ class Chart:
     data: Mapping[str, Any]  # Curves in the form of `impc.studies.charts`
 
 
+@dataclass(frozen=True)
+class Moving:
+    """A body that a script moves over time; still figures in print."""
+
+    data: Mapping[str, Any]  # In the form of `impc.studies.fit.movement`
+    box: str  # SVG view box
+    stills: Sequence[tuple[str, int]]  # Words and frame
+    caption: str
+
+
 @dataclass(frozen=True, eq=False)
 class Finding:
     """Result of one assessment: table, sentences, figure, and level of restriction.

@@ -1,5 +1,5 @@
 "use strict";
-// Copy button, links into folded parts, sortable tables, interactive curves. The page works without scripts.
+// Copy button, links into folded parts, sortable tables, moving body, interactive curves. The page works without scripts.
 (() => {
   const all = (query, place = document) => [...place.querySelectorAll(query)];
   const make = (tag, place, words = "") => {
@@ -59,6 +59,45 @@
         body.append(...[...body.rows].sort((a, b) => sign * order(text(a), text(b))));
       });
     });
+  }
+
+  // Recorded and modelled body; between two frames the numbers of a path are interpolated.
+  for (const place of all(".moving")) {
+    const { start, step, frames, limit } = JSON.parse(place.querySelector("script").textContent);
+    const [play, slow, slider, said] = all("button, input, .time", place);
+    const paths = all(".scripted path", place);
+    let [time, before] = [0, 0];
+    const show = () => {
+      const k = Math.floor(time / step + 1e-6), part = time / step - k;
+      frames.forEach((each, who) => {
+        const next = (each[k + 1] || each[k]).split(" ");
+        paths[who].setAttribute("d", each[k].split(" ").map((one, i) => +one + part * (next[i] - one) || one).join(" "));
+      });
+      paths[1].classList.toggle("limit", limit[k]);
+      slider.value = time;
+      said.textContent = slider.ariaValueText = `${(start + time).toFixed(2)} s${limit[k] ? ", command at its limit" : ""}`;
+      play.textContent = before ? "Pause" : "Play";
+    };
+    const move = (now) => {
+      if (!before) return;
+      // A first frame can have begun before the click.
+      time = Math.min(time + Math.max(now - before, 0) / (slow.checked ? 4000 : 1000), slider.max);
+      before = time < slider.max && now;
+      show();
+      requestAnimationFrame(move);
+    };
+    play.addEventListener("click", () => {
+      before = before ? 0 : performance.now();
+      if (time >= slider.max) time = 0;
+      requestAnimationFrame(before ? move : show);
+    });
+    slider.addEventListener("input", () => {
+      [time, before] = [slider.valueAsNumber, 0];
+      show();
+    });
+    [slider.step, slider.max] = [step, step * (limit.length - 1)];
+    slow.checked = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    show();
   }
 
   // One panel per signal with a common time axis: drag to zoom, double-click to reset.

@@ -40,6 +40,7 @@ def render_page(report: object, charts: bool) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     glossary = Glossary()
     environment.filters["prose"] = lambda text: _unbroken(glossary.marked(text))
     environment.filters["unbroken"] = _unbroken

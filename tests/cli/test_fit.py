@@ -30,6 +30,7 @@ from impc.files.results import read_result, results
 from impc.studies.fit.asked import asked_plant, fit_problem
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_recordings
+from plants import seated_parameters_for
 from tests.support import easier_seat
 
 ROOT, WHOLE = Path(__file__).parents[2], "With limit, inverse MPC"
@@ -267,6 +268,34 @@ def test_the_page_says_what_the_numbers_say(fitted: tuple[Result, Path]) -> None
     assert len(page) < 800_000
     assert not (fitted[1] / "fit-in-progress").exists()
     assert max(map(len, fitted[0].stdout.splitlines())) <= 100
+
+
+def test_the_moving_body_is_that_of_the_table(fitted: tuple[Result, Path]) -> None:
+    """Ends of the seat, lumbar joint and neck as complex numbers, from trajectories.csv."""
+    page = html.unescape((fitted[1] / "report.html").read_text(encoding="utf-8"))
+    (found,) = re.findall(r'<figure class="moving">(.*?)</figure>', page, re.DOTALL)
+    data = json.loads(found[found.index("{") : found.index("</script>")])
+    ((trial, times),) = re.findall(r"(Trial \d), .* drawn (\d) times as large", found)
+    table = pd.read_csv(fitted[1] / "trajectories.csv").query(f"trial == '{trial}'")
+    first, stride = (round(100 * data[name]) for name in ("start", "step"))
+    table, ours, p = table.iloc[first::stride], [], seated_parameters_for(79.7, 1.66)
+    for kind in ("recorded", "simulated"):  # a turn to the right
+        angles = np.radians(table[[f"theta1_{kind}_deg", f"theta2_{kind}_deg"]].to_numpy())
+        low, up = np.exp(-1j * int(times) * angles).T
+        neck = 1j * p.l12 * low + 1.66j * p.l2 * up
+        ours.append([(0.05j - 0.25) * low, (0.05j + 0.25) * low, 1j * p.l12 * low, neck])
+    drawn = [[one.replace("M", "").split() for one in frames] for frames in data["frames"]]
+    numbers = np.array(drawn, float)
+    shown = numbers[..., [0, 2, 12, 16]] - 1j * numbers[..., [1, 3, 13, 17]]
+    mine = np.swapaxes(ours, 1, 2)
+    mine, shown = mine - mine.mean(), shown - shown.mean()
+    scale = np.vdot(mine, shown).real / np.vdot(mine, mine).real
+    assert scale > 800
+    assert np.max(np.abs(shown - scale * mine)) < 1.5  # rounded to whole numbers
+    assert data["limit"] == list(abs(table.command_simulated) >= 6 * (1 - 1e-6))
+    assert 0 < sum(data["limit"]) < len(table)
+    assert found.count(f'd="{data["frames"][1][0]}"') == 2  # a still figure has it too
+    assert len(found) < 150_000
 
 
 def test_the_tables_are_those_of_result_json(fitted: tuple[Result, Path]) -> None:

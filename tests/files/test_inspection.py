@@ -183,6 +183,7 @@ def test_settings_that_only_the_user_knows_are_asked_for(trial: Path, tmp_path: 
     assert "without this line the plant's 79.7 is used" in text
     assert 'height = "?"' in text
     assert '# sex = "male"' in text
+    assert "opposite direction; positive to the right: the right edge of the seat goes" in text
     assert "command in N m" in text
     assert "0.2 s" in text
     table = read_configuration(out).fit

@@ -17,12 +17,14 @@ import scipy.io
 
 from impc.errors import ImpcError, InputError, PlantError
 from impc.files.plant_sources import (
+    Parameter,
     PlantSource,
     import_function,
     make_plant,
     plant_family_of,
     plant_source,
 )
+from plants import seated_balance_for
 from tests.files.samples import mat5_array, mat5_element, mat5_file
 
 A, B, C = [[1.0, 0.1], [0.0, 1.0]], [[0.005, 0.0], [0.1, 0.1]], [[1.0, 0.0]]
@@ -236,3 +238,49 @@ def test_what_does_not_go_with_a_plant() -> None:
 
     with pytest.raises(PlantError, match="has complex matrices"):
         make_plant(PlantSource("mine", complex_plant, {}), ())
+
+
+def test_a_plant_describes_its_arguments_and_parameters() -> None:
+    source = plant_source("plants:seated_balance_for", {"mass": "?"})
+    found = {one.name: one for one in source.parameters()}
+    assert [*found] == [*source.defaults(), *seated_balance_for().parameters]
+    assert found["mass"] == Parameter("mass", "body mass", "kg", 79.7, None, (), True)
+    assert found["sex"].choices == ("male", "female")
+    assert [name for name, one in found.items() if one.own] == ["mass", "height"]
+    assert (found["k_h"].unit, found["k_h"].deviation) == ("N m/rad", "35 %")
+    for one in (*found.values(), *plant_source("plants:cursor_plant", {}).parameters()):
+        assert one.words != one.name
+        assert one.unit or one.name in ("sex", "delay_order", "length")
+
+
+def stating(**stated: Any) -> PlantSource:
+    def rod(length: float = 0.7) -> Any:
+        system = control.ss(0.5, 1, 1, 0, 0.1)
+        vars(system).update(stated)
+        return system
+
+    return PlantSource("mine:rod", rod, {})
+
+
+def test_a_plant_that_describes_nothing_or_a_part() -> None:
+    assert stating().parameters() == (Parameter("length", "length", "", 0.7, None, (), False),)
+    numpy = {"uncertainty": {"length": np.float64(0.1)}, "parameters": {"drag": np.float32(2)}}
+    length, drag = stating(**numpy, arguments={"length": ("rod",)}).parameters()
+    assert (length.words, length.unit, length.deviation) == ("rod", "", 0.1)
+    assert (drag.name, drag.value) == ("drag", 2.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "given"),
+    [
+        *(("arguments", one) for one in (["length"], {"length": "rod"}, {"length": ("rod", 3)},
+          {3: ("rod", "m")}, {"length": ("x" * 1000, "m")}, dict.fromkeys(map(str, range(10**6))))),
+        *(("uncertainty", {"length": one}) for one in (True, [0.1])),
+        ("parameters", {"drag": object()}),
+    ],
+)  # fmt: skip
+def test_what_a_plant_cannot_state_is_one_line(kind: str, given: Any) -> None:
+    with pytest.raises(InputError, match=f"^plant mine:rod {kind}: .*; correct ") as caught:
+        stating(**{kind: given}).parameters()
+    assert len(str(caught.value)) < 300
+    assert "\n" not in str(caught.value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 from typing import Any
 
@@ -79,3 +80,31 @@ def test_a_body_is_a_value() -> None:
     assert not sent.body.code.flags.writeable
     assert (plant.moves, plant.linear().moves) == ("nonlinear", "linear")
     assert linear_body(plant).moves == "nonlinear"
+
+
+def drawn(draw: Any) -> Plant:
+    made = system()
+    made.drawing = draw
+    return Plant(made)
+
+
+def test_lines_of_a_body_at_every_state() -> None:
+    plant = drawn(lambda x: [[[0, 0], [x[0], 1.0]], np.array([[x[1], x[0]]])])
+    one, other = plant.drawing(np.array([[1.0, 2.0], [3.0, 4.0]]))
+    np.testing.assert_array_equal(one, [[[0, 0], [1, 1]], [[0, 0], [3, 1]]])
+    np.testing.assert_array_equal(other, [[[2, 1]], [[4, 3]]])
+    assert digest(plant) == digest(Plant(system()))  # it is neither compared nor sent
+    for plain in (Plant(system()), pickle.loads(pickle.dumps(plant))):
+        assert plain.drawing(np.eye(2)) == ()
+    with pytest.raises(PlantError, match="fails: "):
+        drawn(lambda x: [np.zeros((1 + int(x[0]), 2))]).drawing(np.eye(2))
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [3, lambda x: x[9], lambda _: [[[0, 1, 2]]], lambda _: [[[0, np.nan]]], lambda _: [],
+     lambda _: [np.zeros((10**6, 2))], lambda _: itertools.repeat([[0, 0]]), lambda _: "ab"],
+)  # fmt: skip
+def test_what_is_no_drawing(draw: Any) -> None:
+    with pytest.raises(PlantError, match=r"^plant\.drawing: .*; return lines .*\Z"):
+        drawn(draw)

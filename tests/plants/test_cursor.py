@@ -19,6 +19,17 @@ def test_names_and_size() -> None:
     assert system.dt == pytest.approx(1 / 60)
 
 
+@pytest.mark.parametrize("system", [plants.cursor_plant(), plants.pursuit_plant()])
+def test_the_error_is_positive_in_front_of_the_target(system: control.StateSpace) -> None:
+    """A cursor that is driven to the positive side gets in front, a target that goes there away."""
+    assert system.directions["error"] == "if the cursor is on the positive side of the target"
+    time = system.dt * np.arange(60)
+    for row, sign in ((0, 1), (1, -1)):
+        pushed = control.forced_response(system, time, np.eye(2)[:, [row]] * np.ones(60))
+        assert sign * pushed.outputs[0, -1] > 0
+        assert "to the positive side" in system.directions[system.input_labels[row]]
+
+
 def test_a_step_command_gives_the_position_of_a_delayed_lag() -> None:
     """c(t) of a'' = (1 - exp(-s/lag)), s = t - delay, by the integral; Padé's error is 1e-3."""
     delay, lag, dt = 0.1, 0.08, 0.005

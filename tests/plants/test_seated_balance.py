@@ -213,3 +213,31 @@ def test_bad_sample_time_and_order_are_refused() -> None:
         seated_balance_plant(delay_order=21)
     with pytest.raises(ValueError, match=r"^substeps: "):
         runge_kutta_step(nonlinear_dynamics(), 0.01, substeps=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "samples", "says", "seat", "trunk"),
+    [
+        ("theta1", 0, "right edge of the seat goes down", 1, 0),
+        ("theta2", 0, "head goes to the right", 0, 1),
+        ("theta1_rate", 1, "to the right", 1, None),
+        ("theta2_rate", 1, "to the right", None, 1),
+        ("perturbation", 5, "turns the right edge of the seat down", 1, None),
+        ("command", 25, "trunk to the right and the seat to the left", -1, 1),
+        ("muscle_torque", 5, "trunk to the right and the seat to the left", -1, 1),
+    ],
+)
+def test_the_drawn_body_moves_in_the_stated_direction(
+    name: str, samples: int, says: str, seat: int | None, trunk: int | None
+) -> None:
+    """After some samples: 1 is to the right, -1 to the left; None if nothing is said."""
+    system, step = seated_balance_plant(), runge_kutta_step(nonlinear_dynamics(), 0.01)
+    given = 0.1 * np.array([one == name for one in (*system.state_labels, *system.input_labels)])
+    x, u = given[:-2], given[-2:]
+    for _ in range(samples):
+        x = step(x, u).full().ravel()
+    board, _, lower, *_, head = system.drawing(x)
+    left, right = board[np.argsort(board[:, 0])]
+    assert says in system.directions[name]
+    assert seat in (None, np.sign(np.round(left[1] - right[1], 12)))
+    assert trunk in (None, np.sign(np.round(np.mean(head[:8, 0]) - lower[1, 0], 12)))

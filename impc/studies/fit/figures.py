@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.variance_accounted_for import at_limit
 from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
 from impc.reporting.style import (
@@ -115,8 +116,7 @@ def shown_window(fit: MethodFit, index: int) -> slice:
     problem = fit.estimate.problem
     run, samples = fit.runs[index], problem.recordings[index].samples
     length = min(round(_WINDOW / problem.plant.dt), samples)
-    high = np.asarray(problem.bounds.u_max)
-    at = np.any(np.abs(run.u) >= (1 - 1e-6) * np.where(np.isfinite(high), high, np.inf), axis=1)
+    at = at_limit(run.u, problem.bounds.u_min, problem.bounds.u_max)
     counts = np.convolve(at.astype(float), np.ones(length), "valid")
     first = min(int(np.argmax(counts)), samples - length) if len(counts) else 0
     return slice(max(first, 0), max(first, 0) + length)

@@ -58,6 +58,7 @@ from impc.studies.fit.facts import (
     unlimited_ratio,
     with_unit,
 )
+from impc.studies.fit.movement import movement_section
 from impc.studies.fit.paper import paper_text
 from impc.studies.fit.result import shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
@@ -204,6 +205,7 @@ def _sections(
         Section("Feedback gain", _gain(result, GAIN in no)),
         *([] if result.person is None else [result.person.section()]),
         Section("Does the limit matter?", _limit(result, SHARE in no), "Limit"),
+        *movement_section(result),
         *([structure_section(result)] if result.structures else []),
         Section("Intent: what the cost weights say", _intent(result, WEIGHTS in no), "Intent"),
         *([Section("Frequency response", _response(result))] if result.response else []),

@@ -28,9 +28,11 @@ from impc.model.plant import Plant, change_coordinates
 from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
+from impc.reporting.document import Quiet
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.first import FitProgress
 from impc.studies.fit.memory import FitMemory, open_memory
+from impc.studies.fit.movement import movement_section
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings, stages
@@ -162,6 +164,20 @@ def test_a_plant_of_ones_own_with_one_output(small: tuple[Problem, FitSettings])
     assert result.identifiability.rank == 2
     single = replace(small[0], recordings=small[0].recordings[:1])
     assert not len(fit_recordings(single, small[1]).inverse_mpc.held_out)
+
+
+def test_a_body_without_drawing_and_one_that_fails_after_the_fit(
+    small: tuple[Problem, FitSettings],
+) -> None:
+    result, plant = fit_recordings(*small), small[0].plant
+    assert movement_section(result) == []
+    system = control.ss(plant.A, np.hstack([plant.B, plant.E]), plant.C, 0, plant.dt)
+    system.drawing = lambda x: [[[0.0, 0.0]]] if not any(x) else []
+    given = replace(result.given, plant=Plant(system, ["u[0]"]))
+    (section,) = movement_section(replace(result, given=given))
+    (block,) = section.blocks
+    assert isinstance(block, Quiet)
+    assert block.text.startswith("Not available: plant.drawing: fails: ")
 
 
 def test_an_interrupted_fit_goes_on(
