@@ -33,7 +33,9 @@
                                              errors of signals (SI), recorded commands
     trials                                   label, vaf, whiteness, x0, held_out_vaf, findings
     methods.<name>                           as in every result
-    summary.<column>                         row of impc results; null where the page forbids a gain
+    summary.<column>                         row of impc results, in shown units: limit, and
+                                             gain.<control>.<state> with _low, _high, _unit, null
+                                             where the page forbids it (reason)
     truth                                    K of a truth.json next to the recordings, or null
     plant, settings, files, versions, made
 
