@@ -23,6 +23,7 @@ from impc.assess.lack_of_fit import (
     DELAY,
     LEAN,
     LIMIT,
+    PARAMETERS,
     LackOfFit,
     ModelError,
     lack_of_fit,
@@ -111,12 +112,10 @@ def _refits(problem: Problem, at: Fitted, found: LackOfFit) -> list[tuple[ModelE
             body[there.stated] = 0.0
             errors = np.array(end.problem.errors)
             again[one] = there.at(np.array(there.starts), body, errors)
-    for one in likely:
-        there = with_limit_unknown(problem) if one.name == LIMIT else None
-        if there is not None:
-            lower = np.array(there.logarithms)
-            lower[len(problem.logarithms) :] = _LOWER
-            again[one] = there.at(np.array(there.starts), lower, np.array(there.errors))
+    limit = next((one for one in likely if one.name == LIMIT), None)
+    # A limit that no sample reaches has no test.
+    if limit is not None or not any(one.name == LIMIT for one in found.errors):
+        again |= {limit or _like(first, LIMIT): there for there in _lower_limit(problem)}
     displaced = {_like(first, name): other for name, other in _displaced(problem)}
     return [*ends, *_tried(again | displaced)]
 
@@ -150,6 +149,20 @@ def _refitted(at: Fitted, name: str) -> Fitted | None:
         return refit(there, K, np.array(at.S), _PROMISE)
     except ImpcError:  # it cannot be simulated: no candidate
         return None
+
+
+def _lower_limit(problem: Problem) -> Iterator[Problem]:
+    """The problem with its limit as a further unknown, from a lower one; none without a limit."""
+    fitted = {name.split(".")[0] for name in problem.parameter_names}
+    there = with_limit_unknown(problem)
+    if (
+        there is not None
+        and PARAMETERS[LIMIT] not in fitted
+        and np.all(problem.bounds.u_max < np.inf)
+    ):
+        lower = np.array(there.logarithms)
+        lower[len(problem.logarithms) :] = _LOWER
+        yield there.at(np.array(there.starts), lower, np.array(there.errors))
 
 
 def _displaced(problem: Problem) -> Iterator[tuple[str, Problem]]:
