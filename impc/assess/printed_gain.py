@@ -136,10 +136,18 @@ def covariance_intervals(
 
 
 def _union(own: tuple[Item, ...], *others: tuple[Item, ...]) -> tuple[Item, ...]:
-    """The `own` intervals, widened to the ends of those of the same numbers in `others`."""
+    """The `own` intervals, widened to the ends of those of the same numbers in `others`.
+
+    A singular value at rounding level makes an interval infinite: if it is not so at the own end,
+    the value of the other one counts with the own width.
+    """
     found = []
     for one, *same in zip(own, *others, strict=True):
-        low, high = min(item.low for item in (one, *same)), max(item.high for item in (one, *same))
+        ends = [(one.low, one.high)]
+        for item in same:
+            moved = item.value - one.value if item.low == -np.inf else 0.0
+            ends.append((one.low + moved, one.high + moved) if moved else (item.low, item.high))
+        low, high = min(low for low, _ in ends), max(high for _, high in ends)
         found.append(replace(one, low=low, high=high))
     return tuple(found)
 
