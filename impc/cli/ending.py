@@ -12,6 +12,7 @@ import logging
 import os
 import signal
 import sys
+import time
 import traceback
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,10 @@ from impc.files.disk import NO_ROOM
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+
+# Seconds from an interruption by the end of stdin to the end of the process.
+_PATIENCE = 20.0
 
 
 class ExitStatus(IntEnum):
@@ -109,7 +114,7 @@ def own_process() -> Iterator[None]:
 
 
 def _interrupt_with_input() -> None:
-    """Wait for the end of stdin, then interrupt."""
+    """Wait for the end of stdin, then interrupt, and end the process if that does not."""
     with contextlib.suppress(OSError):  # no stdin
         while os.read(0, 1):  # not sys.stdin: its lock would block the exit
             pass
@@ -117,6 +122,9 @@ def _interrupt_with_input() -> None:
         os.kill(os.getpid(), signal.SIGINT)
     else:
         signal.raise_signal(signal.SIGINT)
+    # An interruption within a lock of Python's thread pools leaves it taken: 1 of 8 runs waited on.
+    time.sleep(_PATIENCE)
+    os._exit(ExitStatus.INTERRUPTED)
 
 
 def _interrupt(_signum: int, _frame: object) -> None:
