@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from impc.cli.plant import KNOWN, find_plant
+
+if TYPE_CHECKING:
+    from impc.files.draft import Draft
 
 
 @click.command("inspect")
@@ -26,7 +31,10 @@ from impc.cli.plant import KNOWN, find_plant
     type=click.Path(path_type=Path),
     help="Check the file against this configuration; needs --plant.",
 )
-def command(file: Path, plant_name: str | None, out: Path | None, config: Path | None) -> None:
+@click.option("--open", "open_page", is_flag=True, help="Draw every signal on a page, and open it.")
+def command(
+    file: Path, plant_name: str | None, out: Path | None, config: Path | None, open_page: bool
+) -> None:
     """Show what a recording holds and write a commented configuration for it."""
     from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
     from impc.files.draft import drafted  # noqa: PLC0415
@@ -41,12 +49,27 @@ def command(file: Path, plant_name: str | None, out: Path | None, config: Path |
     table = read_table(file)
     draft = drafted(table, None if plant_name is None else find_plant(plant_name, {}))
     click.echo(summary(table, draft.plant.dt if draft.plant else None))
+    if open_page:
+        _open(file, plant_name, draft)
     if out is None:
         click.echo("\n" + draft.toml(), nl=False)
     else:
         write_file(out, draft.toml().encode())
         counts = f'{draft.places} places with "?" to fill in, {draft.guesses} guesses to check'
         click.echo(f"\nWritten to {out}: {counts}; then run impc fit with it.")
+
+
+def _open(file: Path, plant_name: str | None, draft: Draft) -> None:
+    """Write the page of a draft to results/inspect and open it."""
+    from impc.cli.console import print_files  # noqa: PLC0415
+    from impc.reporting.writer import owned, write_files  # noqa: PLC0415
+    from impc.studies.inspection import inspection_report  # noqa: PLC0415
+
+    out, plant = Path("results", "inspect"), () if plant_name is None else ("--plant", plant_name)
+    line = shlex.join(["impc", "inspect", file.name, *plant, "--open"])
+    with owned(out, "inspect"):
+        written = write_files(out, inspection_report(draft, plant_name or "", line).files())
+        print_files(out, written, open_page=True)
 
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:

@@ -76,12 +76,12 @@ def _panels(
                 {
                     "label": axis_label(plant, name),
                     "limits": [float(factor * one) for one in limits if np.isfinite(one)],
-                    "curves": [_short(factor * part[::stride, column]) for part in curves],
+                    "curves": [short(factor * part[::stride, column]) for part in curves],
                 }
             )
     return panels
 
 
-def _short(values: Array) -> list[float | None]:
+def short(values: Array) -> list[float | None]:
     """Round to five digits; not finite values become None."""
     return [float(f"{one:.5g}") if np.isfinite(one) else None for one in values]
