@@ -31,6 +31,7 @@ SUBPACKAGES = {
     "studies": "example, fit, compare, cohorts, ...",
     "nonlinear": "optional: nonlinear optimal control",
     "cli": "commands: parse, call, print",
+    "app": "optional: the same in a browser",
     "package": "import impc, python -m impc",
 }
 

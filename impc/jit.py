@@ -96,7 +96,7 @@ def _base() -> Path | None:
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named:
         return Path(named)
-    places = (Path(__file__).parent / "__pycache__", _cache_home() / "impc")
+    places = (Path(__file__).parent / "__pycache__", cache_home() / "impc")
     return next((place for place in places if _writable(place)), None)
 
 
@@ -109,7 +109,7 @@ def keep_caches() -> str:
     if _base() is None:
         stated.append("NUMBA_CACHE_DIR")
     if "MPLCONFIGDIR" not in os.environ and not (
-        _writable(_cache_home() / "matplotlib") and _writable(_config_home() / "matplotlib")
+        _writable(cache_home() / "matplotlib") and _writable(_config_home() / "matplotlib")
     ):
         stated.append("MPLCONFIGDIR")
     if not stated:
@@ -123,7 +123,8 @@ def keep_caches() -> str:
     return f"caches are kept in {folder}: home or installation folder cannot be written"
 
 
-def _cache_home() -> Path:
+def cache_home() -> Path:
+    """Folder of the user for caches."""
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 

@@ -15,6 +15,7 @@ from impc.settings_files import ignore_settings_files
 
 # Command -> module and function; imported only when the command is used.
 _COMMANDS = {
+    "app": ("impc.app.command", "command"),
     "cohort": ("impc.cli.cohort", "command"),
     "compare": ("impc.cli.fit", "compare_command"),
     "example": ("impc.cli.example", "command"),

@@ -22,7 +22,7 @@ from click.testing import CliRunner, Result
 
 from impc.checking import replace
 from impc.cli.main import main
-from impc.cli.plant import read_subject
+from impc.cli.plant import asked_subject
 from impc.files.configuration import read_configuration
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import read_recordings
@@ -441,6 +441,6 @@ def test_the_command_of_a_report_can_be_pasted(subject: Path, tmp_path: Path) ->
     path = shutil.copy(subject / "trial_1.csv", tmp_path / "Jürgen's 1.csv")
     config = tmp_path / "meine Person.toml"
     config.write_text(re.sub("(?m)^pattern.*$", "", (subject / "subject.toml").read_text()))
-    command = read_subject("fit", [Path(path)], "seated-balance", config).command
+    command = asked_subject("fit", [Path(path)], "seated-balance", config).line
     assert shlex.split(command) == ["impc", "fit", "Jürgen's 1.csv", "--plant", "seated-balance",
                                     "--config", "meine Person.toml"]  # fmt: skip

@@ -1,0 +1,150 @@
+"""Fit, results and comparison: what the pages show, and the files that they serve."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from starlette.responses import FileResponse, PlainTextResponse, Response
+
+from impc.app.page import back, page, subject_of
+from impc.app.subject import RESULTS, Subject
+from impc.errors import ImpcError
+from impc.reporting.rendering import report_script_hashes
+from impc.reporting.writer import written
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from starlette.requests import Request
+
+    from impc.app.fits import Fit
+
+# A report may come from someone else: it runs the scripts of impc's pages and no others, and is no
+# page of this server.
+_REPORT = (
+    "sandbox allow-scripts allow-popups allow-downloads; default-src 'none'; img-src data:; "
+    "style-src 'unsafe-inline'; script-src {}; frame-ancestors 'self'"
+)
+
+
+def show_fit(request: Request) -> Response:
+    """What stops a fit, its progress, and its command."""
+    subject, fits = subject_of(request), request.app.state.fits
+    run: Fit | None = fits.of(subject.folder / RESULTS)
+    problem = takes = ""
+    words: list[str] = []
+    if not subject.trials:
+        problem = "There is nothing to fit yet: add recordings."
+    elif run is not None and not run.over:
+        words = list(run.words)
+    else:
+        words = subject.command(subject.out)
+        if request.headers.get("hx-target") != "progress":
+            problem, takes = _ready(subject)
+    return page(
+        request, "fit", run=run, before=fits.before(run) if run else 0, problem=problem,
+        takes=takes, words=words, resumes=subject.out.exists(),
+    )  # fmt: skip
+
+
+def _ready(subject: Subject) -> tuple[str, str]:
+    """What stops a fit before it begins, and its time and memory."""
+    from impc.cli.plant import asked_subject, read_subject  # noqa: PLC0415  # slow
+    from impc.studies.effort import fit_effort  # noqa: PLC0415
+
+    try:
+        found = read_subject(asked_subject("fit", (), subject.plant_name, subject.config))
+        effort = fit_effort(found.problem, found.settings)
+    except ImpcError as error:
+        return str(error).replace(f"{subject.folder}/", ""), ""
+    minutes = max(1, round(effort.seconds / 60))
+    return "", f"about {minutes} minute{'s' * (minutes > 1)}, {effort.gigabytes:.2g} GB of memory"
+
+
+def start(request: Request, _: dict[str, str]) -> Response:
+    """Queue the fit that the page shows."""
+    subject = subject_of(request)
+    if subject.trials:
+        request.app.state.fits.start(subject.command(subject.out), subject.out)
+    return back(request, "fit")
+
+
+def stop(request: Request, _: dict[str, str]) -> Response:
+    """Stop the fit of the folder."""
+    run = request.app.state.fits.of(subject_of(request).folder / RESULTS)
+    if run is not None:
+        run.stop()
+    return show_fit(request)
+
+
+def _table(folder: Path) -> Any:
+    from impc.files.results import results as table_of  # noqa: PLC0415  # pandas
+
+    return table_of(folder)
+
+
+def results(request: Request) -> Response:
+    """Reports of the folder, one in a frame."""
+    subject = subject_of(request)
+    rows = [] if not subject.outs else _table(subject.folder / RESULTS).to_dict("records")
+    shown = [f"results/{row['folder']}" for row in rows]
+    chosen = request.query_params.get("r", "")
+    chosen = chosen if chosen in shown else shown[0] if shown else ""
+    return page(request, "results", rows=rows, shown=shown, chosen=chosen)
+
+
+def compare(request: Request) -> Response:
+    """One row for each subject, or for each fit, below the root."""
+    found, every = _table(request.app.state.root), request.query_params.get("all") == "1"
+    if not every:
+        found = found.drop_duplicates(["subject", "visit", "condition"])
+    rows = [_row(row) for row in found.to_dict("records")]
+    heads = list(dict.fromkeys(head for row in rows for head in row))
+    return page(request, "compare", heads=heads, rows=rows, every=every)
+
+
+def _row(fit: dict[str, Any]) -> dict[str, Any]:
+    """Cells of a fit by heading: a gain with its interval, or no gain and the reason."""
+    known = {name: value for name, value in fit.items() if value is not None and value == value}  # noqa: PLR0124  # NaN
+    row = {name: known.get(name, "") for name in ("folder", "subject", "visit", "condition")}
+    row |= {"verdict": known.get("verdict", ""), "trials": f"{known.get('trials', 0):.0f}"}
+    for name, value in known.items():
+        if f"{name}_low" in known:
+            ends = (known[f"{name}_{end}"] for end in ("low", "high"))
+            low, high = (f"{end:.3g}" for end in ends)
+            row[known[f"{name}_unit"]] = f"{value:.3g} ({low} to {high})"
+        elif name.startswith(("vaf.", "limit")):
+            words = name.replace("vaf.", "VAF (%), ").replace("limit.", "limit, ")
+            row[words] = f"{value:.4g}"
+    return row | {"why no gain": known.get("reason", "") or known.get("note", "")}
+
+
+def workbook(request: Request) -> Response:
+    """The table of results as a workbook."""
+    from impc.files.spreadsheet import workbook_bytes  # noqa: PLC0415
+
+    content = workbook_bytes({"fits": _table(request.app.state.root)})
+    return Response(content, headers=_download("subjects.xlsx"))
+
+
+def _download(name: str) -> Mapping[str, str]:
+    return {"content-disposition": f"attachment; filename*=utf-8''{quote(name, safe='')}"}
+
+
+def result_file(request: Request) -> Response:
+    """A file that impc listed as a result, and no others; reports in their sandbox."""
+    root: Path = request.app.state.root
+    asked = root / request.path_params["name"]
+    real = Path(os.path.realpath(asked))
+    for folder in real.parents if real.is_relative_to(root) else ():
+        name = real.relative_to(folder).as_posix()
+        if folder.is_relative_to(root) and name in written(folder) and real.is_file():
+            if real.suffix != ".html":
+                return FileResponse(real, headers=_download(real.name))
+            sealed = " ".join(f"'sha256-{one}'" for one in report_script_hashes())
+            policy = {"content-security-policy": _REPORT.format(sealed)}
+            return FileResponse(real, headers=policy, media_type="text/html")
+    return PlainTextResponse("There is no such result.\n", 404)

@@ -1,0 +1,63 @@
+"""The application: addresses, and the functions that answer them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+import impc.reporting
+from impc.app import reports, screens
+from impc.app.fits import Fits
+from impc.app.page import posted
+from impc.errors import ImpcError
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
+_HERE, _REPORTING = Path(__file__).parent, Path(impc.reporting.__file__).parent
+_STATIC = {
+    "htmx.js": _HERE / "vendor/htmx.min.js",
+    "app.js": _HERE / "app.js",
+    "app.css": _HERE / "app.css",
+    "style.css": _REPORTING / "style.css",
+    "uplot.js": _REPORTING / "vendor/uPlot.iife.min.js",
+    "uplot.css": _REPORTING / "vendor/uPlot.min.css",
+}
+_GETS = {
+    "": screens.recordings, "recordings": screens.recordings, "signals": screens.show_signals,
+    "body": screens.show_body, "fit": reports.show_fit, "results": reports.results,
+    "compare": reports.compare, "subjects.xlsx": reports.workbook,
+    "file/{name:path}": reports.result_file,
+}  # fmt: skip
+_POSTS = {
+    "use": screens.use, "practise": screens.practise, "signals": screens.set_signals,
+    "body": screens.set_body, "fit": reports.start, "stop": reports.stop,
+}  # fmt: skip
+
+
+def application(root: Path, plants: tuple[str, ...]) -> Starlette:
+    """The application for the folder `root`, with the plants to choose from."""
+    routes = [Route(f"/{name}", handler) for name, handler in _GETS.items()]
+    routes += [Route(f"/{name}", posted(one), methods=["POST"]) for name, one in _POSTS.items()]
+    routes += [Route("/drop", screens.drop, methods=["POST"]), Route("/static/{name}", static)]
+    found = Starlette(routes=routes, exception_handlers={ImpcError: refused})
+    found.state.root, found.state.plants, found.state.fits = root, plants, Fits()
+    return found
+
+
+def refused(request: Request, error: Exception) -> Response:
+    """A page or line for what cannot be done."""
+    return PlainTextResponse(f"{error}\n", 400)
+
+
+def static(request: Request) -> Response:
+    """Scripts and style sheets of the pages."""
+    found = _STATIC.get(request.path_params["name"])
+    if found is None:
+        raise HTTPException(404)
+    return FileResponse(found, headers={"cache-control": "max-age=3600"})

@@ -1,0 +1,129 @@
+"""Fits run in turn in processes of their own, stop, go on, and are never left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from impc.app.fits import Fit, Fits, State
+from impc.jit import cache_home
+from impc.reporting.writer import owned
+from tests.app.serving import ROOT, Client, serving
+
+STATED = ("made", "seconds", "command", "versions")
+
+
+def untimed(value: Any) -> Any:
+    """A result without dates, times and the command."""
+    if isinstance(value, dict):
+        return {key: untimed(one) for key, one in value.items() if key not in STATED}
+    return list(map(untimed, value)) if isinstance(value, list) else value
+
+
+def until(wanted: Callable[[], object], seconds: float = 300.0) -> None:
+    """Wait; the time is only a limit for a test that hangs."""
+    end = time.monotonic() + seconds
+    while not wanted():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    return tmp_path
+
+
+def asked(fits: Fits, folder: Path) -> Fit:
+    out = folder / "fit-1"
+    fits.start(("impc", "fit", "--config", str(folder / "none.toml"), "--out", str(out)), out)
+    found = fits.of(folder)
+    assert found is not None
+    return found
+
+
+def test_a_refused_fit_says_why(home: Path) -> None:
+    fit = asked(Fits(), home)
+    until(lambda: fit.over)
+    assert fit.state is State.REFUSED
+    assert "none.toml: does not exist" in fit.said
+
+
+def test_fits_of_other_windows_come_first(home: Path) -> None:
+    (home / "a").mkdir()
+    (home / "b").mkdir()
+    fits = Fits()
+    with owned(cache_home() / "impc" / "fits", "app"):  # a fit of another server
+        first, second = asked(fits, home / "a"), asked(fits, home / "b")
+        assert (fits.before(first), fits.before(second)) == (0, 1)
+        assert first.state is State.WAITING
+        second.stop()
+        assert asked(fits, home / "a") is first  # not twice
+    until(lambda: second.over)
+    assert (first.state, second.state) == (State.REFUSED, State.STOPPED)
+    assert second.began == 0.0  # it never began
+
+
+def practice(client: Client) -> None:
+    assert client.post("practise", {}).status == 303
+    assert "trial_1.csv" in client.get("recordings", f="practice").text
+
+
+@pytest.mark.full
+def test_a_stopped_fit_goes_on_and_is_that_of_the_command(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    folder.mkdir()
+    with serving(folder, home=tmp_path / "home") as client:
+        practice(client)
+        assert client.post("fit", {}, f="practice").status == 303
+        until(lambda: "inverse MPC</li>" in client.get("fit", f="practice").text)
+        client.post("stop", {}, f="practice")
+        until(lambda: "Stopped" in client.get("fit", f="practice").text)
+        assert not (folder / "practice/results/fit-1/result.json").exists()
+        assert "Go on" in client.get("fit", f="practice").text
+        client.post("fit", {}, f="practice")
+        until(lambda: "Read the report" in client.get("fit", f="practice").text)
+        assert "fit-1" in client.get("results", f="practice").text
+        assert "practice" in client.get("compare").text
+        assert client.get("subjects.xlsx").text.startswith("PK")
+    subprocess.run(
+        [*(sys.executable, "-m", "impc", "fit", "--config", "practice/subject.toml"),
+         *("--out", "typed")],
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, capture_output=True,
+    )  # fmt: skip
+    one, other = (
+        json.loads((folder / out / "result.json").read_text())
+        for out in ("practice/results/fit-1", "typed")
+    )
+    assert untimed(one) == untimed(other)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
+def test_no_fit_is_left_behind(how: signal.Signals, tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    folder.mkdir()
+    with serving(folder, home=tmp_path / "home") as client:
+        practice(client)
+        client.post("fit", {}, f="practice")
+        until(lambda: "inverse MPC</li>" in client.get("fit", f="practice").text)
+        children = psutil.Process(client.process.pid).children(recursive=True)
+        fits = [one for one in children if "fit" in one.cmdline()]
+        assert fits
+        client.process.send_signal(how)
+        client.process.wait(30)
+        _, alive = psutil.wait_procs(fits, timeout=120)
+        assert not alive
+    with serving(folder, home=tmp_path / "home") as client:
+        assert "Go on" in client.get("fit", f="practice").text
