@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
+.PHONY: help env app demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -47,6 +47,7 @@ endif
 
 help:
 	@echo 'make demo       set up .venv, then fit a simulated person: results/fit/report.html'
+	@echo 'make app        set up .venv, then everything in the browser, for the folder results'
 	@echo 'make test       set up .venv, then check and pytest: about ten minutes'
 	@echo 'make full       tests of the site, of all pages, experiments and studies in full size: half an hour'
 	@echo 'make check      ruff check, ruff format --check, mypy --strict'
@@ -74,6 +75,11 @@ demo: $(COMPILED)
 	$(VENV)/bin/impc simulate seated-balance --out results/subject --formats csv
 	$(VENV)/bin/impc example
 	$(VENV)/bin/impc fit --config results/subject/subject.toml --out results/fit
+
+# Import, fit and read recordings in the browser.
+app: $(COMPILED)
+	@mkdir -p results
+	$(VENV)/bin/impc app results
 
 # Each test file runs in one process, longest folders first. The shared closed loop is compiled on one
 # core while the checks run on the other; no test here uses the filter of sensory noise.
@@ -267,7 +273,7 @@ lock:
 	UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet $(UPGRADE) --universal --python-version 3.11 \
 	  --extra dev --generate-hashes pyproject.toml -o requirements.lock
 	echo setuptools | UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet --universal --python-version 3.11 \
-	  --constraints requirements.lock --no-annotate --generate-hashes pyproject.toml - -o requirements-demo.lock
+	  --extra app --constraints requirements.lock --no-annotate --generate-hashes pyproject.toml - -o requirements-demo.lock
 	pair=$$(sed -n 's/^polytope = \[\(.*\)\]$$/\1/p' pyproject.toml | tr -d '",') && test -n "$$pair" && \
 	  printf '%s\n' $$pair | UV_CUSTOM_COMPILE_COMMAND='make lock' $(UV) pip compile --quiet $(UPGRADE) --universal \
 	  --python-version 3.11 --no-deps --generate-hashes - -o requirements-polytope.lock
