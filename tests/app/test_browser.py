@@ -93,7 +93,6 @@ def change(page: Page, place: str, value: str) -> None:
             page.press(place, "Tab")
 
 
-@pytest.mark.full
 def test_every_screen_from_dropped_files_to_the_report(
     page: Page, study: Path, tmp_path: Path
 ) -> None:
