@@ -56,7 +56,7 @@ def _ready(subject: Subject) -> tuple[str, str]:
     from impc.studies.effort import fit_effort  # noqa: PLC0415
 
     try:
-        found = read_subject(asked_subject("fit", (), subject.plant_name, subject.config))
+        found = read_subject(asked_subject("fit", (), subject.given, subject.config))
         effort = fit_effort(found.problem, found.settings)
     except ImpcError as error:
         return str(error).replace(f"{subject.folder}/", ""), ""

@@ -17,7 +17,7 @@ from impc.app import body, signals
 from impc.app.page import page, subject_of
 from impc.app.subject import Subject, may_be_recording, table
 from impc.errors import ImpcError
-from impc.files.disk import LARGEST
+from impc.files.disk import LARGEST, write_whole
 from impc.files.draft import drafted
 from impc.files.formats import FORMATS
 
@@ -166,7 +166,9 @@ def set_body(request: Request, form: dict[str, str]) -> Response:
             subject.change(body.answers(form, subject))
         subject.plant()
     except ImpcError as error:
-        if before is not None:
-            subject.config.write_bytes(before)
+        if before is None:
+            subject.config.unlink(missing_ok=True)
+        else:
+            write_whole(subject.config, before)
         return show_body(request, str(error))
     return show_body(request, saved=True)

@@ -17,11 +17,13 @@ from impc.files.configuration import (
     SubjectTable,
     configuration,
     converted,
+    require_inside,
     toml_content,
 )
 from impc.files.disk import write_whole
 from impc.files.formats import FORMATS, read_table
 from impc.files.plant_sources import consented_name
+from impc.files.saved_plant import SAVED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -105,7 +107,17 @@ class Subject:
         named = self.asked.plant or self.plants[0]
         if named in self.plants:
             return named
-        return consented_name(f"{CONFIG}: subject.plant", named, None, False, "plant", tuple(KNOWN))
+        where = f"{CONFIG}: subject.plant"
+        name = consented_name(where, named, None, False, "plant", tuple(KNOWN))
+        if Path(name).suffix not in SAVED:
+            return name
+        require_inside(where, name)
+        return str(self.folder / name)
+
+    @property
+    def given(self) -> str | None:
+        """Plant that the command names: code that the user allowed when impc app was started."""
+        return self.plant_name if self.plant_name in set(self.plants) - set(KNOWN) else None
 
     @property
     def source(self) -> PlantSource:
@@ -165,7 +177,7 @@ class Subject:
     def command(self, out: Path) -> list[str]:
         """The command of a fit, with paths from the folder in which impc runs."""
         words = ["impc", "fit", "--config", near(self.config), "--out", near(out)]
-        return words if self.plant_name in KNOWN else [*words, "--plant", self.plant_name]
+        return words if self.given is None else [*words, "--plant", self.given]
 
 
 def _number(path: Path) -> int:

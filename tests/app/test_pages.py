@@ -219,6 +219,29 @@ def test_a_file_that_is_deleted_elsewhere_stops_no_page(client: Client, study: P
     assert client.get("signals", f="gone").status == 400
 
 
+def test_a_plant_of_the_folder_stays_and_is_that_of_the_fit(client: Client, study: Path) -> None:
+    folder = study / "own"
+    folder.mkdir()
+    german(folder / "a.csv", 5)
+    names = {"inputs": ["torque"], "outputs": ["angle"]}
+    matrices = {"A": [[0.9]], "B": [[0.1]], "C": [[1.0]], "dt": 0.01}
+    np.savez(folder / "stick.npz", **matrices, **names)  # type: ignore[arg-type]
+    (folder / "subject.toml").write_text(
+        '[subject]\nplant = "stick.npz"\nfiles = ["a.csv"]\n[recording]\ntime = "Zeit"\n'
+        '[signals.angle]\ncolumn = "Sitzwinkel"\nunit = "deg"\n[fit]\nhorizon = 5\n'
+    )
+    page = client.get("body", f="own").text
+    assert f"<option selected>{folder / 'stick.npz'}</option>" in page
+    given = {"plant": str(folder / "stick.npz"), "u_max": "3", "horizon": "5"}
+    assert "Saved." in client.post("body", given, f="own").text
+    found = tomllib.loads((folder / "subject.toml").read_text())
+    assert (found["subject"]["plant"], found["fit"]["u_max"]) == ("stick.npz", 3.0)
+    page = client.get("fit", f="own").text
+    assert "impc fit --config own/subject.toml --out own/results/fit-1" in page
+    assert "is clipped at" in page  # by the check of the fit, with this plant
+    shutil.rmtree(folder)
+
+
 @pytest.mark.parametrize(
     "text",
     [
