@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from impc.app.subject import number
+from impc.app.subject import number, value_at
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import UNCERTAINTY
 
@@ -70,8 +70,4 @@ def answers(form: Mapping[str, str], subject: Subject) -> dict[tuple[str, ...], 
     found["fit", "u_max"] = None if unlimited else FILL_IN if limit is None else limit
     horizon = number(form.get("horizon", ""), "horizon", 0.0) or HORIZON
     found["fit", "horizon"] = int(horizon)
-    plant, fit = content.get("plant", {}), content.get("fit", {})
-    now: dict[tuple[str, ...], Any] = {("fit", key): value for key, value in fit.items()}
-    now |= {("plant", key): value for key, value in plant.items()}
-    now |= {("plant", UNCERTAINTY, key): one for key, one in plant.get(UNCERTAINTY, {}).items()}
-    return {key: new for key, new in found.items() if new != now.get(key)}
+    return {key: new for key, new in found.items() if new != value_at(content, key)}

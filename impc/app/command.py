@@ -48,7 +48,8 @@ def command(folder: Path, more: tuple[str, ...], no_open: bool) -> None:
         if not no_open:
             _open(guard.address)
         settings = {"log_level": "warning", "access_log": False, "lifespan": "off", "ws": "none",
-                    "server_header": False, "proxy_headers": False}  # fmt: skip
+                    "server_header": False, "proxy_headers": False,
+                    "timeout_graceful_shutdown": 2}  # fmt: skip
         try:
             uvicorn.Server(uvicorn.Config(guard, **settings)).run(sockets=[listening])
         finally:

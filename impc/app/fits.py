@@ -28,8 +28,8 @@ from impc.reporting.writer import owned
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-# Seconds between two attempts to lock the folder, and number of lines that are kept for a failure.
-_AGAIN, _KEPT = 0.5, 20
+# Seconds between two attempts to lock the folder.
+_AGAIN = 0.5
 
 
 class State(Enum):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, quote
@@ -12,7 +13,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse
 
-from impc.app.subject import Subject, folder_below, near, shell
+from impc.app.subject import Subject, folder_below, near
 from impc.files.formats import FORMATS
 
 if TYPE_CHECKING:
@@ -39,7 +40,12 @@ def templates() -> Environment:
         loader=FileSystemLoader([Path(__file__).parent]), autoescape=True,
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    found.globals |= {"shell": shell, "near": near, "steps": STEPS, "endings": ", ".join(FORMATS)}
+    found.globals |= {
+        "shell": shlex.join,
+        "near": near,
+        "steps": STEPS,
+        "endings": ", ".join(FORMATS),
+    }
     return found
 
 

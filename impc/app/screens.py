@@ -164,7 +164,7 @@ def set_body(request: Request, form: dict[str, str]) -> Response:
                 subject.change({("subject", "plant"): form["plant"]})
         else:
             subject.change(body.answers(form, subject))
-        subject.plant()
+        subject_of(request).plant()
     except ImpcError as error:
         if before is None:
             subject.config.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tomlkit
 
-from impc.app.subject import number
+from impc.app.subject import number, value_at
 from impc.errors import InputError
 from impc.files.configuration import FILL_IN
 from impc.files.units import si_unit
@@ -178,7 +178,7 @@ def answers(
             found |= keys
         if f"sure.{index}" in form:
             sure |= {key for key, value in keys.items() if value not in (None, FILL_IN)}
-    return {key: new for key, new in found.items() if key in sure or new != _at(content, key)}
+    return {key: new for key, new in found.items() if key in sure or new != value_at(content, key)}
 
 
 def _signal(
@@ -194,9 +194,3 @@ def _signal(
         "limit": number(stop, f"stop of {column}", 0.0),
         "command": True if command else None,
     }
-
-
-def _at(content: Any, place: tuple[str, ...]) -> Any:
-    for key in place:
-        content = content.get(key) if isinstance(content, dict) else None
-    return content

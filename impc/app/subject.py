@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import functools
 import os
-import shlex
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impc.cli.plant import KNOWN, find_plant
+from impc.cli.plant import KNOWN, find_plant, subject_plant
 from impc.errors import ImpcError, InputError
 from impc.files.configuration import (
     FILL_IN,
     SubjectTable,
     configuration,
     converted,
-    require_inside,
     toml_content,
 )
 from impc.files.disk import write_whole
 from impc.files.formats import FORMATS, read_table
-from impc.files.plant_sources import consented_name
-from impc.files.saved_plant import SAVED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,7 +37,7 @@ _one_writer = threading.Lock()
 
 @dataclass(frozen=True)
 class Subject:
-    """The folder of one subject, read anew at each use: files may change elsewhere."""
+    """The folder of one subject, made anew for each request: files may change elsewhere."""
 
     folder: Path
     plants: tuple[str, ...]  # Plants to choose from, the first one at first
@@ -63,7 +59,7 @@ class Subject:
         inside = (path for path in self.folder.iterdir() if path.is_dir())
         return sorted(path for path in inside if path.name[0] not in "._" and path.name != RESULTS)
 
-    @property
+    @functools.cached_property
     def text(self) -> str:
         """subject.toml, or the draft for the first readable recording; empty without one."""
         if self.config.exists():
@@ -81,7 +77,7 @@ class Subject:
         text = drafted(tables[0], find_plant(self.plants[0], {})).toml()
         return edited(text, {("subject", "plant"): self.plants[0], ("subject", "files"): names})
 
-    @property
+    @functools.cached_property
     def content(self) -> dict[str, Any]:
         """The tables of `text`, validated as soon as signals are named."""
         found = toml_content(self.text, CONFIG)
@@ -107,12 +103,7 @@ class Subject:
         named = self.asked.plant or self.plants[0]
         if named in self.plants:
             return named
-        where = f"{CONFIG}: subject.plant"
-        name = consented_name(where, named, None, False, "plant", tuple(KNOWN))
-        if Path(name).suffix not in SAVED:
-            return name
-        require_inside(where, name)
-        return str(self.folder / name)
+        return subject_plant(self.config, named, None, allowed=False)
 
     @property
     def given(self) -> str | None:
@@ -142,7 +133,8 @@ class Subject:
         from impc.files.edited import edited  # noqa: PLC0415
 
         with _one_writer:
-            before, after = self.text, edited(self.text, changes)
+            before = Subject(self.folder, self.plants).text  # as it is now
+            after = edited(before, changes)
             if after != before or not self.config.exists():
                 write_whole(self.config, after.encode())
 
@@ -191,11 +183,6 @@ def near(path: Path) -> str:
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 
-def shell(words: list[str]) -> str:
-    """A command as it is typed."""
-    return shlex.join(words)
-
-
 def may_be_recording(name: str) -> bool:
     """Whether a file name is one of a recording."""
     return name[:1] not in (".", "~", "") and Path(name).suffix.lower() in FORMATS
@@ -227,6 +214,13 @@ def folder_below(root: Path, name: str) -> Path:
     if not found.is_dir() or any(part.startswith((".", "..")) for part in inside):
         raise InputError("folder", f"{name!r} is not below {root}", "open another one")
     return found
+
+
+def value_at(content: Any, place: tuple[str, ...]) -> Any:
+    """The value at a TOML path; None if there is none."""
+    for key in place:
+        content = content.get(key) if isinstance(content, dict) else None
+    return content
 
 
 def number(text: str, what: str, least: float = -1e300) -> float | None:

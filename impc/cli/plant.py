@@ -102,6 +102,20 @@ class Asked:
         return Provenance(source.name, self.line, dict(source.arguments), names, inputs)
 
 
+def subject_plant(config: Path, named: str, given: str | None, allowed: bool) -> str:
+    """Plant that the user gave, or with consent that of [subject], relative to its file."""
+    from impc.files.configuration import require_inside  # noqa: PLC0415
+    from impc.files.plant_sources import consented_name  # noqa: PLC0415
+    from impc.files.saved_plant import SAVED  # noqa: PLC0415
+
+    where = f"{config}: subject.plant"
+    plant = consented_name(where, named, given, allowed, "plant", tuple(KNOWN))
+    if given is not None or PurePath(plant).suffix not in SAVED:
+        return plant
+    require_inside(where, plant)
+    return str(config.parent / plant)
+
+
 def asked_subject(
     command: str,
     files: Sequence[Path],
@@ -111,17 +125,11 @@ def asked_subject(
     allowed: bool = False,
 ) -> Asked:
     """What to fit, if the command line consents to running the plant (`consented_name`)."""
-    from impc.files.configuration import read_configuration, require_inside  # noqa: PLC0415
-    from impc.files.plant_sources import consented_name  # noqa: PLC0415
-    from impc.files.saved_plant import SAVED  # noqa: PLC0415
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
 
     configuration = read_configuration(config)
     named, where = configuration.subject, f"{config}: subject"
-    known = tuple(KNOWN)
-    plant = consented_name(f"{where}.plant", named.plant, plant_name, allowed, "plant", known)
-    if plant_name is None and PurePath(plant).suffix in SAVED:
-        require_inside(f"{where}.plant", plant)
-        plant = str(config.parent / plant)
+    plant = subject_plant(config, named.plant, plant_name, allowed)
     found = tuple(files) or tuple(config.parent / name for name in named.files)
     if not found:
         raise InputError(f"{where}.files", "names no recording", "name them, or pass FILES")
