@@ -11,7 +11,7 @@ import tomlkit
 from impc.app.subject import number, value_at
 from impc.errors import InputError
 from impc.files.configuration import FILL_IN
-from impc.files.units import si_unit
+from impc.files.draft import guess_of
 from impc.reporting.shown_units import signal_name
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def columns(text: str, table: Table, plant: Plant) -> list[Column]:
                 *(index, name, role, "" if unit == FILL_IN else unit, sign),
                 *(_typed(offset), _typed(entry.get("limit", ""))),
                 known[role].positive if role else "",
-                _asked(entry, role, unit, table.units.get(name, "")),
+                _asked(entry, role, unit, guess_of(table, name, "").origin),
                 _curve(table.columns.get(str(clock)), shown),
                 _spoken(shown),
             )
@@ -104,8 +104,11 @@ def _typed(value: Any) -> str:
     return f"{float(value):g}" if isinstance(value, int | float) else ""
 
 
-def _asked(entry: Any, role: str, unit: str, stated: str) -> tuple[Question, ...]:
-    """Questions about a used column: guesses of the draft that stand, and a missing unit."""
+def _asked(entry: Any, role: str, unit: str, origin: str) -> tuple[Question, ...]:
+    """Questions about a used column: guesses of the draft that stand, and a missing unit.
+
+    `origin` is what the draft says about the unit.
+    """
     if not role:
         return ()
     asked = []
@@ -114,11 +117,11 @@ def _asked(entry: Any, role: str, unit: str, stated: str) -> tuple[Question, ...
     if "guess" in comment.lower():
         asked.append(Question(f"This is {comment[0].lower()}{comment[1:]}", must=False))
     if unit == FILL_IN:
-        try:
-            words = f"Is it in {si_unit(stated).written}?" if stated else "Which unit is it in?"
-        except InputError as error:
-            words = f"The file says {stated!r}, which {error.problem}: {error.remedy}"
-        asked.append(Question(words, must=True))
+        asked.append(
+            Question(
+                f"Which unit is it in? {origin[0].upper()}{origin[1:].rstrip('.')}.", must=True
+            )
+        )
     return tuple(asked)
 
 

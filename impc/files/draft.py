@@ -152,7 +152,7 @@ def draft(
         names = (*plant.outputs, *plant.controls[1:])
         chosen = _guessed(table, names, rest, plant)
     none = (FILL_IN, "no remaining column fits: enter its name")
-    signals = {name: _guess(table, *chosen.get(name, none)) for name in names}
+    signals = {name: guess_of(table, *chosen.get(name, none)) for name in names}
     used = [one.column for one in signals.values()]
     unused = tuple(name for name in rest if name not in used)
     plain = {name: value for name, value in (arguments or {}).items()
@@ -206,14 +206,14 @@ def _span(table: Table, column: str) -> str:
 def _fits(table: Table, column: str, signal: str, plant: Plant) -> int:
     """Fit of a column's unit to a signal: 0 contradicts, 1 unknown, 2 same kind."""
     try:
-        stated = si_unit(_guess(table, column, "").unit)
+        stated = si_unit(guess_of(table, column, "").unit)
         needed = si_unit(plant.unit(signal))
     except InputError:  # one of the two units is missing or unknown
         return 1
     return 2 if stated.base == needed.base else int(stated.base == "dimensionless")
 
 
-def _guess(table: Table, column: str, why: str) -> Guess:
+def guess_of(table: Table, column: str, why: str) -> Guess:
     """A column, with the unit that the file or the end of the column's name states."""
     stated = table.units.get(column)
     if stated:
@@ -275,7 +275,7 @@ def clock_guess(table: Table) -> Guess | None:
     name = next(iter([*named, *even]), None)
     if name is None:
         return None
-    values, guess = table.columns[name], _guess(table, name, "")
+    values, guess = table.columns[name], guess_of(table, name, "")
     if guess.unit != "day" and counts_days(values) and not table.units.get(name):
         return Guess(name, "", "day", "a guess: day numbers of a spreadsheet")
     if guess.unit != FILL_IN and si_unit(guess.unit).base == "second":
