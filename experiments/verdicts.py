@@ -22,8 +22,8 @@ import numpy as np
 import impc
 from experiments.coverage import cart
 from impc.checking import replace
+from impc.levels import Level
 from impc.model.riccati import solve_lqr
-from impc.reporting.finding import Level
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.facts import decided, named_gains
 from impc.studies.fit.subject import fit_recordings

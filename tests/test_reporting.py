@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 import impc.reporting
 from impc.errors import OutputError
+from impc.levels import Level
 from impc.reporting.document import (
     Block,
     Check,
@@ -31,7 +32,7 @@ from impc.reporting.document import (
     Section,
     Terms,
 )
-from impc.reporting.finding import Chart, Finding, Level, Picture, table_of
+from impc.reporting.finding import Chart, Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import report_script_hashes
 from impc.reporting.style import new_figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 import tempfile
@@ -57,19 +56,11 @@ def command(folder: Path, more: tuple[str, ...], no_open: bool) -> None:
 
 
 def _open(address: str) -> None:
-    """Open the browser by a file that only the user can read.
-
-    Other users of the machine can see the arguments of programs.
-    """
+    """Open the browser by a file that only the user can read: others see programs' arguments."""
     handle, path = tempfile.mkstemp(prefix="impc-", suffix=".html")
     with open(handle, "w", encoding="utf-8") as page:
         page.write(f'<meta http-equiv="refresh" content="0;url={address}">')
     click.launch(Path(path).as_uri())
-
-    def remove() -> None:
-        with contextlib.suppress(OSError):
-            os.remove(path)
-
-    timer = threading.Timer(_OPENED, remove)
+    timer = threading.Timer(_OPENED, Path(path).unlink, kwargs={"missing_ok": True})
     timer.daemon = True
     timer.start()

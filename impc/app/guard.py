@@ -12,6 +12,8 @@ import secrets
 from http.cookies import SimpleCookie
 from typing import TYPE_CHECKING
 
+from starlette.responses import PlainTextResponse, RedirectResponse
+
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -48,25 +50,25 @@ class Guard:
         if scope["type"] != "http":  # no websockets
             return
         headers = {key.decode("latin1"): value.decode("latin1") for key, value in scope["headers"]}
+
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = {key for key, _ in message["headers"]}
+                ours = ((key.encode(), value.encode()) for key, value in _HEADERS.items())
+                more = [pair for pair in ours if pair[0] not in given]
+                message = {**message, "headers": [*message["headers"], *more]}
+            await send(message)
+
+        answer: ASGIApp = PlainTextResponse(_USED, 403)
         if refused := self._foreign(scope["method"], headers):
-            await _answer(send, 403, {}, refused)
+            answer = PlainTextResponse(refused, 403)
         elif self._opens(scope):
             self._token = ""
             cookie = f"impc={self._cookie}; Path={self.base}/; HttpOnly; SameSite=Strict"
-            await _answer(send, 303, {"location": f"{self.base}/", "set-cookie": cookie})
-        elif not self._admits(scope["path"], headers):
-            await _answer(send, 403, {}, _USED)
-        else:
-
-            async def guarded(message: Message) -> None:
-                if message["type"] == "http.response.start":
-                    given = {key for key, _ in message["headers"]}
-                    ours = ((key.encode(), value.encode()) for key, value in _HEADERS.items())
-                    more = [pair for pair in ours if pair[0] not in given]
-                    message = {**message, "headers": [*message["headers"], *more]}
-                await send(message)
-
-            await self._app({**scope, "root_path": self.base}, receive, guarded)
+            answer = RedirectResponse(f"{self.base}/", 303, {"set-cookie": cookie})
+        elif self._admits(scope["path"], headers):
+            answer, scope = self._app, {**scope, "root_path": self.base}
+        await answer(scope, receive, guarded)
 
     def _foreign(self, method: str, headers: dict[str, str]) -> str:
         """Reason to refuse a request that no page of this server made."""
@@ -88,10 +90,3 @@ class Guard:
             given.value.encode(), self._cookie.encode()
         )
         return known and path.startswith(f"{self.base}/")
-
-
-async def _answer(send: Send, status: int, headers: dict[str, str], text: str = "") -> None:
-    plain = {"content-type": "text/plain; charset=utf-8"}
-    sent = [(key.encode(), value.encode()) for key, value in (_HEADERS | plain | headers).items()]
-    await send({"type": "http.response.start", "status": status, "headers": sent})
-    await send({"type": "http.response.body", "body": text.encode()})

@@ -1,4 +1,4 @@
-"""What the pages have in common: the folder of a request, forms, and the template."""
+"""What the pages have in common: the folder of a request, links, forms, and the template."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qsl, quote
+from urllib.parse import parse_qsl, urlencode
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.concurrency import run_in_threadpool
@@ -15,6 +15,7 @@ from starlette.responses import HTMLResponse, RedirectResponse
 
 from impc.app.subject import Subject, folder_below, near
 from impc.files.formats import FORMATS
+from impc.levels import Level
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,30 +23,20 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
 
-STEPS = {
-    "recordings": "Recordings",
-    "signals": "Signals",
-    "body": "Body and limit",
-    "fit": "Fit",
-    "results": "Results",
-    "compare": "Compare",
-}
+STEPS = {"recordings": "Recordings", "signals": "Signals", "body": "Body and limit", "fit": "Fit",
+         "results": "Results", "compare": "Compare"}  # fmt: skip
 _LARGEST_FORM, _FIELDS = 1_000_000, 5000
 
 
 @functools.cache
-def templates() -> Environment:
-    """The template of all pages."""
+def _templates() -> Environment:
     found = Environment(
-        loader=FileSystemLoader([Path(__file__).parent]), autoescape=True,
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True,
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    found.globals |= {
-        "shell": shlex.join,
-        "near": near,
-        "steps": STEPS,
-        "endings": ", ".join(FORMATS),
-    }
+    words = {one.value: one.words for one in Level}
+    found.globals |= {"shell": shlex.join, "near": near, "steps": STEPS, "verdicts": words,
+                      "endings": ", ".join(FORMATS)}  # fmt: skip
     return found
 
 
@@ -73,25 +64,33 @@ def subject_of(request: Request) -> Subject:
     return Subject(folder_below(state.root, request.query_params.get("f", "")), state.plants)
 
 
-def page(request: Request, step: str, status: int = 200, **more: Any) -> HTMLResponse:
+def inside(request: Request, folder: Path) -> str:
+    """A folder in addresses; empty for the root."""
+    found = folder.relative_to(request.app.state.root).as_posix()
+    return "" if found == "." else found
+
+
+def link(request: Request, to: str, folder: Path, **query: str) -> str:
+    """Address of a page of a folder."""
+    known = inside(request, folder)
+    asked = urlencode(({"f": known} if known else {}) | query)
+    return f"{request.scope['root_path']}/{to}" + (f"?{asked}" if asked else "")
+
+
+def back(request: Request, to: str, folder: Path) -> Response:
+    """Go to a page of a folder."""
+    return RedirectResponse(link(request, to, folder), 303)
+
+
+def page(request: Request, step: str, **more: Any) -> Response:
     """One of the pages `STEPS`, or the part of it that is asked for."""
-    state, subject = request.app.state, subject_of(request)
-    inside = subject.folder.relative_to(state.root).as_posix().removeprefix(".")
+    subject = subject_of(request)
 
-    def link(to: str, **query: str) -> str:
-        pairs = ({"f": inside} if inside else {}) | query
-        asked = "&".join(f"{key}={quote(value, safe='')}" for key, value in pairs.items())
-        return f"{request.scope['root_path']}/{to}" + (f"?{asked}" if asked else "")
+    def linked(to: str, folder: Path = subject.folder, **query: str) -> str:
+        return link(request, to, folder, **query)
 
-    part = request.headers.get("hx-request", "")
-    text = templates().get_template("page.html").render(
-        step=step, subject=subject, root=state.root, inside=inside, link=link, part=part,
-        base=request.scope["root_path"], **more,
-    )  # fmt: skip
-    return HTMLResponse(text, status)
-
-
-def back(request: Request, to: str) -> Response:
-    """Go to another page of the folder."""
-    folder = quote(request.query_params.get("f", ""), safe="")
-    return RedirectResponse(f"{request.scope['root_path']}/{to}?f={folder}", 303)
+    return HTMLResponse(_templates().get_template("page.html").render(
+        step=step, subject=subject, root=request.app.state.root, link=linked, **more,
+        inside=inside(request, subject.folder), part=request.headers.get("hx-request", ""),
+        base=request.scope["root_path"],
+    ))  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -10,8 +11,10 @@ from urllib.parse import quote
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from impc.app.page import back, page, subject_of
-from impc.app.subject import RESULTS, Subject
+from impc.app.subject import RESULTS
+from impc.cli.fit import CONFIGURATION
 from impc.errors import ImpcError
+from impc.files.configuration import toml_content
 from impc.reporting.rendering import report_script_hashes
 from impc.reporting.writer import written
 
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from impc.app.fits import Fit
+    from impc.app.subject import Subject
 
 # A report may come from someone else: it runs the scripts of impc's pages and no others, and is no
 # page of this server.
@@ -69,7 +73,7 @@ def start(request: Request, _: dict[str, str]) -> Response:
     subject = subject_of(request)
     if subject.trials:
         request.app.state.fits.start(subject.command(subject.out), subject.out)
-    return back(request, "fit")
+    return back(request, "fit", subject.folder)
 
 
 def stop(request: Request, _: dict[str, str]) -> Response:
@@ -89,11 +93,38 @@ def _table(folder: Path) -> Any:
 def results(request: Request) -> Response:
     """Reports of the folder, one in a frame."""
     subject = subject_of(request)
-    rows = [] if not subject.outs else _table(subject.folder / RESULTS).to_dict("records")
-    shown = [f"results/{row['folder']}" for row in rows]
-    chosen = request.query_params.get("r", "")
-    chosen = chosen if chosen in shown else shown[0] if shown else ""
-    return page(request, "results", rows=rows, shown=shown, chosen=chosen)
+    folder = subject.folder / RESULTS
+    rows = _table(folder).to_dict("records") if subject.outs else []
+    used = [_used(folder / row["folder"] / CONFIGURATION) for row in rows]
+    changes = [*(_changes(*pair) for pair in pairwise(used)), ""][: len(rows)]
+    since = _changes(_used(subject.config), used[0]) if rows else ""
+    names = [row["folder"] for row in rows]
+    asked = request.query_params.get("r", "")
+    chosen = asked if asked in names else next(iter(names), "")
+    return page(
+        request, "results", rows=rows, changes=changes, since=since, folder=folder, chosen=chosen
+    )
+
+
+def _used(file: Path) -> dict[str, Any]:
+    """Settings of a fit by their TOML paths; empty if they cannot be read."""
+    try:
+        return _flat(toml_content(file.read_text(encoding="utf-8-sig"), file.name))
+    except (ImpcError, OSError, ValueError):
+        return {}
+
+
+def _flat(value: Any, place: str = "") -> dict[str, Any]:
+    if not isinstance(value, dict):
+        return {place.removeprefix("."): value}
+    parts = [_flat(one, f"{place}.{name}") for name, one in value.items()]
+    return {key: one for part in parts for key, one in part.items()}
+
+
+def _changes(new: Mapping[str, Any], old: Mapping[str, Any]) -> str:
+    """Settings that changed, with both values; empty if one of the two is not known."""
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)] if old and new else []
+    return ", ".join(f"{key} {old.get(key, 'none')} → {new.get(key, 'none')}" for key in keys)
 
 
 def compare(request: Request) -> Response:
@@ -113,8 +144,7 @@ def _row(fit: dict[str, Any]) -> dict[str, Any]:
     row |= {"verdict": known.get("verdict", ""), "trials": f"{known.get('trials', 0):.0f}"}
     for name, value in known.items():
         if f"{name}_low" in known:
-            ends = (known[f"{name}_{end}"] for end in ("low", "high"))
-            low, high = (f"{end:.3g}" for end in ends)
+            low, high = (f"{known[f'{name}_{end}']:.3g}" for end in ("low", "high"))
             row[known[f"{name}_unit"]] = f"{value:.3g} ({low} to {high})"
         elif name.startswith(("vaf.", "limit")):
             words = name.replace("vaf.", "VAF (%), ").replace("limit.", "limit, ")
@@ -124,7 +154,7 @@ def _row(fit: dict[str, Any]) -> dict[str, Any]:
 
 def workbook(request: Request) -> Response:
     """The table of results as a workbook."""
-    from impc.files.spreadsheet import workbook_bytes  # noqa: PLC0415
+    from impc.files.spreadsheet import workbook_bytes  # noqa: PLC0415  # pandas
 
     content = workbook_bytes({"fits": _table(request.app.state.root)})
     return Response(content, headers=_download("subjects.xlsx"))
@@ -137,8 +167,7 @@ def _download(name: str) -> Mapping[str, str]:
 def result_file(request: Request) -> Response:
     """A file that impc listed as a result, and no others; reports in their sandbox."""
     root: Path = request.app.state.root
-    asked = root / request.path_params["name"]
-    real = Path(os.path.realpath(asked))
+    real = Path(os.path.realpath(root / request.path_params["name"]))
     for folder in real.parents if real.is_relative_to(root) else ():
         name = real.relative_to(folder).as_posix()
         if folder.is_relative_to(root) and name in written(folder) and real.is_file():

@@ -8,18 +8,18 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import quote
 
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import PlainTextResponse, Response
 
-from impc.app import body, signals
-from impc.app.page import page, subject_of
-from impc.app.subject import Subject, may_be_recording, table
+from impc.app import answers
+from impc.app.page import back, page, subject_of
+from impc.app.subject import RESULTS, Subject, may_be_recording, table
 from impc.errors import ImpcError
 from impc.files.disk import LARGEST, write_whole
 from impc.files.draft import drafted
 from impc.files.formats import FORMATS
+from impc.files.table import OTHER_SHEET
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -27,20 +27,23 @@ if TYPE_CHECKING:
 
 def recordings(request: Request) -> Response:
     """Files of the folder, and folders of further subjects."""
-    subject = subject_of(request)
-    trials, rows = {path.name for path in subject.trials}, []
+    subject, rows = subject_of(request), []
+    named = subject.asked.files
     for path in subject.recordings:
         try:
-            found = table(path)
+            found = table(path, subject.sheet)
         except ImpcError as error:
             rows.append((path.name, f"{error.problem}; {error.remedy}", False, False))
             continue
         names = ", ".join(found.columns)
         what = f"{found.samples} samples, {len(found.columns)} columns: {names}"
-        rows.append((path.name, what, True, path.name in trials))
+        rows.append((path.name, what, True, path.name in named))
     lost = "is named in subject.toml and not in the folder: copy it here, or change a tick above"
-    rows += [(name, lost, False, False) for name in subject.asked.files if name not in trials]
-    folders = [(one.name, _state(Subject(one, subject.plants))) for one in subject.folders]
+    there = {path.name for path in subject.recordings}
+    rows += [(name, lost, False, False) for name in named if name not in there]
+    folders = [(one, _state(Subject(one, subject.plants)))
+               for one in sorted(subject.folder.iterdir())
+               if one.is_dir() and one.name[0] not in "._" and one.name != RESULTS]  # fmt: skip
     return page(request, "recordings", rows=rows, folders=folders)
 
 
@@ -48,11 +51,11 @@ def _state(subject: Subject) -> str:
     """State of the folder of a subject in words."""
     count = len(subject.recordings)
     if not count:
-        return f"{len(subject.folders)} folders" if subject.folders else "empty"
+        return "no recordings"
     fits = sum((out / "result.json").exists() for out in subject.outs)
-    trials = f"{count} recording{'s' * (count > 1)}"
     begun = "begun" if subject.config.exists() else "not begun"
-    return f"{trials}, {f'{fits} fit' + 's' * (fits > 1) if fits else begun}"
+    done = f"{fits} fit{'s' * (fits > 1)}" if fits else begun
+    return f"{count} recording{'s' * (count > 1)}, {done}"
 
 
 def use(request: Request, form: dict[str, str]) -> Response:
@@ -101,44 +104,45 @@ def practise(request: Request, _: dict[str, str]) -> Response:
     )
     if done.returncode:
         return PlainTextResponse(done.stderr, 400)
-    inside = folder.relative_to(request.app.state.root).as_posix()
-    to = f"{request.scope['root_path']}/recordings?f={quote(inside, safe='')}"
-    return RedirectResponse(to, 303)
+    return back(request, "recordings", folder)
 
 
-def show_signals(request: Request, problem: str = "") -> Response:
+def show_signals(request: Request, problem: str = "", file: str = "") -> Response:
     """Every column, what it is taken for, and what is open."""
     subject = subject_of(request)
-    files = [path.name for path in subject.trials]
+    files = {path.name: path for path in subject.trials}
     if not files:
         return page(request, "signals", files=[])
-    asked = request.query_params.get("file", files[0])
-    shown = table(subject.folder / (asked if asked in files else files[0]))
-    plant, text = subject.plant(), subject.text
-    columns = signals.columns(text, shown, plant)
-    asked_there = {("signals", one.role, "unit") for one in columns if one.asked}
-    notices = [one for one in subject.notices() if one.place not in asked_there]
+    path = files.get(file or request.query_params.get("file", ""), subject.trials[0])
+    shown, plant = table(path, subject.sheet), subject.plant()
+    columns, known = answers.columns(subject.text, shown, plant), answers.roles(plant)
+    taken = {column.role for column in columns}
+    asked = {("signals", one.role, "unit") for one in columns if one.question}
     start = drafted(shown, subject.source).start
-    answered = {column.role for column in columns}
-    known = signals.roles(plant)
-    lacking = [known[name].words for name in plant.outputs if name not in answered]
+    sheets = [name.removeprefix("sheet ") for name, why in shown.skipped.items()
+              if why == OTHER_SHEET]  # fmt: skip
     return page(
-        request, "signals", files=files, file=Path(shown.source).name, columns=columns,
-        notices=notices, lacking=lacking, roles=known, rate=shown.rate, text=text,
+        request, "signals", files=list(files), path=path, columns=columns, roles=known,
+        notices=[one for one in subject.notices() if one.place not in asked], rate=shown.rate,
+        lacking=[known[name].words for name in plant.outputs if name not in taken],
         recording=subject.content.get("recording", {}), problem=problem,
-        pulse=start[1] if start else "",
+        pulse=start[1] if start else "", sheets=sheets,
     )  # fmt: skip
 
 
 def set_signals(request: Request, form: dict[str, str]) -> Response:
     """Write what the columns mean."""
     subject = subject_of(request)
-    shown = table(subject.folder / Path(form.get("file", "")).name)
+    path = subject.folder / Path(form.get("file", "")).name
     try:
-        subject.change(signals.answers(form, shown, subject.plant(), subject.content))
+        shown = table(path, subject.sheet)
+        subject.change(answers.signal_changes(form, shown, subject))
     except ImpcError as error:
-        return show_signals(request, str(error))
-    return show_signals(request)
+        return show_signals(request, str(error), path.name)
+    answer = show_signals(request, "", path.name)
+    if form.get("sheet", "") != subject.sheet:  # other columns
+        answer.headers["hx-refresh"] = "true"
+    return answer
 
 
 def show_body(request: Request, problem: str = "", saved: bool = False) -> Response:
@@ -146,11 +150,12 @@ def show_body(request: Request, problem: str = "", saved: bool = False) -> Respo
     subject = subject_of(request)
     if not subject.trials:
         return page(request, "body", rows=[])
-    plant, fit = subject.plant(), subject.content.get("fit", {})
+    plant, content = subject.plant(), subject.content
+    settings = {"horizon": answers.HORIZON} | content.get("fit", {})
     return page(
-        request, "body", rows=body.rows(subject), settings=fit, text=subject.text, problem=problem,
-        saved=saved, unit=plant.unit(plant.controls[0]), dt=plant.dt, plants=subject.plants,
-        horizon=fit.get("horizon", body.HORIZON),
+        request, "body", rows=subject.source.parameters(), given=content.get("plant", {}),
+        settings=settings, problem=problem, saved=saved, unit=plant.unit(plant.controls[0]),
+        dt=plant.dt,
     )  # fmt: skip
 
 
@@ -158,12 +163,12 @@ def set_body(request: Request, form: dict[str, str]) -> Response:
     """Write body and limit; a value that the plant refuses is not kept."""
     subject = subject_of(request)
     before = subject.config.read_bytes() if subject.config.exists() else None
+    other = form.get("plant", "") in {*subject.plants} - {subject.plant_name}
     try:
-        if form.get("plant", subject.plant_name) != subject.plant_name:
-            if form["plant"] in subject.plants:
-                subject.change({("subject", "plant"): form["plant"]})
+        if other:
+            subject.change({("subject", "plant"): form["plant"]})
         else:
-            subject.change(body.answers(form, subject))
+            subject.change(answers.body_changes(form, subject))
         subject_of(request).plant()
     except ImpcError as error:
         if before is None:
@@ -171,4 +176,7 @@ def set_body(request: Request, form: dict[str, str]) -> Response:
         else:
             write_whole(subject.config, before)
         return show_body(request, str(error))
-    return show_body(request, saved=True)
+    answer = show_body(request, saved=True)
+    if other:  # other quantities
+        answer.headers["hx-refresh"] = "true"
+    return answer

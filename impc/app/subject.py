@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import threading
@@ -11,15 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from impc.cli.plant import KNOWN, find_plant, subject_plant
 from impc.errors import ImpcError, InputError
-from impc.files.configuration import (
-    FILL_IN,
-    SubjectTable,
-    configuration,
-    converted,
-    toml_content,
-)
+from impc.files.checks import fault
+from impc.files.configuration import FILL_IN, SubjectTable, configuration, converted, toml_content
 from impc.files.disk import write_whole
+from impc.files.draft import drafted
+from impc.files.edited import edited
+from impc.files.examination import examine
 from impc.files.formats import FORMATS, read_table
+from impc.files.plant_sources import make_plant
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -50,30 +50,21 @@ class Subject:
     @property
     def recordings(self) -> list[Path]:
         """Files of the folder with the ending of a recording."""
-        return sorted(path for path in self.folder.iterdir() if may_be_recording(path.name)
-                      and path.is_file())  # fmt: skip
-
-    @property
-    def folders(self) -> list[Path]:
-        """Folders that may be those of further subjects."""
-        inside = (path for path in self.folder.iterdir() if path.is_dir())
-        return sorted(path for path in inside if path.name[0] not in "._" and path.name != RESULTS)
+        found = (path for path in self.folder.iterdir() if may_be_recording(path.name))
+        return sorted(path for path in found if path.is_file())
 
     @functools.cached_property
     def text(self) -> str:
         """subject.toml, or the draft for the first readable recording; empty without one."""
         if self.config.exists():
             return self.config.read_text(encoding="utf-8-sig")
-        return self._draft()
-
-    def _draft(self) -> str:
-        from impc.files.draft import drafted  # noqa: PLC0415  # numpy, and the plant's libraries
-        from impc.files.edited import edited  # noqa: PLC0415
-
-        tables = [found for path in self.recordings if (found := readable(path)) is not None]
+        names, tables = [], []
+        for path in self.recordings:
+            with contextlib.suppress(ImpcError, OSError):
+                tables.append(table(path))
+                names.append(path.name)
         if not tables:
             return ""
-        names = [Path(one.source).name for one in tables]
         text = drafted(tables[0], find_plant(self.plants[0], {})).toml()
         return edited(text, {("subject", "plant"): self.plants[0], ("subject", "files"): names})
 
@@ -90,6 +81,11 @@ class Subject:
         """Plant and files that are named."""
         given = self.content.get("subject", {})
         return converted(lambda place: f"{CONFIG}: subject.{place}", given, SubjectTable)
+
+    @property
+    def sheet(self) -> str:
+        """Sheet of workbooks; empty for the first with numbers."""
+        return str(self.content.get("recording", {}).get("sheet", ""))
 
     @property
     def trials(self) -> list[Path]:
@@ -124,14 +120,10 @@ class Subject:
 
     def plant(self) -> Plant:
         """The plant with the signals that are recorded."""
-        from impc.files.plant_sources import make_plant  # noqa: PLC0415  # takes a second
-
         return make_plant(self.source, ())
 
     def change(self, changes: Mapping[tuple[str, ...], Any]) -> None:
         """Write answers into subject.toml; all other lines stay."""
-        from impc.files.edited import edited  # noqa: PLC0415
-
         with _one_writer:
             before = Subject(self.folder, self.plants).text  # as it is now
             after = edited(before, changes)
@@ -140,14 +132,10 @@ class Subject:
 
     def notices(self) -> tuple[Notice, ...]:
         """All that the checks of the recordings find."""
-        from impc.files.checks import fault  # noqa: PLC0415
-        from impc.files.examination import examine  # noqa: PLC0415
-        from impc.files.plant_sources import make_plant  # noqa: PLC0415
-
         try:
             asked = self.configuration
             plant = make_plant(self.source, asked.recorded)
-            tables = [table(path, asked.recording.sheet) for path in self.trials]
+            tables = [table(path, self.sheet) for path in self.trials]
             return examine(tables, asked, plant)
         except ImpcError as error:
             return (fault(error),)
@@ -190,21 +178,12 @@ def may_be_recording(name: str) -> bool:
 
 def table(path: Path, sheet: str = "") -> Table:
     """The columns of a recording; kept until the file changes."""
-    found = path.stat()
-    return _table(path, sheet, found.st_mtime_ns, found.st_size)
+    return _table(path, sheet, path.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=16)
-def _table(path: Path, sheet: str, _changed: int, _size: int) -> Table:
+def _table(path: Path, sheet: str, _changed: int) -> Table:
     return read_table(path, sheet=sheet)
-
-
-def readable(path: Path) -> Table | None:
-    """The columns of a recording; None if it cannot be read."""
-    try:
-        return table(path)
-    except (ImpcError, OSError):
-        return None
 
 
 def folder_below(root: Path, name: str) -> Path:
@@ -213,25 +192,4 @@ def folder_below(root: Path, name: str) -> Path:
     inside = found.relative_to(root).parts if found.is_relative_to(root) else ("..",)
     if not found.is_dir() or any(part.startswith((".", "..")) for part in inside):
         raise InputError("folder", f"{name!r} is not below {root}", "open another one")
-    return found
-
-
-def value_at(content: Any, place: tuple[str, ...]) -> Any:
-    """The value at a TOML path; None if there is none."""
-    for key in place:
-        content = content.get(key) if isinstance(content, dict) else None
-    return content
-
-
-def number(text: str, what: str, least: float = -1e300) -> float | None:
-    """A number that was typed, with a decimal point or comma; None for an empty field."""
-    given = text.strip().replace(",", ".")
-    if not given:
-        return None
-    try:
-        found = float(given)
-    except ValueError:
-        found = float("nan")
-    if not least < found < 1e300:
-        raise InputError(what, f"got {text.strip()[:40]!r}", "give a number such as 12.5")
     return found

@@ -19,15 +19,10 @@ from impc.errors import ImpcError
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-_HERE, _REPORTING = Path(__file__).parent, Path(impc.reporting.__file__).parent
-_STATIC = {
-    "htmx.js": _HERE / "vendor/htmx.min.js",
-    "app.js": _HERE / "app.js",
-    "app.css": _HERE / "app.css",
-    "style.css": _REPORTING / "style.css",
-    "uplot.js": _REPORTING / "vendor/uPlot.iife.min.js",
-    "uplot.css": _REPORTING / "vendor/uPlot.min.css",
-}
+_REPORTING = Path(impc.reporting.__file__).parent
+_STATIC = {path.name: path for path in (
+    *(Path(__file__).parent / "static").iterdir(), _REPORTING / "style.css",
+    *(_REPORTING / "vendor").glob("uPlot*"))}  # fmt: skip
 _GETS = {
     "": screens.recordings, "recordings": screens.recordings, "signals": screens.show_signals,
     "body": screens.show_body, "fit": reports.show_fit, "results": reports.results,
@@ -44,19 +39,17 @@ def application(root: Path, plants: tuple[str, ...]) -> Starlette:
     """The application for the folder `root`, with the plants to choose from."""
     routes = [Route(f"/{name}", handler) for name, handler in _GETS.items()]
     routes += [Route(f"/{name}", posted(one), methods=["POST"]) for name, one in _POSTS.items()]
-    routes += [Route("/drop", screens.drop, methods=["POST"]), Route("/static/{name}", static)]
-    found = Starlette(routes=routes, exception_handlers={ImpcError: refused})
+    routes += [Route("/drop", screens.drop, methods=["POST"]), Route("/static/{name}", _static)]
+    found = Starlette(routes=routes, exception_handlers={ImpcError: _refused})
     found.state.root, found.state.plants, found.state.fits = root, plants, Fits()
     return found
 
 
-def refused(request: Request, error: Exception) -> Response:
-    """A page or line for what cannot be done."""
+def _refused(_: Request, error: Exception) -> Response:
     return PlainTextResponse(f"{error}\n", 400)
 
 
-def static(request: Request) -> Response:
-    """Scripts and style sheets of the pages."""
+def _static(request: Request) -> Response:
     found = _STATIC.get(request.path_params["name"])
     if found is None:
         raise HTTPException(404)

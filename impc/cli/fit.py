@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # Title of the last stage.
 _PAGE = "report and figures"
+#: Copy of the configuration among the results of `impc fit`.
+CONFIGURATION = "configuration.toml"
 
 
 @click.command("fit")
@@ -59,6 +61,7 @@ def command(asked: Asked, out: Path, yes: bool, pdf: bool, open_page: bool) -> N
         print_files(out, write_files(out, report.files()), open_page)
         return
     problem, settings = subject.problem, subject.settings
+    used = {CONFIGURATION: asked.config.read_bytes()}  # it may change during the fit
     require_consent(fit_effort(problem, settings), yes)
     unknown = missing(settings, subject.source)
     if unknown:
@@ -72,7 +75,7 @@ def command(asked: Asked, out: Path, yes: bool, pdf: bool, open_page: bool) -> N
         result = replace(result, falls=subject.falls)
         with angles_in(subject.angles):
             report = fit_report(result, subject.provenance, truth, unknown)
-            content = report.files(pdf=pdf)
+            content = report.files(pdf=pdf) | used
         done(_PAGE)
     written = write_files(out, content)
     memory.cache.forget()
@@ -102,7 +105,7 @@ def _own_problem(asked: Asked, out: Path) -> bool:
         provenance = asked.provenance(source, asked.inputs(source))
         with angles_in(configuration.report.angles):
             report = optimal_report(fit, provenance)
-            content = report.files()
+            content = report.files() | {CONFIGURATION: asked.config.read_bytes()}
         done(_PAGE)
     written = write_files(out, content)
     click.echo(report.verdict.text())

@@ -6,7 +6,6 @@ Messages name file, signal and column, the number of samples, and the first of t
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import DataError, FallError, one_line
+from impc.levels import Level
 
 if TYPE_CHECKING:
     from impc.arrays import Array, BoolArray
@@ -43,18 +43,11 @@ _LARGEST, _SMALLEST = 1e50, 1e-50
 _SLOWER = 50
 
 
-class Level(enum.Enum):
-    """Whether a notice stops a fit."""
-
-    AMBER = "amber"  # A finding, or a fall
-    RED = "red"  # A fault that stops a fit
-
-
 @dataclass(frozen=True)
 class Notice:
     """One fault or finding."""
 
-    level: Level
+    level: Level  # AMBER: a finding, or a fall; RED: a fault that stops a fit
     file: str  # Recording or configuration
     place: tuple[str, ...]  # TOML path to look at; empty if there is none
     text: str

@@ -92,10 +92,8 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
     source, path = str(path), Path(path)
     try:
         form = recognised(path, largest)
-        if sheet and path.suffix.lower() not in _WORKBOOKS:
-            remedy = "leave recording.sheet out"
-            raise DataError(source, "has no sheets", remedy).at("", "recording", "sheet")
-        return form.read(path, largest, sheet) if sheet else form.read(path, largest)
+        named = sheet and path.suffix.lower() in _WORKBOOKS
+        return form.read(path, largest, sheet) if named else form.read(path, largest)
     except ImpcError as error:
         error.at(source)
         raise

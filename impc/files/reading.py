@@ -15,7 +15,7 @@ from impc.errors import DataError, FallError, InputError, blamed
 from impc.files import checks
 from impc.files.apart import match_apart
 from impc.files.causality import departures, misaligned, rows_later
-from impc.files.checks import Level, Notice, finding
+from impc.files.checks import Notice, finding
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest
@@ -31,6 +31,7 @@ from impc.files.resampling import (
 )
 from impc.files.steps import steps_of
 from impc.files.units import si_unit
+from impc.levels import Level
 from impc.model.foresight import physical_disturbances, physical_states
 from impc.model.plant import UNKNOWN
 from impc.model.recordings import Label, Recording

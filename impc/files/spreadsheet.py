@@ -30,7 +30,7 @@ from impc.files.layout import (
     require_no_thousands,
     written_heading,
 )
-from impc.files.table import make_table
+from impc.files.table import OTHER_SHEET, make_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -71,7 +71,7 @@ def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
         raise DataError(source, problem, "save one signal per column, its name above it")
     full = [item for item in found if item[1].several]
     chosen, block = (full or found)[0]
-    skipped = {f"sheet {item.name}": "is another sheet" for item in sheets if item is not chosen}
+    skipped = {f"sheet {item.name}": OTHER_SHEET for item in sheets if item is not chosen}
     notes = (f"sheet {chosen.name!r} is read; other sheets have rows of numbers too",)
     return _table(source, chosen, block, skipped, notes if len(full) > 1 else ())
 

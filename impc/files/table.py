@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
 
+#: Why a sheet of a workbook is skipped.
+OTHER_SHEET = "is another sheet"
 _LONGEST = 160  # characters of a name, a unit or a reason, as used in messages and TOML
 
 

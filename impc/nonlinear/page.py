@@ -11,9 +11,10 @@ from markupsafe import Markup
 
 from impc.arrays import Frozen
 from impc.inverse.estimates import Status
+from impc.levels import Level
 from impc.nonlinear.combinations import interval
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
-from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.shown_units import shown_as

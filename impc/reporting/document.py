@@ -17,7 +17,8 @@ from markupsafe import Markup
 
 from impc.files.results import SCHEMA
 from impc.files.spreadsheet import workbook_bytes
-from impc.reporting.finding import MOST_CELLS, Chart, Finding, Level, Moving, Picture, csv_bytes
+from impc.levels import Level
+from impc.reporting.finding import MOST_CELLS, Chart, Finding, Moving, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
 from impc.reporting.style import drawn, inline

@@ -5,7 +5,6 @@ To add an assessment, write a function that returns a `Finding` and add it to a 
 
 from __future__ import annotations
 
-import enum
 import io
 import math
 import re
@@ -18,18 +17,10 @@ import pandas as pd
 
 from impc.files.spreadsheet import as_data
 from impc.files.table import in_columns
+from impc.levels import Level
 from impc.reporting.rendering import fixed, p_value, sentence_case
 
 T = TypeVar("T")
-
-
-class Level(enum.Enum):
-    """How far a finding restricts the statements about a person."""
-
-    GREEN = "green"  # No restriction
-    AMBER = "amber"  # Some statements must not be made
-    RED = "red"  # No statement about the person's control may be made
-    NOTE = "note"  # For information
 
 
 @dataclass(frozen=True)

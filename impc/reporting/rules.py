@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.verdict import Alert, Claim, Verdict
 
 F = TypeVar("F")

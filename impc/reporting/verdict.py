@@ -7,16 +7,10 @@ from dataclasses import dataclass
 from textwrap import fill, indent
 from typing import Any
 
-from impc.reporting.finding import Level
+from impc.levels import Level
 
 #: Width of the text in a terminal, in characters.
 WIDTH = 100
-_BADGES = {
-    Level.GREEN: "Ready to report",
-    Level.AMBER: "Check before reporting",
-    Level.RED: "Do not report",
-    Level.NOTE: "Note",
-}
 
 
 @dataclass(frozen=True)
@@ -73,7 +67,7 @@ class Verdict:
     @property
     def words(self) -> str:
         """Words of the badge."""
-        return self.badge or _BADGES[self.level]
+        return self.badge or self.level.words
 
     def data(self) -> dict[str, Any]:
         """Entry in result.json."""

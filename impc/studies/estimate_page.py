@@ -9,8 +9,9 @@ from impc.assess.assessments import evaluate_method
 from impc.checking import checked, replace
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
+from impc.levels import Level
 from impc.reporting.document import Report, Section
-from impc.reporting.finding import Level, Picture
+from impc.reporting.finding import Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.writer import owned, write_files
 from impc.studies.compare.report import compare_report

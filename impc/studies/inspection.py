@@ -9,8 +9,9 @@ import pandas as pd
 
 from impc.files.configuration import FILL_IN
 from impc.files.units import si_unit
+from impc.levels import Level
 from impc.reporting.document import Report, Section
-from impc.reporting.finding import Chart, Finding, Level
+from impc.reporting.finding import Chart, Finding
 from impc.reporting.provenance import Provenance
 from impc.reporting.verdict import Verdict
 from impc.studies.charts import short

@@ -1,4 +1,4 @@
-"""A server of `impc app` in a process of its own, and a client that knows its address."""
+"""A server of `impc app` in a process of its own, a client that knows its address, and files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlencode
+
+import numpy as np
 
 ROOT = Path(__file__).parents[2]
 
@@ -26,12 +28,22 @@ class Answer:
 
 @dataclass(frozen=True)
 class Client:
-    """A browser without scripts."""
+    """A browser without scripts; `opened` is what the address answered."""
 
     process: subprocess.Popen[str]
     host: str
-    base: str
-    cookie: str
+    token: str  # Path that the address has
+    opened: Answer
+
+    @property
+    def base(self) -> str:
+        """Path of the pages."""
+        return self.opened.headers["location"].rstrip("/")
+
+    @property
+    def cookie(self) -> str:
+        """Cookie of the browser."""
+        return self.opened.headers["set-cookie"].partition(";")[0]
 
     def get(self, path: str, **asked: str) -> Answer:
         """Page below the base."""
@@ -46,38 +58,45 @@ class Client:
         return ask(self.host, "POST", f"{self.base}/{path}{query}", given, **origin)
 
 
-def ask(host: str, method: str, path: str, body: bytes = b"", **headers: str) -> Answer:
-    """One request."""
+def ask(host: str, method: str, path: str, body: bytes = b"", /, **headers: str) -> Answer:
+    """One request; _ is - in names of headers."""
     connection = http.client.HTTPConnection(host, timeout=120)
     with contextlib.closing(connection):
-        connection.request(method, path, body, headers)
+        given = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, body, given)
         found = connection.getresponse()
         text = found.read().decode("utf-8", "replace")
         return Answer(found.status, {k.lower(): v for k, v in found.getheaders()}, text)
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *more: str, home: Path | None = None) -> Iterator[Client]:
-    """Start `impc app FOLDER`, open its address, and end it."""
-    cache = {} if home is None else {"XDG_CACHE_HOME": str(home)}
-    given = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+def serving(folder: Path, *before: str) -> Iterator[Client]:
+    """Start `impc app FOLDER` by the words `before`, open its address, and end it."""
+    given = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1",
+             "XDG_CACHE_HOME": str(folder.parent / "home")}  # fmt: skip
     process = subprocess.Popen(
-        [sys.executable, "-m", "impc", "app", "--no-open", *more, str(folder)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-        cwd=folder,
-        env=os.environ | given | cache,
-    )
+        [*before, sys.executable, "-m", "impc", "app", "--no-open", str(folder)],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=folder,
+        env=os.environ | given,
+    )  # fmt: skip
     try:
         assert process.stdout is not None
         address = process.stdout.readline().split()[1]
-        host, path = address.removeprefix("http://").split("/", 1)
-        opened = ask(host, "GET", f"/{path}")
-        cookie = opened.headers["set-cookie"].partition(";")[0]
-        yield Client(process, host, opened.headers["location"].rstrip("/"), cookie)
+        host, token = address.removeprefix("http://").split("/", 1)
+        yield Client(process, host, f"/{token}", ask(host, "GET", f"/{token}"))
     finally:
         process.terminate()
         process.wait(30)
         if process.stdout is not None:
             process.stdout.close()
+
+
+def german(path: Path, seed: int = 1) -> None:
+    """A recording as a German export: semicolons, decimal commas, umlauts, cp1252."""
+    rng = np.random.default_rng(seed)
+    push = np.repeat(rng.choice([-5.0, 0.0, 5.0], 60), 10)
+    angle = np.cumsum(push) / 300
+    lines = ["Zeit [s];Sitzwinkel [Grad];Rumpfwinkel;Störmoment [Nm]"]
+    rows = zip(np.arange(600) / 100, angle, 0.5 * np.roll(angle, 7), push, strict=True)
+    lines += [";".join(f"{value:.5f}".replace(".", ",") for value in row) for row in rows]
+    path.write_bytes("\r\n".join(lines).encode("cp1252"))

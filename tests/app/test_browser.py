@@ -6,14 +6,16 @@ import base64
 import importlib.util
 import re
 import shutil
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pandas as pd
 import pytest
 
-from tests.app.serving import serving
-from tests.app.test_pages import german
+import impc
+from tests.app.serving import german, serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import ConsoleMessage, Page
@@ -42,7 +44,7 @@ def page(study: Path) -> Iterator[Page]:
     from playwright.sync_api import sync_playwright  # noqa: PLC0415  # optional
 
     faults: list[str] = []
-    with serving(study, home=study.parent / "home") as client, sync_playwright() as driver:
+    with serving(study) as client, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         context = browser.new_context(viewport={"width": 1500, "height": 950})
         name, value = client.cookie.split("=", 1)
@@ -83,14 +85,51 @@ def accessible(page: Page) -> None:
     page.set_viewport_size({"width": 1500, "height": 900})
 
 
-def change(page: Page, place: str, value: str) -> None:
-    """Type into a field or choose, and wait until it is saved."""
+def workbook(table: impc.Table, path: Path) -> None:
+    """The columns of a table as numbers in a sheet, with the units in the headings."""
+    heads = {name: f"{name} [{table.units[name]}]" if name in table.units else name
+             for name in table.columns}  # fmt: skip
+    pd.DataFrame(dict(table.columns)).rename(columns=heads).to_excel(path, index=False)
+
+
+def reached(page: Page, wanted: str) -> None:
+    """Press Tab until an element has the focus; its id or its text is `wanted`."""
+    for _ in range(100):
+        page.keyboard.press("Tab")
+        where = "[document.activeElement.id, document.activeElement.textContent.trim()]"
+        if wanted in page.evaluate(where):
+            return
+    raise AssertionError(wanted)
+
+
+def typed(page: Page, place: str, keys: str) -> None:
+    """Reach a field by Tab, type, and wait until it is saved; the focus stays in the page."""
+    page.evaluate("document.activeElement.blur()")
+    reached(page, place)
     with page.expect_response(lambda one: one.request.method == "POST"):
-        if page.locator(place).evaluate("one => one.tagName") == "SELECT":
-            page.select_option(place, value)
-        else:
-            page.fill(place, value)
-            page.press(place, "Tab")
+        page.keyboard.type(keys)
+        page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.tagName") != "BODY"
+
+
+def followed(page: Page, link: str) -> None:
+    """Reach a link by Tab, and follow it."""
+    reached(page, link)
+    with page.expect_navigation():
+        page.keyboard.press("Enter")
+
+
+def drag(page: Page, place: str, share: float) -> float:
+    """Drag a handle to a share of the plot's width; the saved time in s."""
+    handle, plot = (page.locator(one).first.bounding_box() for one in (place, ".u-over"))
+    assert handle is not None
+    assert plot is not None
+    page.mouse.move(handle["x"] + handle["width"] / 2, handle["y"] + 9)
+    page.mouse.down()
+    page.mouse.move(plot["x"] + share * plot["width"], handle["y"] + 9, steps=4)
+    with page.expect_response(lambda one: one.request.method == "POST"):
+        page.mouse.up()
+    return float(page.input_value("#start"))
 
 
 def test_every_screen_from_dropped_files_to_the_report(
@@ -100,6 +139,8 @@ def test_every_screen_from_dropped_files_to_the_report(
     page.get_by_role("link", name="VP07").click()
     for seed in (1, 2):
         german(tmp_path / f"Versuch {seed}.csv", seed)
+    workbook(impc.read_table(tmp_path / "Versuch 2.csv"), tmp_path / "Versuch 2.xlsx")
+    (tmp_path / "Versuch 2.csv").unlink()
     (tmp_path / "notes.docx").write_text("no recording")
     files = [{"name": one.name, "text": base64.b64encode(one.read_bytes()).decode()}
              for one in sorted(tmp_path.iterdir()) if one.is_file()]  # fmt: skip
@@ -110,20 +151,23 @@ def test_every_screen_from_dropped_files_to_the_report(
     page.get_by_role("link", name="Next: what each signal means").click()
     page.wait_for_selector(".uplot")
     accessible(page)
-    for place, value in (("#unit1", "deg"), ("#unit2", "deg"), ("#subject", "VP07")):
-        change(page, place, value)
-    assert page.evaluate("document.activeElement.id") != ""  # the focus is kept
+    cut = drag(page, ".cut.start", 0.25)
+    assert cut == pytest.approx(1.5, abs=0.1)
+    assert tomllib.loads((study / "VP07/subject.toml").read_text())["recording"]["start"] == cut
+    # From here on by keyboard alone.
+    for place, value in (("unit1", "deg"), ("unit2", "deg"), ("subject", "VP07")):
+        typed(page, place, value)
     for index in (1, 2, 3):
         if page.locator(f"#sure{index}").count():
-            with page.expect_response(lambda one: one.request.method == "POST"):
-                page.check(f"#sure{index}")
+            typed(page, f"sure{index}", " ")
     page.wait_for_selector("aside h2:has-text('Ready')")
-    page.get_by_role("link", name="Next: body and limit").click()
+    followed(page, "Next: body and limit")
     accessible(page)
-    for place, value in (("#p_mass", "79,7"), ("#p_height", "1,66"), ("#u_max", "6")):
-        change(page, place, value)
-    page.get_by_role("link", name="Next: fit").click()
+    for place, value in (("p_mass", "79,7"), ("p_height", "1,66"), ("u_max", "6")):
+        typed(page, place, value)
+    followed(page, "Next: fit")
     accessible(page)
+    assert page.locator("button:has-text('Fit')").is_enabled()
 
 
 @pytest.mark.full

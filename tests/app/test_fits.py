@@ -84,7 +84,7 @@ def practice(client: Client) -> None:
 def test_a_stopped_fit_goes_on_and_is_that_of_the_command(tmp_path: Path) -> None:
     folder = tmp_path / "study"
     folder.mkdir()
-    with serving(folder, home=tmp_path / "home") as client:
+    with serving(folder) as client:
         practice(client)
         assert client.post("fit", {}, f="practice").status == 303
         until(lambda: "inverse MPC</li>" in client.get("fit", f="practice").text)
@@ -116,7 +116,7 @@ def test_no_fit_is_left_behind(how: signal.Signals, tmp_path: Path) -> None:
         pytest.skip("it is ignored here, as under nohup, and the server goes on")
     folder = tmp_path / "study"
     folder.mkdir()
-    with serving(folder, home=tmp_path / "home") as client:
+    with serving(folder) as client:
         practice(client)
         client.post("fit", {}, f="practice")
         until(lambda: "inverse MPC</li>" in client.get("fit", f="practice").text)
@@ -127,5 +127,5 @@ def test_no_fit_is_left_behind(how: signal.Signals, tmp_path: Path) -> None:
         client.process.wait(30)
         _, alive = psutil.wait_procs(fits, timeout=120)
         assert not alive
-    with serving(folder, home=tmp_path / "home") as client:
+    with serving(folder) as client:
         assert "Go on" in client.get("fit", f="practice").text

@@ -12,11 +12,12 @@ from click.testing import CliRunner
 from impc.arrays import Array
 from impc.cli.main import main
 from impc.errors import InputError
-from impc.files.checks import Level, Notice
+from impc.files.checks import Notice
 from impc.files.configuration import Configuration, configuration
 from impc.files.examination import examine
 from impc.files.reading import recording_of
 from impc.files.table import Table, make_table
+from impc.levels import Level
 from impc.model.plant import Plant
 from plants import seated_balance_plant
 from tests.files.damaged_files import PLANT

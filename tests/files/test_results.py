@@ -10,8 +10,8 @@ import pytest
 
 from impc.errors import DataError
 from impc.files.results import SCHEMA, read_result
+from impc.levels import Level
 from impc.reporting.document import Report
-from impc.reporting.finding import Level
 from impc.reporting.verdict import Verdict
 
 HEAD = {"schema": SCHEMA, "command": "", "made": "", "versions": {}, "files": [], "sha256": None}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.rendering import sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim

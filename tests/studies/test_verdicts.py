@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from impc.levels import Level
 from impc.nonlinear import page
-from impc.reporting.finding import Level
 from impc.reporting.rules import Line, Rules
 from impc.studies.compare import verdict as compare
 from impc.studies.example import report as example

@@ -12,8 +12,9 @@ from markupsafe import Markup
 
 from impc.checking import replace
 from impc.files.checks import FELL
+from impc.levels import Level
 from impc.reporting.document import Block, Check, Checks, Copy, Lines, Report, Section, Terms
-from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key, Verdict

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.levels import Level
 from impc.model.plant import UNKNOWN
-from impc.reporting.finding import Level
 from impc.reporting.rendering import number, p_value, sentence_case
 from impc.studies.cohort.comparison import (
     compare_cohort,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim, Verdict
 from impc.studies.cohort.results import SIGNIFICANT, Cohort

@@ -8,8 +8,9 @@ import numpy as np
 
 from impc.checking import replace
 from impc.inverse.estimates import Status
+from impc.levels import Level
 from impc.reporting.document import Block, Check, Checks, Copy, Fold, Report, Section
-from impc.reporting.finding import Chart, Finding, Level, Picture
+from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories

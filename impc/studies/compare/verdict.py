@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.shown_units import signal_name

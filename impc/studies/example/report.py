@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from impc.levels import Level
 from impc.model.weights import condition_number
 from impc.reporting.document import Block, Draw, Fold, Lines, Report, Section
-from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Key, Verdict
 from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights

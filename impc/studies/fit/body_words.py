@@ -18,8 +18,9 @@ from impc.assess.lack_of_fit import (
     STIFFNESS,
     signal_of,
 )
+from impc.levels import Level
 from impc.model.signal_errors import KINDS
-from impc.reporting.finding import Finding, Level, table_of
+from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, signal_name
 from impc.studies.fit.facts import shifted

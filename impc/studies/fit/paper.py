@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.levels import Level
 from impc.model.foresight import physical_disturbances
 from impc.reporting.document import Copy
-from impc.reporting.finding import Level
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.fit.aim import aim_sentences

@@ -12,6 +12,7 @@ from impc.assess.lack_of_fit import LIMIT
 from impc.assess.printed_gain import LastingResponse, lasting_responses
 from impc.checking import replace
 from impc.inverse.minimiser import Ended
+from impc.levels import Level
 from impc.reporting.document import (
     Block,
     Check,
@@ -24,7 +25,7 @@ from impc.reporting.document import (
     Section,
     Terms,
 )
-from impc.reporting.finding import Chart, Level, Picture
+from impc.reporting.finding import Chart, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import fixed, number, probability
 from impc.reporting.shown_units import shown_unit, signal_name

@@ -12,7 +12,7 @@ import numpy as np
 
 from impc.assess.lack_of_fit import LIMIT, signal_of
 from impc.checking import replace
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.studies.fit.body_words import (

@@ -11,8 +11,8 @@ import numpy as np
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.expected import MULTIPLES
+from impc.levels import Level
 from impc.reporting.document import Check, Copy
-from impc.reporting.finding import Level
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Rules, always
 from impc.reporting.shown_units import shown_unit, signal_name

@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 
 from impc.assess.several_tests import holm
+from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
-from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, probability, sentence_case
 from impc.reporting.verdict import Key

@@ -11,8 +11,9 @@ import pandas as pd
 import scipy
 
 from impc.files.disk import truth_beside
+from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
-from impc.reporting.finding import Finding, Level, Picture
+from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, RECORDED, RULE, new_figure

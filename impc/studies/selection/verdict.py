@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.covariance import TWO_SIDED
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.studies.reliability.icc import GOOD

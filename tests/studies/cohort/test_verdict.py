@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from impc.files.configuration import Configuration, RecordingTable
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.studies.cohort.figures import forest
 from impc.studies.cohort.report import comparisons, subjects
 from impc.studies.cohort.results import Cohort

@@ -15,12 +15,12 @@ from impc.assess.assessments import MethodFit
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.inverse.problem import Problem
+from impc.levels import Level
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.reporting.document import Checks, Copy, Report
-from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import page_style

@@ -12,11 +12,11 @@ import pytest
 
 from impc.assess.assessments import MethodFit
 from impc.checking import replace
+from impc.levels import Level
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
 from impc.reporting.document import json_bytes
-from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.studies.example.cases import CASES, EXAMPLE, CaseResult
 from impc.studies.example.report import example_data, example_report, example_verdict

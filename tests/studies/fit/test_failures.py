@@ -12,7 +12,7 @@ import pytest
 import impc
 from experiments.search_problems import stick
 from impc.errors import SolverError
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.provenance import Provenance
 from impc.studies.fit import first, subject
 from impc.studies.fit.report import fit_report

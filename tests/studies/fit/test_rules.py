@@ -12,8 +12,8 @@ from impc.assess.assessments import MethodFit
 from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.assess.variance_accounted_for import explained_share, vaf
 from impc.checking import replace
+from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report
-from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.studies.fit.facts import unlimited_ratio
 from impc.studies.fit.report import fit_report

@@ -15,10 +15,10 @@ from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import InputError
 from impc.inverse.noisy_fit import fit_controller
+from impc.levels import Level
 from impc.model.bounds import Bounds
 from impc.model.weights import Weights
 from impc.reporting.document import Report
-from impc.reporting.finding import Level
 from impc.reporting.verdict import Verdict
 from impc.studies.fit.asked import fit_problem, fit_structures
 from impc.studies.fit.result import FitResult

@@ -15,12 +15,12 @@ from impc.checking import replace
 from impc.control.controller import Controller
 from impc.files.plant_sources import plant_source
 from impc.inverse.minimiser import Ended
+from impc.levels import Level
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from impc.reporting.document import Copy
-from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import angles_in
 from impc.reporting.style import VERMILLION, page_style

@@ -14,10 +14,10 @@ from impc.arrays import Array
 from impc.checking import replace
 from impc.control.controller import Controller
 from impc.errors import InputError, SolverError
+from impc.levels import Level
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
-from impc.reporting.finding import Level
 from impc.reporting.provenance import Provenance
 from impc.studies.plan.designs import Design, Person, try_design
 from impc.studies.plan.report import plan_report

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from impc.arrays import Array
-from impc.reporting.finding import Level
+from impc.levels import Level
 from impc.reporting.verdict import Verdict
 from impc.studies.reliability.analysis import Reliability, measured
 from impc.studies.reliability.icc import icc

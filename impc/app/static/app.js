@@ -1,5 +1,5 @@
 "use strict";
-// Drop zone, plots, and the choice of the trial that is shown. Everything else is HTML and htmx.
+// Drop zone, plots with handles of the cut, and faults. Everything else is HTML and htmx.
 (() => {
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const plots = (place) => {
@@ -8,12 +8,34 @@
       const data = JSON.parse(one.querySelector("script").textContent);
       const axis = { stroke: colour("--muted"), grid: { stroke: colour("--rule"), width: 1 } };
       const size = () => ({ width: one.clientWidth || 600, height: 130 });
+      const moved = [];
       const plot = new uPlot({
-        ...size(), scales: { x: { time: false } }, legend: { show: false }, cursor: { sync: { key: "all" } },
+        ...size(), hooks: { draw: [() => { for (const one of moved) one(); }] }, scales: { x: { time: false } }, legend: { show: false }, cursor: { sync: { key: "all" } },
         axes: [axis, { ...axis, size: 60, space: 22, label: one.dataset.unit, labelSize: 18 }], series: [{}, { stroke: colour("--accent"), width: 1 }],
       }, data, one);
+      moved.push(...["start", "stop"].map((name) => cut(plot, data[0], name)));
       addEventListener("resize", () => plot.setSize(size()));
     }
+  };
+  // A handle at the begin or end of the trial: dragged, it writes the time into its field.
+  const cut = (plot, time, name) => {
+    const field = document.getElementById(name), handle = document.createElement("div");
+    const edge = name === "start" ? time[0] : time[time.length - 1];
+    const shown = () => { handle.style.left = `${plot.valToPos(parseFloat(field.value.replace(",", ".")) || edge, "x")}px`; };
+    handle.className = `cut ${name}`;
+    handle.title = name === "start" ? "Drag to where the trial begins" : "Drag to where the trial ends";
+    handle.addEventListener("mousedown", (one) => one.stopPropagation()); // no zoom
+    handle.addEventListener("pointerdown", (one) => { one.stopPropagation(); handle.setPointerCapture(one.pointerId); });
+    handle.addEventListener("pointermove", (one) => {
+      if (!handle.hasPointerCapture(one.pointerId)) return;
+      const at = plot.posToVal(one.clientX - plot.over.getBoundingClientRect().left, "x");
+      field.value = Math.min(Math.max(at, time[0]), time[time.length - 1]).toFixed(2);
+      shown();
+    });
+    handle.addEventListener("pointerup", () => field.dispatchEvent(new Event("change", { bubbles: true })));
+    field.addEventListener("change", shown);
+    plot.over.append(handle);
+    return shown;
   };
   const send = async (files) => {
     const said = document.getElementById("said"), place = document.getElementById("drop");
@@ -37,6 +59,10 @@
     for (const kind of ["dragover", "drop"]) addEventListener(kind, (one) => one.preventDefault()); // beside the zone: do not leave the page
   }
   document.addEventListener("change", (one) => { if (one.target.dataset.go) location = one.target.dataset.go + encodeURIComponent(one.target.value); });
+  const fault = (text) => { document.getElementById("fault").textContent = text; };
+  document.addEventListener("htmx:afterRequest", (one) => { if (one.detail.successful) fault(""); });
+  document.addEventListener("htmx:responseError", (one) => fault(`Not saved: ${one.detail.xhr.responseText}`));
+  document.addEventListener("htmx:sendError", () => fault("impc app does not answer: was its window closed? Start it again; all answers are kept."));
   document.addEventListener("htmx:oobAfterSwap", () => plots(document));
   document.addEventListener("DOMContentLoaded", () => plots(document));
 })();
