@@ -9,9 +9,10 @@ import numpy as np
 import tomlkit
 
 from impc.errors import InputError
-from impc.files.configuration import FILL_IN
+from impc.files.configuration import FILL_IN, SignalTable
 from impc.files.draft import guess_of
 from impc.files.plant_sources import UNCERTAINTY
+from impc.files.reading import unit_faults
 from impc.files.units import si_unit
 from impc.reporting.shown_units import signal_name
 
@@ -82,7 +83,7 @@ def columns(text: str, table: Table, plant: Plant) -> list[Column]:
         origin = guess_of(table, name, "").origin.rstrip(".")
         comment = entry.item(named).trivia.comment.lstrip("# ") if named in entry else ""
         asked = f"Which unit is it in? {origin[0].upper()}{origin[1:]}."
-        guessed = f"This is {comment[:1].lower()}{comment[1:]}"
+        guessed = f"This is {comment[:1].lower()}{comment[1:].replace('GUESS', 'guess')}"
         shown = entry.get("sign", 1) * (values - float(entry.get("offset", 0)))
         found.append(Column(
             name, role, "" if unit == FILL_IN else unit, entry,
@@ -144,6 +145,9 @@ def signal_changes(form: Mapping[str, str], table: Table, subject: Subject) -> C
             found["recording", "rate"] = None
         else:
             entry = _signal(form, index, names[index], known[role])
+            given = SignalTable(column=names[index], unit=unit)
+            for error in unit_faults(role, given, plant.unit(role), names[index]) if unit else ():
+                raise error
             entry |= {"unit": unit or FILL_IN, "command": role == plant.controls[0] or None}
             keys = {("signals", role, key): value for key, value in entry.items()}
         found |= keys
@@ -181,7 +185,10 @@ def body_changes(form: Mapping[str, str], subject: Subject) -> Changes:
         found["plant", UNCERTAINTY, one.name] = exact or None
     limit = number(form.get("u_max", ""), "largest command", 0.0)
     found["fit", "u_max"] = None if "no_limit" in form else FILL_IN if limit is None else limit
-    found["fit", "horizon"] = int(number(form.get("horizon", ""), "horizon", 0.0) or HORIZON)
+    horizon = number(form.get("horizon", ""), "horizon", 0.0) or HORIZON
+    if horizon != int(horizon):
+        raise InputError("horizon", f"got {horizon:g}", "give a whole number of samples")
+    found["fit", "horizon"] = int(horizon)
     return _changed(found, subject)
 
 
@@ -205,5 +212,6 @@ def number(text: str, what: str, least: float = -1e300) -> float | None:
     except ValueError:
         found = float("nan")
     if found is not None and not least < found < 1e300:
-        raise InputError(what, f"got {text.strip()[:40]!r}", "give a number such as 12.5")
+        kind = "positive number" if least == 0 else "number"
+        raise InputError(what, f"got {text.strip()[:40]!r}", f"give a {kind} such as 12.5")
     return found

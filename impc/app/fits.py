@@ -10,11 +10,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import queue
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -98,27 +98,30 @@ class Fit:
                 self.state = State.STOPPED
                 return
             self.began, self.state = time.monotonic(), State.RUNNING
-            given = {"IMPC_PROGRESS": "json", "IMPC_STOP_WITH_INPUT": "1", "IMPC_QUIET": "",
-                     "PYTHONIOENCODING": "utf-8:backslashreplace"}  # fmt: skip
-            # -P: the working folder may hold files called impc.py or numpy.py.
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "impc", *self.words[1:], "--yes"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                encoding="utf-8",
-                errors="replace",
-                env=os.environ | given,
-            )
-            if self._stop.is_set():  # meanwhile
-                self._close()
-            assert self._process.stderr is not None  # a pipe
-            for line in self._process.stderr:
-                self._hear(line.strip())
-            status = self._process.wait()
+            try:
+                status = self._run()
+            except OSError as error:  # no memory or disk for a process
+                status, self.said = -1, str(error)
             self.ended = time.monotonic()
             failed = State.STOPPED if self._stop.is_set() else State.FAILED
             self.state = next((end for code, end in _ENDS.items() if code == status), failed)
+
+    def _run(self) -> int:
+        """Exit status of the command."""
+        given = {"IMPC_PROGRESS": "json", "IMPC_STOP_WITH_INPUT": "1", "IMPC_QUIET": "",
+                 "PYTHONIOENCODING": "utf-8:backslashreplace"}  # fmt: skip
+        # -P: the working folder may hold files called impc.py or numpy.py.
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "impc", *self.words[1:], "--yes"],
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            encoding="utf-8", errors="replace", env=os.environ | given,
+        )  # fmt: skip
+        if self._stop.is_set():  # meanwhile
+            self._close()
+        assert self._process.stderr is not None  # a pipe
+        for line in self._process.stderr:
+            self._hear(line.strip())
+        return self._process.wait()
 
     def _hear(self, line: str) -> None:
         try:
@@ -134,16 +137,15 @@ class Fits:
     """The fits of one server, in the order in which they were asked for."""
 
     def __init__(self) -> None:
-        self._asked: queue.SimpleQueue[Fit] = queue.SimpleQueue()
+        self._turns = ThreadPoolExecutor(1)
         self._last: dict[Path, Fit] = {}
-        threading.Thread(target=self._work, daemon=True).start()
 
     def start(self, words: Sequence[str], out: Path) -> None:
         """Queue the command that writes to `out`, unless it is queued or running."""
         known = self._last.get(out.parent)
         if known is None or known.over:
             self._last[out.parent] = Fit(tuple(words), out)
-            self._asked.put(self._last[out.parent])
+            self._turns.submit(self._last[out.parent].run)
 
     def of(self, folder: Path) -> Fit | None:
         """The last fit with results in a `folder`."""
@@ -158,14 +160,6 @@ class Fits:
         """Stop all, as the server ends."""
         for one in self._last.values():
             one.stop()
-
-    def _work(self) -> None:
-        while True:
-            fit = self._asked.get()
-            try:
-                fit.run()
-            except OSError as error:  # no memory or disk for a process
-                fit.state, fit.said = State.FAILED, str(error)
 
 
 @contextlib.contextmanager

@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse
 
 from impc.app.subject import Subject, folder_below, near
+from impc.errors import InputError
 from impc.files.formats import FORMATS
 from impc.levels import Level
 
@@ -84,13 +85,25 @@ def back(request: Request, to: str, folder: Path) -> Response:
 
 def page(request: Request, step: str, **more: Any) -> Response:
     """One of the pages `STEPS`, or the part of it that is asked for."""
-    subject = subject_of(request)
+    return _page(request, subject_of(request), step, 200, **more)
 
+
+def refused(request: Request, fault: str) -> Response:
+    """A page that only says what is wrong; of the first folder if that of the request is wrong."""
+    state = request.app.state
+    try:
+        subject = subject_of(request)
+    except InputError:
+        subject = Subject(state.root, state.plants)
+    return _page(request, subject, "", 400, fault=fault.replace(f"{subject.folder}/", ""))
+
+
+def _page(request: Request, subject: Subject, step: str, status: int, **more: Any) -> Response:
     def linked(to: str, folder: Path = subject.folder, **query: str) -> str:
         return link(request, to, folder, **query)
 
     return HTMLResponse(_templates().get_template("page.html").render(
-        step=step, subject=subject, root=request.app.state.root, link=linked, **more,
+        step=step, subject=subject, root=request.app.state.root, link=linked,
         inside=inside(request, subject.folder), part=request.headers.get("hx-request", ""),
-        base=request.scope["root_path"],
-    ))  # fmt: skip
+        base=request.scope["root_path"], **more,
+    ), status)  # fmt: skip

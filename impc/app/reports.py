@@ -38,24 +38,23 @@ def show_fit(request: Request) -> Response:
     """What stops a fit, its progress, and its command."""
     subject, fits = subject_of(request), request.app.state.fits
     run: Fit | None = fits.of(subject.folder / RESULTS)
-    problem = takes = ""
-    words: list[str] = []
-    if not subject.trials:
-        problem = "There is nothing to fit yet: add recordings."
-    elif run is not None and not run.over:
-        words = list(run.words)
-    else:
-        words = subject.command(subject.out)
-        if request.headers.get("hx-target") != "progress":
-            problem, takes = _ready(subject)
+    running = run is not None and not run.over
+    words = list(run.words) if run and running else subject.command(subject.out)
+    target = request.headers.get("hx-target")
+    waits = bool(subject.trials) and not running and target is None  # for the check, with a sign
+    problem, answer, takes = "There is nothing to fit yet: add recordings.", "recordings", ""
+    if subject.trials:
+        problem, answer, takes = _ready(subject) if target == "fit" else ("", "", "")
+    last = next(iter(subject.outs), None)
     return page(
         request, "fit", run=run, before=fits.before(run) if run else 0, problem=problem,
-        takes=takes, words=words, resumes=subject.out.exists(),
+        answer=answer, takes=takes, words=words, resumes=subject.out.exists(), waits=waits,
+        polled=target == "progress", since=_since(subject, last) if last else "",
     )  # fmt: skip
 
 
-def _ready(subject: Subject) -> tuple[str, str]:
-    """What stops a fit before it begins, and its time and memory."""
+def _ready(subject: Subject) -> tuple[str, str, str]:
+    """What stops a fit before it begins, the page that answers it, and time and memory."""
     from impc.cli.plant import asked_subject, read_subject  # noqa: PLC0415  # slow
     from impc.studies.effort import fit_effort  # noqa: PLC0415
 
@@ -63,9 +62,15 @@ def _ready(subject: Subject) -> tuple[str, str]:
         found = read_subject(asked_subject("fit", (), subject.given, subject.config))
         effort = fit_effort(found.problem, found.settings)
     except ImpcError as error:
-        return str(error).replace(f"{subject.folder}/", ""), ""
+        table = error.place[0] if error.place else ""
+        page_of = {"plant": "body", "fit": "body", "signals": "signals", "recording": "signals"}
+        return str(error).replace(f"{subject.folder}/", ""), page_of.get(table, ""), ""
     minutes = max(1, round(effort.seconds / 60))
-    return "", f"about {minutes} minute{'s' * (minutes > 1)}, {effort.gigabytes:.2g} GB of memory"
+    return (
+        "",
+        "",
+        f"about {minutes} minute{'s' * (minutes > 1)}, {effort.gigabytes:.2g} GB of memory",
+    )
 
 
 def start(request: Request, _: dict[str, str]) -> Response:
@@ -97,13 +102,18 @@ def results(request: Request) -> Response:
     rows = _table(folder).to_dict("records") if subject.outs else []
     used = [_used(folder / row["folder"] / CONFIGURATION) for row in rows]
     changes = [*(_changes(*pair) for pair in pairwise(used)), ""][: len(rows)]
-    since = _changes(_used(subject.config), used[0]) if rows else ""
+    since = _since(subject, folder / rows[0]["folder"]) if rows else ""
     names = [row["folder"] for row in rows]
     asked = request.query_params.get("r", "")
     chosen = asked if asked in names else next(iter(names), "")
     return page(
         request, "results", rows=rows, changes=changes, since=since, folder=folder, chosen=chosen
     )
+
+
+def _since(subject: Subject, out: Path) -> str:
+    """What changed since the fit in a folder of results."""
+    return _changes(_used(subject.config), _used(out / CONFIGURATION))
 
 
 def _used(file: Path) -> dict[str, Any]:
@@ -132,7 +142,7 @@ def compare(request: Request) -> Response:
     found, every = _table(request.app.state.root), request.query_params.get("all") == "1"
     if not every:
         found = found.drop_duplicates(["subject", "visit", "condition"])
-    rows = [_row(row) for row in found.to_dict("records")]
+    rows = [_row(row) for row in found.sort_values("folder").to_dict("records")]
     heads = list(dict.fromkeys(head for row in rows for head in row))
     return page(request, "compare", heads=heads, rows=rows, every=every)
 
@@ -147,7 +157,7 @@ def _row(fit: dict[str, Any]) -> dict[str, Any]:
             low, high = (f"{known[f'{name}_{end}']:.3g}" for end in ("low", "high"))
             row[known[f"{name}_unit"]] = f"{value:.3g} ({low} to {high})"
         elif name.startswith(("vaf.", "limit")):
-            words = name.replace("vaf.", "VAF (%), ").replace("limit.", "limit, ")
+            words = name.replace("vaf.", "variance explained (%), ").replace("limit.", "limit, ")
             row[words] = f"{value:.4g}"
     return row | {"why no gain": known.get("reason", "") or known.get("note", "")}
 

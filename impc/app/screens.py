@@ -20,6 +20,7 @@ from impc.files.disk import LARGEST, write_whole
 from impc.files.draft import drafted
 from impc.files.formats import FORMATS
 from impc.files.table import OTHER_SHEET
+from impc.reporting.shown_units import signal_name
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -155,7 +156,7 @@ def show_body(request: Request, problem: str = "", saved: bool = False) -> Respo
     return page(
         request, "body", rows=subject.source.parameters(), given=content.get("plant", {}),
         settings=settings, problem=problem, saved=saved, unit=plant.unit(plant.controls[0]),
-        dt=plant.dt,
+        dt=plant.dt, command=signal_name(plant, plant.controls[0]),
     )  # fmt: skip
 
 

@@ -70,11 +70,8 @@ class Subject:
 
     @functools.cached_property
     def content(self) -> dict[str, Any]:
-        """The tables of `text`, validated as soon as signals are named."""
-        found = toml_content(self.text, CONFIG)
-        if found.get("signals"):
-            configuration(found, CONFIG)
-        return found
+        """The tables of `text`."""
+        return _valid(self.text)
 
     @property
     def asked(self) -> SubjectTable:
@@ -123,10 +120,11 @@ class Subject:
         return make_plant(self.source, ())
 
     def change(self, changes: Mapping[tuple[str, ...], Any]) -> None:
-        """Write answers into subject.toml; all other lines stay."""
+        """Write answers into subject.toml if they are valid; all other lines stay."""
         with _one_writer:
             before = Subject(self.folder, self.plants).text  # as it is now
             after = edited(before, changes)
+            _valid(after)
             if after != before or not self.config.exists():
                 write_whole(self.config, after.encode())
 
@@ -158,6 +156,14 @@ class Subject:
         """The command of a fit, with paths from the folder in which impc runs."""
         words = ["impc", "fit", "--config", near(self.config), "--out", near(out)]
         return words if self.given is None else [*words, "--plant", self.given]
+
+
+def _valid(text: str) -> dict[str, Any]:
+    """The tables of a TOML text, validated as soon as signals are named."""
+    found = toml_content(text, CONFIG)
+    if found.get("signals"):
+        configuration(found, CONFIG)
+    return found
 
 
 def _number(path: Path) -> int:

@@ -13,7 +13,7 @@ from starlette.routing import Route
 import impc.reporting
 from impc.app import reports, screens
 from impc.app.fits import Fits
-from impc.app.page import posted
+from impc.app.page import posted, refused
 from impc.errors import ImpcError
 
 if TYPE_CHECKING:
@@ -45,7 +45,9 @@ def application(root: Path, plants: tuple[str, ...]) -> Starlette:
     return found
 
 
-def _refused(_: Request, error: Exception) -> Response:
+def _refused(request: Request, error: Exception) -> Response:
+    if request.method == "GET" and "hx-request" not in request.headers:
+        return refused(request, str(error))
     return PlainTextResponse(f"{error}\n", 400)
 
 

@@ -50,6 +50,12 @@ class Client:
         query = f"?{urlencode(asked)}" if asked else ""
         return ask(self.host, "GET", f"{self.base}/{path}{query}", cookie=self.cookie)
 
+    def part(self, path: str, target: str, **asked: str) -> str:
+        """What a script fetches for the element `target`."""
+        query = f"?{urlencode(asked)}" if asked else ""
+        given = {"cookie": self.cookie, "hx_request": "true", "hx_target": target}
+        return ask(self.host, "GET", f"{self.base}/{path}{query}", **given).text
+
     def post(self, path: str, body: bytes | dict[str, str], **asked: str) -> Answer:
         """Send a form, or a file."""
         given = body if isinstance(body, bytes) else urlencode(body).encode()

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import base64
 import importlib.util
+import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +19,7 @@ import pandas as pd
 import pytest
 
 import impc
-from tests.app.serving import german, serving
+from tests.app.serving import ROOT, german, serving
 
 if TYPE_CHECKING:
     from playwright.sync_api import ConsoleMessage, Page
@@ -195,6 +199,21 @@ def test_practice_is_fitted_stopped_gone_on_read_and_compared(page: Page, study:
     with page.expect_download() as got:
         page.get_by_role("link", name="Export to Excel").click()
     assert got.value.suggested_filename == "subjects.xlsx"
+    words = ["fit", "--config", "practice/subject.toml", "--out", "typed"]
+    done = subprocess.run([sys.executable, "-m", "impc", *words], cwd=study, check=False,
+                          env=os.environ | {"PYTHONPATH": str(ROOT)})  # fmt: skip
+    assert done.returncode == 0
+    assert untimed(study / "practice/results/fit-1") == untimed(study / "typed")
+
+
+def untimed(folder: Path) -> Any:
+    """A result without dates, times and the command."""
+
+    def kept(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        stated = ("made", "seconds", "command", "versions")
+        return {key: value for key, value in pairs if key not in stated}
+
+    return json.loads((folder / "result.json").read_text(), object_pairs_hook=kept)
 
 
 def hostile(page: Page, report: Path) -> None:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -19,15 +14,6 @@ from impc.app.fits import Fit, Fits, State
 from impc.jit import cache_home
 from impc.reporting.writer import owned
 from tests.app.serving import ROOT, Client, serving
-
-STATED = ("made", "seconds", "command", "versions")
-
-
-def untimed(value: Any) -> Any:
-    """A result without dates, times and the command."""
-    if isinstance(value, dict):
-        return {key: untimed(one) for key, one in value.items() if key not in STATED}
-    return list(map(untimed, value)) if isinstance(value, list) else value
 
 
 def until(wanted: Callable[[], object], seconds: float = 300.0) -> None:
@@ -78,35 +64,6 @@ def test_fits_of_other_windows_come_first(home: Path) -> None:
 def practice(client: Client) -> None:
     assert client.post("practise", {}).status == 303
     assert "trial_1.csv" in client.get("recordings", f="practice").text
-
-
-@pytest.mark.full
-def test_a_stopped_fit_goes_on_and_is_that_of_the_command(tmp_path: Path) -> None:
-    folder = tmp_path / "study"
-    folder.mkdir()
-    with serving(folder) as client:
-        practice(client)
-        assert client.post("fit", {}, f="practice").status == 303
-        until(lambda: "inverse MPC</li>" in client.get("fit", f="practice").text)
-        client.post("stop", {}, f="practice")
-        until(lambda: "Stopped" in client.get("fit", f="practice").text)
-        assert not (folder / "practice/results/fit-1/result.json").exists()
-        assert "Go on" in client.get("fit", f="practice").text
-        client.post("fit", {}, f="practice")
-        until(lambda: "Read the report" in client.get("fit", f="practice").text)
-        assert "fit-1" in client.get("results", f="practice").text
-        assert "practice" in client.get("compare").text
-        assert client.get("subjects.xlsx").text.startswith("PK")
-    subprocess.run(
-        [*(sys.executable, "-m", "impc", "fit", "--config", "practice/subject.toml"),
-         *("--out", "typed")],
-        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, capture_output=True,
-    )  # fmt: skip
-    one, other = (
-        json.loads((folder / out / "result.json").read_text())
-        for out in ("practice/results/fit-1", "typed")
-    )
-    assert untimed(one) == untimed(other)
 
 
 @pytest.mark.full

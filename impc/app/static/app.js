@@ -7,11 +7,11 @@
       if (one.querySelector(".uplot")) continue;
       const data = JSON.parse(one.querySelector("script").textContent);
       const axis = { stroke: colour("--muted"), grid: { stroke: colour("--rule"), width: 1 } };
-      const size = () => ({ width: one.clientWidth || 600, height: 130 });
+      const size = () => ({ width: one.clientWidth || 600, height: 150 });
       const moved = [];
       const plot = new uPlot({
         ...size(), hooks: { draw: [() => { for (const one of moved) one(); }] }, scales: { x: { time: false } }, legend: { show: false }, cursor: { sync: { key: "all" } },
-        axes: [axis, { ...axis, size: 60, space: 22, label: one.dataset.unit, labelSize: 18 }], series: [{}, { stroke: colour("--accent"), width: 1 }],
+        axes: [{ ...axis, label: "s", labelSize: 18 }, { ...axis, size: 60, space: 16, label: one.dataset.unit, labelSize: 18 }], series: [{}, { stroke: colour("--accent"), width: 1 }],
       }, data, one);
       moved.push(...["start", "stop"].map((name) => cut(plot, data[0], name)));
       addEventListener("resize", () => plot.setSize(size()));
@@ -62,7 +62,7 @@
   const fault = (text) => { document.getElementById("fault").textContent = text; };
   document.addEventListener("htmx:afterRequest", (one) => { if (one.detail.successful) fault(""); });
   document.addEventListener("htmx:responseError", (one) => fault(`Not saved: ${one.detail.xhr.responseText}`));
-  document.addEventListener("htmx:sendError", () => fault("impc app does not answer: was its window closed? Start it again; all answers are kept."));
+  document.addEventListener("htmx:sendError", () => fault("Not saved: impc app does not answer. Was its window closed? Start it again, and repeat the last answer."));
   document.addEventListener("htmx:oobAfterSwap", () => plots(document));
   document.addEventListener("DOMContentLoaded", () => plots(document));
 })();
