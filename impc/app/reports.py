@@ -54,7 +54,7 @@ def show_fit(request: Request) -> Response:
 
 
 def _ready(subject: Subject) -> tuple[str, str, str]:
-    """What stops a fit before it begins, the page that answers it, and time and memory."""
+    """What stops a fit before it begins, the page that answers it, and the time that it takes."""
     from impc.cli.plant import asked_subject, read_subject  # noqa: PLC0415  # slow
     from impc.studies.effort import fit_effort  # noqa: PLC0415
 
@@ -66,11 +66,7 @@ def _ready(subject: Subject) -> tuple[str, str, str]:
         page_of = {"plant": "body", "fit": "body", "signals": "signals", "recording": "signals"}
         return str(error).replace(f"{subject.folder}/", ""), page_of.get(table, ""), ""
     minutes = max(1, round(effort.seconds / 60))
-    return (
-        "",
-        "",
-        f"about {minutes} minute{'s' * (minutes > 1)}, {effort.gigabytes:.2g} GB of memory",
-    )
+    return "", "", f"about {minutes} minute{'s' * (minutes > 1)}"
 
 
 def start(request: Request, _: dict[str, str]) -> Response:
@@ -143,7 +139,7 @@ def compare(request: Request) -> Response:
     if not every:
         found = found.drop_duplicates(["subject", "visit", "condition"])
     rows = [_row(row) for row in found.sort_values("folder").to_dict("records")]
-    heads = list(dict.fromkeys(head for row in rows for head in row))
+    heads = list(dict.fromkeys(head for row in rows for head in row if row[head]))
     return page(request, "compare", heads=heads, rows=rows, every=every)
 
 

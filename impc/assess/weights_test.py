@@ -4,10 +4,12 @@
 
 K is the best unrestricted gain, K(Q, R) the gain of the fitted weights, V the HAC covariance of K
 along these directions. If the true gain belongs to some weights, D is at most chi-squared with as
-many degrees of freedom as directions: it is zero where K itself has weights. A larger D rejects all
-weights, and then no statement about the intent holds. If the residuals contradict the model itself,
-noise is not the only source of gain errors: weights are then rejected only if their misfit is also
-more than 5 % larger.
+many degrees of freedom as directions: it is zero where K itself has weights. So is the likelihood
+ratio N log(misfit of the weights^2 / misfit of K^2). If both are larger, all weights are rejected,
+and then no statement about the intent holds. If only D is larger, V is too small: near a limit the
+curvature at K can be that of a crease, and intervals of K are too narrow.
+If the residuals contradict the model itself, noise is not the only source of gain errors: weights
+are then rejected only if their misfit is also more than 5 % larger.
 
 Whether weights have K itself is a linear matrix inequality. With one input and an invertible A, the
 return difference of an optimal regulator explains the result (docs/why/theory.md):
@@ -74,8 +76,9 @@ class WeightsTest:
     """Result of `weights_test`."""
 
     statistic: float  # D
+    likelihood_ratio: float  # Increase of -2 log likelihood from K to the gain of the weights
     freedom: int  # Number of identified directions of the gain
-    p_value: float  # Approximate, from chi-squared
+    p_value: float  # Approximate: chi-squared, of the smaller of the two statistics
     more: float  # Misfit of the weights over that of the gain
     contradicted: bool  # Whether the residuals contradict the model
     exist: bool  # Whether positive definite weights have the identified gain exactly
@@ -85,6 +88,21 @@ class WeightsTest:
     def rejected(self) -> bool:
         """Whether all cost weights are rejected as an explanation of the gain."""
         return self.p_value < _LEVEL and (not self.contradicted or self.more > _MORE)
+
+    @property
+    def conflicting(self) -> bool:
+        """Whether D rejects weights that explain the recordings about as well as the gain."""
+        known = not self.contradicted and not self.rejected
+        return known and _p_value(self.statistic, self.freedom) < _LEVEL
+
+    @property
+    def conflict(self) -> str:
+        """The two statistics in words."""
+        return (
+            f"Cost weights with another gain explain the recordings about as well (chi-squared "
+            f"{self.likelihood_ratio:.3g}), but by the standard errors of the gain they should be "
+            f"much worse ({self.statistic:.3g})."
+        )
 
     @property
     def sentence(self) -> str:
@@ -118,14 +136,19 @@ def weights_test(
     d = covariance.along(estimate.K - fitted.gain)[identified] / sizes
     statistic = 0.0 if exact else float(d @ np.linalg.solve(V, d))
     freedom = len(d)
-    p_value = float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
     try:
         exist = weights_margin(gain_fibre(plant, estimate.K)).exist
     except (WeightsError, SolverError):  # unstable, or numerically undecided
         exist = False
     more = 1.0 if exact else fitted.misfit / estimate.misfit
+    ratio = max(0.0, 2 * estimate.problem.recorded_numbers * float(np.log(more)))
+    p_value = _p_value(min(statistic, ratio), freedom)
     difference = return_difference(plant, estimate.K)
-    return WeightsTest(statistic, freedom, p_value, more, contradicted, exist, difference)
+    return WeightsTest(statistic, ratio, freedom, p_value, more, contradicted, exist, difference)
+
+
+def _p_value(statistic: float, freedom: int) -> float:
+    return float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
 
 
 def return_difference(plant: Plant, gain: Array) -> ReturnDifference | None:

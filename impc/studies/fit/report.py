@@ -132,8 +132,8 @@ def _hero(result: FitResult, index: int) -> Picture:
     return Picture(
         "movement",
         f"Recorded and modelled outputs, and the command within its limit, in {name}",
-        f"Part of {name[:1].lower()}{name[1:]}. Grey: recorded; blue: model{limit}. In the whole "
-        f"trial they differ by {said} (RMS, {signal_name(plant, plant.outputs[0])}).",
+        f"Part of {name.replace('Trial ', 'trial ')}. Grey: recorded; blue: model{limit}. In the "
+        f"whole trial they differ by {said} (RMS, {signal_name(plant, plant.outputs[0])}).",
     )
 
 

@@ -199,6 +199,7 @@ _WORDS: dict[str, Callable[[FitResult], object]] = {
     ),
     "offset": outside_offset,
     "weights": lambda it: it.weights_test.sentence,
+    "conflict": lambda it: it.weights_test.conflict,
     "structure": lambda it: it.structures[0].structure.name if it.structures else "",
     "used": lambda it: len(it.trials),
     "count": lambda it: len(it.trials) + len(it.falls),
@@ -388,6 +389,22 @@ _KINDS: tuple[Kind[FitResult], ...] = (
             "person.",
         ),
         frozenset([WEIGHTS]),
+    ),
+    Kind(
+        Level.AMBER,
+        lambda it: it.weights_test.conflicting,
+        "The model explains the movement, but its gain is less certain than its interval.",
+        "Another gain explains the recordings about as well. You may report the explained "
+        "variance, but no single gain.",
+        "The interval of the gain is too narrow",
+        "{conflict}",
+        "The model is not contradicted, but the recordings leave a wider range of gains than the "
+        "interval. This happens in short trials with much time at the limit.",
+        (
+            "Record longer trials, or more of them, and fit all together.",
+            "Compare groups by measures of movement, or by all people together (impc cohort).",
+        ),
+        _NO_GAIN,
     ),
     Kind(
         Level.AMBER,
