@@ -21,6 +21,8 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 #: control.StateSpace, or an object with its attributes.
 System = Any
+#: casadi.SX, MX or DM, a list of them, or numbers.
+Expression = Any
 #: Array of any element type, as compiled code takes it.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 

@@ -132,7 +132,7 @@ class Controller(Value):
             x0: ArrayLike,
             steps: int | None = None,
             disturbance: ArrayLike | None = None,
-            target: Mapping[str, Any] | None = None,
+            target: Mapping[str, ArrayLike] | None = None,
         ) -> Simulation: ...
 
     @checked(horizon=(1, LONGEST_HORIZON))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def simulate_from(
     x0: ArrayLike,
     steps: int | None = None,
     disturbance: ArrayLike | None = None,
-    target: Mapping[str, Any] | None = None,
+    target: Mapping[str, ArrayLike] | None = None,
 ) -> Simulation:
     """Simulate the plant under this controller.
 

@@ -58,7 +58,7 @@ def read_body(function: Any, order: Sequence[int], n: int) -> Body:
     """Convert a function (state, input) -> next state to a `Body`."""
     import casadi as ca  # noqa: PLC0415  # takes 0.3 s; most plants have no body
 
-    if not isinstance(function, ca.Function):
+    if not issubclass(type(function), ca.Function):
         kind = type(function).__name__
         raise PlantError(
             "plant.body", f"expected a casadi.Function, got {kind}", "see docs/howto/nonlinear.md"

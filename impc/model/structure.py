@@ -104,8 +104,8 @@ class Structure(Value):
     def __init__(
         self,
         plant: Plant,
-        Q: Any = "diagonal",
-        R: Any = "diagonal",
+        Q: str | Sequence[str] = "diagonal",
+        R: str | Sequence[str] = "diagonal",
         *,
         over: Sequence[str] | None = None,
         name: str | None = None,
@@ -143,6 +143,7 @@ class Structure(Value):
         each = (k, self._split - k, rest, self.count - self._split - rest)
         return np.repeat([True, False, True, False], each)
 
+    @checked(z="~count")
     def weights(self, z: Array) -> Weights:
         """Return the weights at the unknowns z (count,); -inf is a cost weight of zero.
 
@@ -152,18 +153,18 @@ class Structure(Value):
             If a cost weight overflows.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            states, inputs = self._factors(np.asarray(z, dtype=np.float64))
+            states, inputs = self._factors(z)
             Q, R = states.T @ states, inputs.T @ inputs
         if not (np.all(np.isfinite(Q)) and np.all(np.isfinite(R))):
             raise WeightsError("Q, R", "a cost weight overflows", "start from other unknowns")
         return Weights(Q, R)
 
+    @checked(z="~count")
     def changes(self, z: Array) -> tuple[Array, Array]:
         """Derivatives of Q (count, n, n) and R (count, m, m) with respect to z (count,).
 
         For a cost weight of zero, with respect to the cost weight itself.
         """
-        z = np.asarray(z, dtype=np.float64)
         own, beside = z[: self._split], np.concatenate([[0.0], z[self._split :]])
         dQ = _changes(self.features, own, coupled=self.coupled)
         dR = _changes(self.input_features, beside, coupled=self.input_coupled)[1:]
@@ -173,13 +174,13 @@ class Structure(Value):
             np.concatenate([np.zeros((len(dQ), m, m)), dR]),
         )
 
+    @checked(z="~count")
     def reported(self, z: Array) -> tuple[Array, Array]:
         """Unknowns as reported (count,), and their Jacobian (count, count) by `z` (count,).
 
         These are logarithms of the cost weights W_ii and, if coupled, for each pair the correlation
         W_ij / sqrt(W_ii W_jj), between -1 and 1.
         """
-        z = np.asarray(z, dtype=np.float64)
         beside = np.concatenate([[0.0], z[self._split :]])
         first, along = _identified(len(self.labels), z[: self._split], coupled=self.coupled)
         rest, slope = _identified(len(self.input_labels), beside, coupled=self.input_coupled)

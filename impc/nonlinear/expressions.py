@@ -46,8 +46,8 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca
 def symbols_of(subject: str, given: Any) -> list[Any]:
     """Symbols of SX or MX; vectors of SX are split, so that each entry has its name."""
     found: list[Any] = []
-    for item in given if isinstance(given, list | tuple) else [given]:
-        if not isinstance(item, ca.SX | ca.MX) or not item.is_valid_input():
+    for item in given if type(given) in (list, tuple) else [given]:
+        if not issubclass(type(item), ca.SX | ca.MX) or not item.is_valid_input():
             raise InputError(
                 subject, f"got {type(item).__name__}, not symbols", "make them with casadi's sym"
             )
@@ -90,7 +90,7 @@ def function_of(
     try:
         vector = ca.densify(kind(expression))
         raw = ca.Function(name, flat, [vector], {"allow_free": True})
-    except (NotImplementedError, TypeError, RuntimeError):
+    except (NotImplementedError, SystemError, TypeError, RuntimeError):
         raise InputError(
             name, f"got {type(expression).__name__}", f"give an expression of {kind.__name__}"
         ) from None
