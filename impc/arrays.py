@@ -89,6 +89,8 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
     Accepts lists, tuples, arrays, and series and frames of pandas; rejects text, complex numbers
     and dates, some of which numpy would convert. `values` any shape; returns same shape.
     """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
     if isinstance(values, np.ma.MaskedArray):
         if values.dtype.kind not in "biuf":
             raise _not_numbers(name, f"an array of {values.dtype}")

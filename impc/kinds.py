@@ -12,18 +12,16 @@ import functools
 import math
 import numbers
 import os
-from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from impc.arrays import as_numbers
 from impc.errors import ImpcError, InputError, PlantError, brief
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    Kind = Callable[[str, Any], Any]
+Kind = Callable[[str, Any], Any]
 
 # Limit for counts (samples, evaluations): no array of the package has more entries.
 _LARGEST_COUNT = 2**31 - 1
@@ -63,15 +61,17 @@ def described(value: object) -> str:
 
 
 def _array_of(dtype: type, remedy: str) -> Kind:
-    """Array of this type; whole numbers may be given as others."""
+    """Array of truth values or whole numbers, which may be given as floats."""
 
     def check(name: str, value: Any) -> Any:
-        if type(value) is np.ndarray and value.dtype == dtype:
-            return value
-        found = as_numbers(name, value)
-        if dtype is np.bool_ or np.any(found != found.astype(dtype)):
-            raise _refused(name, value, remedy)
-        return found.astype(dtype)
+        found = np.asarray(value)
+        if found.dtype == dtype:
+            return found
+        if dtype is np.int64 and found.dtype.kind in "iuf" and np.all(np.abs(found) < 2**53):
+            whole = found.astype(np.int64)
+            if np.all(whole == found):
+                return whole
+        raise _refused(name, value, remedy)
 
     return check
 
@@ -100,13 +100,16 @@ def _text(name: str, value: Any) -> str:
     return str.__str__(value)
 
 
-def _function(name: str, value: Any) -> Any:
-    if not callable(value):
-        raise _refused(name, value, "give a function")
-    return value
+def _only(fits: Callable[[Any], bool], remedy: str) -> Kind:
+    def check(name: str, value: Any) -> Any:
+        if not fits(value):
+            raise _refused(name, value, remedy)
+        return value
+
+    return check
 
 
-def _path(name: str, value: Any) -> str:
+def _path(name: str, value: Any) -> str | Path:
     """A possible file name; whether the file exists is checked where it is opened."""
     if not isinstance(value, (str, os.PathLike)):
         raise _refused(name, value, "give a path, as text or a Path")
@@ -117,14 +120,7 @@ def _path(name: str, value: Any) -> str:
         raise InputError(name, f"got {brief(ascii(text))}", "give a name that is text") from None
     if zero:
         raise InputError(name, f"has a zero byte: {brief(ascii(text))}", "remove it")
-    return text
-
-
-def _own_page(name: str, value: Any) -> Any:
-    """An estimate of an optional subpackage, which makes its own report."""
-    if not hasattr(type(value), "page"):
-        raise _refused(name, value, "call fit_optimal_control")
-    return value
+    return text if isinstance(value, str) else Path(text)
 
 
 def _system(name: str, value: Any) -> Any:
@@ -144,12 +140,12 @@ def _expression(name: str, value: Any) -> Any:
 
 _NAMED: dict[str, Kind] = {
     "Any": lambda _, value: value,
-    "Array": _array_of(np.float64, ""),
+    "Array": as_numbers,
     "ArrayLike": as_numbers,
     "BoolArray": _array_of(np.bool_, "give an array of True and False"),
     "Expression": _expression,
     "IntArray": _array_of(np.int64, "give whole numbers"),
-    "OwnPage": _own_page,
+    "OwnPage": _only(lambda value: hasattr(type(value), "page"), "call fit_optimal_control"),
     "Path": _path,
     "System": _system,
     "bool": _scalar(bool, bool, "give True or False"),
@@ -174,7 +170,7 @@ def _parsed(node: ast.expr) -> Kind:
         case ast.Subscript(value=ast.Name(id=outer), slice=inner):
             inside = inner.elts if isinstance(inner, ast.Tuple) else [inner]
             if outer == "Callable":
-                return _function
+                return _only(callable, "give a function")
             if outer == "Mapping":
                 return _mapping(_parsed(inside[0]), _parsed(inside[1]))
             if outer == "Sequence" or ast.unparse(inside[-1]) == "...":

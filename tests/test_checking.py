@@ -21,15 +21,18 @@ from impc.arrays import Frozen, as_numbers
 from impc.checking import checked, replace
 from impc.control.controller import Controller
 from impc.control.simulation import scenario
+from impc.control.terminal_set import maximal_invariant_set
 from impc.errors import BoundsError, DataError, ImpcError, InputError, PlantError, WeightsError
 from impc.files.formats import read_table
 from impc.files.reading import read_recordings
 from impc.files.saved_estimates import load
 from impc.files.table import make_table
+from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
+from impc.model.targets import steady_state
 from impc.model.weights import Weights
 from tests.wrong_arguments import calls, values, wrong_values
 
@@ -117,6 +120,11 @@ def test_what_means_the_same_is_welcome() -> None:
     )
     np.testing.assert_array_equal(one.K, other.K)
     assert type(other.horizon) is int
+    lists = impc.vaf([[1.0], [np.nan], [2]], [[1.0], [5.0], [2.0]])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(lists, [100.0])
+    make: Any = len
+    family = impc.PlantFamily(make, ["a", "b"], [1, 2])
+    assert family.part([True, False], [0, 0]).names == ("a",)  # type: ignore[arg-type]
     huge = as_numbers("whole", [2**70, 3])
     np.testing.assert_array_equal(huge, [2.0**70, 3.0])
 
@@ -212,7 +220,17 @@ WRONG: list[tuple[Callable[[], object], type[ImpcError], str]] = [
     (law(PLANT, PAIR, BOX, 5001), InputError, "horizon: got 5001; give a whole number"),
     (law(PLANT, PAIR, BOX, 2**63), InputError, "horizon: is beyond 2147483647"),
     (law(softening=-1), InputError, "^softening: got -1"),
-    (law(solver="gurobi"), InputError, "^solver: got 'gurobi'; choose one of"),
+    *[(law(solver=name), InputError, f"^solver: got '{name}'; choose one of")
+      for name in ("gurobi", "", "DAQ", "OSQP")],
+    (made(Problem, PLANT, BOX, 4, [Recording(PLANT, np.ones((3, 2)))], solver="gurobi"),
+     InputError, "^solver: got 'gurobi'; choose one of"),
+    (made(maximal_invariant_set, PLANT, [[1, 0]], BOX, tolerance=-1.0), InputError, "^tolerance"),
+    (made(maximal_invariant_set, PLANT, [[1, 0]], BOX, max_steps=0), InputError, "^max_steps"),
+    (made(maximal_invariant_set, PLANT, [[1], [0]], BOX), DataError, "^gain: expected shape"),
+    (made(scenario, PLANT, [1, 3]), DataError, "^steps: is missing, without a disturbance"),
+    (made(scenario, PLANT, [1, np.nan], 5), DataError, "^x0: 1 of 2 entries are NaN"),
+    (made(steady_state, PLANT, disturbance=[0.1]), DataError,
+     r"^disturbance: expected shape \(0\)"),
     (made(Controller.from_gain, PLANT, [[0, 0]], BOX, 3), InputError, "^gain: does not stabilise"),
     (made(Controller.from_gain, PLANT, [1, 1], BOX, 3), DataError, "^gain: expected shape"),
     (made(Weights, [[1, 2], [3]], 1), InputError, "Q: expected real numbers, got list"),

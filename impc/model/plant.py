@@ -22,8 +22,7 @@ import scipy
 from impc.arrays import Array, System, as_numbers, finite_array, frozen
 from impc.checking import Value, asked, checked, replace
 from impc.errors import PlantError, brief
-from impc.model.body import Body, read_body
-from impc.model.drawing import lines_at
+from impc.model.body import Body, lines_at, read_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

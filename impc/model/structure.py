@@ -18,7 +18,7 @@ import scipy
 
 from impc.arrays import Array, frozen
 from impc.checking import Value, checked
-from impc.errors import InputError, WeightsError, brief
+from impc.errors import InputError, WeightsError
 from impc.model.combinations import linear_combination
 from impc.model.weights import Weights
 
@@ -202,7 +202,10 @@ class Structure(Value):
 
 
 def _features(
-    plant: Plant, which: str, given: Any, over: Sequence[str] | None
+    plant: Plant,
+    which: str,
+    given: str | Sequence[str],
+    over: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], Array]:
     if isinstance(given, str) and given not in _WORDS:
         words = ", ".join(f'"{word}"' for word in _WORDS)
@@ -214,7 +217,7 @@ def _features(
     if isinstance(given, str):
         chosen = tuple(plant.states if over is None else over)
     elif over is None:
-        chosen = _texts(which, given)
+        chosen = tuple(given)
     else:
         raise InputError("over", "needs diagonal or full", "leave it out with a list of features")
     if not chosen:
@@ -222,10 +225,10 @@ def _features(
     return chosen, np.array([linear_combination(text, plant.states) for text in chosen])
 
 
-def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
+def _inputs(plant: Plant, given: str | Sequence[str]) -> tuple[tuple[str, ...], Array]:
     if isinstance(given, str) and given not in _WORDS[:2]:
         raise InputError("R", f"got {given!r}", 'give "diagonal", "full" or a list of features')
-    chosen = tuple(plant.controls) if isinstance(given, str) else _texts("R", given)
+    chosen = tuple(plant.controls) if isinstance(given, str) else tuple(given)
     rows = [linear_combination(text, plant.controls) for text in chosen]
     features = np.array(rows).reshape(-1, plant.m)
     if np.linalg.matrix_rank(features) < plant.m:
@@ -235,13 +238,9 @@ def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
     return chosen, features
 
 
-def _texts(which: str, given: Any) -> tuple[str, ...]:
-    if not isinstance(given, (list, tuple)) or not all(isinstance(item, str) for item in given):
-        raise InputError(which, f"got {brief(repr(given))}", "give a list of features by name")
-    return tuple(given)
-
-
-def _default_name(Q: Any, over: Sequence[str] | None, labels: tuple[str, ...]) -> str:
+def _default_name(
+    Q: str | Sequence[str], over: Sequence[str] | None, labels: tuple[str, ...]
+) -> str:
     if not isinstance(Q, str):
         return ", ".join(labels)
     return Q if over is None else f"{Q} over {', '.join(labels)}"

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import casadi as ca
 import numpy as np
 
+from impc.checking import asked
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -68,13 +69,15 @@ def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
     """Stack the expressions of `given`; name each row."""
     parts: list[Any] = []
     names: list[str] = []
-    for name, expression in given.items():
+    for name, each in given.items():
+        expression = ca.vertcat(*each) if isinstance(each, list) else each
         symbolic = isinstance(expression, ca.SX | ca.MX)
         items: list[Any] = expression.elements() if isinstance(expression, ca.SX) else [expression]
         if symbolic and any(item.is_op(kind) for item in items for kind in _COMPARISONS):
             remedy = "write the expression that must be <= 0: u - 1 for u <= 1"
             raise InputError(f"constraint {name}", "is a comparison", remedy)
-        parts.append(ca.vec(expression) if symbolic else ca.DM(expression))
+        subject = f"constraint {name}"
+        parts.append(ca.vec(expression) if symbolic else asked(subject, ca.DM, expression))
         names += _entries(name, parts[-1].numel())
     return (ca.vertcat(*parts) if parts else ca.DM.zeros(0, 1)), tuple(names)
 

@@ -317,7 +317,10 @@ class OptimalControlProblem(Frozen):
         x0: ArrayLike | None = None,
         unknown_start: bool | None = None,
     ) -> OptimalRecording:
-        """Make a recording of a closed loop: x (steps + 1, n), u (steps, m), as `recorded_plan`."""
+        """Make a recording of a closed loop: x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,).
+
+        All arguments are as in `recorded_plan`.
+        """
         return optimal_recording(self, x, u, d, x0, unknown_start, closed_loop=True)
 
 
