@@ -21,6 +21,8 @@ IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 #: control.StateSpace, or an object with its attributes.
 System = Any
+#: casadi.SX, MX or DM, a list of them, or numbers.
+Expression = Any
 #: Array of any element type, as compiled code takes it.
 Buffer = np.ndarray[Any, np.dtype[Any]]
 
@@ -87,6 +89,8 @@ def as_numbers(name: str, values: ArrayLike) -> Array:
     Accepts lists, tuples, arrays, and series and frames of pandas; rejects text, complex numbers
     and dates, some of which numpy would convert. `values` any shape; returns same shape.
     """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
     if isinstance(values, np.ma.MaskedArray):
         if values.dtype.kind not in "biuf":
             raise _not_numbers(name, f"an array of {values.dtype}")

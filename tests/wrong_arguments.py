@@ -36,7 +36,14 @@ def values() -> dict[str, Any]:
         [[1.1, 0.4], [0.0, 0.8]], [[0.2, 0.1, 0.3], [1, 0.5, 0]], np.eye(2), 0, True
     )
     two = impc.Plant(system, ["u[0]", "u[1]"])
-    x, u, w = (ca.SX.sym(name) for name in "xuw")
+    x, u, w, d = (ca.SX.sym(name) for name in "xuwd")
+    point: dict[str, Any] = {
+        "states": x, "inputs": u, "parameters": {"price": w}, "next_state": x + u,
+        "stage_cost": w * x**2 + u**2, "horizon": 2, "terminal_cost": 0,
+        "constraints": {"u": u - 9}, "terminal_constraints": {"x": x - 9},
+        "disturbances": None, "signed": ["price"],
+        "units": {"price": "1"}, "dt": 0.1,
+    }  # fmt: skip
     box = impc.Bounds(two, u_min=-1, u_max=1)
     pair = impc.Weights(np.diag([2.0, 1.0]), np.diag([1.0, 3.0]))
     law = impc.Controller(two, pair, box, 4)
@@ -48,12 +55,15 @@ def values() -> dict[str, Any]:
     fibre = impc.gain_fibre(two, solution.K)
     return {
         "system": system, "plant": two, "bounds": box, "weights": pair, "controller": law,
-        "scenario": drive, "simulation": run, "recording": trial, "problem": problem,
+        "scenario": drive,
+        "open": impc.Controller(two, pair, box, 4, terminal_set=False),
+        "simulation": run, "recording": trial, "problem": problem,
         "solution": solution, "fibre": fibre, "set": weights_set(fibre), "terminal": law.terminal,
-        "point": impc.OptimalControlProblem(
-            x, u, {"price": w}, x + u, w * x**2 + u**2, 2
+        "point": impc.OptimalControlProblem(**point), "point arguments": point,
+        "wide point": impc.OptimalControlProblem(
+            x, u, {"price": w, "goal": d}, x + u, w * (x - d) ** 2 + u**2, 2
         ),
-        "family": impc.PlantFamily(lambda _: two, ["mass"], [1.0]),
+        "estimate": impc.fit(problem), "family": impc.PlantFamily(lambda _: two, ["mass"], [1.0]),
     }  # fmt: skip
 
 
@@ -82,8 +92,43 @@ def wrong_values() -> dict[str, Any]:
         "frame of words": pd.DataFrame({"x": ["a", "b"], "y": ["c", "d"]}),
         "series with NA": pd.Series([1, None], dtype="Int64"), "sparse": scipy.sparse.eye_array(2),
         "dictionary": {"x": 1.0}, "set": {1.0, 2.0}, "generator": (item for item in (1.0, 2.0)),
-        "function": len, "type": float, "object": object(),
+        "function": len, "type": float, "object": object(), "folder": Path(_FOLDER.name),
+        "empty": {}, "many": ["x"] * 1000, "tuple": (np.eye(2), np.ones(2)), "two words": "a b",
+        "infinite numbers": np.full((2, 2), np.inf), "one": [1.0], "large number": 1e300,
+        "names": ["x[0]", "x[1]"], "name": "x[0]", "to number": {"x[0]": 1.0},
+        "to cube": {"x[0]": np.ones((2, 2, 2))}, "to text": {"x[0]": "rad"},
+        "to object": {"x[0]": object()}, "by number": {1: 1.0},
+        "to raising": {"x[0]": raising("__float__", "__array__")},
+        "raising items": [raising("__float__", "__array__", "__str__", "__index__")],
+        **{f"raises in {'-'.join(names)}": raising(*names) for names in _CONVERSIONS},
+        "raising text": raising("__str__", "__len__", "__hash__", base=str)("x[0]"),
+        "raising array": raising("__array__", "__len__", base=np.ndarray)((2, 2)),
+        "raising number": raising("__float__", "__index__", "__int__", base=float)(1.0),
+        "raising list": raising("__iter__", "__len__", "__getitem__", base=list)([1.0, 2.0]),
+        "raising dictionary": raising("__iter__", "items", "keys", base=dict)({"x[0]": 1.0}),
+        "raising tuple": raising("__iter__", "__len__", base=tuple)((1.0, 2.0)),
     }  # fmt: skip
+
+
+#: Python's ways to ask an object for a value; each set of them is one object that raises in all.
+_CONVERSIONS = (
+    ("__array__",), ("__float__",), ("__index__",), ("__fspath__",), ("__len__", "__iter__"),
+    ("__iter__",), ("__getitem__", "keys"), ("__bool__",), ("__str__", "__repr__"), ("__eq__",),
+    ("__hash__",), ("__getattr__",), ("__class__",), ("shape",), ("dtype", "ndim"), ("A", "B"),
+    ("__array__", "__float__", "__len__", "__iter__", "__fspath__", "__str__", "__repr__"),
+)  # fmt: skip
+
+
+def raising(*names: str, base: type = object) -> Any:
+    """An object (with another `base` its class) that raises in each of these methods."""
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("this object has no value\nof any kind")
+
+    fixed = ("shape", "dtype", "ndim", "A", "B", "__class__")
+    made = {name: property(fail) if name in fixed else fail for name in names}
+    found: Any = type("Raising", (base,), made)
+    return found() if base is object else found
 
 
 def changed(value: Any) -> Call:
@@ -105,14 +150,127 @@ def _of_files() -> list[Call]:
     one = impc.Plant(control.ss([[0.9]], [[1]], [[1]], 0, 1, outputs=["y"]))
     lab.write_text('[recording]\ntime = "t"\n[signals.y]\ncolumn = "y"\nunit = "1"\n')
     settings = impc.read_configuration(lab)
-    table = {"source": "s", "columns": columns, "units": {"y": "m"}, "skipped": {"z": "is text"}}
+    table = {
+        "source": "s",
+        "columns": columns,
+        "units": {"y": "m"},
+        "skipped": {"z": "is text"},
+        "rate": 10.0,
+        "notes": ("none",),
+    }
     return [
         (impc.make_table, table),
-        (impc.read_table, {"path": trial, "largest": 10**6}),
+        (impc.read_table, {"path": trial, "largest": 10**6, "sheet": ""}),
         (impc.write_table, {"path": folder / "again.csv", "table": made}),
         (impc.read_configuration, {"path": lab}),
         (impc.read_recordings, {"paths": [trial], "configuration": settings, "plant": one}),
     ]
+
+
+def _of_methods() -> list[Call]:
+    """Methods of public classes, and functions of estimates."""
+    v = values()
+    law, two, box, trial = v["controller"], v["plant"], v["bounds"], v["recording"]
+    shape, person = impc.Structure(two), impc.Observer(two, ["x[0]"], sensory=0.1)
+    family, point, found = v["family"], v["point"], v["estimate"]
+    start = {"theta": {"price": 1.0}, "x0": [1.0], "mu": 1e-9}
+    push, size = np.zeros((30, 1)), np.ones(2)
+    commanded = impc.Recording(two, trial.outputs, trial.disturbance, commands=v["simulation"].u)
+    continuous = impc.Plant(
+        control.c2d(control.ss([[0, 1], [0, 0]], [[0], [1]], np.eye(2), 0), 0.1)
+    )
+    return [
+        (impc.Controller.from_continuous_gain, {
+            "plant": continuous, "gain": [[4, 3]], "bounds": impc.Bounds(continuous), "horizon": 5,
+            "metric": [[1]], "terminal_set": True, "softening": None, "solver": "compiled",
+        }),
+        (v["open"].simulate, {
+            "x0": size, "steps": 30, "disturbance": push, "target": {"y[0]": 0.1},
+        }),
+        (two.unit, {"name": "x[0]"}), (two.word, {"name": "x[0]"}),
+        (two.direction, {"name": "x[0]"}), (two.drawing, {"states": np.ones((3, 2))}),
+        (shape.weights, {"z": np.zeros(3)}), (shape.changes, {"z": np.zeros(3)}),
+        (shape.reported, {"z": np.zeros(3)}),
+        (person.with_levels, {"levels": person.levels}), (person.names, {"plant": two}),
+        (family.values, {"logarithms": np.zeros(1)}),
+        (family.part, {"chosen": np.array([True]), "logarithms": np.zeros(1)}),
+        (family.wider, {
+            "names": ["more"], "nominal": [1.0], "deviations": [0.1], "change": lambda one, _: one,
+        }),
+        (family.with_delay, {"deviation": 0.1, "dt": 0.1}),
+        (family.with_limits, {"plant": two, "bounds": box}), (family.limits, {"plant": two}),
+        (family.bounds_at, {"plant": two, "bounds": box, "logarithms": np.zeros(1)}),
+        (v["problem"].leaving_out, {"trial": 0}),
+        (v["problem"].at, {
+            "starts": v["problem"].starts, "logarithms": np.zeros(0), "errors": v["problem"].errors,
+        }),
+        (v["terminal"].contains, {"x": size}),
+        (v["terminal"].project, {"first": 0, "second": 1}),
+        (impc.ImpcError("a", "b", "c").at, {"file": "a"}),
+        (point.with_horizon, {"horizon": 3}), (point.values, {"theta": {"price": 1.0}}),
+        (v["wide point"].with_known, {"known": {"price": 1.0}}),
+        (point.closed_loop, {**start, "steps": 2, "d": np.zeros((2, 0)), "solver": "ipopt"}),
+        (point.recorded_plan, {
+            "x": np.ones((3, 1)), "u": np.ones((2, 1)), "d": np.zeros((2, 0)), "x0": [1.0],
+            "unknown_start": True,
+        }),
+        (point.recorded_loop, {
+            "x": np.ones((3, 1)), "u": np.ones((2, 1)), "d": np.zeros((2, 0)), "x0": [1.0],
+            "unknown_start": False,
+        }),
+        (impc.OptimalControlProblem, v["point arguments"]),
+        (found.simulate, {"x0": size, "steps": 30, "disturbance": push}),
+        (found.plot, {"trial": 0, "axes": None}),
+        (found.save, {"path": Path(_FOLDER.name, "found.json")}),
+        (impc.load, {"path": _saved(), "plant": two, "family": None}),
+        (impc.command_regression, {"estimate": impc.fit(impc.Problem(two, box, 4, [commanded]))}),
+        (impc.report, {"estimate": found, "folder": Path(_FOLDER.name, "page"), "settings": None}),
+        (impc.FitSettings, vars(impc.FitSettings())),
+        (impc.fit_problem, {
+            "plant": two, "recordings": [trial], "family": None,
+            "settings": impc.FitSettings(horizon=3, u_max=1.0, settle=0.0),
+        }),
+        (impc.fit_output_feedback, {
+            "found": found, "observer": person, "recorder": size, "spread": 1.0,
+            "max_evaluations": 1, "held": ["motor"], "counted": 0,
+        }),
+        (impc.mpc_function, {"controller": law}),
+        (impc.closed_loop_function, {
+            "controller": law, "steps": 3, "disturbance": np.zeros((3, 1)), "of": "gain",
+        }),
+        (impc.simulate_and_differentiate, {
+            "controller": law, "given": v["scenario"], "along": impc.directions(law, 2),
+        }),
+        (impc.with_rates, {"plant": two}), (impc.replace, {"value": box, "u_max": size}),
+        (impc.PlantFamily, {
+            "make": lambda _: two, "names": ["mass"], "nominal": [1.0],
+            "uncertainty": {"mass": "5 %"}, "slopes": lambda _: {},
+        }),
+        (impc.Plant, {
+            "system": v["system"], "controls": None, "units": {"x[0]": "m"},
+            "words": {"x[0]": "place"}, "body": None,
+        }),
+        (impc.steady_state, {
+            "plant": two, "target": {"y[0]": 1.0}, "disturbance": [0.1], "bounds": box,
+        }),
+        (impc.Recording, {
+            "plant": two, "outputs": trial.outputs, "finer": trial.disturbance,
+            "timing": {"y[0]": 0.01},
+        }),
+        (impc.Problem, {
+            "plant": two, "bounds": box, "horizon": 4, "recordings": [trial],
+            "signal_errors": {"offset": ["y[0]"]}, "structure": shape, "feedback_states": ["x[0]"],
+            "solver": "compiled", "terminal_weight": np.eye(2),
+        }),
+        (impc.Structure, {"plant": two, "Q": ["x[0]", "x[1]"], "R": "diagonal"}),
+        (impc.Structure, {"plant": two, "Q": "full", "over": ["x[0]", "x[1]"]}),
+    ]  # fmt: skip
+
+
+@cache
+def _saved() -> Path:
+    found: Path = values()["estimate"].save(Path(_FOLDER.name, "saved.json"))
+    return found
 
 
 def calls() -> list[Call]:
@@ -122,6 +280,7 @@ def calls() -> list[Call]:
     two, box, pair, trial = v["plant"], v["bounds"], v["weights"], v["recording"]
     problem, about = {"problem": v["problem"]}, {"plant": two, "gain": K}
     made = {"bounds": box, "horizon": 4, "terminal_set": True, "softening": 1e6}
+    solved = {**made, "solver": "compiled"}
     own = {**made, "terminal_set": v["terminal"], "terminal_weight": states}
     demonstrated = v["point"].recorded_plan(np.ones((3, 1)), np.ones((2, 1)))
     return [
@@ -142,9 +301,9 @@ def calls() -> list[Call]:
         (impc.maximal_invariant_set, {
             **about, "bounds": box, "tolerance": 1e-9, "max_steps": 500, "near": v["terminal"],
         }),
-        (impc.Controller, {"plant": two, "weights": pair, **made}),
+        (impc.Controller, {"plant": two, "weights": pair, **solved}),
         (impc.Controller, {"plant": two, "weights": pair, **own}),
-        (impc.Controller.from_gain, {**about, **made, "metric": S, "near": v["terminal"]}),
+        (impc.Controller.from_gain, {**about, **solved, "metric": S, "near": v["terminal"]}),
         (impc.scenario, {"plant": two, "x0": size, "steps": 30, "disturbance": np.zeros(30)}),
         (impc.scenario, {"plant": two, "x0": size, "steps": 30, "target": {"y[0]": 1.0}}),
         (impc.steady_state, {"plant": two, "target": {"y[0]": 1.0}, "bounds": box}),
@@ -157,11 +316,11 @@ def calls() -> list[Call]:
             "unknown_start": False, "family": v["family"], "command_scale": size, "offsets": [],
         }),
         (impc.gain_fibre, {**about, "metric": S}),
-        (impc.least_condition_weights, {"fibre": v["fibre"]}),
+        (impc.least_condition_weights, {"fibre": v["fibre"], "member": pair}),
         (impc.other_weights, {"fibre": v["fibre"], "count": 2, "condition_ratio": 10.0}),
         (impc.inverse_lqr_lmi, about),
         (impc.inverse_lqr_gradient, {**about, "start": pair, "max_evaluations": 3}),
-        (impc.table_3_1, {**problem, "absolute": False}),
+        (impc.table_3_1, {**problem, "absolute": False, "progress": str}),
         (impc.fit, {**problem, "method": "inverse_mpc", "start": pair}),
         (impc.identifiability, {**problem, "weights": pair}),
         (impc.vaf, {"recorded": trial.outputs, "simulated": trial.outputs}),
@@ -174,8 +333,9 @@ def calls() -> list[Call]:
         (v["point"].plan, {"theta": {"price": 1.0}, "x0": [1.0], "solver": "ipopt", "mu": 1e-9}),
         (impc.fit_optimal_control, {
             "problem": v["point"], "recordings": [demonstrated], "start": {"price": 1.0},
-            "evaluations": 3, "starts": 1,
+            "evaluations": 3, "starts": 1, "solver": "ipopt",
         }),
         (impc.Label, {"subject": "a", "visit": "b", "condition": "c", "trial": "d"}),
-        *map(changed, (two, box, trial, v["controller"], v["problem"])),
+        *_of_methods(),
+        *map(changed, (two, box, trial, v["controller"], v["problem"], v["terminal"])),
     ]  # fmt: skip

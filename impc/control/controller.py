@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from impc.arrays import Array, finite_array, frozen, symmetric_matrix
+from impc.arrays import Array, frozen, symmetric_matrix
 from impc.attached_methods import attach
 from impc.checking import Value, checked
 from impc.control.named_solver import COMPILED, require_solver
@@ -132,7 +132,7 @@ class Controller(Value):
             x0: ArrayLike,
             steps: int | None = None,
             disturbance: ArrayLike | None = None,
-            target: Mapping[str, Any] | None = None,
+            target: Mapping[str, ArrayLike] | None = None,
         ) -> Simulation: ...
 
     @checked(horizon=(1, LONGEST_HORIZON))
@@ -226,7 +226,7 @@ class Controller(Value):
             solver is unknown.
         """
         plant.require_discrete()
-        K = finite_array("gain", gain, (plant.m, plant.n))
+        K = np.asarray(gain)
         if terminal_set is True and not stabilises(plant, K):
             raise InputError(
                 "gain", "does not stabilise the plant", "give one with |eig(A - BK)| < 1"
@@ -297,7 +297,7 @@ class Controller(Value):
         >>> law.K.round(3)
         array([[3.454, 2.759]])
         """
-        held = held_gain(plant, finite_array("gain", gain, (plant.m, plant.n)))
+        held = held_gain(plant, np.asarray(gain))
         return cls.from_gain(plant, held, bounds, horizon, **settings)
 
     @property

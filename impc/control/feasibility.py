@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def simulate_from(
     x0: ArrayLike,
     steps: int | None = None,
     disturbance: ArrayLike | None = None,
-    target: Mapping[str, Any] | None = None,
+    target: Mapping[str, ArrayLike] | None = None,
 ) -> Simulation:
     """Simulate the plant under this controller.
 
@@ -68,32 +68,29 @@ def simulate_from(
     if run.complete:
         return run
     end = run.reached
-    status = Status(int(run.status[end]))
-    said = status.sentence
-    if status is Status.INFEASIBLE:
-        bound, remedy = excluded_bound(controller, run)
-        said = f"no input sequence keeps {bound} ({remedy})"
-    warnings.warn(f"sample {end}: {said}; later samples are NaN", stacklevel=3)
+    said, remedy = _failure(controller, run)
+    hint = f" ({remedy})" if run.status[end] == Status.INFEASIBLE else ""
+    warnings.warn(f"sample {end}: {said}{hint}; later samples are NaN", stacklevel=3)
     x, u = np.array(run.x), np.array(run.u)
     x[end + 1 :], u[end:] = np.nan, np.nan
     return replace(run, x=x, u=u)
 
 
-def excluded_bound(controller: Controller, simulation: Simulation) -> tuple[str, str]:
-    """Bound that made a simulation infeasible, and the remedy, as text."""
+def _failure(controller: Controller, run: Simulation) -> tuple[str, str]:
+    """What ended a simulation, and the remedy."""
+    status = Status(int(run.status[run.reached]))
+    if status is not Status.INFEASIBLE:
+        return status.sentence, "check the plant, the gain and the bounds"
+    bound = "the bounds"
     remedy = "start nearer to the origin, lengthen the horizon, or soften the state bounds"
-    row = simulation.failed_row
-    if row < 0:
-        return "the bounds", remedy
-    rows = build_rows(controller)
-    name = families(controller).names[rows.family[row]]
-    stage = int(rows.stage[row])
-    if stage < controller.horizon:
-        return f"the bound {name} at sample {stage} of the horizon", remedy
-    return (
-        f"the bound {name} in the terminal set, at sample {stage} of the horizon",
-        f"{remedy}, or set terminal_set=False",
-    )
+    if run.failed_row >= 0:
+        rows = build_rows(controller)
+        stage = int(rows.stage[run.failed_row])
+        where = f"at sample {stage} of the horizon"
+        if stage >= controller.horizon:
+            where, remedy = f"in the terminal set, {where}", f"{remedy}, or set terminal_set=False"
+        bound = f"the bound {families(controller).names[rows.family[run.failed_row]]} {where}"
+    return f"no input sequence keeps {bound}", remedy
 
 
 @checked
@@ -138,12 +135,7 @@ def require_complete(controller: Controller, simulation: Simulation) -> Simulati
     """
     if simulation.complete:
         return simulation
-    sample = simulation.reached
-    status = Status(int(simulation.status[sample]))
-    if status is Status.INFEASIBLE:
-        bound, remedy = excluded_bound(controller, simulation)
-        where = "x0" if sample == 0 else f"sample {sample}"
-        raise InfeasibleError(where, f"no input sequence keeps {bound}", remedy)
-    raise SolverError(
-        f"sample {sample}", status.sentence, "check the plant, the gain and the bounds"
-    )
+    sample, failure = simulation.reached, _failure(controller, simulation)
+    if simulation.status[sample] == Status.INFEASIBLE:
+        raise InfeasibleError("x0" if sample == 0 else f"sample {sample}", *failure)
+    raise SolverError(f"sample {sample}", *failure)

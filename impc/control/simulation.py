@@ -209,7 +209,7 @@ def scenario(
     x0: ArrayLike,
     steps: int | None = None,
     disturbance: ArrayLike | None = None,
-    target: Mapping[str, Any] | None = None,
+    target: Mapping[str, ArrayLike] | None = None,
 ) -> Scenario:
     """Return a checked scenario for a simulation.
 

@@ -20,7 +20,7 @@ E. G. Gilbert, K. T. Tan, Linear systems with state and control constraints, IEE
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -93,6 +93,8 @@ class TerminalSet(Value):
     (True, False, (4, 2))
     """
 
+    _rules: ClassVar[Mapping[str, Any]] = {"H": "r n", "h": "r", "gain": "m n", "F": "n n"}
+
     H: Array
     h: Array
     family: IntArray
@@ -105,10 +107,10 @@ class TerminalSet(Value):
     bases: Mapping[int, IntArray] = field(repr=False, compare=False)
     own: bool = False
 
+    @checked(x="n")
     def contains(self, x: ArrayLike) -> bool:
         """Whether the state `x` (n,) is in the set, within its tolerance of each bound."""
-        state = finite_array("x", x, (self.H.shape[1],))
-        return bool(np.all(self.H @ state <= self.h * (1 + self.tolerance)))
+        return bool(np.all(self.H @ np.asarray(x) <= self.h * (1 + self.tolerance)))
 
     def vertices(self) -> Array:
         """Return the corners (v, n) in the units of the states; for two counter-clockwise.
@@ -123,6 +125,7 @@ class TerminalSet(Value):
             raise InputError("terminal set", f"has {n} states", f"corners: {_MOST_STATES} at most")
         return corners(self.H / self.h[:, None])
 
+    @checked(first=0, second=0)
     def project(self, first: int, second: int) -> Array:
         """Return the corners (v, 2) of the projection on two states, counter-clockwise.
 
@@ -136,6 +139,9 @@ class TerminalSet(Value):
         InputError
             As in `vertices`.
         """
+        n = self.H.shape[1]
+        if first == second or max(first, second) >= n:
+            raise InputError("first, second", f"got {first}, {second}", f"give two below {n}")
         return hull(self.vertices()[:, [first, second]])
 
     def to_pytope(self) -> Any:

@@ -44,6 +44,7 @@ _PLAIN: dict[Any, Any] = {"bool": bool, "int": int, "str": str}
 _SAME = 1e-9
 
 
+@checked
 def save_estimate(estimate: Estimate, path: str | Path) -> Path:
     """Save the estimate and its problem as JSON; read the file with `impc.load`."""
     place = Path(path)

@@ -6,7 +6,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from impc.arrays import Frozen, frozen
+import numpy as np
+
+from impc.arrays import Frozen, frozen, with_shape
 from impc.checking import checked
 from impc.errors import DataError
 from impc.files.alignment import aligned, own_clocks
@@ -86,7 +88,9 @@ def make_table(
     >>> table.samples, dict(table.units)
     (2, {'tilt': 'deg'})
     """
-    vectors: dict[str, Any] = {_line(name): value for name, value in columns.items()}
+    vectors: dict[str, Any] = {
+        _line(name): with_shape(name, np.asarray(value), (None,)) for name, value in columns.items()
+    }
     if len(vectors) < len(columns):
         raise DataError(source, "has two columns of one name", "give each its own name")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}

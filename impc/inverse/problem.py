@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
-from impc.arrays import Array, BoolArray, finite_array, frozen
+from impc.arrays import Array, BoolArray, finite_array, frozen, with_shape
 from impc.checking import Value, checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import LONGEST_HORIZON, Controller
@@ -266,10 +266,14 @@ class Problem(Value):
         kept = tuple(pair for pair, stated in pairs if not stated)
         return replace(self, recordings=tuple(trials), signal_errors=kept)
 
+    @checked(trial=0)
     def leaving_out(self, trial: int) -> Problem:
         """Copy without one trial, counted from 0."""
+        if trial >= len(self.recordings):
+            raise InputError("trial", f"got {trial}", f"give one below {len(self.recordings)}")
         return replace(self, recordings=self.recordings[:trial] + self.recordings[trial + 1 :])
 
+    @checked(starts="recordings n", logarithms="logarithms", errors="recordings * *")
     def at(self, starts: Array, logarithms: Array, errors: Array | None = None) -> Problem:
         """Return a copy at other initial states, parameters and errors of signals.
 
@@ -282,7 +286,7 @@ class Problem(Value):
         errors : ndarray of shape (trials, kinds, p + d), optional
             Errors of the signals; unchanged by default.
         """
-        moved = self.errors if errors is None else errors
+        moved = self.errors if errors is None else with_shape("errors", errors, self.errors.shape)
         recordings = tuple(
             replace(trial, x0=frozen(x0), errors=frozen(error))
             for trial, x0, error in zip(self.recordings, starts, moved, strict=True)

@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from impc.arrays import Array, IntArray, frozen
+from impc.arrays import Array, IntArray, finite_array, frozen
 from impc.checking import Value, replace
-from impc.errors import PlantError
+from impc.errors import PlantError, one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
+_MOST = 200  # points of a drawing
 #: Names of the operations in CasADi, without ``OP_``; code refers to them by index.
 OPERATIONS = (
     *("OUTPUT", "MUL", "ADD", "SUB", "DIV", "NEG", "SQ", "TWICE", "SIN", "COS", "TAN", "SQRT"),
@@ -58,7 +60,7 @@ def read_body(function: Any, order: Sequence[int], n: int) -> Body:
     """Convert a function (state, input) -> next state to a `Body`."""
     import casadi as ca  # noqa: PLC0415  # takes 0.3 s; most plants have no body
 
-    if not isinstance(function, ca.Function):
+    if not issubclass(type(function), ca.Function):
         kind = type(function).__name__
         raise PlantError(
             "plant.body", f"expected a casadi.Function, got {kind}", "see docs/howto/nonlinear.md"
@@ -122,3 +124,19 @@ def _names() -> dict[int, str]:
     found = {getattr(ca, f"OP_{name}"): name for name in (*OPERATIONS, "CONST", "INPUT")}
     others = {getattr(ca, name): name[3:] for name in dir(ca) if name.startswith("OP_")}
     return {**others, **found}
+
+
+def lines_at(draw: Callable[[Array], Any], states: Array) -> tuple[Array, ...]:
+    """Lines (samples, points, 2) of a user's function at `states` (samples, n), checked."""
+    try:
+        each = [
+            [finite_array("a line", one, (None, 2)) for one in islice(draw(state), _MOST + 1)]
+            for state in states
+        ]
+        lines = tuple(map(np.stack, zip(*each, strict=True)))
+        if not 0 < sum(line.shape[1] for line in lines) <= _MOST:
+            raise ValueError(f"it needs 1 to {_MOST} points")
+    except Exception as error:  # the function may raise anything
+        remedy = "return lines (points, 2), the same points in every state"
+        raise PlantError("plant.drawing", f"fails: {one_line(error)}", remedy) from None
+    return lines

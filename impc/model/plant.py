@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import scipy
 
-from impc.arrays import Array, System, finite_array, frozen
-from impc.checking import Value, checked, replace
+from impc.arrays import Array, System, as_numbers, finite_array, frozen
+from impc.checking import Value, asked, checked, replace
 from impc.errors import PlantError, brief
-from impc.model.body import Body, read_body
-from impc.model.drawing import lines_at
+from impc.model.body import Body, lines_at, read_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -129,8 +128,8 @@ class Plant(Value):
         self,
         system: System,
         controls: Sequence[str] | None = None,
-        units: Mapping[str, Any] | None = None,
-        words: Mapping[str, Any] | None = None,
+        units: Mapping[str, str] | None = None,
+        words: Mapping[str, str] | None = None,
         body: Any = None,
     ) -> None:
         if isinstance(system, Plant):
@@ -143,13 +142,13 @@ class Plant(Value):
         if unknown or not chosen:
             raise PlantError(
                 "controls",
-                f"{unknown or 'none given'}: the inputs are {list(names)}",
+                f"{brief(unknown or 'none given')}: the inputs are {list(names)}",
                 "name at least one of them",
             )
         rest = tuple(name for name in names if name not in chosen)
         moves = getattr(system, "body", None) if body is None else body
         if callable(moves) and not hasattr(moves, "n_in"):  # factory of the body
-            moves = moves()
+            moves = asked("plant.body", moves)
         order = [names.index(name) for name in (*chosen, *rest)]
         self._fill(
             A=matrices["A"],
@@ -197,18 +196,22 @@ class Plant(Value):
         """Return the plant without its nonlinear body."""
         return replace(self, body=None)
 
+    @checked
     def unit(self, name: str) -> str:
         """Unit of signal `name`; "SI" if unknown."""
         return dict(self.units).get(name, UNKNOWN)
 
+    @checked
     def word(self, name: str) -> str:
         """Description of signal `name`; empty if the plant has none."""
         return dict(self.words).get(name, "")
 
+    @checked
     def direction(self, name: str) -> str:
         """What is positive in signal `name`, in words; empty if the plant has none."""
         return dict(self.directions).get(name, "")
 
+    @checked(states="* n")
     def drawing(self, states: Array) -> tuple[Array, ...]:
         """Lines (samples, points, 2) in m of the body at `states` (samples, n); y is up.
 
@@ -262,7 +265,7 @@ def _matrices(system: Any) -> dict[str, Array]:
         raise PlantError(
             "plant", f"expected a control.StateSpace, got {kind}", "pass control.ss(A, B, C, D, dt)"
         )
-    matrices = {name: frozen(getattr(system, name)) for name in "ABCD"}
+    matrices = {name: frozen(as_numbers(f"plant.{name}", getattr(system, name))) for name in "ABCD"}
     for name, matrix in matrices.items():
         if not np.all(np.isfinite(matrix)):
             raise PlantError(f"plant.{name}", "has NaN or infinite entries", "correct the model")

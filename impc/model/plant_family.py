@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -111,7 +111,7 @@ class PlantFamily(Value):
         make: Callable[[Array], Plant],
         names: Sequence[str],
         nominal: Sequence[float],
-        uncertainty: Mapping[str, Any] | None = None,
+        uncertainty: Mapping[str, float | str] | None = None,
         slopes: Callable[[Array], Mapping[str, Sequence[Array]]] = lambda _: {},
     ) -> None:
         if len(names) != len(nominal):
@@ -159,6 +159,7 @@ class PlantFamily(Value):
         """Scale (k,) of each search coordinate in units of the logarithm."""
         return np.where(self.stated, self.deviations, _FREE)
 
+    @checked(logarithms="names")
     def values(self, logarithms: Array) -> Array:
         """Parameter values (k,) at the logarithms (k,) of their ratios to the nominal ones."""
         begins = self.make(self.nominal).dt if DELAY in self.names else 0.0
@@ -169,6 +170,7 @@ class PlantFamily(Value):
         """Return the same family without nonlinear bodies."""
         return replace(self, make=lambda values: self.make(values).linear())
 
+    @checked(chosen="names", logarithms="names")
     def part(self, chosen: BoolArray, logarithms: Array) -> PlantFamily:
         """Family of the `chosen` parameters (k,) only; the others fixed at `logarithms` (k,)."""
         whole, made, known = self.nominal * np.exp(logarithms), self.make, self.slopes
@@ -187,6 +189,7 @@ class PlantFamily(Value):
             deviations=frozen(self.deviations[chosen]),
         )
 
+    @checked
     def wider(
         self,
         names: Sequence[str],
@@ -210,6 +213,7 @@ class PlantFamily(Value):
             deviations=frozen([*self.deviations, *deviations]),
         )
 
+    @checked(deviation=0, dt=1e-12)
     def with_delay(self, deviation: float, dt: float) -> PlantFamily:
         """Extend by a delay of the commands with a prior of `deviation` samples of `dt` s."""
         if deviation > _LONGEST:
@@ -223,6 +227,7 @@ class PlantFamily(Value):
             lambda plant, late: with_late_commands(plant, late[0] / dt - 1),
         )
 
+    @checked
     def with_limits(self, plant: Plant, bounds: Bounds) -> PlantFamily:
         """Extend by the limits of the controls as parameters, if they are uncertain."""
         bounded = np.flatnonzero(np.isfinite(bounds.u_max))
@@ -235,11 +240,13 @@ class PlantFamily(Value):
         limits, known = np.array(bounds.u_max)[bounded], [self.limit_deviation] * len(bounded)
         return replace(self.wider(names, limits.tolist(), known), limit_deviation=0.0)
 
+    @checked
     def limits(self, plant: Plant) -> list[tuple[int, int]]:
         """Pairs (index of the parameter, index of the control) of the limits."""
         named = {f"{LIMIT}.{control}": place for place, control in enumerate(plant.controls)}
         return [(k, named[name]) for k, name in enumerate(self.names) if name in named]
 
+    @checked(logarithms="names")
     def bounds_at(self, plant: Plant, bounds: Bounds, logarithms: Array) -> Bounds:
         """Bounds with the limits at these `logarithms` (k,)."""
         found = self.limits(plant)

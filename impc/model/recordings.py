@@ -154,7 +154,7 @@ class Recording(Value):
         disturbance: ArrayLike | None = None,
         x0: ArrayLike | None = None,
         *,
-        target: Mapping[str, Any] | None = None,
+        target: Mapping[str, ArrayLike] | None = None,
         commands: ArrayLike | None = None,
         offset: ArrayLike | None = None,
         finer: ArrayLike | None = None,

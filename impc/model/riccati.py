@@ -22,7 +22,7 @@ import scipy
 
 from impc.arrays import Array, Frozen, frozen, symmetric_matrix
 from impc.checking import checked
-from impc.errors import InputError, WeightsError
+from impc.errors import WeightsError
 from impc.model.weights import require_semidefinite
 
 if TYPE_CHECKING:
@@ -98,7 +98,6 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     >>> found.K.round(4)
     array([[ 1.4938, -0.8811]])
     """
-    _require_sizes(plant, weights)
     solver = (
         scipy.linalg.solve_discrete_are if plant.discrete else scipy.linalg.solve_continuous_are
     )
@@ -119,15 +118,6 @@ def solve_lqr(plant: Plant, weights: Weights) -> LqrSolution:
     return LqrSolution(plant, weights, frozen(P), frozen(K), frozen(S), frozen(F))
 
 
-def _require_sizes(plant: Plant, weights: Weights) -> None:
-    if weights.Q.shape != (plant.n, plant.n) or weights.R.shape != (plant.m, plant.m):
-        raise InputError(
-            "Q, R",
-            f"have shapes {weights.Q.shape} and {weights.R.shape}",
-            f"the plant needs {(plant.n, plant.n)} and {(plant.m, plant.m)}",
-        )
-
-
 def terminal_matrix(plant: Plant, given: ArrayLike) -> Array:
     """Terminal weight P (n, n) from user input: a matrix, or 0 for none."""
     none = np.ndim(given) == 0 and np.all(np.asarray(given) == 0)
@@ -140,7 +130,6 @@ def solve_finite_horizon(
     plant: Plant, weights: Weights, terminal: Array, horizon: int
 ) -> FiniteHorizonLqr:
     """Backward Riccati recursion from a `terminal` weight (n, n) at stage N."""
-    _require_sizes(plant, weights)
     A, B, P, K, S = plant.A, plant.B, [terminal], [], []
     for _ in range(horizon):
         S.append(weights.R + B.T @ P[-1] @ B)

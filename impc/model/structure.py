@@ -18,7 +18,7 @@ import scipy
 
 from impc.arrays import Array, frozen
 from impc.checking import Value, checked
-from impc.errors import InputError, WeightsError, brief
+from impc.errors import InputError, WeightsError
 from impc.model.combinations import linear_combination
 from impc.model.weights import Weights
 
@@ -104,8 +104,8 @@ class Structure(Value):
     def __init__(
         self,
         plant: Plant,
-        Q: Any = "diagonal",
-        R: Any = "diagonal",
+        Q: str | Sequence[str] = "diagonal",
+        R: str | Sequence[str] = "diagonal",
         *,
         over: Sequence[str] | None = None,
         name: str | None = None,
@@ -143,6 +143,7 @@ class Structure(Value):
         each = (k, self._split - k, rest, self.count - self._split - rest)
         return np.repeat([True, False, True, False], each)
 
+    @checked(z="~count")
     def weights(self, z: Array) -> Weights:
         """Return the weights at the unknowns z (count,); -inf is a cost weight of zero.
 
@@ -152,18 +153,18 @@ class Structure(Value):
             If a cost weight overflows.
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            states, inputs = self._factors(np.asarray(z, dtype=np.float64))
+            states, inputs = self._factors(z)
             Q, R = states.T @ states, inputs.T @ inputs
         if not (np.all(np.isfinite(Q)) and np.all(np.isfinite(R))):
             raise WeightsError("Q, R", "a cost weight overflows", "start from other unknowns")
         return Weights(Q, R)
 
+    @checked(z="~count")
     def changes(self, z: Array) -> tuple[Array, Array]:
         """Derivatives of Q (count, n, n) and R (count, m, m) with respect to z (count,).
 
         For a cost weight of zero, with respect to the cost weight itself.
         """
-        z = np.asarray(z, dtype=np.float64)
         own, beside = z[: self._split], np.concatenate([[0.0], z[self._split :]])
         dQ = _changes(self.features, own, coupled=self.coupled)
         dR = _changes(self.input_features, beside, coupled=self.input_coupled)[1:]
@@ -173,13 +174,13 @@ class Structure(Value):
             np.concatenate([np.zeros((len(dQ), m, m)), dR]),
         )
 
+    @checked(z="~count")
     def reported(self, z: Array) -> tuple[Array, Array]:
         """Unknowns as reported (count,), and their Jacobian (count, count) by `z` (count,).
 
         These are logarithms of the cost weights W_ii and, if coupled, for each pair the correlation
         W_ij / sqrt(W_ii W_jj), between -1 and 1.
         """
-        z = np.asarray(z, dtype=np.float64)
         beside = np.concatenate([[0.0], z[self._split :]])
         first, along = _identified(len(self.labels), z[: self._split], coupled=self.coupled)
         rest, slope = _identified(len(self.input_labels), beside, coupled=self.input_coupled)
@@ -201,7 +202,10 @@ class Structure(Value):
 
 
 def _features(
-    plant: Plant, which: str, given: Any, over: Sequence[str] | None
+    plant: Plant,
+    which: str,
+    given: str | Sequence[str],
+    over: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], Array]:
     if isinstance(given, str) and given not in _WORDS:
         words = ", ".join(f'"{word}"' for word in _WORDS)
@@ -213,7 +217,7 @@ def _features(
     if isinstance(given, str):
         chosen = tuple(plant.states if over is None else over)
     elif over is None:
-        chosen = _texts(which, given)
+        chosen = tuple(given)
     else:
         raise InputError("over", "needs diagonal or full", "leave it out with a list of features")
     if not chosen:
@@ -221,10 +225,10 @@ def _features(
     return chosen, np.array([linear_combination(text, plant.states) for text in chosen])
 
 
-def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
+def _inputs(plant: Plant, given: str | Sequence[str]) -> tuple[tuple[str, ...], Array]:
     if isinstance(given, str) and given not in _WORDS[:2]:
         raise InputError("R", f"got {given!r}", 'give "diagonal", "full" or a list of features')
-    chosen = tuple(plant.controls) if isinstance(given, str) else _texts("R", given)
+    chosen = tuple(plant.controls) if isinstance(given, str) else tuple(given)
     rows = [linear_combination(text, plant.controls) for text in chosen]
     features = np.array(rows).reshape(-1, plant.m)
     if np.linalg.matrix_rank(features) < plant.m:
@@ -234,13 +238,9 @@ def _inputs(plant: Plant, given: Any) -> tuple[tuple[str, ...], Array]:
     return chosen, features
 
 
-def _texts(which: str, given: Any) -> tuple[str, ...]:
-    if not isinstance(given, (list, tuple)) or not all(isinstance(item, str) for item in given):
-        raise InputError(which, f"got {brief(repr(given))}", "give a list of features by name")
-    return tuple(given)
-
-
-def _default_name(Q: Any, over: Sequence[str] | None, labels: tuple[str, ...]) -> str:
+def _default_name(
+    Q: str | Sequence[str], over: Sequence[str] | None, labels: tuple[str, ...]
+) -> str:
     if not isinstance(Q, str):
         return ", ".join(labels)
     return Q if over is None else f"{Q} over {', '.join(labels)}"

@@ -13,7 +13,7 @@ active bounds z_s solves one linear system, whose derivative is that of the targ
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -46,7 +46,7 @@ class PlantChange:
     bounds: Array  # (c, p), right sides
 
 
-@checked
+@checked(disturbance="d")
 def steady_state(
     plant: Plant,
     target: Mapping[str, float] | None = None,
@@ -92,14 +92,14 @@ def steady_state(
     values, names = reference(plant, target, 1)
     push = np.zeros((1, plant.E.shape[1]))
     if disturbance is not None:
-        push = push + as_numbers("disturbance", disturbance).reshape(1, -1)
+        push += np.asarray(disturbance)
     found = SteadyStates(plant, signal_rows(plant, names), bounds or Bounds(plant))
     z, _ = found.at(values, push)
     return z[0, : plant.n], z[0, plant.n :]
 
 
 def reference(
-    plant: Plant, target: Mapping[str, Any] | None, samples: int
+    plant: Plant, target: Mapping[str, ArrayLike] | None, samples: int
 ) -> tuple[Array, tuple[str, ...]]:
     """Targets as columns (samples, q), and their names; a number holds for all samples."""
     names = tuple(target or {})

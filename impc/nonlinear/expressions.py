@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import casadi as ca
 import numpy as np
 
+from impc.checking import asked
 from impc.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,8 +47,8 @@ _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca
 def symbols_of(subject: str, given: Any) -> list[Any]:
     """Symbols of SX or MX; vectors of SX are split, so that each entry has its name."""
     found: list[Any] = []
-    for item in given if isinstance(given, list | tuple) else [given]:
-        if not isinstance(item, ca.SX | ca.MX) or not item.is_valid_input():
+    for item in given if type(given) in (list, tuple) else [given]:
+        if not issubclass(type(item), ca.SX | ca.MX) or not item.is_valid_input():
             raise InputError(
                 subject, f"got {type(item).__name__}, not symbols", "make them with casadi's sym"
             )
@@ -68,13 +69,15 @@ def stacked(given: Mapping[str, Any]) -> tuple[Any, tuple[str, ...]]:
     """Stack the expressions of `given`; name each row."""
     parts: list[Any] = []
     names: list[str] = []
-    for name, expression in given.items():
+    for name, each in given.items():
+        expression = ca.vertcat(*each) if isinstance(each, list) else each
         symbolic = isinstance(expression, ca.SX | ca.MX)
         items: list[Any] = expression.elements() if isinstance(expression, ca.SX) else [expression]
         if symbolic and any(item.is_op(kind) for item in items for kind in _COMPARISONS):
             remedy = "write the expression that must be <= 0: u - 1 for u <= 1"
             raise InputError(f"constraint {name}", "is a comparison", remedy)
-        parts.append(ca.vec(expression) if symbolic else ca.DM(expression))
+        subject = f"constraint {name}"
+        parts.append(ca.vec(expression) if symbolic else asked(subject, ca.DM, expression))
         names += _entries(name, parts[-1].numel())
     return (ca.vertcat(*parts) if parts else ca.DM.zeros(0, 1)), tuple(names)
 
@@ -90,7 +93,7 @@ def function_of(
     try:
         vector = ca.densify(kind(expression))
         raw = ca.Function(name, flat, [vector], {"allow_free": True})
-    except (NotImplementedError, TypeError, RuntimeError):
+    except (NotImplementedError, SystemError, TypeError, RuntimeError):
         raise InputError(
             name, f"got {type(expression).__name__}", f"give an expression of {kind.__name__}"
         ) from None

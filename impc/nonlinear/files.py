@@ -199,8 +199,9 @@ def read_recording(
     x, u, d = (np.array([columns.get(name, nothing) for name in group]).reshape(-1, len(nothing)).T
                for group in groups)  # fmt: skip
     make = problem.recorded_plan if settings.recorded == "plan" else problem.recorded_loop
-    start = {"x0": first_state(problem, x[0], settings), "unknown_start": settings.unknown_start}
-    return make(x, u[:-1], d=d[:-1], **start), findings
+    start = first_state(problem, x[0], settings)
+    made = make(x, u[:-1], d=d[:-1], x0=start, unknown_start=settings.unknown_start)
+    return made, findings
 
 
 def first_state(

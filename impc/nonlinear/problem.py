@@ -10,14 +10,13 @@ A row of h that no input affects is dropped at k = 0 (docs/howto/nonlinear.md).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
-from impc.arrays import Array, BoolArray, Frozen, finite_array
-from impc.checking import checked
+from impc.arrays import Array, BoolArray, Expression, Frozen, finite_array
+from impc.checking import asked, checked
 from impc.errors import InputError
 from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
 from impc.nonlinear.expressions import (
@@ -32,6 +31,8 @@ from impc.nonlinear.recordings import OptimalRecording, optimal_recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from numpy.typing import ArrayLike
 
 _LONGEST = 10_000  # stages; the size of the program is proportional
 
@@ -136,8 +137,8 @@ class OptimalControlProblem(Frozen):
         horizon: int,
         *,
         terminal_cost: Any = 0,
-        constraints: Mapping[str, Any] | None = None,
-        terminal_constraints: Mapping[str, Any] | None = None,
+        constraints: Mapping[str, Expression] | None = None,
+        terminal_constraints: Mapping[str, Expression] | None = None,
         disturbances: Any = None,
         signed: Sequence[str] = (),
         units: Mapping[str, str] | None = None,
@@ -145,7 +146,7 @@ class OptimalControlProblem(Frozen):
     ) -> None:
         if dt is not None and not 0 < dt < np.inf:
             raise InputError("dt", f"got {dt}", "give a sample time above 0, s")
-        if hasattr(next_state, "updfcn"):
+        if asked("next_state", hasattr, next_state, "updfcn"):
             raise InputError("next_state", "is a system of python-control", "call its function"
                              " with the symbols: docs/howto/nonlinear.md")  # fmt: skip
         x, u = symbols_of("states", states), symbols_of("inputs", inputs)
@@ -246,13 +247,11 @@ class OptimalControlProblem(Frozen):
                 raise InputError(f"parameter {name}", "has no value", "give one for each name")
         return np.array([found[name] for name in self.parameter_names])
 
-    def _value(self, name: str, value: object) -> float:
+    def _value(self, name: str, number: float) -> float:
         if name not in self.parameter_names:
             known = f"known: {', '.join(self.parameter_names)}"
             raise InputError(f"parameter {name}", "is not known", known)
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise InputError(f"parameter {name}", f"got {value!r:.40}", "give a number")
-        positive, number = self.positive[self.parameter_names.index(name)], float(value)
+        positive = self.positive[self.parameter_names.index(name)]
         if not np.isfinite(number) or (positive and number <= 0):
             wanted = "a positive one, or name it in signed" if positive else "a finite one"
             raise InputError(f"parameter {name}", f"got {number:g}", f"give {wanted}")
@@ -260,7 +259,7 @@ class OptimalControlProblem(Frozen):
 
     @checked
     def plan(
-        self, theta: Mapping[str, float], x0: Any, *, solver: str = "ipopt", mu: float = 1e-10
+        self, theta: Mapping[str, float], x0: ArrayLike, *, solver: str = "ipopt", mu: float = 1e-10
     ) -> Plan:
         """Return the optimal plan from a state x0 (n,), at values theta by name.
 
@@ -274,10 +273,10 @@ class OptimalControlProblem(Frozen):
     def closed_loop(
         self,
         theta: Mapping[str, float],
-        x0: Any,
+        x0: ArrayLike,
         steps: int,
         *,
-        d: Any = None,
+        d: ArrayLike | None = None,
         solver: str = "ipopt",
         mu: float = 1e-10,
     ) -> ClosedLoop:
@@ -291,17 +290,38 @@ class OptimalControlProblem(Frozen):
         first = self.plan(theta, x0, solver=solver, mu=mu)
         return closed_loop_from(first, first.theta, first.x[0], known, mu)
 
-    def recorded_plan(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
+    @checked
+    def recorded_plan(
+        self,
+        x: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        d: ArrayLike | None = None,
+        x0: ArrayLike | None = None,
+        unknown_start: bool | None = None,
+    ) -> OptimalRecording:
         """Make a recording of one plan: x (N + 1, n), u (N, m); NaN marks missing values.
 
         Further arguments: d (N, d), x0 (n,) and `unknown_start`, whether x0 is estimated; by
         default it is if x0 is not given.
         """
-        return optimal_recording(self, x, u, closed_loop=False, **more)
+        return optimal_recording(self, x, u, d, x0, unknown_start, closed_loop=False)
 
-    def recorded_loop(self, x: Any, u: Any = None, **more: Any) -> OptimalRecording:
-        """Make a recording of a closed loop: x (steps + 1, n), u (steps, m), as `recorded_plan`."""
-        return optimal_recording(self, x, u, closed_loop=True, **more)
+    @checked
+    def recorded_loop(
+        self,
+        x: ArrayLike,
+        u: ArrayLike | None = None,
+        *,
+        d: ArrayLike | None = None,
+        x0: ArrayLike | None = None,
+        unknown_start: bool | None = None,
+    ) -> OptimalRecording:
+        """Make a recording of a closed loop: x (steps + 1, n), u (steps, m), d (steps, d), x0 (n,).
+
+        All arguments are as in `recorded_plan`.
+        """
+        return optimal_recording(self, x, u, d, x0, unknown_start, closed_loop=True)
 
 
 def _fixed(values: Any) -> BoolArray:

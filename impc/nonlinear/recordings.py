@@ -30,12 +30,12 @@ class OptimalRecording(Frozen):
 def optimal_recording(
     problem: Stages,
     x: Any,
-    u: Any = None,
+    u: Any,
+    d: Any,
+    x0: Any,
+    unknown_start: bool | None,
     *,
     closed_loop: bool,
-    d: Any = None,
-    x0: Any = None,
-    unknown_start: bool | None = None,
 ) -> OptimalRecording:
     """Make a checked recording.
 

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from impc.arrays import Array, as_numbers, finite_array, frozen
-from impc.checking import Value, add_value, checked, replace
+from impc.checking import Value, checked, replace
 from impc.errors import InputError, SolverError
 from impc.model.combinations import linear_combination
 from impc.model.riccati import is_stable, lyapunov_series
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from impc.model.plant import Plant
-
-add_value("Observer", "Observer(plant, ...)")
 
 #: Kinds of noise SDs, in the order of the unknowns.
 LEVELS = ("motor", "share", "process", "sensory", "walk")
@@ -184,12 +182,14 @@ class Observer(Value):
         both = zip(LEVELS, self.by_kind, strict=True)
         return [kind for kind, values in both for _ in values]
 
+    @checked(levels="levels")
     def with_levels(self, levels: Array) -> Observer:
         """Return the same model with other noise SDs, `levels` (l,)."""
         parts = np.split(levels, np.cumsum([len(values) for values in self.by_kind])[:-1])
         found = {name: frozen(part) for name, part in zip(LEVELS, parts, strict=True)}
         return replace(self, **{**found, "walk": None if self.walk is None else found["walk"]})
 
+    @checked
     def names(self, plant: Plant) -> tuple[str, ...]:
         """Names of the noise SDs: kind and signal."""
         signals = (plant.controls, plant.controls, plant.states, self.sensed, plant.disturbances)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import escape
 
+from impc.checking import asked, checked
 from impc.errors import InputError
 from impc.inverse.methods import METHODS
 from impc.model.plant import gain_unit
@@ -110,6 +111,7 @@ def gain_table(plant: Plant, gain: Array) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["input", "state", "unit", "value"])
 
 
+@checked(trial=0)
 def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any, Any]:
     """Plot outputs and inputs of a trial (counted from 0); returns matplotlib axes.
 
@@ -119,15 +121,15 @@ def plot(estimate: Estimate, trial: int = 0, axes: Any = None) -> np.ndarray[Any
     import matplotlib.pyplot as plt  # noqa: PLC0415  # a second
 
     problem, plant = estimate.problem, estimate.problem.plant
-    if not isinstance(trial, int) or not 0 <= trial < len(problem.recordings):
+    if trial >= len(problem.recordings):
         last = len(problem.recordings) - 1
-        raise InputError("trial", f"got {trial!r:.40}", f"pass an integer from 0 to {last}")
+        raise InputError("trial", f"got {trial}", f"pass an integer from 0 to {last}")
     run, recorded = estimate.simulations[trial], problem.recordings[trial].corrected
     count = len(plant.outputs) + plant.m
     if axes is None:
         _, axes = plt.subplots(count, sharex=True, layout="constrained")
-    shown = np.ravel(np.asarray(axes, dtype=object))
-    if len(shown) != count:
+    shown: np.ndarray[Any, Any] = asked("axes", lambda: np.ravel(np.asarray(axes, dtype=object)))
+    if len(shown) != count or not all(hasattr(type(axis), "plot") for axis in shown):
         raise InputError("axes", f"got {len(shown)}", f"pass {count}: outputs, then inputs")
     for k, name in enumerate(plant.outputs):
         factor, _ = shown_unit(plant, name)

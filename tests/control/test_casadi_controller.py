@@ -84,6 +84,9 @@ def test_an_infeasible_start_names_the_bound_and_the_step(
     assert run.reached == 0
     with pytest.raises(InfeasibleError, match=r"^x0: no input sequence keeps the bound u\[0\]"):
         require_complete(controller, run)
+    run = simulate(controller, scenario(example_plant, [90, 3], 5))
+    with pytest.raises(InfeasibleError, match=r"u\[0\] <= 1 in the terminal set, at sample 3"):
+        require_complete(controller, run)
     boxed = Bounds(example_plant, x_max=1)
     outside = Controller(example_plant, Weights(np.eye(2), 1), boxed, 3)
     run = simulate(outside, scenario(example_plant, [3, 1], 20))

@@ -25,11 +25,9 @@ from impc.control.named_solver import (
 )
 from impc.control.simulation import Status, scenario
 from impc.errors import InputError
-from impc.inverse.problem import Problem
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
-from impc.model.recordings import Recording
 from impc.model.weights import Weights
 from tests.control.test_closed_loop import entries, problem, unit_directions
 from tests.support import saturated_problem
@@ -123,21 +121,6 @@ def test_a_wrong_answer_is_not_believed(
     with pytest.warns(UserWarning, match="cannot be determined"):
         run = controller.simulate([1, 3], steps=3)
     assert run.status[0] == Status.UNSOLVED
-
-
-@pytest.mark.parametrize("name", ["gurobi", "", "DAQ", "OSQP"])
-def test_an_unknown_solver_is_one_line(name: str, example_plant: Plant) -> None:
-    bounds = Bounds(example_plant, u_min=-1, u_max=1)
-    weights = Weights(np.eye(2), 1)
-    trial = Recording(example_plant, np.ones((3, 2)))
-    for make in (
-        lambda: require_solver(name),
-        lambda: Controller(example_plant, weights, bounds, 3, solver=name),
-        lambda: Problem(example_plant, bounds, 3, [trial], solver=name),
-    ):
-        with pytest.raises(InputError, match=f"^solver: got '{name}'; choose one of") as caught:
-            make()
-        assert "\n" not in str(caught.value)
 
 
 def test_a_solver_that_casadi_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

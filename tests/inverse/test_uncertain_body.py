@@ -23,7 +23,7 @@ from impc.inverse.unknowns import Unknowns
 from impc.model.plant_family import plant_differential
 from tests.support import posed, regulator, slopes
 
-KNOWN = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
+KNOWN: dict[str, float | str] = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
 SEAT = "plants:seated_balance_for"
 
 

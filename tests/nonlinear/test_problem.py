@@ -65,7 +65,7 @@ def test_a_controller_does_not_reckon_with_disturbances() -> None:
     d = ca.SX.sym("d")
     problem = made(disturbances=d, next_state=lambda x, u, p: x + 0.1 * ca.vertcat(
         x[1], (u + d) / p["mass"]))  # fmt: skip
-    pushed = problem.closed_loop(TRUTH, [0, 0], 3, d=[[1.0], [0], [0]])
+    pushed = problem.closed_loop(TRUTH, [0, 0], 3, d=[[1.0], [0.0], [0.0]])
     assert pushed.u[0] == pytest.approx(0, abs=1e-9)
     assert pushed.x[1, 1] == pytest.approx(0.1 / 1.5)
     assert pushed.u[1] < 0
@@ -124,8 +124,8 @@ def test_a_problem_that_is_none_is_refused_in_a_line(case: str) -> None:
         ({"mass": 1.0, "price": 1.0}, "parameter limit: has no value"),
         (TRUTH | {"colour": 1.0}, "parameter colour: is not known; known: mass, price, limit"),
         (TRUTH | {"mass": -1.0}, "parameter mass: got -1; give a positive one"),
-        (TRUTH | {"mass": np.nan}, "parameter mass: got nan; give a positive one"),
-        (TRUTH | {"mass": "heavy"}, "parameter mass: got 'heavy'; give a number"),
+        (TRUTH | {"mass": np.nan}, r"theta\['mass'\]: is NaN; give a number"),
+        (TRUTH | {"mass": "heavy"}, r"theta\['mass'\]: got 'heavy'; give a number"),
     ],
 )
 def test_values_that_are_none_are_refused(theta: dict[str, Any], words: str) -> None:
@@ -206,7 +206,7 @@ def test_recordings_are_checked() -> None:
         (lambda: problem.recorded_plan(x, u + np.inf), "inputs: has infinite entries"),
         (lambda: problem.recorded_plan(x * np.nan, u), "x0: 2 of 2 entries are NaN"),
         (lambda: problem.recorded_loop(x[:1]), "states: has 1 samples; give at least 2"),
-        (lambda: problem.recorded_plan("x"), "states: expected real numbers"),
+        (lambda: problem.recorded_plan("x"), "x: expected real numbers"),
         (
             lambda: problem.recorded_plan(x * np.nan, x0=[0, 0]),
             "recording: has missing values only",
