@@ -95,5 +95,6 @@ def _filled(block: str) -> str:
         return block
     items = re.split(r"\n(?=- )", block)
     return "\n".join(
-        textwrap.fill(item, 100, subsequent_indent="  " * item.startswith("- ")) for item in items
+        textwrap.fill(" ".join(item.split()), 100, subsequent_indent="  " * item.startswith("- "))
+        for item in items
     )
