@@ -1,12 +1,12 @@
 """Predict people who steer a cursor: delayed feedback, inverse LQR, and inverse MPC.
 
-    python -m experiments.steering FOLDER [trials]
+    python -m experiments.steering FOLDER
 
-FOLDER contains trials of Yamagami, Howell, Roth and Burden (CPHS 2018) as <person>_<plant>_<trial>
-.csv, plain or inside *_prepared.tar.gz, with columns time (s), y, slider, push at 60 Hz. They are
-public and not part of the project. The plant is y' = u + d (fo) or y'' = u + d - y' (so), without
-model error. Each method is fitted to the first `trials` (3) trials with phases `p` and simulated on
-all trials with phases `m`. The command writes experiments/steering.md and its figure.
+FOLDER is experiment/data of the public repository EmDash00/CPHS2017 (Yamagami, Howell, Roth and
+Burden, CPHS 2018), which is not part of the project, or has archives *_prepared.tar.gz of its
+trials as <person>_<plant>_<trial>.csv with columns time (s), y, slider, push. Rows come at 60 Hz.
+The plant is y' = u + d (fo) or y'' = u + d - y' (so), without model error. Each method is fitted to
+the first three trials with phases `p` and simulated on all trials with phases `m`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import tarfile
 import time
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import control
 import numpy as np
@@ -27,30 +28,27 @@ import scipy.linalg
 import scipy.optimize
 
 import impc
-from experiments.steering_page import Case, Fit, write_page
+from experiments.steering_page import PERIOD, RATE, SETTLE, Case, Fit, write_page
 from impc.arrays import Array
 from impc.assess.ceiling import ceiling
-from impc.errors import ImpcError
+from impc.errors import DataError, ImpcError
 from impc.inverse.problem import controller_for
 from impc.jit import njit
 from impc.output_feedback.simulation import simulate_person
 from plants.actuation import pade_delay
 
-RATE, SETTLE, HORIZON, FAR, PERIOD = 60.0, 5.0, 20, 1e3, 1200
-#: Budget of likelihood evaluations of the output-feedback fit.
-EVALUATIONS = 250
-# Scale of the noise in a simulation without noise.
-QUIET = 1e-6
-#: SHA-256 of the recordings that were prepared for this page.
-DIGESTS = {
-    "cphs2017_dp_r0_prepared.tar.gz": (
-        "58e42cd4f0fb02baf03f482dfcf34a2490ec9c8ba9ea98604c4362c13188298b"
-    ),
-    "cphs2017_gy_r0_prepared.tar.gz": (
-        "f0c40461dea4c24325c026466e6de61e38944fcce04e5aa420adb1fad74e7e91"
-    ),
-}
-_NAME = re.compile(r"([A-Za-z0-9-]+)_(fo|so)_(\w+)([pm])\.csv")
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+TRAINED, HORIZON, FAR = 3, 20, 1e3
+#: Delay (s), lag (s) and learning rate (1/s) at which searches start.
+START = (0.25, 0.08, 1.0)
+#: Budget of likelihood evaluations of the output-feedback fit; scale of "no noise" in simulations.
+EVALUATIONS, QUIET = 250, 1e-6
+_RAW = re.compile(r"[\d-]+_[\w-]+_(fo|so)_r-zer_d-sos\+A_s49_p(\d)a1_([+-])1\.csv")
+_PREPARED = re.compile(r"([A-Za-z0-9-]+)_(fo|so)_(\d)([pm])\.csv")
+
+Trials = dict[tuple[str, str], dict[str, Array]]
 
 
 def hand_and_cursor(values: Array, order: int) -> impc.Plant:
@@ -78,39 +76,43 @@ def hand_and_cursor(values: Array, order: int) -> impc.Plant:
     return impc.with_observer(plant, values[2]) if len(values) > 2 else plant
 
 
-def read_trials(folder: Path) -> tuple[dict[tuple[str, str, str], dict[str, Array]], list[str]]:
-    """Trials by person, plant and phase, and what was read; ends with one line if there are none.
-
-    Members of archives are read in memory; links and other files are skipped.
-    """
-    found: dict[tuple[str, str, str], dict[str, Array]] = {}
-    sources = []
-
-    def add(name: str, text: bytes) -> None:
-        if match := _NAME.fullmatch(name):
-            rows = np.loadtxt(io.StringIO(text.decode()), delimiter=",", skiprows=1, ndmin=2)
+def read_trials(folder: Path) -> tuple[Trials, str]:
+    """Trials (samples, 4) by person and plant and by number and phase; SHA-256 of all files."""
+    found: Trials = {}
+    digest = hashlib.sha256()
+    for file in sorted(folder.glob("*/*.csv")):
+        if match := _RAW.fullmatch(file.name):
+            content = file.read_bytes()
+            digest.update(content)
+            # Row k + 1 has the slider and the disturbance that act from sample k to k + 1
+            rows = np.loadtxt(io.BytesIO(content), delimiter=",")
+            trial = np.column_stack([rows[:-1, [0, 5]], rows[1:, 3:5]])
+            number = match[2] + {"+": "p", "-": "m"}[match[3]]
+            found.setdefault((file.parent.name, match[1]), {})[number] = trial
+    for name, content in _members(folder):
+        if match := _PREPARED.fullmatch(name):
+            digest.update(content)
+            trial = np.loadtxt(io.BytesIO(content), delimiter=",", skiprows=1, ndmin=2)
+            found.setdefault((match[1], match[2]), {})[match[3] + match[4]] = trial
+    for pair, trials in found.items():
+        for number, rows in trials.items():
             if rows.shape[1] != 4 or len(rows) <= 2 * PERIOD or not np.all(np.isfinite(rows)):
-                sys.exit(f"{name}: expected 4 columns and over 40 s at 60 Hz; remove the file")
-            found.setdefault((match[1], match[2], match[4]), {})[match[3]] = rows
+                what = "expected 4 columns and over 40 s at 60 Hz"
+                raise DataError(f"{' '.join(pair)} {number}", what, "remove the file")
+    if not found:
+        remedy = "give experiment/data of EmDash00/CPHS2017"
+        raise DataError(folder.name, "has no recordings of this study", remedy)
+    return found, digest.hexdigest()
 
+
+def _members(folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the regular files in the archives of a folder, read in memory."""
     for file in sorted(folder.glob("*_prepared.tar.gz")):
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
-        if DIGESTS.get(file.name, digest) != digest:
-            sys.exit(f"{file.name}: its SHA-256 differs from that of the page; get the file again")
-        known = "digest checked" if file.name in DIGESTS else "no digest known, not checked"
-        sources.append(f"{file.name} ({known})")
         with tarfile.open(file) as archive:
             for member in archive:
                 stream = archive.extractfile(member) if member.isreg() else None
                 if stream is not None:
-                    add(Path(member.name).name, stream.read())
-    plain = [file for pattern in ("*.csv", "*/*.csv") for file in sorted(folder.glob(pattern))]
-    for file in filter(lambda one: _NAME.fullmatch(one.name), plain):
-        add(file.name, file.read_bytes())
-        sources.append(f"{file.name} (no digest known, not checked)")
-    if not found:
-        sys.exit(f"{folder.name}: no *_prepared.tar.gz or <person>_<fo|so>_<trial><p|m>.csv there")
-    return found, sources
+                    yield Path(member.name).name, stream.read()
 
 
 def scored(trials: list[Array], simulated: list[Array]) -> Array:
@@ -141,35 +143,38 @@ def _feedback_loop(gains: Array, delay: int, start: float, push: Array, order: i
     return out
 
 
-def fit_delayed(case: Case, order: int) -> Fit:
+def fit_delayed(label: str, trained: list[Array], case: Case) -> Fit:
     """Least-squares gains and delay of delayed PI (fo) or PID (so) feedback, by shooting on y."""
+    order, begun = case.order, time.perf_counter()
 
     def runs(theta: Array, delay: int, trials: list[Array]) -> list[Array]:
         gains = np.append(theta, np.zeros(3 - len(theta)))
         return [_feedback_loop(gains, delay, one[0, 1], one[:, 3].copy(), order) for one in trials]
 
     def missed(theta: Array, delay: int) -> float:
-        pairs = zip(runs(theta, delay, case.train), case.train, strict=True)
+        pairs = zip(runs(theta, delay, trained), trained, strict=True)
         return float(sum(np.sum((run[:, 0] - own[:, 1]) ** 2) for run, own in pairs))
 
     best: tuple[float, Array, int] = (np.inf, np.zeros(2), 0)
     for delay in range(2, 31):
-        for begun in ([1.0, 0.3, 1.0], [3.0, 1.0, 3.0]):
+        for start in ([1.0, 0.3, 1.0], [3.0, 1.0, 3.0]):
             found = scipy.optimize.minimize(
-                missed, begun[: order + 1], (delay,), "Nelder-Mead", options={"maxfev": 300}
+                missed, start[: order + 1], (delay,), "Nelder-Mead", options={"maxfev": 300}
             )
             if found.fun < best[0]:
                 best = (float(found.fun), found.x, delay)
     theta, delay = best[1:]
     simulated = runs(theta, delay, case.test)
-    named = zip(("kp", "ki", "kd"), theta, strict=False)
-    values = (*(f"{name} = {value:.2f}" for name, value in named), f"delay {delay / RATE:.2f} s")
-    train = scored(case.train, runs(theta, delay, case.train))
-    label = "delayed PI" if order == 1 else "delayed PID"
-    return Fit(label, train, scored(case.test, simulated), simulated, parameters=values)
+    values = dict(zip(("kp", "ki", "kd"), map("{:.2f}".format, theta), strict=False))
+    values["delay"] = f"{delay / RATE:.2f}"
+    train = scored(trained, runs(theta, delay, trained))
+    seconds = time.perf_counter() - begun
+    return Fit(label, train, scored(case.test, simulated), simulated, values, seconds=seconds)
 
 
-def problem_of(trials: list[Array], values: list[float], order: int, *, free: bool) -> impc.Problem:
+def problem_of(
+    trials: list[Array], values: tuple[float, ...], order: int, *, free: bool
+) -> impc.Problem:
     """Inverse problem of some trials, without bounds; with `free` parameters or fixed ones."""
     plant = hand_and_cursor(np.array(values), order)
     family = impc.PlantFamily(
@@ -185,10 +190,10 @@ def problem_of(trials: list[Array], values: list[float], order: int, *, free: bo
     )
 
 
-def fit_of(label: str, found: impc.Estimate, case: Case, seconds: float) -> Fit:
+def fit_of(label: str, found: impc.Estimate, case: Case) -> Fit:
     """Simulate a fitted controller from the recorded cursor, with the hand at rest."""
     if found.K is None:
-        return Fit(label, np.zeros((0, 2)), np.zeros((0, 2)), reason=found.reason, seconds=seconds)
+        return Fit(label, reason=found.reason, seconds=found.seconds)
     law, C = found.controller(), found.problem.plant.C
 
     def run(one: Array) -> Array:
@@ -198,31 +203,29 @@ def fit_of(label: str, found: impc.Estimate, case: Case, seconds: float) -> Fit:
 
     simulated = [run(one) for one in case.test]
     train = scored(case.train, [run(one) for one in case.train])
-    test = scored(case.test, simulated)
-    rows: tuple[str, ...] = ()
-    if found.method == "inverse_mpc":
+    test, rows = scored(case.test, simulated), {}
+    if label.startswith("offset-free"):
         try:
-            rows = tuple(_worded(name, row) for name, row in found.intervals().iterrows())
+            rows = {str(name): _worded(row) for name, row in found.intervals().iterrows()}
         except ImpcError as error:  # Unidentified parameters can leave every possible plant
-            rows = (f"intervals are not available ({error})",)
-    return Fit(label, train, test, simulated, "", found.doubts, rows, seconds)
+            rows = {"intervals": f"not available ({error})"}
+    return Fit(label, train, test, simulated, rows, found.doubts, seconds=found.seconds)
 
 
-def _worded(name: object, row: object) -> str:
+def _worded(row: object) -> str:
     """Value and 95 % interval of a fitted number; "not identified" for a width over a factor 10."""
     value, low, high = (float(getattr(row, part)) for part in ("value", "low", "high"))
-    short = str(name).replace("K.command.", "K ")
     narrow = low * high > 0 and max(high / low, low / high) <= 10
-    return f"{short} {value:.3g} ({low:.2g} to {high:.2g})" if narrow else f"{short} not identified"
+    return f"{value:.2g} ({low:.2g} to {high:.2g})" if narrow else "not identified"
 
 
-def fit_noisy(case: Case, values: list[float], order: int) -> Fit:
-    """Output feedback with sensory noise on one trial, delay (s) and lag (s) fixed at `values`."""
+def fit_noisy(case: Case, delay: float, lag: float) -> Fit:
+    """Output feedback with sensory noise on one trial, at a fixed delay (s) and lag (s)."""
     label, begun = "output feedback", time.perf_counter()
     trials = case.train[:1]
     motor, walk = float(np.std(trials[0][:, 2])), 0.1 * float(np.std(trials[0][:, 3]))
     try:
-        start = impc.fit(problem_of(trials, values, order, free=False))
+        start = impc.fit(problem_of(trials, (delay, lag), case.order, free=False))
         plant = start.problem.plant
         sensory = 0.2 * float(np.std(trials[0][:, 1]))
         senses = impc.Observer(plant, ["y"], motor=0.3 * motor, sensory=sensory, walk=walk)
@@ -233,8 +236,7 @@ def fit_noisy(case: Case, values: list[float], order: int) -> Fit:
     except ImpcError as error:
         reason, likely = str(error), None
     if likely is None or not likely.converged:
-        seconds = time.perf_counter() - begun
-        return Fit(label, np.zeros((0, 2)), np.zeros((0, 2)), reason=reason, seconds=seconds)
+        return Fit(label, reason=reason, seconds=time.perf_counter() - begun)
     law = controller_for(likely.problem, np.array(likely.K), np.array(likely.S))
     # Without noise; the filter depends on ratios of noise only and stays the same.
     quiet = likely.observer.with_levels(np.array(likely.observer.levels) * QUIET)
@@ -246,62 +248,60 @@ def fit_noisy(case: Case, values: list[float], order: int) -> Fit:
 
     simulated = [run(one) for one in case.test]
     train, test = scored(trials, [run(one) for one in trials]), scored(case.test, simulated)
-    found = zip(likely.observer.names(plant), likely.observer.levels, strict=True)
-    levels = tuple(f"{name} {value:.2g}" for name, value in found if value > 0)
-    return Fit(
-        label, train, test, simulated, "", ("converged",), levels, time.perf_counter() - begun
-    )
+    return Fit(label, train, test, simulated, {}, likely.doubts, "", time.perf_counter() - begun)
 
 
 def fitted_case(person: str, kind: str, train: list[Array], test: list[Array]) -> Case:
     """Fit every method to one person and plant."""
-    order = 1 if kind == "fo" else 2
     mirrored = [
         any(np.allclose(a[:PERIOD, 3], -b[:PERIOD, 3], atol=1e-9) for b in train) for a in test
     ]
+    case = Case(person, kind, train, test, [not one for one in mirrored])
+    order = case.order
     # The last periods only, and a few samples: the ramp before them does not repeat
-    whole = problem_of([one[-2 * PERIOD - 6 :] for one in test], [0.25, 0.08], order, free=False)
+    whole = problem_of([one[-2 * PERIOD - 6 :] for one in test], START[:2], order, free=False)
     top = ceiling(whole, 6 / RATE)
-    rows = None if top is None else np.array([top.vaf, top.low, top.high])
-    case = Case(person, kind, train, test, [not one for one in mirrored], rows, [], ())
+    case.ceiling = None if top is None else np.array([top.vaf, top.low, top.high])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        case.fits.append(fit_delayed(case, order))
-        posed = problem_of(train, [0.25, 0.08], order, free=True)
+        case.fits.append(fit_delayed("delayed PI", train, case))
+        case.fits.append(fit_delayed("delayed PI, fitted to these trials", test, case))
+        posed = problem_of(train, START[:2], order, free=True)
         plain = impc.fit(posed)
-        classical = impc.fit(posed, "inverse_lqr", start=plain)
-        free = impc.fit(problem_of(train, [0.25, 0.08, 1.0], order, free=True))
-        case.fits.append(fit_of("inverse LQR", classical, case, classical.seconds))
-        case.fits.append(fit_of("inverse MPC", plain, case, plain.seconds))
-        case.fits.append(fit_of("offset-free inverse MPC", free, case, free.seconds))
-        at = np.exp(free.problem.logarithms)[:2] * np.array([0.25, 0.08])
-        case.fits.append(fit_noisy(case, [float(one) for one in at], order))
-    said = sorted({str(one.message).splitlines()[0] for one in caught})
-    return Case(person, kind, train, test, case.unseen, rows, case.fits, tuple(said))
+        free = impc.fit(problem_of(train, START, order, free=True))
+        case.fits.append(fit_of("inverse LQR", impc.fit(posed, "inverse_lqr", start=plain), case))
+        case.fits.append(fit_of("inverse MPC", plain, case))
+        case.fits.append(fit_of("offset-free inverse MPC", free, case))
+        delay, lag = np.exp(free.problem.logarithms)[:2] * np.array(START[:2])
+        case.fits.append(fit_noisy(case, float(delay), float(lag)))
+    case.warned = sorted({str(one.message).splitlines()[0] for one in caught})
+    return case
 
 
-def main(folder: Path, most: int) -> None:
+def main(folder: Path) -> None:
     """Fit every person and plant in a folder and write the page."""
     begun = time.perf_counter()
-    found, sources = read_trials(folder)
+    found, digest = read_trials(folder)
     cases, skipped = [], []
-    for person, kind in sorted({key[:2] for key in found}):
-        parts = [found.get((person, kind, phase), {}) for phase in "pm"]
-        train, test = ([one for _, one in sorted(part.items())] for part in parts)
+    for (person, kind), trials in sorted(found.items()):
+        train, test = ([trials[key] for key in sorted(trials) if key[1] == phase] for phase in "pm")
+        print(f"{person} {kind}", flush=True)
         if not train or not test:
             skipped.append(f"{person} {kind} (no trials p or no trials m)")
             continue
-        print(f"{person} {kind}", flush=True)
         try:
-            cases.append(fitted_case(person, kind, train[:most], test))
+            cases.append(fitted_case(person, kind, train[:TRAINED], test))
         except ImpcError as error:
             skipped.append(f"{person} {kind} ({error})")
     if not cases:
-        sys.exit(f"{folder.name}: nothing was fitted: {'; '.join(skipped)}")
-    write_page(cases, sources, skipped, most, time.perf_counter() - begun)
+        raise DataError(folder.name, f"nothing was fitted: {'; '.join(skipped)}", "see the list")
+    write_page(cases, digest, skipped, time.perf_counter() - begun)
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 2:
-        sys.exit("usage: python -m experiments.steering FOLDER [trials]")
-    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 3)
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m experiments.steering FOLDER")
+    try:
+        main(Path(sys.argv[1]))
+    except DataError as error:
+        sys.exit(f"experiments.steering: {error}")

@@ -22,9 +22,10 @@ METHODS = {
         "_repr_html_": "reporting.estimate_text:as_html",
     },
     "OptimalControlEstimate": {"page": "nonlinear.page:estimate_report"},
+    "OutputFeedbackFit": {"doubts": "output_feedback.doubts:fit_doubts"},
 }
 #: Those that are read without a call.
-PROPERTIES = {"vaf"}
+PROPERTIES = {"doubts", "vaf"}
 
 
 class _Named:

@@ -16,6 +16,7 @@ import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.variance_accounted_for import whiteness
+from impc.attached_methods import attach
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
 from impc.inverse.minimiser import Prior, Rows, Stop, minimise
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 
 # Lags of the whiteness test: 1 s, which shows a missed rhythm; at least this many.
 _LEAST_LAGS = 10
-# p-value below which innovations are not white.
-_WHITE = 0.01
 # Evaluations of the first stage, in which the gain is fixed: with noise SDs far off, the best gain
 # lies on the stability boundary, where 3 of 21 searches ended.
 _FIRST = 10
@@ -108,30 +107,39 @@ class OutputFeedbackFit(Frozen):
         """Akaike information criterion, 2 count - 2 log L; smaller is better."""
         return 2 * self.count - 2 * self.log_likelihood
 
+    if TYPE_CHECKING:  # attached by `impc.attached_methods`
+
+        @property
+        def doubts(self) -> tuple[str, ...]:
+            """Sentences that qualify the result, as those of `Estimate.doubts`."""
+
+    def __str__(self) -> str:
+        gain = np.array2string(self.K, precision=4)
+        levels = zip(self.space.names, self.levels, strict=True)
+        noise = ", ".join(f"{name} {value:.3g}" for name, value in levels)
+        return " ".join(["output feedback:", *self.doubts, f"K = {gain}, noise SDs: {noise}"])
+
+    @property
+    def standardised(self) -> Array:
+        """Innovations of all trials (samples, p) over their standard deviations."""
+        trials = self.identified.trials
+        return np.concatenate(
+            [one.innovations / np.sqrt(np.einsum("tpp->tp", one.spreads)) for one in trials]
+        )
+
+    @property
+    def lags(self) -> int:
+        """Samples of a second, at least ten: past that tests of prediction errors look at."""
+        return max(_LEAST_LAGS, round(1 / self.problem.plant.dt))
+
     @property
     def whiteness(self) -> Array:
         """p-values (p,) of whiteness of the standardised innovations of each output."""
-        trials = self.identified.trials
-        joined = np.concatenate(
-            [one.innovations / np.sqrt(np.einsum("tpp->tp", one.spreads)) for one in trials]
-        )
-        lags = max(_LEAST_LAGS, round(1 / self.problem.plant.dt))
-        return whiteness(joined, min(lags, len(joined) - 1))
+        joined = self.standardised
+        return whiteness(joined, min(self.lags, len(joined) - 1))
 
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Sentences that qualify the result, as those of `Estimate.doubts`."""
-        found = []
-        if not self.converged:
-            found.append("The search did not converge: do not report these gains.")
-        names = zip(self.problem.plant.outputs, self.whiteness, strict=True)
-        left = [name for name, p in names if p < _WHITE]
-        if left:
-            found.append(
-                f"Prediction errors of {' and '.join(left)} are autocorrelated: the model is "
-                "incomplete, and gains may be wrong by more than their intervals show."
-            )
-        return tuple(found)
+
+attach(OutputFeedbackFit)
 
 
 @checked(spread=0, max_evaluations=1, recorder="p", counted=0)

@@ -20,12 +20,12 @@ from impc.checking import replace
 from impc.control.aims import aim_of, window
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
-from impc.control.simulation import Status
 from impc.errors import ImpcError
 from impc.inverse.problem import controller_for, drive_of
 from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
 from impc.output_feedback import intervals
+from impc.output_feedback.doubts import at_limit
 from impc.output_feedback.fit import End, fit_output_feedback, person_at
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import joint_loop, run_joint
@@ -52,15 +52,8 @@ _ASKED, _BESIDE = 250, 60
 _SHARE = 0.1
 # A noise SD counts as identified if its 95 % interval ends within a factor of ten.
 _IDENTIFIED = np.log(10)
-# Correlation of gain and noise from which they can hardly be separated.
-_CONFUSED = 0.9
 # AIC differences below this do not decide (Burnham and Anderson 2002).
 _UNDECIDED = 4.0
-# From simulated subjects (experiments/output_feedback.md).
-_AT_LIMIT = (
-    "A limit was reached, so these intervals are approximate: in simulations they contained 80 to "
-    "95 % of the true values."
-)
 _KINDS = {
     "motor": "noise in", "share": "noise in proportion to", "process": "unmodelled change of",
     "sensory": "sensory noise of", "walk": "assumed step of", "recorder": "recording noise of",
@@ -106,17 +99,8 @@ class PersonReport(Frozen):
     # 95 % intervals of the gain entries (entries, 2); if profiled, all by profile, and NaN where an
     # entry is not individually identified
     entries: Array
-    confusion: float  # largest correlation of gain and noise; NaN without a fit
-    whiteness: Array  # (p,), p-values of whiteness of the innovations of each output
     ahead: tuple[int, ...]  # prediction horizons in samples
     errors: Array  # (k, p), root-mean-square prediction errors, in the outputs' units
-
-    @property
-    def at_limit(self) -> bool:
-        """Whether a bound was reached, so that the likelihood is approximate."""
-        return self.fit is not None and any(
-            np.any(trial.status != Status.FREE) for trial in self.fit.identified.trials
-        )
 
     @property
     def preferred(self) -> bool:
@@ -132,17 +116,11 @@ class PersonReport(Frozen):
         asked, fit, entries = self.models[0], self.fit, np.array(self.entries)
         if fit is None:
             return [f"No model with noise in senses or muscles could be fitted: {asked.reason}."]
-        found, together = [self._compared()], self.confusion
+        found = [self._compared()]
         if len(entries):
             count = int(np.count_nonzero((entries[:, 0] > 0) | (entries[:, 1] < 0)))
             found.append(f"The 95 % CI of {count} of {len(entries)} gains excludes zero.")
-        found += fit.doubts
-        if self.at_limit:
-            found.append(_AT_LIMIT)
-        if together >= _CONFUSED:
-            how = f"correlation {together:.2f}"
-            found.append(f"Gain and noise can hardly be separated here ({how}).")
-        return found
+        return [*found, *fit.doubts]
 
     def _compared(self) -> str:
         asked, *others = self.models
@@ -175,7 +153,7 @@ class PersonReport(Frozen):
             return found
         return found | {
             "K": fit.K,
-            "at_limit": self.at_limit,
+            "at_limit": at_limit(fit),
             "profiled": self.profiled,
             "K_intervals": self.entries.reshape(*fit.K.shape, 2),
             "sensed": fit.observer.sensed,
@@ -186,8 +164,8 @@ class PersonReport(Frozen):
                     fit.space.names, fit.levels, self.levels, strict=True
                 )
             },
-            "confusion": self.confusion,
-            "whiteness": self.whiteness,
+            "confusion": intervals.confusion(fit),
+            "whiteness": fit.whiteness,
             "ahead": self.ahead,
             "errors_ahead": self.errors,
         }
@@ -222,8 +200,7 @@ def person_report(
         done(name)
     fit, plant, none = models[0].fit, found.problem.plant, frozen(np.zeros((0, 2)))
     report = PersonReport(
-        tuple(models), plant, found.gain, fit, None, profiled, none, none, np.nan,
-        frozen([np.nan] * len(plant.outputs)), (), frozen([[]]),
+        tuple(models), plant, found.gain, fit, None, profiled, none, none, (), frozen([[]]),
     )  # fmt: skip
     if fit is not None:
         covariance = intervals.person_covariance(fit)
@@ -237,8 +214,6 @@ def person_report(
             covariance=covariance,
             levels=levels,
             entries=entries,
-            confusion=intervals.confusion(fit),
-            whiteness=frozen(fit.whiteness),
             ahead=ahead,
             errors=frozen(prediction_errors(fit, ahead)),
         )

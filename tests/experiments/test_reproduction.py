@@ -1,4 +1,4 @@
-"""The reproduction page is complete, its names exist, and quick entries have its verdicts."""
+"""The reproduction page has all claims, its names exist, and quick values have its verdicts."""
 
 from __future__ import annotations
 
@@ -6,32 +6,41 @@ import importlib
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from experiments.reproduction.entry import Verdict
-from experiments.reproduction.example import controller_entries
-
-pytestmark = pytest.mark.full
+from experiments.reproduction.example import controller_values
+from experiments.reproduction.page import CLAIMS, FIGURES, VERDICTS, claims_page, joined, table
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reproduction"
 PAGE = (FOLDER / "index.md").read_text(encoding="utf-8")
-ROWS = [
-    [cell.replace("\\|", "|").strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-    for line in PAGE.splitlines()
-    if line.startswith("| **")
-]
-TABLES = {"2": 6, "3": 2, "4": 3, "5": 5, "C": 1}
+TEMPLATE = CLAIMS.read_text(encoding="utf-8")
+
+
+def rows(text: str, start: str = "| **") -> list[list[str]]:
+    return [
+        re.split(r" (?<!\\)\| ", line.strip("| "))
+        for line in text.splitlines()
+        if line.startswith(start)
+    ]
 
 
 def test_every_line_has_a_verdict_and_says_why_where_it_must() -> None:
-    for verdict, item, _, _ in ROWS:
+    for verdict, item, _, _ in rows(PAGE):
         word, _, why = verdict.removeprefix("**").partition("**.")
-        assert word in {known.value for known in Verdict}, item
+        assert word in VERDICTS, item
         assert word == "reproduced" or why.strip(), f"{item}: {word}, but not why"
 
 
+def test_the_page_has_every_statement_of_the_claims() -> None:
+    claims = [row for row in rows(TEMPLATE, "| ") if row[0] not in ("verdict", "---|---|---|---")]
+    says = [row[2].replace("{{", "{").replace("}}", "}") for row in claims]
+    assert says == [row[2] for row in rows(PAGE)]
+    assert len(says) > 100
+
+
 def test_every_name_on_the_page_exists() -> None:
-    names = set(re.findall(r"`((?:impc|plants|experiments)[\w.]*(?::\w+)?)`", PAGE))
+    names = set(re.findall(r"`((?:impc|plants|experiments)[\w.]*(?::\w+)?)`", PAGE + TEMPLATE))
     assert len(names) > 50
     for name in names:
         module, _, attribute = name.partition(":")
@@ -41,12 +50,53 @@ def test_every_name_on_the_page_exists() -> None:
 
 def test_every_figure_is_there() -> None:
     pictures = re.findall(r"```\{figure\} (\S+)", PAGE)
-    assert len(pictures) > 8
+    assert len(pictures) == len(FIGURES)
     assert [name for name in pictures if not (FOLDER / name).exists()] == []
 
 
-def test_quick_entries_come_out_as_the_page_says() -> None:
-    shown = {row[1] + row[2]: row[0] for row in ROWS}
-    for entry in controller_entries():
-        says = shown[entry.item + entry.says]
-        assert says.startswith(f"**{entry.verdict.value}**"), entry
+@pytest.mark.full
+def test_quick_values_have_the_verdicts_of_the_page() -> None:
+    values = controller_values()
+    shown = {row[1] + row[2]: row[0] for row in rows(PAGE)}
+    checked = 0
+    for row in rows(TEMPLATE, "| {"):
+        name, _, verdict = row[0].removeprefix("{").partition("}")[0].partition(":")
+        if name in values:
+            said = verdict if values[name] else "not reproduced"
+            assert shown[row[1] + row[2]].startswith(f"**{said}**"), row[1]
+            checked += 1
+    assert checked == 7
+
+
+class Anything:
+    """Value that a claim can show in any format, with any part."""
+
+    def __getitem__(self, _: object) -> Anything:
+        return self
+
+    def __format__(self, _: str) -> str:
+        return "1.5"
+
+
+def test_a_statement_that_does_not_hold_is_not_reproduced() -> None:
+    """One value decides the verdict, the count and the text of a figure."""
+    anything = dict.fromkeys(re.findall(r"\{(\w+)", TEMPLATE), Anything())
+    verdicts = dict.fromkeys(re.findall(r"\{(\w+):[a-z ]*reproduced", TEMPLATE), True)
+    text = {}
+    for holds in (True, False):
+        text[holds] = claims_page(anything | verdicts | {"fit_is_close": np.bool_(holds)})
+    counts = {holds: text[holds].count("| **reproduced in kind**") for holds in text}
+    assert counts[True] == counts[False] + 1
+    assert f"{counts[False]} reproduced in kind" in text[False]
+    assert "VAF 1.5 and 1.5 %. **not reproduced**." in text[False]
+    assert "VAF 1.5 and 1.5 %. **reproduced in kind**." in text[True]
+
+
+def test_parts_of_a_page_are_filled_and_tables_are_not() -> None:
+    long, wide = "word " * 30, table(["a", "b"], [["1" * 80, "2" * 80]])
+    text = joined("# Head", f"{long}\n\n- {long}\n- short", wide)
+    lines = text.splitlines()
+    assert max(len(line) for line in lines if not line.startswith("|")) <= 100
+    assert [line[:2] for line in lines if line[:1] == "-"] == ["- ", "- "]
+    assert lines[-1] == f"| {'1' * 80} | {'2' * 80} |"
+    assert " ".join(text.split()) == " ".join(f"# Head {long} - {long} - short {wide}".split())

@@ -18,6 +18,7 @@ from impc.errors import InputError
 from impc.inverse.methods import fit
 from impc.model.recordings import Recording
 from impc.model.structure import Structure
+from impc.output_feedback import doubts
 from impc.output_feedback.fit import OutputFeedbackFit
 from impc.output_feedback.intervals import person_covariance
 from impc.output_feedback.models import (
@@ -191,7 +192,7 @@ def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
     assert f"“{best.name}” explains" in beaten.sentences()[0]
 
 
-def test_what_is_said_of_gains_noise_and_limits() -> None:
+def test_what_is_said_of_gains_noise_and_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     report, fit = report_and_fit()
 
     def said(intervals: list[list[float]], *, loose: bool = False) -> str:
@@ -210,8 +211,10 @@ def test_what_is_said_of_gains_noise_and_limits() -> None:
     met = replace(report, fit=replace(fit, identified=replace(terms, trials=limited)))
     assert any("80 to 95 %" in line for line in met.sentences())
     assert met.data()["at_limit"] is True
-    other = replace(report, confusion=0.95).sentences()[-1]
-    assert other == "Gain and noise can hardly be separated here (correlation 0.95)."
+    monkeypatch.setattr(doubts, "confusion", lambda _: 0.95)
+    assert report.sentences()[-1] == (
+        "Gain and noise can hardly be separated here (correlation 0.95)."
+    )
 
 
 def test_a_model_whose_prediction_errors_are_not_white_is_doubted() -> None:
@@ -221,7 +224,7 @@ def test_a_model_whose_prediction_errors_are_not_white_is_doubted() -> None:
     terms = fit.identified
     summed = [one._replace(innovations=np.cumsum(one.innovations, axis=0)) for one in terms.trials]
     wrong = replace(fit, identified=replace(terms, trials=summed))
-    (doubt,) = wrong.doubts
+    doubt, *_ = wrong.doubts
     assert doubt.startswith("Prediction errors of x are autocorrelated: the model is incomplete")
     assert doubt in replace(report, fit=wrong).sentences()
     assert "did not converge" in replace(fit, converged=False).doubts[0]

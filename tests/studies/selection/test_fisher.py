@@ -10,7 +10,7 @@ import pytest
 
 import impc.studies.selection.fisher
 import plants
-from experiments.reproduction.appendices import kronecker_sensitivity
+from experiments.reproduction.selection import kronecker_sensitivity
 from experiments.selection_claims import exhaustive
 from impc.checking import replace
 from impc.errors import DataError, InputError
