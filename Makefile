@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env app demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
+.PHONY: help env app demo test full check docs architecture reproduce wheel slow coverage structures plans default-subjects noisy-people nonlinear look search numerics measure bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -66,7 +66,7 @@ help:
 	@echo 'make lock       compile the lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
 	@echo 'make clean      remove caches and build products; .venv and results stay'
 	@echo 'Studies, with their results in experiments/README.md: make coverage, noisy-people, structures,'
-	@echo 'followers, plans, default-subjects, nonlinear, nonlinear-seat (minutes to hours each).'
+	@echo 'plans, default-subjects, nonlinear (minutes to hours each).'
 	@echo 'PYTHON=python3.12 chooses the Python; otherwise it is the first of python3, python3.13,'
 	@echo 'python3.12, python3.11 with a version from 3.11 to 3.13.'
 
@@ -108,7 +108,6 @@ reproduce: env
 ifdef DATA
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.rotary_pendulum $(DATA)/rotary-pendulum
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.steering $(DATA)/cphs2017
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.two_link_standing
 else
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.reproduction
 endif
@@ -166,12 +165,6 @@ structures: env
 	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
 	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
 
-# Subjects who follow a target, and the package lqg: the tables of experiments/cursor_tracking.md.
-followers: env $(FILTER)
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_people_study
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer SubjectiveActor
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer BoundedActor
-
 # A hundred fits of every experiment: the table of experiments/planning.md.
 plans: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.plan_study cart --fits 100
@@ -190,11 +183,6 @@ nonlinear: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark starts
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark loops
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark noise
-
-# The tables and the figure of experiments/nonlinear_seat.md.
-nonlinear-seat: env
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat people
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat prices --amplitudes 5
 
 measure: env
 	$(PY) -m tests.measure

@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from experiments.benchmarks.fits import fit_rows
 from experiments.benchmarks.growth import growth_rows
-from experiments.benchmarks.layers import layer_rows
 from experiments.benchmarks.likelihood import likelihood_rows
 from experiments.benchmarks.routes import route_rows
 from experiments.benchmarks.runner import runner_rows
@@ -28,7 +27,6 @@ _PARTS = {
     "fits": fit_rows,
     "growth": growth_rows,
     "routes": route_rows,
-    "layers": layer_rows,
     "likelihood": likelihood_rows,
     "runner": runner_rows,
 }
