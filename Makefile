@@ -129,7 +129,7 @@ slow: env $(FILTER)
 	$(PY) -m pytest -m slow
 
 coverage: env
-	$(PY) -m experiments.printed_intervals --recordings 300
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.printed_intervals --recordings 300
 
 # Twenty times the examples of `make test`, other ones each time; SEED=... repeats a search.
 SEED ?= $(shell date +%s)
@@ -149,21 +149,19 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 	@touch $@
 
 # Hundreds of simulated subjects: the table of experiments/output_feedback.md.
-PEOPLE = $(PY) -m experiments.noisy_people_study
+PEOPLE = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.noisy_people_study
 noisy-people: env $(FILTER)
-	$(PEOPLE) run --subjects 200 --profiles --out results/noisy-people.jsonl
-	$(PEOPLE) run --body seat --subjects 20 --out results/noisy-people.jsonl
-	$(PEOPLE) sum results/noisy-people.jsonl
+	$(PEOPLE) --subjects 200 --profiles
+	$(PEOPLE) --body seat --subjects 20
 
 # Hundreds of simulated subjects: the table of experiments/structures.md.
 STUDY = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.structure_study
 structures: env
-	$(STUDY) run seat --vaf 90 --subjects 200 --out results/structures-seat.jsonl
-	$(STUDY) run seat --vaf 99 --subjects 200 --out results/structures-seat.jsonl
-	$(STUDY) run carts --test-only --subjects 400 --out results/structures-carts.jsonl
-	$(STUDY) run carts --test-only --root 0.8 --subjects 400 --out results/structures-carts.jsonl
-	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
-	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
+	$(STUDY) seat --vaf 90
+	$(STUDY) seat --vaf 99
+	$(STUDY) carts --test-only --subjects 400
+	$(STUDY) carts --test-only --root 0.8 --subjects 400
+	$(STUDY) carts --test-only --cross 0.5 --subjects 100
 
 # A hundred fits of every experiment: the table of experiments/planning.md.
 plans: env

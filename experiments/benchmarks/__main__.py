@@ -1,4 +1,4 @@
-"""Run all benchmarks; write results.md, results.json and growth.{png,pdf} into this folder.
+"""Run all benchmarks; write results.md and results.json into this folder.
 
     python -m experiments.benchmarks [--runs 7]
 
@@ -42,7 +42,7 @@ def main() -> None:
     with tqdm(_PARTS.items()) as parts:
         for name, measure in parts:
             parts.set_description(name)
-            rows += measure(chosen.runs, chosen.out)
+            rows += measure(chosen.runs)
             written = write_tables(rows, chosen.out, chosen.runs)  # so that no part is lost
     print(written)
 
