@@ -5,7 +5,7 @@
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help env app demo test full check docs architecture reproduce wheel slow coverage structures followers plans default-subjects noisy-people nonlinear nonlinear-seat look search numerics measure bench fuzz lock clean
+.PHONY: help env app demo test full check docs architecture reproduce wheel slow coverage structures plans default-subjects noisy-people nonlinear look search numerics measure bench fuzz lock clean
 
 PYTHON ?= python3
 # Not to be set from outside: the environment is made with `venv --clear`.
@@ -66,7 +66,7 @@ help:
 	@echo 'make lock       compile the lock files again (needs uv); UPGRADE=--upgrade takes newer versions'
 	@echo 'make clean      remove caches and build products; .venv and results stay'
 	@echo 'Studies, with their results in experiments/README.md: make coverage, noisy-people, structures,'
-	@echo 'followers, plans, default-subjects, nonlinear, nonlinear-seat (minutes to hours each).'
+	@echo 'plans, default-subjects, nonlinear (minutes to hours each).'
 	@echo 'PYTHON=python3.12 chooses the Python; otherwise it is the first of python3, python3.13,'
 	@echo 'python3.12, python3.11 with a version from 3.11 to 3.13.'
 
@@ -108,7 +108,6 @@ reproduce: env
 ifdef DATA
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.rotary_pendulum $(DATA)/rotary-pendulum
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.steering $(DATA)/cphs2017
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.two_link_standing
 else
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.reproduction
 endif
@@ -130,7 +129,7 @@ slow: env $(FILTER)
 	$(PY) -m pytest -m slow
 
 coverage: env
-	$(PY) -m experiments.printed_intervals --recordings 300
+	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.printed_intervals --recordings 300
 
 # Twenty times the examples of `make test`, other ones each time; SEED=... repeats a search.
 SEED ?= $(shell date +%s)
@@ -150,27 +149,19 @@ numerics: .venv-oldest/.stamp .venv-newest/.stamp
 	@touch $@
 
 # Hundreds of simulated subjects: the table of experiments/output_feedback.md.
-PEOPLE = $(PY) -m experiments.noisy_people_study
+PEOPLE = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.noisy_people_study
 noisy-people: env $(FILTER)
-	$(PEOPLE) run --subjects 200 --profiles --out results/noisy-people.jsonl
-	$(PEOPLE) run --body seat --subjects 20 --out results/noisy-people.jsonl
-	$(PEOPLE) sum results/noisy-people.jsonl
+	$(PEOPLE) --subjects 200 --profiles
+	$(PEOPLE) --body seat --subjects 20
 
 # Hundreds of simulated subjects: the table of experiments/structures.md.
 STUDY = OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.structure_study
 structures: env
-	$(STUDY) run seat --vaf 90 --subjects 200 --out results/structures-seat.jsonl
-	$(STUDY) run seat --vaf 99 --subjects 200 --out results/structures-seat.jsonl
-	$(STUDY) run carts --test-only --subjects 400 --out results/structures-carts.jsonl
-	$(STUDY) run carts --test-only --root 0.8 --subjects 400 --out results/structures-carts.jsonl
-	$(STUDY) run carts --test-only --cross 0.5 --subjects 100 --out results/structures-carts.jsonl
-	$(STUDY) sum results/structures-seat.jsonl results/structures-carts.jsonl
-
-# Subjects who follow a target, and the package lqg: the tables of experiments/cursor_tracking.md.
-followers: env $(FILTER)
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_people_study
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer SubjectiveActor
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.cursor_peer BoundedActor
+	$(STUDY) seat --vaf 90
+	$(STUDY) seat --vaf 99
+	$(STUDY) carts --test-only --subjects 400
+	$(STUDY) carts --test-only --root 0.8 --subjects 400
+	$(STUDY) carts --test-only --cross 0.5 --subjects 100
 
 # A hundred fits of every experiment: the table of experiments/planning.md.
 plans: env
@@ -190,11 +181,6 @@ nonlinear: env
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark starts
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark loops
 	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.peer_benchmark noise
-
-# The tables and the figure of experiments/nonlinear_seat.md.
-nonlinear-seat: env
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat people
-	OPENBLAS_NUM_THREADS=1 $(PY) -m experiments.nonlinear_seat prices --amplitudes 5
 
 measure: env
 	$(PY) -m tests.measure

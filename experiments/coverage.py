@@ -12,20 +12,16 @@ from __future__ import annotations
 
 import argparse
 import functools
-from concurrent.futures import ProcessPoolExecutor
 
 import control
 import numpy as np
-import scipy.signal
-from tqdm import tqdm
 
+from experiments.driver import each, with_noise
+from experiments.summary import markdown
 from impc.arrays import Array
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import residual_noise, white_noise
-from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.feasibility import require_complete
-from impc.control.simulation import scenario
 from impc.inverse.search import fit_gain
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -36,10 +32,9 @@ from impc.studies.fit.settings import FitSettings
 
 __all__ = ["cart", "covered", "true_controller"]
 
-_SAMPLES = 1500
-_NOISE = 0.2
-_HORIZON = 10
-_SETTINGS = FitSettings(horizon=_HORIZON, u_max=1.0)
+_SAMPLES, _HORIZON = 1500, 10
+# The noise has a fifth of the size of the position.
+_VAF = 100 / (1 + 0.2**2)
 
 
 def cart(dt: float = 0.05) -> Plant:
@@ -59,21 +54,15 @@ def true_controller() -> Controller:
 
 def noisy_trial(seed: int, root: float) -> Recording:
     """One recording with first-order noise of coefficient `root` and the same size for each."""
-    rng, controller = np.random.default_rng(seed), true_controller()
+    rng = np.random.default_rng(seed)
     push = np.repeat(rng.choice([-0.85, 0.0, 0.85], _SAMPLES // 10), 10)
-    drive = scenario(controller.plant, np.zeros(2), disturbance=push)
-    run = require_complete(controller, simulate(controller, drive))
-    clean = (run.x @ controller.plant.C.T)[:_SAMPLES]
-    white = rng.standard_normal((_SAMPLES + 500, 1))
-    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[500:]
-    size = _NOISE * np.sqrt(np.mean(clean**2))
-    return Recording(controller.plant, clean + size * noise, push)
+    return with_noise(true_controller(), push, rng, _VAF, root)
 
 
 def covered(seed: int, root: float) -> Array:
     """Error over standard error, shape (2, n): Cramér-Rao, then sandwich."""
-    problem = fit_problem(cart(), [noisy_trial(seed, root)], _SETTINGS)
-    fit = fit_gain(problem)
+    settings = FitSettings(horizon=_HORIZON, u_max=1.0)
+    fit = fit_gain(fit_problem(cart(), [noisy_trial(seed, root)], settings))
     error = fit.K - true_controller().K
     rows = [
         np.ravel(error / gain_covariance(fit.problem, fit.K, fit.S, colour).entries)
@@ -86,16 +75,13 @@ def main() -> None:
     """Print the share of recordings whose interval covers the true entry."""
     parser = argparse.ArgumentParser(description="Coverage of 95 % intervals of the gain.")
     parser.add_argument("--recordings", type=int, default=400)
-    count = parser.parse_args().recordings
+    count, rows = parser.parse_args().recordings, []
     for root in (0.0, 0.9):
-        with ProcessPoolExecutor(2) as pool:
-            found = pool.map(functools.partial(covered, root=root), range(count), chunksize=8)
-            scores = np.array(list(tqdm(found, total=count, desc=f"root {root:g}", disable=None)))
-        print(f"\nnoise of root {root:g}, {count} recordings (seeds 0 to {count - 1})")
-        for row, name in enumerate(("Cramér-Rao", "sandwich")):
-            shares = 100 * np.mean(np.abs(scores[:, row]) <= 1.96, axis=0)
-            shown = "  ".join(f"K{i + 1}: {share:5.1f} %" for i, share in enumerate(shares))
-            print(f"  {name:<12} {shown}")
+        scores = np.array(each(functools.partial(covered, root=root), range(count)))
+        shares = 100 * np.mean(np.abs(scores) <= 1.96, axis=0)
+        for name, row in zip(("Cramér-Rao", "sandwich"), shares, strict=True):
+            rows.append([f"{root:g}", name, *(f"{share:.1f}" for share in row)])
+    print(markdown(["root of the noise", "standard errors", "K1, %", "K2, %"], rows))
 
 
 if __name__ == "__main__":

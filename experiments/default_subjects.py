@@ -11,15 +11,17 @@ entries of the true gain inside the printed 95 % intervals, for the nonlinear bo
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
+from experiments.driver import Row, kept_rows
+from experiments.summary import clustered
 from impc.assess.printed_gain import covariance_intervals, gain_estimate
 from impc.cli.plant import asked_subject, read_subject
 from impc.cli.simulate import command
@@ -28,25 +30,12 @@ from impc.inverse.noisy_fit import fit_controller
 __all__ = ["Found", "fitted_subject", "simulated_files"]
 
 
-@dataclass(frozen=True)
-class Found:
-    """One fit of a simulated subject.
+class Found(NamedTuple):
+    """One fit of a simulated subject."""
 
-    Attributes
-    ----------
-    inside : int
-        Number of entries of the true gain inside their intervals, of `entries`.
-    entries : int
-    misfit : float
-        2-norm of the residual.
-    seconds : float
-        CPU time of the fit and of its intervals.
-    """
-
-    inside: int
-    entries: int
-    misfit: float
-    seconds: float
+    inside: list[bool]  # Whether each entry of the true gain is inside its interval
+    misfit: float  # 2-norm of the residual
+    seconds: float  # CPU time of the fit and of its intervals
 
 
 def simulated_files(folder: Path, seed: int, *more: str) -> tuple[Path, ...]:
@@ -71,35 +60,35 @@ def fitted_subject(files: tuple[Path, ...], body: str) -> Found:
     seconds = time.process_time() - begun
     truth = np.ravel(json.loads((folder / "truth.json").read_text())["K"])
     pairs = zip(intervals, truth, strict=True)
-    inside = sum(bool(item.low <= value <= item.high) for item, value in pairs)
-    return Found(inside, len(truth), fitted.misfit, seconds)
+    inside = [bool(item.low <= value <= item.high) for item, value in pairs]
+    return Found(inside, fitted.misfit, seconds)
+
+
+def _row(study: str, seed: int, bodies: tuple[str, ...]) -> Row:
+    with tempfile.TemporaryDirectory() as folder:
+        motor = study.partition(" ")[2]
+        files = simulated_files(Path(folder, "one"), seed, "--motor-noise", motor)
+        return {body: fitted_subject(files, body)._asdict() for body in bodies}
 
 
 def main() -> None:
-    """Print a line for each subject, and the shares over all."""
+    """Fit the subjects that the file does not have, and print the shares of all."""
     parser = argparse.ArgumentParser(description="Coverage of the default subject.")
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--motor-noise", default="0", help="Nm")
-    parser.add_argument("--beside", type=int, default=20, help="how many with the linear body too")
+    parser.add_argument("--bodies", nargs="+", default=["nonlinear", "linear"])
+    parser.add_argument("--out", type=Path, default=Path("results", "default-subjects.jsonl"))
     given = parser.parse_args()
-    found: dict[str, list[Found]] = {"nonlinear": [], "linear": []}
-    for seed in tqdm(range(given.first, given.first + given.seeds), unit="subject", disable=None):
-        with tempfile.TemporaryDirectory() as folder:
-            files = simulated_files(Path(folder, "one"), seed, "--motor-noise", given.motor_noise)
-            for body in [*found][: 2 if seed < given.beside else 1]:
-                one = fitted_subject(files, body)
-                found[body].append(one)
-                print(f"seed {seed}, {body}: {one}", flush=True)
-    for body, fits in found.items():
-        if fits:
-            inside, entries = (
-                sum(getattr(one, key) for one in fits) for key in ("inside", "entries")
-            )
-            print(f"{body}: {inside} of {entries} entries inside, {100 * inside / entries:.1f} %")
-    pairs = zip(found["nonlinear"], found["linear"], strict=False)
-    ratios = [own.seconds / other.seconds for own, other in pairs]
-    if ratios:
+    study, one = f"motor {given.motor_noise}", functools.partial(_row, bodies=tuple(given.bodies))
+    rows = kept_rows(given.out, one, [(study, seed) for seed in range(given.seeds)])[study]
+    for body in given.bodies:
+        held = [row[body]["inside"] for row in rows if body in row]
+        share, error = clustered(held)
+        inside = sum(map(sum, held)), sum(map(len, held))
+        print(f"{body}: {inside[0]} of {inside[1]} inside, {share:.1f} ± {error:.1f} %")
+    both = [row for row in rows if {"nonlinear", "linear"} <= row.keys()]
+    if both:
+        ratios = [row["nonlinear"]["seconds"] / row["linear"]["seconds"] for row in both]
         least, median, most = np.quantile(ratios, [0, 0.5, 1])
         print(f"CPU time, nonlinear over linear: {median:.2f} ({least:.2f} to {most:.2f})")
 

@@ -11,40 +11,26 @@ from __future__ import annotations
 import numpy as np
 import scipy.optimize
 
-import plants
 from experiments.benchmarks.workloads import seat
-from impc.model.plant import Plant
-
-__all__ = ["least_radius"]
-
-
-def least_radius(seed: int, reach: float = 10.0) -> tuple[float, list[float]]:
-    """Smallest spectral radius found, and its four gains."""
-    plant = Plant(plants.seated_balance_plant(), ["command"])
-    truth = np.abs(np.array(seat(1, 1.0).controller.K)[0, :4])
-
-    def radius(scaled: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
-        gain = np.zeros((1, plant.n))
-        gain[0, :4] = scaled * truth
-        return float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ gain))))
-
-    found = scipy.optimize.differential_evolution(
-        radius,
-        scipy.optimize.Bounds([-reach] * 4, [reach] * 4),
-        seed=seed,
-        maxiter=600,
-        popsize=20,
-        tol=1e-8,
-    )
-    return float(found.fun), [float(value) for value in found.x * truth]
+from impc.arrays import Array
 
 
 def main() -> None:
-    """Print the result of each seed."""
+    """Print the smallest spectral radius and its gains for each seed."""
+    law = seat(1, 1.0).controller
+    plant, truth = law.plant, np.abs(np.array(law.K)[0, :4])
+
+    def radius(scaled: Array) -> float:
+        gain = np.append(scaled * truth, np.zeros(plant.n - 4))[None]
+        return float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ gain))))
+
     for seed in range(4):
-        radius, gains = least_radius(seed)
-        shown = ", ".join(f"{value:.0f}" for value in gains)
-        print(f"seed {seed}: smallest spectral radius {radius:.4f} at K_4 = [{shown}]")
+        bounds = scipy.optimize.Bounds([-10] * 4, [10] * 4)
+        found = scipy.optimize.differential_evolution(
+            radius, bounds, seed=seed, maxiter=600, popsize=20, tol=1e-8
+        )
+        gains = ", ".join(f"{value:.0f}" for value in found.x * truth)
+        print(f"seed {seed}: smallest spectral radius {found.fun:.4f} at K_4 = [{gains}]")
 
 
 if __name__ == "__main__":

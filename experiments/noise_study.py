@@ -3,7 +3,7 @@
 The linear seat under a torque limit, one trial of 30 s with white noise on the angles. For each
 limit (70, 6 and 4.5 Nm: the subject is at it never, in an eighth and in a third of the samples),
 noise level and seed, every method of `impc compare` and inverse KKT is fitted. Its controller then
-simulates another trial and is compared with the noise-free truth. Finished cells are kept in the
+simulates another trial and is compared with the noise-free truth. Finished subjects are kept in the
 folder, so the same command continues an interrupted run. Results: experiments/noise_study.md.
 
     python -m experiments.noise_study --out results/noise-study
@@ -13,17 +13,15 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
+from experiments.driver import Row, kept_rows, noisy
 from experiments.inverse_kkt import INVERSE_KKT
+from experiments.summary import markdown
 from impc.assess.variance_accounted_for import vaf
 from impc.checking import replace
 from impc.control.closed_loop import simulate
@@ -31,7 +29,6 @@ from impc.inverse.methods import METHODS, fit
 from impc.inverse.problem import controller_for
 from impc.inverse.solution_set import natural_coordinates
 from impc.model.recordings import Recording
-from impc.reporting.rendering import plain
 from impc.reporting.style import (
     BLUE,
     GREEN,
@@ -55,10 +52,11 @@ if TYPE_CHECKING:
     from impc.inverse.estimates import Estimate
     from impc.inverse.problem import Problem
 
-__all__ = ["COMPARED", "Cell", "Outcome", "study_cell"]
+__all__ = ["COMPARED", "study_cell"]
 
-#: The methods by name: those of `impc compare`, and inverse KKT.
-COMPARED = {name: METHODS[name] for name in compared_methods()} | {"inverse_kkt": INVERSE_KKT}
+#: The methods by name: those of `impc compare` that need no recorded commands, and inverse KKT.
+COMPARED = {name: METHODS[name] for name in compared_methods() if name != "command_regression"}
+COMPARED["inverse_kkt"] = INVERSE_KKT
 
 _LIMITS = (70.0, 6.0, 4.5)
 _CEILINGS = (99.99, 99.0, 90.0, 70.0, 50.0)
@@ -76,53 +74,20 @@ _MARKS = {
 }
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One simulated subject: torque limit (Nm), VAF of the true controller (%), seed."""
+def study_cell(limit: float, ceiling: float, seed: int) -> Row:
+    """Fit every method to a noisy trial, and evaluate it on another trial without noise.
 
-    limit: float
-    ceiling: float
-    seed: int
-
-    @property
-    def name(self) -> str:
-        """Name of the result file."""
-        return f"{self.limit:g}Nm-{self.ceiling:g}-{self.seed}"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """One method in one cell.
-
-    Attributes
-    ----------
-    vaf : float or None
-        VAF of another trial without noise, mean over outputs, %; None without a gain, or if the
-        simulation diverges.
-    gain_error : float or None
-        ||(K - K_true) T|| / ||K_true T||, in whitened coordinates of the truth.
-    has_weights : bool
-    seconds : float
-    reason : str
+    Torque limit in Nm, VAF of the true controller in %. By method: whether it has a `gain`, the
+    `missed` share of the variance of the other trial, mean over outputs, % (100 if the simulation
+    diverges), and the gain's `error` ||(K - K_true) T|| / ||K_true T|| in whitened coordinates.
     """
-
-    vaf: float | None
-    gain_error: float | None
-    has_weights: bool
-    seconds: float
-    reason: str
-
-
-def study_cell(cell: Cell) -> dict[str, Outcome]:
-    """Fit every method to a noisy trial, and evaluate it on another trial without noise."""
-    work = seat(2, 30.0, cell.limit)
+    work = seat(2, 30.0, limit)
     plant, (clean, unseen) = work.problem.plant, work.problem.recordings
-    rng = np.random.default_rng([cell.seed, round(100 * cell.ceiling), round(10 * cell.limit)])
-    share = (100 - cell.ceiling) / cell.ceiling
-    size = np.sqrt(share * np.mean(clean.outputs**2, axis=0))
-    noisy = clean.outputs + size * rng.standard_normal(clean.outputs.shape)
-    trial = Recording(plant, noisy, clean.disturbance)
-    problem = fit_problem(plant, [trial], FitSettings(u_max=cell.limit))
+    rng = np.random.default_rng([seed, round(100 * ceiling), round(10 * limit)])
+    noise = rng.standard_normal(clean.outputs.shape)
+    outputs = noisy(np.array(clean.outputs), (100 - ceiling) / ceiling, noise)
+    trial = Recording(plant, outputs, clean.disturbance)
+    problem = fit_problem(plant, [trial], FitSettings(u_max=limit))
     truth = np.array(work.controller.K)
     judged = replace(work.problem, recordings=(unseen,))
     start = fit(problem)
@@ -132,88 +97,54 @@ def study_cell(cell: Cell) -> dict[str, Outcome]:
     }
 
 
-def _judge(estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array) -> Outcome:
+def _judge(estimate: Estimate, unseen: Problem, drive: Scenario, truth: Array) -> Row:
     if estimate.K is None:
-        return Outcome(None, None, False, estimate.seconds, estimate.reason)
+        return {"gain": False, "missed": np.nan, "error": np.nan}
     K, plant = np.array(estimate.K), unseen.plant
     T, _ = natural_coordinates(plant, truth)
     error = float(np.linalg.norm((K - truth) @ T) / np.linalg.norm(truth @ T))
     run = simulate(
         controller_for(COMPARED[estimate.method].restrict(unseen), K, np.array(estimate.S)), drive
     )
-    share = None
+    share = 0.0
     if run.complete:
         share = float(np.mean(vaf(unseen.recordings[0].outputs, run.x @ plant.C.T)))
-    return Outcome(share, error, estimate.weights is not None, estimate.seconds, estimate.reason)
+    return {"gain": True, "missed": 100 - max(share, 0.0), "error": error}
 
 
-def _run(cells: list[Cell], out: Path) -> dict[str, dict[str, Outcome]]:
-    """Read finished cells from the folder; compute and keep the others."""
-    kept = out / "cells"
-    found: dict[str, dict[str, Outcome]] = {}
-    for cell in cells:
-        path = kept / f"{cell.name}.json"
-        if path.exists():
-            content = json.loads(path.read_text())
-            found[cell.name] = {name: Outcome(**values) for name, values in content.items()}
-    left = [cell for cell in cells if cell.name not in found]
-    with (
-        ProcessPoolExecutor(2) as pool,
-        tqdm(total=len(cells), initial=len(found), unit="subject", disable=None) as bar,
-    ):
-        pending = {pool.submit(study_cell, cell): cell for cell in left}
-        try:
-            for done in as_completed(pending):
-                cell, outcomes = pending[done], done.result()
-                content = plain({name: asdict(item) for name, item in outcomes.items()})
-                write_files(kept, {f"{cell.name}.json": json.dumps(content).encode()})
-                found[cell.name] = outcomes
-                bar.update()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return found
+def _cell(study: str, seed: int) -> Row:
+    limit, ceiling = map(float, study.split())
+    return study_cell(limit, ceiling, seed)
 
 
-def _median(
-    found: dict[str, dict[str, Outcome]], limit: float, ceiling: float, seeds: int, name: str
-) -> tuple[float, float, int]:
-    """Median VAF (a fall counts as 0) and gain error over seeds, and the number with a gain."""
-    cells = [Cell(limit, ceiling, seed).name for seed in range(seeds)]
-    items = [found[cell][name] for cell in cells if name in found[cell]]
-    usable = [item for item in items if item.gain_error is not None]
-    if not usable:
-        return float("nan"), float("nan"), 0
-    shares = [0.0 if item.vaf is None else max(item.vaf, 0.0) for item in usable]
-    errors = [item.gain_error for item in usable if item.gain_error is not None]
-    return float(np.median(shares)), float(np.median(errors)), len(usable)
+def _median(rows: list[Row], name: str) -> tuple[float, float]:
+    """Median missed share and gain error over the seeds with a gain; NaN without any."""
+    found = [(row[name]["missed"], row[name]["error"]) for row in rows if row[name]["gain"]]
+    missed, error = np.median(found, axis=0) if found else (np.nan, np.nan)
+    return float(missed), float(error)
 
 
-def _table(found: dict[str, dict[str, Outcome]], seeds: int) -> str:
-    lines = []
+def _tables(found: dict[str, list[Row]]) -> str:
+    texts = []
     for limit in _LIMITS:
-        lines += [
-            f"\nlimit {limit:g} Nm: VAF % of an unseen trial without noise (error of the gain)",
-            f"{'VAF of the truth':<38}" + "".join(f"{ceiling:>15.2f} %" for ceiling in _CEILINGS),
-        ]
+        rows = []
         for name, method in COMPARED.items():
-            cells = []
-            for ceiling in _CEILINGS:
-                share, error, count = _median(found, limit, ceiling, seeds, name)
-                text = f"{share:.2f} ({error:.2g})" if count else "none"
-                cells.append(f"{text:>17}")
-            lines.append(f"{method.label:<38}{''.join(cells)}")
-    return "\n".join(lines)
+            medians = [_median(found[f"{limit} {ceiling}"], name) for ceiling in _CEILINGS]
+            cells = [f"{100 - missed:.2f} ({error:.2g})" for missed, error in medians]
+            rows.append([method.label, *(cell if "nan" not in cell else "none" for cell in cells)])
+        head = [f"limit {limit:g} Nm", *(f"VAF of the truth {ceiling} %" for ceiling in _CEILINGS)]
+        texts.append(markdown(head, rows))
+    return "VAF % of an unseen trial without noise (error of the gain)\n\n" + "\n\n".join(texts)
 
 
-def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
+def _figure(found: dict[str, list[Row]]) -> Figure:
     figure = new_figure(HALF, 3.2)
     axes = figure.subplots(1, len(_LIMITS), sharey=True)
     noise = [100 - ceiling for ceiling in _CEILINGS]
     for position, (ax, limit) in enumerate(zip(axes, _LIMITS, strict=True)):
         for name, method in COMPARED.items():
             color, marker, line = _MARKS[name]
-            missed = [100 - _median(found, limit, ceiling, seeds, name)[0] for ceiling in _CEILINGS]
+            missed = [_median(found[f"{limit} {ceiling}"], name)[0] for ceiling in _CEILINGS]
             ax.loglog(
                 noise,
                 np.maximum(missed, 1e-3),
@@ -232,25 +163,17 @@ def _figure(found: dict[str, dict[str, Outcome]], seeds: int) -> Figure:
 
 
 def main() -> None:
-    """Run the study, print the table, and write figure and result.json."""
+    """Run the study, print the tables, and write the figure."""
     parser = argparse.ArgumentParser(description="Methods over noise and saturation.")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("results", "noise-study"))
     given = parser.parse_args()
-    cells = [Cell(*item) for item in itertools.product(_LIMITS, _CEILINGS, range(given.seeds))]
-    try:
-        found = _run(cells, given.out)
-    except KeyboardInterrupt:
-        print(f"interrupted; finished cells are kept in {given.out / 'cells'}")
-        return
-    print(_table(found, given.seeds))
-    content: Any = plain(
-        {cell: {name: asdict(item) for name, item in row.items()} for cell, row in found.items()}
-    )
-    files = {"result.json": (json.dumps(content, indent=1) + "\n").encode()}
+    studies = [f"{limit} {ceiling}" for limit, ceiling in itertools.product(_LIMITS, _CEILINGS)]
+    tasks = itertools.product(studies, range(given.seeds))
+    found = kept_rows(given.out / "subjects.jsonl", _cell, tasks)
+    print(_tables(found))
     with page_style():
-        files["noise-study.png"] = render(_figure(found, given.seeds), "png")
-    write_files(given.out, files)
+        write_files(given.out, {"noise-study.png": render(_figure(found), "png")})
     print(f"\nwritten to {given.out}")
 
 

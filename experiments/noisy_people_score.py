@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,120 +19,52 @@ if TYPE_CHECKING:
     from impc.output_feedback.intervals import PersonCovariance
     from impc.output_feedback.observer import Observer
 
-__all__ = [
-    "FALLEN",
-    "LIMITS",
-    "Score",
-    "above_truth",
-    "blind",
-    "falls",
-    "passed_over",
-    "score",
-    "true_unknowns",
-]
+__all__ = ["Score", "above_truth", "blind", "passed_over", "score"]
 
-#: A limit that is not reached, and one that is, for each body and VAF.
-LIMITS = {
-    ("cart", 90.0): (5.0, 0.7),
-    ("cart", 70.0): (5.0, 0.7),
-    ("pair", 90.0): (5.0, 0.7),
-    ("pair", 70.0): (5.0, 0.7),
-    ("seat", 90.0): (70.0, 6.0),
-    ("seat", 70.0): (70.0, 9.0),
-}
 # Subjects on the seat are left out if they saturate outside this range, or if they fall in any of
 # `_SIMULATED` further trials: the noise of trials without a fall differs from that of the model.
 _SHARES, _UNSEEN, _SIMULATED = (0.12, 0.40), 1000, 60
-#: Angle that counts as a fall, rad.
-FALLEN = 1.0
+# Angle that counts as a fall, rad.
+_FALLEN = 1.0
+
+Pairs = list[tuple[float, float]]
 
 
-@dataclass(frozen=True)
-class Score:
-    """Scores of both fits of a subject.
+class Score(NamedTuple):
+    """Scores of both fits of a subject."""
 
-    Attributes
-    ----------
-    study : str
-        Body, noise, VAF and limit.
-    seed : int
-    saturated : float
-        Share of the samples at the limit.
-    vaf : float
-        VAF of the motion without noise, %.
-    above : float
-        Objective of the search at its end minus that at the truth, nats.
-    converged : bool
-    evaluations : int
-    least_error, likely_error : float
-        Relative error of the gain, in whitened coordinates.
-    least, likely, expected : list of pairs
-        Error and standard error along each determined direction, best first: of least squares,
-        and of maximum likelihood with sandwich and with expected covariance.
-    entries : list of pairs
-        Printed sandwich intervals of the gain entries minus the truth, relative to the entry.
-    fell : list of float
-        Optional: fall of the likelihood with each direction of `likely` fixed at the truth, nats.
-    levels, found : list of float
-        True and fitted noise SDs: motor, senses, recording.
-    level_intervals : list of pairs
-        Printed sandwich intervals of the noise SDs.
-    seconds : list of float
-        Processor time of least squares, likelihood, and profiles.
-    """
-
-    study: str
-    seed: int
-    saturated: float
-    vaf: float
-    above: float
+    saturated: float  # Share of the samples at the limit
+    vaf: float  # VAF of the motion without noise, %
+    above: float  # Objective of the search at its end minus that at the truth, nats
     converged: bool
-    evaluations: int
-    least_error: float
-    likely_error: float
-    least: list[tuple[float, float]]
-    likely: list[tuple[float, float]]
-    expected: list[tuple[float, float]]
-    entries: list[tuple[float, float]]
+    least_error: float  # Relative error of the gain of least squares, in whitened coordinates
+    likely_error: float  # The same of maximum likelihood
+    # Error and standard error along each determined direction, best first: of least squares, and of
+    # maximum likelihood with sandwich and with expected covariance.
+    least: Pairs
+    likely: Pairs
+    expected: Pairs
+    # Fall of the likelihood with each direction of `likely` fixed at the truth, nats, if profiled.
     fell: list[float]
-    levels: list[float]
-    found: list[float]
-    level_intervals: list[tuple[float, float]]
-    seconds: list[float]
+    levels: list[float]  # True noise SDs: motor, senses, recording
+    found: list[float]  # Fitted noise SDs
+    level_intervals: Pairs  # Their printed sandwich intervals
 
 
-def score(
-    who: Subject,
-    trials: Recorded,
-    study: str,
-    seed: int,
-    *,
-    profiled: bool = False,
-) -> Score:
+def score(who: Subject, trials: Recorded, *, profiled: bool = False) -> Score:
     """Fit a subject by both methods, with profiles on request."""
     truth = np.array(who.controller.K)
-    clock = [time.process_time()]
     first = fit(trials.problem)
     gain, metric = np.array(first.gain), np.array(first.metric)
     least = gain_covariance(first.problem, gain, metric, curvature=True)
-    clock.append(time.process_time())
     likely = fit_output_feedback(first, blind(who))
-    clock.append(time.process_time())
-    expected = person_covariance(likely, "expected")
     robust = person_covariance(likely)
-    true = truth.reshape(-1, 1)
-    entries = (robust.entry_intervals(likely.K) - true) / np.abs(true)
-    fell = _fell(likely, robust, who) if profiled else []
-    clock.append(time.process_time())
     size = float(np.linalg.norm(truth @ least.T))
     return Score(
-        study,
-        seed,
         trials.saturated,
         trials.vaf,
         above_truth(likely, who),
         likely.converged,
-        likely.evaluations,
         float(np.linalg.norm((gain - truth) @ least.T)) / size,
         float(np.linalg.norm((likely.K - truth) @ least.T)) / size,
         _pairs(
@@ -143,13 +73,11 @@ def score(
             np.asarray(np.linalg.solve(least.G, (gain - truth) @ least.T)),
         ),
         _steps(likely, robust, truth),
-        _steps(likely, expected, truth),
-        entries.tolist(),
-        fell,
+        _steps(likely, person_covariance(likely, "expected"), truth),
+        _fell(likely, robust, who) if profiled else [],
         [*who.person.levels[who.person.levels > 0], *who.recorder],
         likely.levels.tolist(),
         robust.level_intervals(likely.levels).tolist(),
-        np.diff(clock).tolist(),
     )
 
 
@@ -160,10 +88,10 @@ def blind(who: Subject) -> Observer:
 
 def above_truth(likely: OutputFeedbackFit, who: Subject) -> float:
     """Objective of the search at the fit minus that at the true subject, nats."""
-    return likely.value - likely.space.at(true_unknowns(likely, who)).value
+    return likely.value - likely.space.at(_true_unknowns(likely, who)).value
 
 
-def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
+def _true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
     """The true subject in the coordinates of the fit, shape (q,)."""
     space = likely.space
     own, theta = space.space, np.array(space.start)
@@ -176,9 +104,7 @@ def true_unknowns(likely: OutputFeedbackFit, who: Subject) -> Array:
     return theta
 
 
-def _steps(
-    likely: OutputFeedbackFit, covariance: PersonCovariance, truth: Array
-) -> list[tuple[float, float]]:
+def _steps(likely: OutputFeedbackFit, covariance: PersonCovariance, truth: Array) -> Pairs:
     space = likely.space
     error = space.gain_law.natural(np.array(likely.K) - truth)
     along = np.tensordot(space.gain_law.natural(space.gain_law.gains), error, 2)
@@ -192,25 +118,17 @@ def _identified(directions: Array, deviations: Array) -> tuple[Array, Array]:
     return directions[order], deviations[order]
 
 
-def _aims(
-    fit: OutputFeedbackFit, covariance: PersonCovariance, who: Subject
-) -> tuple[Array, Array, Array]:
-    """Determined directions, their standard errors, and the truth along them."""
-    directions, deviations = _identified(covariance.directions, covariance.deviations)
-    return directions, deviations, directions @ true_unknowns(fit, who)[: fit.space.gain]
-
-
 def _fell(likely: OutputFeedbackFit, covariance: PersonCovariance, who: Subject) -> list[float]:
-    """Fall of the likelihood with each direction fixed at the truth, nats."""
-    found, along = [], np.zeros(len(likely.theta))
-    directions, _, aims = _aims(likely, covariance, who)
-    for direction, aim in zip(directions, aims, strict=True):
-        along[: likely.space.gain] = direction
-        found.append(fallen(likely, along, float(aim)))
+    """Fall of the likelihood with each determined direction fixed at the truth, nats."""
+    found, along, size = [], np.zeros(len(likely.theta)), likely.space.gain
+    truth = _true_unknowns(likely, who)[:size]
+    for direction in _identified(covariance.directions, covariance.deviations)[0]:
+        along[:size] = direction
+        found.append(fallen(likely, along, float(direction @ truth)))
     return found
 
 
-def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[float, float]]:
+def _pairs(directions: Array, deviations: Array, error: Array) -> Pairs:
     """Errors and standard errors along determined directions, with a fixed sign convention."""
     found = []
     for direction, deviation in zip(*_identified(directions, deviations), strict=True):
@@ -222,17 +140,17 @@ def _pairs(directions: Array, deviations: Array, error: Array) -> list[tuple[flo
 def passed_over(who: Subject, trials: Recorded, seed: int, *, met: bool) -> str:
     """Why a subject on the seat is left out; empty if kept."""
     low, high = _SHARES
-    if trials.largest > FALLEN or (met and falls(who, seed)):
+    if trials.largest > _FALLEN or (met and _falls(who, seed)):
         return "falls"
     return "" if not met or low <= trials.saturated <= high else "not so often at the limit"
 
 
-def falls(who: Subject, seed: int) -> int:
+def _falls(who: Subject, seed: int) -> int:
     """Number of sixty further simulated trials that end in a fall."""
     found = 0
     for number in range(_SIMULATED):
         push = who.pushes[number % len(who.pushes)]
         drawn = [seed, _UNSEEN + number]
         outputs = simulate_person(who.controller, who.person, push, seed=drawn).outputs
-        found += bool(np.any(np.abs(np.array(outputs)) > FALLEN))
+        found += bool(np.any(np.abs(np.array(outputs)) > _FALLEN))
     return found

@@ -1,114 +1,125 @@
 """Coverage of least squares and maximum likelihood on subjects with sensory noise.
 
-The subjects are those of `noisy_people`. Each line that is written is one subject, of each kind in
-turn, so a run can be interrupted, continued and summarised.
-Results: experiments/output_feedback.md.
+The subjects are those of `noisy_people`, each kind in turn. The table has all subjects of the file,
+with `--subjects 0` at any time. Results: experiments/output_feedback.md.
 
-    python -m experiments.noisy_people_study run --subjects 200 --out a.jsonl
-    python -m experiments.noisy_people_study run --body seat --vaf 90 --subjects 20 --out b.jsonl
-    python -m experiments.noisy_people_study sum a.jsonl b.jsonl
+    python -m experiments.noisy_people_study --subjects 200 --out a.jsonl
+    python -m experiments.noisy_people_study --body seat --vaf 90 --subjects 20 --out a.jsonl
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
-import json
-from dataclasses import asdict
+from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from experiments.driver import Row, kept_rows
 from experiments.noisy_people import BODIES, NOISES, recorded, subject
-from experiments.noisy_people_score import LIMITS, Score, passed_over, score
-from experiments.noisy_people_table import pooled, table
+from experiments.noisy_people_score import Pairs, Score, passed_over, score
+from experiments.summary import clustered, markdown
+from impc.assess.covariance import TWO_SIDED
 from impc.errors import ImpcError
 
-# Digits kept of each number.
-_DIGITS = 4
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["HEAD", "cells"]
+
+# A limit that is not reached, and one that is, for each body and VAF; those of a pair are a cart's.
+_LIMITS = {
+    ("cart", 90.0): (5.0, 0.7),
+    ("cart", 70.0): (5.0, 0.7),
+    ("seat", 90.0): (70.0, 6.0),
+    ("seat", 70.0): (70.0, 9.0),
+}
+#: Headings of the columns; shares are in % with the standard error of independent subjects.
+HEAD = (
+    "subjects", "count", "at the limit %", "ended at the truth or above", "converged",
+    "error of the gain %: least squares", "likelihood", "95 % holds: least squares",
+    "sandwich", "expected", "profile", "noise SDs",
+)  # fmt: skip
+# Fall of the likelihood at either end of a 95 % interval, nats; a search ended at the truth if it
+# is at most so far below it, nats.
+_LOWER, _ENDED = TWO_SIDED**2 / 2, 0.5
 
 
-def _run(given: argparse.Namespace) -> None:
-    path = Path(given.out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done = set()
-    if path.exists():
-        kept = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        done = {(one["study"], one["seed"]) for one in kept}
-    kinds = list(itertools.product(given.noise, given.vaf, given.met))
-    with path.open("a", encoding="utf-8") as file:
-        for seed, (noise, share, met) in itertools.product(
-            range(given.first, given.first + given.subjects), kinds
-        ):
-            study = f"{given.body}, {noise}, VAF {share:g}, {'met' if met else 'none met'}"
-            if (study, seed) in done:
-                continue
-            try:
-                who = subject(given.body, seed, noise, share, LIMITS[given.body, share][met])
-                trials = recorded(who, seed)
-                reason = passed_over(who, trials, seed, met=met) if given.body == "seat" else ""
-                line = {"study": study, "seed": seed, "passed": reason}
-                if not reason:
-                    line = asdict(score(who, trials, study, seed, profiled=given.profiles))
-            except ImpcError as error:  # Most are first fits of a diverged cart
-                line = {"study": study, "seed": seed, "reason": str(error)}
-            file.write(json.dumps(_short(line)) + "\n")
-            file.flush()
+def cells(study: str, scores: Sequence[Score]) -> list[str]:
+    """Row of the table for the subjects of one kind."""
+    levels = [zip(one.levels, one.level_intervals, strict=True) for one in scores]
+    return [
+        study,
+        f"{len(scores)}",
+        f"{100 * np.mean([one.saturated for one in scores]):.0f}",
+        f"{sum(one.above >= -_ENDED for one in scores)}",
+        f"{sum(one.converged for one in scores)}",
+        f"{100 * np.median([one.least_error for one in scores]):.1f}",
+        f"{100 * np.median([one.likely_error for one in scores]):.1f}",
+        _share([_inside(one.least) for one in scores]),
+        _share([_inside(one.likely) for one in scores]),
+        _share([_inside(one.expected) for one in scores]),
+        _share([[nats <= _LOWER for nats in one.fell] for one in scores]),
+        _share([[low <= level <= high for level, (low, high) in each] for each in levels]),
+    ]
 
 
-def _short(value: object) -> object:
-    """Round all numbers."""
-    if isinstance(value, float):
-        return float(f"{value:.{_DIGITS}g}")
-    if isinstance(value, dict):
-        return {name: _short(item) for name, item in value.items()}
-    return [_short(item) for item in value] if isinstance(value, (list, tuple)) else value
+def _inside(pairs: Pairs) -> list[bool]:
+    return [abs(error) <= TWO_SIDED * deviation for error, deviation in pairs]
 
 
-def _sum(given: argparse.Namespace) -> None:
-    scores: dict[str, list[Score]] = {}
-    others: dict[str, int] = {}
-    for name in given.files:
-        for line in Path(name).read_text(encoding="utf-8").splitlines():
-            found = json.loads(line)
-            why = found.get("reason") or found.get("passed")
-            if why:
-                others[f"{found['study']}: {why}"] = others.get(f"{found['study']}: {why}", 0) + 1
-            else:
-                scores.setdefault(found["study"], []).append(Score(**found))
-    for line in table(list(scores.values())):
-        print(line)
-    print()
-    for body, met in itertools.product(BODIES, ("none met", "met")):
-        ends = f"{body}, ", f", {met}"
-        people = [
-            each
-            for name, each in scores.items()
-            if name.startswith(ends[0]) and name.endswith(ends[1])
-        ]
-        if people:
-            print(f"{body}, {met}: {pooled(people)}")
-    for reason, count in others.items():
-        print(f"not scored: {reason}: {count}")
+def _share(held: list[list[bool]]) -> str:
+    share, error = clustered(held)
+    return "-" if np.isnan(share) else f"{share:.0f} ± {error:.0f} of {sum(map(len, held))}"
+
+
+def _row(study: str, seed: int, *, profiled: bool) -> Row:
+    """Score of a subject, or why there is none."""
+    body, noise, vaf, limit = study.split(", ")
+    share, met = float(vaf.removeprefix("VAF ")), limit == "met"
+    limits = _LIMITS["seat" if body == "seat" else "cart", share]
+    try:
+        who = subject(body, seed, noise, share, limits[met])
+        trials = recorded(who, seed)
+        reason = passed_over(who, trials, seed, met=met) if body == "seat" else ""
+        return {"passed": reason} if reason else score(who, trials, profiled=profiled)._asdict()
+    except ImpcError as error:  # Most are first fits of a diverged cart
+        return {"passed": str(error)}
 
 
 def main() -> None:
-    """Run a study, or summarise result files."""
+    """Score the subjects that the file does not have, and print the table of the file."""
     parser = argparse.ArgumentParser(description="Coverage on subjects with sensory noise.")
-    which = parser.add_subparsers(required=True)
-    run = which.add_parser("run")
-    run.add_argument("--body", choices=BODIES, default="cart")
-    run.add_argument("--noise", choices=tuple(NOISES), nargs="+", default=list(NOISES))
-    run.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0])
-    run.add_argument("--met", type=int, nargs="+", choices=(0, 1), default=[0, 1])
-    run.add_argument("--first", type=int, default=0)
-    run.add_argument("--subjects", type=int, default=200)
-    run.add_argument("--profiles", action="store_true")
-    run.add_argument("--out", required=True)
-    run.set_defaults(run=_run)
-    summed = which.add_parser("sum")
-    summed.add_argument("files", nargs="+")
-    summed.set_defaults(run=_sum)
+    parser.add_argument("--body", choices=BODIES, default="cart")
+    parser.add_argument("--noise", choices=tuple(NOISES), nargs="+", default=list(NOISES))
+    parser.add_argument("--vaf", type=float, nargs="+", default=[90.0, 70.0], help="90, 70 or both")
+    parser.add_argument(
+        "--met", choices=("none met", "met"), nargs="+", default=["none met", "met"]
+    )
+    parser.add_argument("--subjects", type=int, default=200)
+    parser.add_argument("--profiles", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("results", "noisy-people.jsonl"))
     given = parser.parse_args()
-    given.run(given)
+    tasks = [
+        (f"{given.body}, {noise}, VAF {vaf:g}, {met}", seed)
+        for seed, noise, vaf, met in itertools.product(
+            range(given.subjects), given.noise, given.vaf, given.met
+        )
+    ]
+    found = kept_rows(given.out, functools.partial(_row, profiled=given.profiles), tasks)
+    table, others = [], Counter[str]()
+    for study, rows in found.items():
+        scored = [row for row in rows if "passed" not in row]
+        others.update(f"{study}: {row['passed']}" for row in rows if "passed" in row)
+        if scored:
+            scores = [Score(**{name: row[name] for name in Score._fields}) for row in scored]
+            table.append(cells(study, scores))
+    print(markdown(HEAD, table))
+    for reason, count in others.items():
+        print(f"not scored: {reason}: {count}")
 
 
 if __name__ == "__main__":

@@ -9,23 +9,21 @@ lose balance only near 0 Nm/rad.
 
 from __future__ import annotations
 
-from functools import cache
+import functools
 
 import numpy as np
 
 import plants
 from experiments.protocols import critical_stiffness, torque_amplitude
 from impc.arrays import Array
-from impc.control.controller import Controller
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.weights import Weights
+from impc.cli.seat import seat_controller
 from impc.studies.simulated_people import simulate_subject
 
 __all__ = ["subject_balances", "subject_peak"]
 
 _LIMIT, _MOTOR, _STOP, _RATE = 6.0, 1.0, 12.0, 1000.0
-_LEARNT = 120.0  # Nm/rad
+# The controller is learnt at 120 Nm/rad.
+_controller = functools.cache(lambda: seat_controller({"k_r": 120.0}, _LIMIT))
 
 
 def subject_balances(stiffness: float, torque: Array, seed: int) -> bool:
@@ -42,16 +40,6 @@ def subject_peak(stiffness: float, torque: Array, seed: int) -> float:
     if trial.fell is not None:
         return np.inf
     return float(np.degrees(np.max(np.abs(trial.states[:, 0]))))
-
-
-@cache
-def _controller() -> Controller:
-    plant = Plant(plants.seated_balance_for(k_r=_LEARNT), ["command"])
-    v = np.array([0.70, 0.65, 0.22, 0.20]) / np.linalg.norm([0.70, 0.65, 0.22, 0.20])
-    Q = 1e-2 * np.eye(plant.n)
-    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
-    return Controller(plant, Weights(Q, 1), bounds, 20, terminal_set=False)
 
 
 def main() -> None:

@@ -10,28 +10,27 @@ A start is truth * exp(S normal), seeds 0 to 9 (Jin, Mou and Pappas, NeurIPS 202
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
+from experiments.driver import each
 from experiments.peer_systems import SYSTEMS
+from experiments.summary import counted, markdown
 from impc.errors import ImpcError
 from impc.nonlinear.fit import fit_optimal_control
 from impc.nonlinear.plan import SOLVERS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from experiments.peer_systems import PeerSystem
     from impc.arrays import Array
-    from impc.nonlinear.combinations import Combination, Combinations
+    from impc.nonlinear.combinations import Combination
     from impc.nonlinear.recordings import OptimalRecording
 
-__all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "identified_error"]
+__all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from"]
 
 #: Closed loops: initial state, and changes of the true parameters so that limits of states and of
 #: inputs are both reached.
@@ -41,28 +40,14 @@ LOOPS: dict[str, tuple[list[float], dict[str, float]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Result of one search.
+class Outcome(NamedTuple):
+    """Result of one search."""
 
-    Attributes
-    ----------
-    loss : float
-        Sum of squares over states and inputs; NaN without a plan at the start.
-    error : float
-        Largest relative error of an identified product of parameters.
-    evaluations : int
-    seconds : float
-        CPU time, s.
-    unidentified : str
-        Unidentified combinations.
-    """
-
-    loss: float
-    error: float
+    loss: float  # Sum of squares over states and inputs; NaN without a plan at the start
+    error: float  # Largest relative error of an identified product of parameters
     evaluations: int
-    seconds: float
-    unidentified: str
+    seconds: float  # CPU time, s
+    unidentified: str  # Unidentified combinations
 
 
 def demonstration(system: PeerSystem) -> OptimalRecording:
@@ -91,14 +76,9 @@ def fit_from(
         return Outcome(np.nan, np.nan, 0, time.process_time() - began, str(error))
     seconds = time.process_time() - began
     unidentified = ", ".join(one.name for one in found.combinations.unidentified) or "none"
-    wrong = identified_error(found.combinations, truth)
+    products = found.combinations.identified
+    wrong = max(abs(one.value / _product(truth, one) - 1) for one in products)
     return Outcome(found.loss, wrong, found.evaluations, seconds, unidentified)
-
-
-def identified_error(found: Combinations, truth: dict[str, float]) -> float:
-    """Largest relative error of the identified products."""
-    errors = [abs(one.value / _product(truth, one) - 1) for one in found.identified]
-    return max(errors)
 
 
 def _product(truth: dict[str, float], one: Combination) -> float:
@@ -112,23 +92,25 @@ def coverage(repetitions: int, decibel: float = 20.0) -> tuple[dict[str, list[bo
     initial state is known, and the search starts at the truth. The second result lists repetitions
     with other unidentified directions.
     """
-    system = SYSTEMS["robot arm"]()
-    clean = demonstration(system)
-    share = 10 ** (-decibel / 20)
     held: dict[str, list[bool]] = {}
-    odd: list[str] = []
-    for seed in tqdm(range(repetitions), unit="repetition", disable=None):
-        rng = np.random.default_rng([20, seed])
-        noisy = [_noisy(item, share, rng) for item in (clean.x, clean.u)]
-        recording = system.problem.recorded_plan(*noisy, x0=system.x0)
-        found = fit_optimal_control(system.problem, [recording], system.truth).combinations
-        for one in found.identified:
-            expected = _product(system.truth, one)
-            inside = abs(np.log(one.value / expected)) < 1.96 * one.deviation
-            held.setdefault(one.name, []).append(bool(inside))
-        if len(found.unidentified) != 2:
-            odd.append("; ".join(found.sentences[:-1]))
-    return held, odd
+    found = each(functools.partial(_covered, share=10 ** (-decibel / 20)), range(repetitions))
+    for name, inside in itertools.chain(*(one for one, _ in found)):
+        held.setdefault(name, []).append(inside)
+    return held, [odd for _, odd in found if odd]
+
+
+def _covered(seed: int, share: float) -> tuple[list[tuple[str, bool]], str]:
+    """Identified products of one repetition, and other unidentified directions than usual."""
+    system = SYSTEMS["robot arm"]()
+    clean, rng = demonstration(system), np.random.default_rng([20, seed])
+    noisy = [_noisy(item, share, rng) for item in (clean.x, clean.u)]
+    recording = system.problem.recorded_plan(*noisy, x0=system.x0)
+    found = fit_optimal_control(system.problem, [recording], system.truth).combinations
+    held = []
+    for one in found.identified:
+        error = np.log(one.value / _product(system.truth, one))
+        held.append((one.name, bool(abs(error) < 1.96 * one.deviation)))
+    return held, "; ".join(found.sentences[:-1]) if len(found.unidentified) != 2 else ""
 
 
 def _noisy(values: Array, share: float, rng: np.random.Generator) -> Array:
@@ -136,47 +118,55 @@ def _noisy(values: Array, share: float, rng: np.random.Generator) -> Array:
     return np.asarray(values + share * size * rng.normal(size=values.shape))
 
 
-def _line(name: str, S: float, outcomes: list[Outcome]) -> str:
-    good = [one for one in outcomes if one.loss < 1e-10]
-    unidentified = sorted({one.unidentified for one in good})
-    return (
-        f"| {name} | {S:g} | {len(good)} of {len(outcomes)} | "
-        f"{max(one.loss for one in good):.1e} | {max(one.error for one in good):.1e} | "
-        f"{np.median([one.evaluations for one in good]):.0f} | "
-        f"{np.median([one.seconds for one in good]):.2f} ({max(o.seconds for o in good):.2f}) | "
-        f"{' or '.join(unidentified)} |"
-    )
+def _start(task: tuple[str, float, int]) -> Outcome:
+    name, S, seed = task
+    system = SYSTEMS[name]()
+    return fit_from(system, demonstration(system), system.truth, S, seed)
 
 
-def _starts(systems: Iterable[str], count: int) -> None:
-    for name in systems:
-        system = SYSTEMS[name]()
-        recording = demonstration(system)
-        for S in (0.1, 0.3):
-            found = [fit_from(system, recording, system.truth, S, seed) for seed in range(count)]
-            print(_line(name, S, found), flush=True)
-            for seed, one in enumerate(found):
-                if not one.loss < 1e-10:
-                    print(
-                        f"  seed {seed}: loss {one.loss:.3g}, {one.seconds:.1f} s; "
-                        f"{one.unidentified}"
-                    )
+def _starts(systems: list[str], count: int) -> None:
+    tasks = list(itertools.product(systems, (0.1, 0.3), range(count)))
+    found = dict(zip(tasks, each(_start, tasks), strict=True))
+    rows = []
+    for name, S in itertools.product(systems, (0.1, 0.3)):
+        outcomes = [found[name, S, seed] for seed in range(count)]
+        good = [one for one in outcomes if one.loss < 1e-10]
+        seconds = [one.seconds for one in good]
+        rows.append([
+            name, f"{S:g}", f"{len(good)} of {count}",
+            f"{max((one.loss for one in good), default=np.nan):.1e}",
+            f"{max((one.error for one in good), default=np.nan):.1e}",
+            f"{np.median([one.evaluations for one in good]):.0f}",
+            f"{np.median(seconds):.2f} ({max(seconds, default=np.nan):.2f})",
+            " or ".join(sorted({one.unidentified for one in good})),
+        ])  # fmt: skip
+        for seed, one in enumerate(outcomes):
+            if not one.loss < 1e-10:
+                print(f"{name}, S {S:g}, seed {seed}: loss {one.loss:.3g}; {one.unidentified}")
+    head = "system,S,loss below 1e-10,largest loss,largest error,evaluations,CPU s,not identified"
+    print(markdown(head.split(","), rows))
 
 
-def _loops(systems: Iterable[str], count: int, solver: str) -> None:
-    for name in [name for name in LOOPS if name in systems]:
-        x0, changes = LOOPS[name]
-        system = SYSTEMS[name](20)
-        truth = system.truth | changes
-        loop = system.problem.closed_loop(truth, x0, 60, mu=1e-12)
-        recording = system.problem.recorded_loop(loop.x, loop.u)
-        for seed in range(count):
-            found = fit_from(system, recording, truth, 0.1, seed, solver)
-            print(
-                f"| {name} | {solver} | {seed} | {found.loss:.1e} | {found.error:.1e} | "
-                f"{found.evaluations} | {found.seconds:.1f} | {found.unidentified} |",
-                flush=True,
-            )
+def _loop(task: tuple[str, int], solver: str) -> Outcome:
+    name, seed = task
+    x0, changes = LOOPS[name]
+    system = SYSTEMS[name](20)
+    truth = system.truth | changes
+    loop = system.problem.closed_loop(truth, x0, 60, mu=1e-12)
+    recording = system.problem.recorded_loop(loop.x, loop.u)
+    return fit_from(system, recording, truth, 0.1, seed, solver)
+
+
+def _loops(systems: list[str], count: int, solver: str) -> None:
+    tasks = [(name, seed) for name in LOOPS if name in systems for seed in range(count)]
+    found = each(functools.partial(_loop, solver=solver), tasks)
+    rows = [
+        [name, solver, f"{seed}", f"{one.loss:.1e}", f"{one.error:.1e}", f"{one.evaluations}",
+         f"{one.seconds:.1f}", one.unidentified]
+        for (name, seed), one in zip(tasks, found, strict=True)
+    ]  # fmt: skip
+    head = "system,solver,seed,loss,largest error,evaluations,CPU s,not identified"
+    print(markdown(head.split(","), rows))
 
 
 def main() -> None:
@@ -194,7 +184,7 @@ def main() -> None:
     else:
         held, odd = coverage(10 * given.count)
         for name, item in (*held.items(), ("all", list(itertools.chain(*held.values())))):
-            print(f"{name}: {sum(item)} of {len(item)}, {100 * np.mean(item):.1f} %")
+            print(f"{name}: {counted(sum(item), len(item))}")
         print(f"another direction is not identified in {len(odd)}:", *odd, sep="\n")
 
 

@@ -15,10 +15,11 @@ import argparse
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 import plants
+from experiments.driver import each
 from experiments.printed_intervals import carts
+from experiments.summary import markdown
 from impc.control.controller import Controller
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -74,20 +75,24 @@ _PEOPLE: dict[str, Callable[[], tuple[Person, Perturbation, tuple[Design, ...], 
 }
 
 
+def _compared(task: tuple[str, int, int]) -> tuple[Design, Array, Array] | None:
+    """Predicted and observed standard errors of the experiment of an index of a grid."""
+    name, index, fits = task
+    person, perturbation, grid, trials = _PEOPLE[name]()
+    tried = try_design(person, grid[index], perturbation, trials=trials, draws=trials)
+    if tried.expected is None or tried.problem is None:
+        return None
+    seen = simulated_fits(person, tried.problem, fits, 1)
+    gain = tried.expected.gain
+    steps = np.array([gain.along(K - person.controller.K) for K in seen.gains])
+    known = gain.identified
+    return grid[index], gain.deviations[known], np.std(steps[:, known], axis=0)
+
+
 def compare(name: str, fits: int) -> list[tuple[Design, Array, Array]]:
     """Experiment, then predicted and observed standard errors of identified directions."""
-    person, perturbation, grid, trials = _PEOPLE[name]()
-    found = []
-    for design in tqdm(grid, disable=None):
-        tried = try_design(person, design, perturbation, trials=trials, draws=trials)
-        if tried.expected is None or tried.problem is None:
-            continue
-        seen = simulated_fits(person, tried.problem, fits, 1)
-        gain = tried.expected.gain
-        steps = np.array([gain.along(K - person.controller.K) for K in seen.gains])
-        known = gain.identified
-        found.append((design, gain.deviations[known], np.std(steps[:, known], axis=0)))
-    return found
+    tasks = [(name, index, fits) for index in range(len(_PEOPLE[name]()[2]))]
+    return [found for found in each(_compared, tasks) if found is not None]
 
 
 def main() -> None:
@@ -96,11 +101,11 @@ def main() -> None:
     parser.add_argument("person", choices=tuple(_PEOPLE))
     parser.add_argument("--fits", type=int, default=100)
     given = parser.parse_args()
-    print("| amplitude | hold time (s) | predicted | observed / predicted |")
-    print("|---|---|---|---|")
-    for design, foreseen, seen in compare(given.person, given.fits):
-        row = f"| {design.amplitude:g} | {design.dwell:g} | {_list(foreseen)} "
-        print(f"{row}| {_list(seen / foreseen)} |")
+    rows = [
+        [f"{design.amplitude:g}", f"{design.dwell:g}", _list(predicted), _list(seen / predicted)]
+        for design, predicted, seen in compare(given.person, given.fits)
+    ]
+    print(markdown(["amplitude", "hold time (s)", "predicted", "observed / predicted"], rows))
 
 
 def _list(values: Array) -> str:

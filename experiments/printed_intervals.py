@@ -15,20 +15,17 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import control
 import numpy as np
-import scipy.signal
-from tqdm import tqdm
 
+from experiments.driver import each, with_noise
+from experiments.summary import markdown
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import gain_estimate
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.feasibility import require_complete
 from impc.control.simulation import scenario
 from impc.inverse.noisy_fit import fit_controller
 from impc.model.bounds import Bounds
@@ -51,31 +48,18 @@ __all__ = [
     "regulator",
     "score",
     "score_carts",
-    "score_random",
     "shares",
-    "with_noise",
 ]
 
-_HORIZON, _SAMPLES, _HOLD, _BEFORE = 8, 800, 10, 500
+_HORIZON, _SAMPLES, _HOLD = 8, 800, 10
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Errors of one fit over the printed standard errors.
+class Scores(NamedTuple):
+    """Errors of one fit over the printed standard errors; NaN if not identified."""
 
-    Attributes
-    ----------
-    entries : Array
-        Errors of the entries of K (m * n,); NaN if not individually identified.
-    directions : Array
-        Errors along the directions of the gain (m * n,), best first; NaN if not identified.
-    bias : Array
-        Relative error of each entry of K (m * n,).
-    """
-
-    entries: Array
-    directions: Array
-    bias: Array
+    entries: Array  # Of the entries of K (m * n,)
+    directions: Array  # Along the directions of the gain (m * n,), best first
+    bias: Array  # Relative error of each entry of K (m * n,)
 
 
 def carts(count: int, dt: float = 0.1) -> Plant:
@@ -117,19 +101,6 @@ def noisy_recording(controller: Controller, seed: int, vaf: float, root: float) 
     count = controller.plant.E.shape[1]
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (_SAMPLES // _HOLD, count)), _HOLD, axis=0)
     return with_noise(controller, push, rng, vaf, root)
-
-
-def with_noise(
-    controller: Controller, push: Array, rng: np.random.Generator, vaf: float, root: float
-) -> Recording:
-    """Simulate the controller under a disturbance and add noise to its outputs."""
-    plant, samples = controller.plant, len(push)
-    run = simulate(controller, scenario(plant, np.zeros(plant.n), disturbance=push))
-    clean = (require_complete(controller, run).x @ plant.C.T)[:samples]
-    white = rng.standard_normal((samples + _BEFORE, clean.shape[1]))
-    noise = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)[_BEFORE:]
-    size = np.sqrt((100 - vaf) / vaf * np.mean(clean**2, axis=0))
-    return Recording(plant, clean + size * noise, push)
 
 
 def random_recording(seed: int, inputs: int, vaf: float) -> tuple[Controller, Recording]:
@@ -186,8 +157,9 @@ def score_carts(seed: int, inputs: int, vaf: float, root: float) -> Scores:
     return score(controller, noisy_recording(controller, seed, vaf, root))
 
 
-def score_random(seed: int, inputs: int, vaf: float) -> Scores:
-    """`score` of one random plant."""
+def _score_random(seed: int, inputs: int, vaf: float, root: float) -> Scores:
+    """`score` of one random plant, whose noise is white."""
+    assert root == 0
     return score(*random_recording(seed, inputs, vaf))
 
 
@@ -195,32 +167,6 @@ def shares(scores: Array) -> Array:
     """Coverage of the 95 % intervals of each column; NaN is left out."""
     inside = np.where(np.isnan(scores), np.nan, np.abs(scores) <= TWO_SIDED)
     return np.asarray(np.nanmean(inside, axis=0))
-
-
-def _cell(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float, root: float) -> None:
-    one = functools.partial(score_carts, inputs=inputs, vaf=vaf, root=root)
-    found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
-    entries = np.array([item.entries for item in found])
-    directions = np.array([item.directions for item in found])
-    bias = 100 * np.median([item.bias[0] for item in found])
-    identified = 100 * np.mean(np.isfinite(directions))
-    print(
-        f"| {inputs} | {vaf:g} | {root:g} | {_range(entries)} | {_range(directions)} | "
-        f"{identified:.0f} | {bias:+.1f} |",
-        flush=True,
-    )
-
-
-def _random(pool: ProcessPoolExecutor, count: int, inputs: int, vaf: float) -> None:
-    one = functools.partial(score_random, inputs=inputs, vaf=vaf)
-    found = list(tqdm(pool.map(one, range(count), chunksize=4), total=count, disable=None))
-    entries = np.concatenate([item.entries for item in found])[:, None]
-    directions = np.concatenate([item.directions for item in found])[:, None]
-    identified = 100 * np.mean(np.isfinite(directions))
-    cells = [f"{100 * shares(scores)[0]:.1f}" for scores in (entries, directions)]
-    print(
-        f"| {inputs}, random | {vaf:g} | 0 | {' | '.join(cells)} | {identified:.0f} | |", flush=True
-    )
 
 
 def _range(scores: Array) -> str:
@@ -241,18 +187,24 @@ def main() -> None:
     parser.add_argument("--random", action="store_true", help="random plants, white noise")
     parser.add_argument("--roots", type=float, nargs="+", default=[0.0, 0.8])
     given = parser.parse_args()
-    print(
-        "| inputs | VAF % | root | entries of K, % | directions, % | identified, % | bias of K11, "
-        "% |"
-    )
-    print("|---|---|---|---|---|---|---|")
-    with ProcessPoolExecutor(2) as pool:
-        if given.random:
-            for inputs, vaf in itertools.product(given.inputs, given.vaf):
-                _random(pool, given.recordings, inputs, vaf)
-            return
-        for inputs, vaf, root in itertools.product(given.inputs, given.vaf, given.roots):
-            _cell(pool, given.recordings, inputs, vaf, root)
+    one, roots = (_score_random, [0.0]) if given.random else (score_carts, given.roots)
+    rows = []
+    for inputs, vaf, root in itertools.product(given.inputs, given.vaf, roots):
+        study = functools.partial(one, inputs=inputs, vaf=vaf, root=root)
+        found = each(study, range(given.recordings))
+        if given.random:  # Plants of several sizes have one column together
+            entries, directions, bias = (
+                np.concatenate(a)[:, None] for a in zip(*found, strict=True)
+            )
+        else:
+            entries, directions, bias = (np.array(a) for a in zip(*found, strict=True))
+        identified = 100 * np.mean(np.isfinite(directions))
+        cells = [_range(entries), _range(directions), f"{identified:.0f}"]
+        first = "" if given.random else f"{100 * np.median(bias[:, 0]):+.1f}"
+        rows.append([f"{inputs}", f"{vaf:g}", f"{root:g}", *cells, first])
+        print(*rows[-1], sep=" | ", flush=True)
+    head = "inputs,VAF %,root,entries of K %,directions %,identified %,bias of K11 %"
+    print(markdown(head.split(","), rows))
 
 
 if __name__ == "__main__":

@@ -19,37 +19,33 @@ from __future__ import annotations
 import argparse
 import collections
 import functools
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+import itertools
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-import scipy.signal
-from tqdm import tqdm
 
 import plants
-from impc.arrays import Array
+from experiments.driver import each, first_order_noise
+from experiments.summary import counted
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
+from impc.cli.seat import seat_weights
 from impc.control.controller import Controller
-from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.refit import refit
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
-from impc.model.weights import Weights
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
 from impc.studies.simulated_people import simulate_subject
 
-__all__ = ["SUBJECTS", "Kind", "diagnosed", "fitted_subject"]
+__all__ = ["SUBJECTS", "Kind", "diagnosed"]
 
 _LIMIT = 6.0
 
 
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """A kind of subject: motor noise (Nm), noise on the angles (degrees), its root, the plant."""
 
     motor: float
@@ -68,16 +64,18 @@ SUBJECTS = {
 }
 
 
-def fitted_subject(
-    kind: Kind, seed: int, order: int, horizon: int, duration: float = 30.0
-) -> Estimate:
-    """Simulate and fit a subject; `order` of the Padé delay, `duration` of a trial in s."""
+def diagnosed(
+    seed: int, name: str, order: int = 5, horizon: int = 20, duration: float = 30.0
+) -> LackOfFit | None:
+    """Residual test of a subject; `order` of the Padé delay, `duration` of a trial in s."""
+    kind = SUBJECTS[name]
     system = plants.seated_balance_for(sample_time=0.01, delay_order=order)
     plant = Plant(system, ["command"]).linear()
-    weights = _weights(plant)
+    weights = seat_weights(plant)
     bounds = Bounds(plant, u_min=-_LIMIT, u_max=_LIMIT)
     controller = Controller(plant, weights, bounds, horizon, terminal_set=False)
-    step = _linear_step(plant) if kind.linear else _nonlinear_step(order)
+    nonlinear = plants.seated_balance_step_for(sample_time=0.01, delay_order=order)
+    step = _linear_step(plant) if kind.linear else nonlinear
     rng = np.random.default_rng([seed, 1])
     trials: list[Recording] = []
     for number, child in enumerate(np.random.SeedSequence(seed).spawn(3)):
@@ -85,27 +83,12 @@ def fitted_subject(
         run = simulate_subject(
             controller, step, torque, rate=100.0, motor=kind.motor, largest=0.5, seed=child
         )
-        noise = np.radians(kind.sensor) * _noise(kind.root, run.outputs.shape, rng)
-        trials.append(Recording(plant, run.outputs + noise, run.disturbance))
+        noise = first_order_noise(rng, run.outputs.shape, kind.root)
+        outputs = run.outputs + np.radians(kind.sensor) * noise
+        trials.append(Recording(plant, outputs, run.disturbance))
     settings = FitSettings(horizon=horizon, u_max=_LIMIT)
-    return fit_controller(fit_problem(plant, trials, settings), weights)
-
-
-def diagnosed(
-    seed: int, name: str, order: int = 5, horizon: int = 20, duration: float = 30.0
-) -> LackOfFit | None:
-    """Residual test of one subject with three trials of `duration` s."""
-    fitted = fitted_subject(SUBJECTS[name], seed, order, horizon, duration)
-    K, S = np.array(fitted.gain), np.array(fitted.metric)
-    return lack_of_fit(refit(fitted.problem, K, S))
-
-
-def _weights(plant: Plant) -> Weights:
-    v = np.array([0.70, 0.65, 0.22, 0.20])
-    v /= np.linalg.norm(v)
-    Q = 1e-2 * np.eye(plant.n)
-    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    return Weights(Q, 1)
+    fitted = fit_controller(fit_problem(plant, trials, settings), weights)
+    return lack_of_fit(refit(fitted.problem, np.array(fitted.gain), np.array(fitted.metric)))
 
 
 def _linear_step(plant: Plant) -> Any:
@@ -114,14 +97,10 @@ def _linear_step(plant: Plant) -> Any:
     return ca.Function("step", [x, u], [ca.DM(np.array(plant.A)) @ x + ca.DM(both) @ u])
 
 
-def _nonlinear_step(order: int) -> Any:
-    return plants.seated_balance_step_for(sample_time=0.01, delay_order=order)
-
-
-def _noise(root: float, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    white = rng.standard_normal((shape[0] + 500, *shape[1:]))
-    filtered = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
-    return np.asarray(filtered[500:])
+def _alarm(task: tuple[str, int], order: int, horizon: int) -> str:
+    """Name of the error after an alarm; empty without one."""
+    lack = diagnosed(task[1], task[0], order, horizon)
+    return lack.errors[0].name if lack is not None and lack.alarm else ""
 
 
 def main() -> None:
@@ -131,14 +110,12 @@ def main() -> None:
     parser.add_argument("--order", type=int, default=5)
     parser.add_argument("--horizon", type=int, default=20)
     given = parser.parse_args()
+    tasks = list(itertools.product(SUBJECTS, range(given.seeds)))
+    study = functools.partial(_alarm, order=given.order, horizon=given.horizon)
+    found = list(zip(tasks, each(study, tasks), strict=True))
     for name in SUBJECTS:
-        study = functools.partial(diagnosed, name=name, order=given.order, horizon=given.horizon)
-        with ProcessPoolExecutor(2) as pool:
-            found = list(tqdm(pool.map(study, range(given.seeds)), total=given.seeds, disable=None))
-        alarms = [lack.errors[0].name for lack in found if lack is not None and lack.alarm]
-        print(
-            f"{name:<10} {len(alarms)} alarms of {len(found)}: {dict(collections.Counter(alarms))}"
-        )
+        alarms = [alarm for task, alarm in found if task[0] == name and alarm]
+        print(f"{name:<10} {counted(len(alarms), given.seeds)}: {collections.Counter(alarms)}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Share of default searches that find the right gain: a table of experiments/coverage.md.
 
-python -m experiments.search_study                 # all rows: a quarter of an hour on one core
+python -m experiments.search_study                 # all rows: a quarter of an hour
 python -m experiments.search_study --rows sticks   # one row
 """
 
@@ -11,17 +11,15 @@ import itertools
 import time
 from typing import TYPE_CHECKING
 
-import scipy.stats
-
+from experiments.driver import each
 from experiments.search_problems import Known, random_problem, stick_problem
+from experiments.summary import counted
 from impc.errors import ImpcError
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.problem import recorded_size
 from impc.inverse.search import refine_gain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from impc.inverse.estimates import Estimate
 
 __all__ = ["is_right", "warned"]
@@ -29,6 +27,15 @@ __all__ = ["is_right", "warned"]
 # Right: a misfit of at most this multiple of that of a search from the truth, or for exact
 # recordings of at most this share of the recorded outputs.
 _NOISY, _EXACT = 1.01, 1e-6
+# Number of inputs (0: the stick), half of the outputs or all states, and number of problems.
+_ROWS = {
+    "sticks": (0, False, 100),
+    "one": (1, False, 200),
+    "half": (1, True, 67),
+    "two": (2, False, 100),
+    "three": (3, False, 100),
+    "two-half": (2, True, 100),
+}
 
 
 def is_right(known: Known, found: Estimate) -> bool:
@@ -45,24 +52,25 @@ def warned(found: Estimate) -> bool:
     return bool(found.doubts) or not found.converged
 
 
-def _sticks() -> Iterator[Known]:
-    known = (stick_problem(seed) for seed in itertools.count())
-    return (one for one in known if one is not None and 0.05 <= one.saturated < 0.45)
+def _posed(task: tuple[str, int]) -> Known | None:
+    """Problem of a row and a seed; None if its share of samples at the limit is extreme."""
+    row, seed = task
+    inputs, half, _ = _ROWS[row]
+    known = random_problem(seed, inputs, half=half) if inputs else stick_problem(seed)
+    if known is None or not 0.05 <= known.saturated < (0.4 if inputs else 0.45):
+        return None
+    return known
 
 
-def _random(inputs: int, half: bool) -> Iterator[Known]:
-    known = (random_problem(seed, inputs, half=half) for seed in itertools.count())
-    return (one for one in known if one is not None and 0.05 <= one.saturated < 0.4)
-
-
-_ROWS: dict[str, tuple[str, Callable[[], Iterator[Known]], int]] = {
-    "sticks": ("a stick, 5 to 45 % at the limit, noise", _sticks, 100),
-    "one": ("one input, exact, all states", lambda: _random(1, False), 200),
-    "half": ("one input, exact, half of the outputs", lambda: _random(1, True), 67),
-    "two": ("two inputs, exact, all states", lambda: _random(2, False), 100),
-    "three": ("three inputs, exact, all states", lambda: _random(3, False), 100),
-    "two-half": ("two inputs, exact, half of the outputs", lambda: _random(2, True), 100),
-}
+def _answer(task: tuple[str, int]) -> tuple[bool, bool, float]:
+    """Whether the search of a problem is right, whether it warns, and its processor time, s."""
+    known, began = _posed(task), time.process_time()
+    assert known is not None
+    try:
+        found = fit_controller(known.problem)
+    except ImpcError:
+        return False, True, time.process_time() - began
+    return is_right(known, found), warned(found), time.process_time() - began
 
 
 def main() -> None:
@@ -72,21 +80,14 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="number of problems in each row")
     chosen = parser.parse_args()
     for row in chosen.rows:
-        name, make, usual = _ROWS[row]
-        count, right, loud, began = chosen.count or usual, 0, 0, time.process_time()
-        for known in itertools.islice(make(), count):
-            try:
-                found = fit_controller(known.problem)
-            except ImpcError:
-                loud += 1
-                continue
-            fine = is_right(known, found)
-            right, loud = right + fine, loud + (not fine and warned(found))
-        low, high = scipy.stats.binomtest(right, count).proportion_ci()
-        seconds = (time.process_time() - began) / count
+        count = chosen.count or _ROWS[row][2]
+        tasks = ((row, seed) for seed in itertools.count())
+        found = each(_answer, list(itertools.islice(filter(_posed, tasks), count)))
+        right = sum(fine for fine, _, _ in found)
+        loud = sum(warns and not fine for fine, warns, _ in found)
         print(
-            f"{name}: {right} of {count} right (95 %: {100 * low:.0f} to {100 * high:.0f} %), "
-            f"{loud} of {count - right} others warn, {seconds:.2f} s of processor time each",
+            f"{row}: {counted(right, count)} right, {loud} of {count - right} others warn, "
+            f"{sum(seconds for *_, seconds in found) / count:.2f} s of processor time each",
             flush=True,
         )
 

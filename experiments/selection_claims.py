@@ -18,6 +18,7 @@ import numpy as np
 import scipy.optimize
 
 import plants
+from experiments.summary import markdown
 from impc.arrays import percentiles
 from impc.studies.selection.analysis import bootstrap_subset
 from impc.studies.selection.estimation import estimate, free_indices
@@ -222,13 +223,14 @@ def main() -> None:
     parser.add_argument("--nelder-mead", action="store_true", help="Table C.1 too: minutes")
     given = parser.parse_args()
     for shortest, longest in ((0.3, 0.9), (0.2, 0.6), (0.5, 1.5)):
-        print(f"\nwidths of 95 % intervals, ten subjects, steps of {shortest} to {longest} s")
-        for item in bootstrap_widths(shortest, longest, given.replicates):
-            inside = abs(item.mean - item.quoted) <= item.deviation
-            print(
-                f"  {item.name:8} {item.mean:8.3g} ± {item.spread:7.2g}   dissertation "
-                f"{item.quoted:g} ± {item.deviation:g}   {'inside' if inside else 'outside'}"
-            )
+        rows = [
+            [item.name, f"{item.quoted:g} ± {item.deviation:g}",
+             f"{item.mean:.3g} ± {item.spread:.2g}",
+             "inside" if abs(item.mean - item.quoted) <= item.deviation else "outside"]
+            for item in bootstrap_widths(shortest, longest, given.replicates)
+        ]  # fmt: skip
+        head = ["width", "dissertation", f"steps of {shortest} to {longest} s", "within one SD"]
+        print(markdown(head, rows), flush=True)
     _print_reduction(given.replicates)
     model, found = nominal_information()
     for label, (times, selected) in search_times(nelder_mead=given.nelder_mead).items():

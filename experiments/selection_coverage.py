@@ -11,6 +11,7 @@ experiments/reliability_selection.md.
 from __future__ import annotations
 
 import argparse
+import itertools
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from pathlib import Path
 import numpy as np
 from click.testing import CliRunner
 
+from experiments.driver import each
+from experiments.summary import markdown
 from impc.assess.long_run_covariance import white_noise
 from impc.cli.main import main as impc
 from impc.cli.select import read_model_study
@@ -31,8 +34,12 @@ _SUBSETS = (("Kccr", "tau", "tauMS1"), ("Kvis", "Kccr", "tau", "tau1A", "tauCNS1
 _STATED = ("exactly typical", "stated deviations", "a quarter of the range")
 
 
-def coverage(people: int, seed: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """For each of `_STATED`: covered, and width over range, shape (subjects, parameters, 2)."""
+def coverage(task: tuple[int, int, tuple[str, ...]]) -> dict[str, np.ndarray]:
+    """For each of `_STATED`: covered, and width over range, shape (subjects, parameters, 2).
+
+    A task is the number of subjects, the seed, and the selected parameters.
+    """
+    people, seed, names = task
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "data"
         given = ["--subjects", str(people), "--seed", str(seed), "--out", str(folder)]
@@ -62,15 +69,17 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=10)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     given = parser.parse_args()
-    for names in _SUBSETS:
-        print(f"\n{', '.join(names)}: {given.people} subjects of each of seeds {given.seeds}")
-        found = [coverage(given.people, seed, names) for seed in given.seeds]
-        for stated in _STATED:
-            both = np.concatenate([item[stated] for item in found])
-            widths = ", ".join(f"{100 * one:.0f}" for one in np.median(both[..., 1], axis=0))
-            narrow = both[both[..., 1] < 1 - 1e-9, 0]
-            print(f"  {stated:23} inside {both[..., 0].sum():.0f} of {both[..., 0].size}, without")
-            print(f"    whole ranges {narrow.sum():.0f} of {narrow.size}; median widths {widths} %")
+    tasks = [(given.people, seed, names) for names in _SUBSETS for seed in given.seeds]
+    found, rows = each(coverage, tasks), []
+    for names, stated in itertools.product(_SUBSETS, _STATED):
+        both = np.concatenate(
+            [one[stated] for task, one in zip(tasks, found, strict=True) if task[2] == names]
+        )
+        held, narrow = both[..., 0], both[both[..., 1] < 1 - 1e-9, 0]
+        widths = ", ".join(f"{100 * one:.0f}" for one in np.median(both[..., 1], axis=0))
+        shares = [f"{one.sum():.0f} of {one.size}" for one in (held, narrow)]
+        rows.append([", ".join(names), stated, *shares, widths])
+    print(markdown(["selected", "others", "inside", "without whole ranges", "widths, %"], rows))
 
 
 if __name__ == "__main__":

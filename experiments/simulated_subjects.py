@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import argparse
 import functools
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from experiments.benchmarks.workloads import seat
+from experiments.driver import each, noisy
+from experiments.summary import markdown
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import covariance_intervals, follows_command, gain_estimate
 from impc.inverse.noisy_fit import fit_controller
@@ -34,21 +33,12 @@ if TYPE_CHECKING:
 __all__ = ["Subject", "noisy_recordings", "simulated_subject"]
 
 
-@dataclass(frozen=True)
-class Subject:
-    """One fit compared with the truth.
+class Subject(NamedTuple):
+    """One fit compared with the truth."""
 
-    Attributes
-    ----------
-    below_ceiling : float
-        VAF of the true controller minus that of the fit, percentage points, scaled outputs.
-    entries : Array
-        Distance of each shown entry of K from the centre of its interval, which spans 3.92.
-    directions : Array
-        The same along the directions of `GainCovariance`, shape (n,).
-    """
-
-    below_ceiling: float
+    below_ceiling: float  # VAF of the truth minus that of the fit, points, scaled outputs
+    # Distance of each shown entry of K from the centre of its interval, which spans 3.92; the same
+    # along the directions of `GainCovariance` (n,).
     entries: Array
     directions: Array
 
@@ -61,9 +51,9 @@ def noisy_recordings(
     trials = []
     work = seat(3, seconds, limit)
     for trial in work.problem.recordings:
-        size = np.sqrt((1 - ceiling) / ceiling * np.mean(trial.outputs**2, axis=0))
-        noisy = trial.outputs + size * rng.standard_normal(trial.outputs.shape)
-        trials.append(Recording(work.problem.plant, noisy, trial.disturbance))
+        noise = rng.standard_normal(trial.outputs.shape)
+        outputs = noisy(np.array(trial.outputs), (1 - ceiling) / ceiling, noise)
+        trials.append(Recording(work.problem.plant, outputs, trial.disturbance))
     return tuple(trials)
 
 
@@ -77,47 +67,23 @@ def simulated_subject(seed: int, limit: float, ceiling: float = 0.9) -> Subject:
     estimate = gain_estimate(fitted)
     covariance = estimate.covariance
     noise = sum(
-        float(np.sum(((noisy.outputs - clean.outputs) / problem.output_scale) ** 2))
-        for noisy, clean in zip(trials, work.problem.recordings, strict=True)
+        float(np.sum(((trial.outputs - clean.outputs) / problem.output_scale) ** 2))
+        for trial, clean in zip(trials, work.problem.recordings, strict=True)
     )
     samples = sum(trial.outputs.size for trial in trials)
-    error = estimate.K - truth
-    along = covariance.along(error)
     intervals = covariance_intervals(estimate, covariance, "sandwich")
     shown = _shown(plant)
     ends = np.array([[intervals[index].low, intervals[index].high] for index in shown])
     return Subject(
         100 * (fitted.misfit**2 - noise) / samples,
         (ends.mean(axis=1) - np.ravel(truth)[shown]) / (np.ptp(ends, axis=1) / (2 * TWO_SIDED)),
-        along / covariance.deviations,
+        covariance.along(estimate.K - truth) / covariance.deviations,
     )
 
 
 def _shown(plant: Plant) -> IntArray:
     """Places of the states whose gains the report shows, for a plant with one control."""
     return np.flatnonzero(~follows_command(plant))
-
-
-def _study(limit: float, count: int) -> list[Subject]:
-    with ProcessPoolExecutor(2) as pool:
-        found = pool.map(functools.partial(simulated_subject, limit=limit), range(count))
-        return list(tqdm(found, total=count, desc=f"{limit:g} Nm", unit="subject", disable=None))
-
-
-def _print(limit: float, found: list[Subject], names: tuple[str, ...]) -> None:
-    below = np.array([item.below_ceiling for item in found])
-    entries = np.array([item.entries for item in found])
-    directions = np.array([item.directions for item in found])
-    print(f"\ntorque limit {limit:g} Nm, {len(found)} subjects (seeds 0 to {len(found) - 1})")
-    print(f"points below the ceiling: median {np.median(below):.3f}, most {np.max(below):.3f}")
-    print("entry of K           within 3 SE           SD of error/SE")
-    for index, name in enumerate(names):
-        share = np.mean(np.abs(entries[:, index]) <= 3)
-        print(f"  {name:<18} {100 * share:12.0f} % {np.std(entries[:, index]):22.2f}")
-    print("direction, best determined first")
-    for index in range(directions.shape[1]):
-        share = np.mean(np.abs(directions[:, index]) <= 3)
-        print(f"  {index + 1:<18} {100 * share:12.0f} % {np.std(directions[:, index]):22.2f}")
 
 
 def main() -> None:
@@ -127,9 +93,22 @@ def main() -> None:
     parser.add_argument("--limits", type=float, nargs="+", default=[70.0, 6.0, 4.5])
     given = parser.parse_args()
     plant = seat(1, 1.0).problem.plant
-    names = tuple(plant.states[index] for index in _shown(plant))
     for limit in given.limits:
-        _print(limit, _study(limit, given.subjects), names)
+        study = functools.partial(simulated_subject, limit=limit)
+        below, entries, directions = map(
+            np.array, zip(*each(study, range(given.subjects)), strict=True)
+        )
+        print(f"\ntorque limit {limit:g} Nm, {len(below)} subjects (seeds from 0)")
+        print(
+            f"points below the ceiling: median {np.median(below):.3f}, most {np.max(below):.3f}\n"
+        )
+        names = [f"entry {plant.states[index]}" for index in _shown(plant)]
+        names += [f"direction {index + 1}, best first" for index in range(directions.shape[1])]
+        rows = [
+            [name, f"{100 * np.mean(np.abs(errors) <= 3):.0f}", f"{np.std(errors):.2f}"]
+            for name, errors in zip(names, np.hstack([entries, directions]).T, strict=True)
+        ]
+        print(markdown(["of the gain", "within 3 SE, %", "SD of error / SE"], rows))
 
 
 if __name__ == "__main__":

@@ -3,26 +3,26 @@
 Seat: cost weights of the four body states, log-uniform within a factor of four of (6e3, 9e3, 6e2,
 4e2), three trials of 30 s under the ternary torque, no limit, noise on the angles. Carts: two of
 `experiments.printed_intervals` with cost weights of four states and two inputs, at their limits in
-some percent of the samples; their gain depends on a cross term. Each line that is written is one
-subject, so a run can be interrupted and summarised at any time. Results: experiments/structures.md.
+some percent of the samples; their gain depends on a cross term. The table has all subjects of the
+file, with `--subjects 0` at any time. Results: experiments/structures.md.
 
-    python -m experiments.structure_study run seat --vaf 90 --subjects 200 --out seat.jsonl
-    python -m experiments.structure_study run carts --cross 0.5 --subjects 400 --out carts.jsonl
-    python -m experiments.structure_study sum seat.jsonl carts.jsonl
+    python -m experiments.structure_study seat --vaf 90 --subjects 200 --out seat.jsonl
+    python -m experiments.structure_study carts --cross 0.5 --subjects 400 --out carts.jsonl
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-from dataclasses import asdict, dataclass
+import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 import plants
-from experiments.printed_intervals import carts, with_noise
+from experiments.driver import Row, kept_rows, with_noise
+from experiments.printed_intervals import carts
+from experiments.summary import clustered, markdown
 from impc.assess.structured_weights import Tangent, tangent, weight_covariance
 from impc.assess.structures import structure_test
 from impc.assess.weight_profiles import WeightProfiles
@@ -37,6 +37,8 @@ from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.settings import FitSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from impc.arrays import Array
     from impc.inverse.problem import Problem
 
@@ -48,57 +50,25 @@ _TYPICAL = np.log([6e3, 9e3, 6e2, 4e2])
 _GLOBAL = 0.5
 
 
-@dataclass(frozen=True)
-class Person:
-    """A simulated subject.
+class Person(NamedTuple):
+    """A simulated subject."""
 
-    Attributes
-    ----------
-    structure : Structure
-        Fitted structure.
-    cost_weights : Array
-        True logarithms of the cost weights, shape (count,).
-    problem : Problem
-    """
-
-    structure: Structure
-    cost_weights: Array
+    structure: Structure  # Fitted structure
+    cost_weights: Array  # True logarithms of the cost weights (count,)
     problem: Problem
 
 
-@dataclass(frozen=True)
-class Score:
-    """A fit compared with its truth.
+class Score(NamedTuple):
+    """A fit compared with its truth; lists have an item for each cost weight."""
 
-    Attributes
-    ----------
-    study : str
-        Plant, VAF, noise coefficient, cross term.
-    seed : int
-    holds, normal : list of bool
-        Whether the profile and the normal interval of each cost weight cover the true value.
-    one_sided : list of bool
-        Whether the profile has no lower end.
-    errors : list of float or None
-        Errors of the logarithms over their SEs; None for a cost weight of zero.
-    excess : float
-        Misfit above that of a search from the truth, in units of chi-squared.
-    probability, freedom : float and int
-        p value and degrees of freedom of the test of the structure.
-    power : float
-        Predicted power, the largest over cross terms.
-    """
-
-    study: str
-    seed: int
-    holds: list[bool]
-    normal: list[bool]
-    one_sided: list[bool]
-    errors: list[float | None]
-    excess: float
-    probability: float
-    freedom: int
-    power: float
+    holds: list[bool]  # Whether the profile interval covers the true value
+    normal: list[bool]  # The same of the normal interval
+    one_sided: list[bool]  # Whether the profile has no lower end
+    errors: list[float | None]  # Errors of the logarithms over their SEs; None: fitted as zero
+    excess: float  # Misfit above that of a search from the truth, units of chi-squared
+    probability: float  # p value of the test of the structure
+    freedom: int  # Degrees of freedom of that test
+    power: float  # Predicted power, the largest over cross terms
 
 
 def seat_person(seed: int, vaf: float, root: float) -> Person:
@@ -137,17 +107,10 @@ def cart_person(seed: int, vaf: float, root: float, cross: float) -> Person:
     return Person(structure, cost_weights, fit_problem(plant, trials, settings))
 
 
-def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> Score:
+def score(person: Person, *, intervals: bool = True) -> Score:
     """Fit a subject from the default start, and compare with the truth.
 
-    Parameters
-    ----------
-    person : Person
-    study : str
-        Name of the study in the output.
-    seed : int
-    intervals : bool
-        Whether to compute intervals; the test alone takes a third of the time.
+    The test without `intervals` takes a third of the time.
     """
     problem, structure = person.problem, person.structure
     near = fit_controller(problem)
@@ -174,8 +137,6 @@ def score(person: Person, study: str, seed: int, *, intervals: bool = True) -> S
         ]
     powers = [item.power for item in tested.powers]
     return Score(
-        study,
-        seed,
         [item.holds(float(true)) for item, true in zip(made, person.cost_weights, strict=False)],
         [error is None or abs(error) <= 1.96 for error in errors],
         [item.low == -np.inf for item in made],
@@ -192,84 +153,61 @@ def _misfit(at: Tangent) -> float:
     return float(np.sum(at.without_nuisance(np.array(at.residual)[:, None]) ** 2))
 
 
-def _summed(scores: list[Score]) -> str:
-    """One row of the table."""
-    count = len(scores)
-    holds = [item for one in scores for item in one.holds]
-    sided = [item for one in scores for item in one.one_sided]
-    normal = [item for one in scores for item in one.normal]
-    refused = [one.probability < 0.05 for one in scores]
-    reached = [one.excess < _GLOBAL for one in scores if np.isfinite(one.excess)]
+def _cells(study: str, scores: Sequence[Score]) -> list[str]:
+    """Row of the table."""
     whole = [one.holds for one in scores if one.holds]
-    at_zero = [item for one in scores if None in one.errors for item in one.holds]
-    each = [np.mean([one[i] for one in whole]) for i in range(len(whole[0]) if whole else 0)]
-    return (
-        f"| {scores[0].study} | {count} | {_share(holds)} ({_list(each)}) | "
-        f"{_share(at_zero)} | {_share(sided)} | "
-        f"{_share(normal)} | {_share(refused)} | {_share(reached)} | "
-        f"{100 * np.median([one.power for one in scores]):.0f} |"
-    )
+    each = 100 * np.mean(whole, axis=0) if whole else []
+    return [
+        study,
+        f"{len(scores)}",
+        f"{_share(item for one in scores for item in one.holds)} "
+        f"({', '.join(f'{share:.0f}' for share in each)})",
+        _share(item for one in scores if None in one.errors for item in one.holds),
+        _share(item for one in scores for item in one.one_sided),
+        _share(item for one in scores for item in one.normal),
+        _share(one.probability < 0.05 for one in scores),
+        _share(one.excess < _GLOBAL for one in scores if np.isfinite(one.excess)),
+        f"{100 * np.median([one.power for one in scores]):.0f}",
+    ]
 
 
-def _share(items: list[bool]) -> str:
-    if not items:
-        return "-"
-    share = float(np.mean(items))
-    error = 100 * np.sqrt(share * (1 - share) / len(items))
-    return f"{100 * share:.1f} ± {error:.1f}"
+def _share(items: Iterable[bool]) -> str:
+    """Share in %, with the standard error of independent items."""
+    share, error = clustered([[item] for item in items])
+    return "-" if np.isnan(share) else f"{share:.1f} ± {error:.1f}"
 
 
-def _list(shares: list[np.floating]) -> str:
-    return ", ".join(f"{100 * float(item):.0f}" for item in shares)
-
-
-def _run(given: argparse.Namespace) -> None:
-    study = f"{given.plant}, VAF {given.vaf:g}, root {given.root:g}, cross {given.cross:g}"
-    Path(given.out).parent.mkdir(parents=True, exist_ok=True)
-    with Path(given.out).open("a", encoding="utf-8") as file:
-        for seed in range(given.first, given.first + given.subjects):
-            if given.plant == "seat":
-                person = seat_person(seed, given.vaf, given.root)
-            else:
-                person = cart_person(seed, given.vaf, given.root, given.cross)
-            found = score(person, study, seed, intervals=not given.test_only)
-            file.write(json.dumps(asdict(found)) + "\n")
-            file.flush()
+def _row(_: str, seed: int, given: argparse.Namespace) -> Row:
+    if given.plant == "seat":
+        person = seat_person(seed, given.vaf, given.root)
+    else:
+        person = cart_person(seed, given.vaf, given.root, given.cross)
+    return score(person, intervals=not given.test_only)._asdict()
 
 
 def main() -> None:
-    """Run a study, or summarise result files."""
+    """Score the subjects that the file does not have, and print the table of the file."""
     parser = argparse.ArgumentParser(description="Cost structures on simulated subjects.")
-    which = parser.add_subparsers(required=True)
-    run = which.add_parser("run")
-    run.add_argument("plant", choices=("seat", "carts"))
-    run.add_argument("--vaf", type=float, default=90.0)
-    run.add_argument("--root", type=float, default=0.0)
-    run.add_argument("--cross", type=float, default=0.0)
-    run.add_argument("--subjects", type=int, default=200)
-    run.add_argument("--first", type=int, default=0)
-    run.add_argument("--test-only", action="store_true")
-    run.add_argument("--out", required=True)
-    run.set_defaults(run=_run)
-    summed = which.add_parser("sum")
-    summed.add_argument("files", nargs="+")
-    summed.set_defaults(run=_sum)
+    parser.add_argument("plant", choices=("seat", "carts"))
+    parser.add_argument("--vaf", type=float, default=90.0)
+    parser.add_argument("--root", type=float, default=0.0)
+    parser.add_argument("--cross", type=float, default=0.0)
+    parser.add_argument("--subjects", type=int, default=200)
+    parser.add_argument("--test-only", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("results", "structures.jsonl"))
     given = parser.parse_args()
-    given.run(given)
-
-
-def _sum(given: argparse.Namespace) -> None:
-    print("| study | subjects | profiles cover % (each) | if a cost weight is zero % "
-          "| one-sided % | normal intervals cover % "
-          "| rejected at 5 % | global minimum % | predicted power % |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|---|")
-    by_study: dict[str, list[Score]] = {}
-    for name in given.files:
-        for line in Path(name).read_text(encoding="utf-8").splitlines():
-            one = Score(**json.loads(line))
-            by_study.setdefault(one.study, []).append(one)
-    for scores in by_study.values():
-        print(_summed(scores))
+    study = f"{given.plant}, VAF {given.vaf:g}, root {given.root:g}, cross {given.cross:g}"
+    tasks = [(study, seed) for seed in range(given.subjects)]
+    found = kept_rows(given.out, functools.partial(_row, given=given), tasks)
+    head = (
+        "study, subjects, profiles cover % (each), if a cost weight is zero %, one-sided %, "
+        "normal intervals cover %, rejected at 5 %, global minimum %, predicted power %"
+    )
+    rows = [
+        _cells(name, [Score(**{key: row[key] for key in Score._fields}) for row in rows])
+        for name, rows in found.items()
+    ]
+    print(markdown(head.split(", "), rows))
 
 
 if __name__ == "__main__":

@@ -9,17 +9,17 @@ weights, target and noise. Results: experiments/coverage.md.
 
 from __future__ import annotations
 
+import itertools
 import sys
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import control
 import numpy as np
 import scipy.signal
-from scipy.stats import beta
 
 import impc
+from experiments.driver import each
+from experiments.summary import counted
 
 STEPS, HORIZON = 300, 8
 
@@ -88,23 +88,14 @@ def covered(task: tuple[str, int]) -> tuple[int, int, int]:
     return int(known.sum()), int((inside & known).sum()), int(np.count_nonzero(run.status))
 
 
-def rate(inside: int, count: int) -> str:
-    """A share with its Clopper-Pearson 95 % interval."""
-    low = beta.ppf(0.025, inside, count - inside + 1) if inside else 0.0
-    high = beta.ppf(0.975, inside + 1, count - inside) if inside < count else 1.0
-    return (
-        f"{inside} of {count} = {100 * inside / count:.1f} % ({100 * low:.0f} to {100 * high:.0f})"
-    )
-
-
-def main(recordings: int, report: Callable[[str], None] = print) -> None:
+def main(recordings: int) -> None:
     """Print the coverage of all kinds."""
-    with ProcessPoolExecutor(2) as pool:
-        for kind in KINDS:
-            found = np.array(list(pool.map(covered, [(kind, seed) for seed in range(recordings)])))
-            known, inside, _ = found.sum(axis=0)
-            at_limit = int(np.count_nonzero(found[:, 2]))
-            report(f"{kind}: {rate(int(inside), int(known))}; {at_limit} recordings at a limit")
+    tasks = list(itertools.product(KINDS, range(recordings)))
+    found = np.array(each(covered, tasks)).reshape(len(KINDS), recordings, 3)
+    for kind, rows in zip(KINDS, found, strict=True):
+        known, inside, _ = rows.sum(axis=0)
+        at_limit = np.count_nonzero(rows[:, 2])
+        print(f"{kind}: {counted(int(inside), int(known))}; {at_limit} recordings at a limit")
 
 
 if __name__ == "__main__":

@@ -3,33 +3,33 @@
     python -m experiments.uncertain_body coverage cart 60 99 0.0   subjects, VAF, correlation
     python -m experiments.uncertain_body coverage seat 20 99 0.0
     python -m experiments.uncertain_body test none 100 99 0.9      error, subjects, VAF, correlation
-    python -m experiments.uncertain_body summary FILE...           summarise the lines of files
 
 Every subject has a body drawn from the stated uncertainty and weights drawn about typical ones. The
-fit starts without prior knowledge of the weights and uses the nominal body. Each output line is the
-JSON of one subject. Errors of `test` are none, plant (3 % of both coefficients), delay (one
-sample), limit (5 %) and lean (a constant push of 0.04 of the limit, the effect of 1 degree on a
-cart that falls as a seated subject does). Results: experiments/coverage.md.
+fit starts without prior knowledge of the weights and uses the nominal body. Errors of `test` are
+none, plant (3 % of both coefficients), delay (one sample), limit (5 %) and lean (a constant push of
+0.04 of the limit, the effect of 1 degree on a cart that falls as a seated subject does). Results:
+experiments/coverage.md.
 """
 
 from __future__ import annotations
 
+import argparse
 import collections
-import json
+import functools
 import signal
-import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import control
 import numpy as np
 import scipy.linalg
-import scipy.signal
-from scipy.stats import beta
 
 import impc
 import plants
+from experiments.driver import Row, first_order_noise, kept_rows
+from experiments.summary import clustered, counted
 from impc.arrays import Array
 from impc.assess.lack_of_fit import lack_of_fit
 from impc.assess.printed_gain import gain_estimate
@@ -62,13 +62,6 @@ def cart(factors: Sequence[float] = (1.0, 1.0), outputs: int = 1) -> impc.Plant:
     )
 
 
-def noise(rng: Rng, samples: int, p: int, root: float) -> Array:
-    """Stationary first-order noise of variance one, shape (samples, p)."""
-    white = rng.standard_normal((samples + 200, p))
-    found = scipy.signal.lfilter([np.sqrt(1 - root**2)], [1.0, -root], white, axis=0)
-    return np.asarray(found[200:])
-
-
 def moved(law: impc.Controller, push: Array, late: int) -> Array:
     """Outputs of a controller that acts on the state `late` samples ago; NaN after a fall."""
     plant = law.plant
@@ -95,7 +88,7 @@ def recorded(
         outputs = moved(law, push + lean, late)
         if not np.all(np.isfinite(outputs)) or np.max(np.abs(outputs)) > 20:
             return None
-        added = share * outputs.std(axis=0) * noise(rng, len(push), outputs.shape[1], root)
+        added = share * outputs.std(axis=0) * first_order_noise(rng, outputs.shape, root, 200)
         trials.append(impc.Recording(nominal, outputs + added, push))
     return trials
 
@@ -157,7 +150,7 @@ def seat_person(seed: int, vaf: float, root: float, error: str = "none") -> Pers
     return Person(problem, np.array(impc.solve_lqr(true, weights).K), factors)
 
 
-def covered(person: Person) -> dict[str, Any]:
+def covered(person: Person) -> Row:
     """Errors of identified entries and directions in standard errors, body uncertain and exact."""
     problem, truth, _ = person
     both = {}
@@ -176,7 +169,7 @@ def covered(person: Person) -> dict[str, Any]:
     return both
 
 
-def tested(person: Person) -> dict[str, Any]:
+def tested(person: Person) -> Row:
     """Run the residual test: alarm, and each error with probability and size."""
     found = lack_of_fit(gain_estimate(impc.fit(person.problem)))
     assert found is not None
@@ -184,72 +177,62 @@ def tested(person: Person) -> dict[str, Any]:
     return {"alarm": found.alarm, "errors": errors}
 
 
-def summary(path: str) -> str:
-    """Rates of a result file with 95 % intervals; coverage is clustered by subject."""
-    with open(path, encoding="utf-8") as file:
-        rows = [row for row in map(json.loads, file) if "failed" not in row]
-    if "alarm" in rows[0]:
+def _too_long(*_: object) -> None:
+    raise TimeoutError("takes too long")
+
+
+def _row(study: str, seed: int, kind: str, what: str, vaf: float, root: float) -> Row:
+    """What is counted of one subject; or that they fell, or why there is no fit."""
+    make: Callable[..., Person | None] = seat_person if what == "seat" else cart_person
+    person = make(seed, vaf, root, "none" if kind == "coverage" else what)
+    if person is None:
+        return {"failed": "fell"}
+    signal.signal(signal.SIGALRM, _too_long)
+    signal.alarm(_LONGEST)
+    try:
+        return covered(person) if kind == "coverage" else tested(person)
+    except (impc.ImpcError, TimeoutError) as refused:
+        return {"failed": str(refused)}
+    finally:
+        signal.alarm(0)
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """Rates with 95 % intervals; coverage is clustered by subject."""
+    rows = [row for row in rows if "failed" not in row]
+    if not rows or "alarm" in rows[0]:
         alarms = [row["errors"][0][0] for row in rows if row["alarm"]]
-        low, high = _interval(len(alarms), len(rows))
-        named = dict(collections.Counter(alarms))
-        return f"{len(alarms)} of {len(rows)} ({low:.0f} to {high:.0f} %): {named}"
+        return f"{counted(len(alarms), len(rows))}: {dict(collections.Counter(alarms))}"
     said = [f"{len(rows)} subjects"]
     for kind in ("stated", "exact"):
         for what, key in (("entries", "z"), ("directions", "directions")):
-            said.append(f"{kind} {_coverage([row[kind][key] for row in rows])} {what}")
+            held = [(np.abs(row[kind][key]) < 1.96).tolist() for row in rows]
+            share, error = clustered(held)
+            count = sum(map(len, held))
+            said.append(f"{kind} {share:.0f} ± {1.96 * error:.0f} % of {count} {what}")
         width, error = (
-            np.median(np.concatenate([row[kind][name] for row in rows] or [np.nan]))
+            np.median(np.concatenate([row[kind][name] for row in rows]))
             for name in ("width", "error")
         )
         said.append(f"standard error {100 * width:.2g} %, error {100 * error:.2g} %")
     return "; ".join(said)
 
 
-def _coverage(z: list[list[float]]) -> str:
-    """Coverage of 95 % intervals with its own interval, clustered by subject."""
-    counts = np.array([len(one) for one in z])
-    if not counts.sum():
-        return "none of 0"
-    inside = np.array([np.sum(np.abs(one) < 1.96) for one in z])
-    rate = inside.sum() / counts.sum()
-    spread = np.sqrt(np.sum((inside - rate * counts) ** 2)) / counts.sum()
-    return f"{100 * rate:.0f} ± {196 * spread:.0f} % of {counts.sum()}"
-
-
-def _interval(k: int, n: int) -> tuple[float, float]:
-    """Clopper-Pearson interval of a rate, %."""
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-    return 100 * float(low), 100 * float(high)
-
-
-def _too_long(*_: object) -> None:
-    raise TimeoutError("takes too long")
-
-
-def main(kind: str, *given: str) -> None:
-    """Print one line a subject, or a summary."""
-    if kind == "summary":
-        for path in given:
-            print(path, summary(path))
-        return
-    what, count, vaf, root = given[:4]
-    first = int(given[4]) if len(given) > 4 else 0
-    make: Callable[..., Person | None] = seat_person if what == "seat" else cart_person
-    error = "none" if kind == "coverage" else what
-    signal.signal(signal.SIGALRM, _too_long)
-    for seed in range(first, first + int(count)):
-        person = make(seed, float(vaf), float(root), error)
-        if person is None:
-            continue
-        signal.alarm(_LONGEST)
-        try:
-            found = covered(person) if kind == "coverage" else tested(person)
-        except (impc.ImpcError, TimeoutError) as refused:
-            found = {"failed": str(refused)}
-        signal.alarm(0)
-        print(json.dumps({"seed": seed, **found}), flush=True)
+def main() -> None:
+    """Fit the subjects that the file does not have, and summarise it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("kind", choices=("coverage", "test"))
+    parser.add_argument("what", choices=("cart", "seat", "none", "plant", "delay", "limit", "lean"))
+    parser.add_argument("subjects", type=int)
+    parser.add_argument("vaf", type=float)
+    parser.add_argument("root", type=float)
+    parser.add_argument("--out", type=Path, default=Path("results", "uncertain-body.jsonl"))
+    given = parser.parse_args()
+    study = f"{given.kind} {given.what}, VAF {given.vaf:g}, root {given.root:g}"
+    one = functools.partial(_row, kind=given.kind, what=given.what, vaf=given.vaf, root=given.root)
+    rows = kept_rows(given.out, one, [(study, seed) for seed in range(given.subjects)])
+    print(f"{study}: {summary(rows.get(study, []))}")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

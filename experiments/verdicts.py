@@ -11,16 +11,18 @@ experiments/coverage.md.
 from __future__ import annotations
 
 import argparse
+import functools
+import itertools
 import warnings
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 import impc
 from experiments.coverage import cart
+from experiments.driver import each
 from impc.checking import replace
 from impc.levels import Level
 from impc.model.riccati import solve_lqr
@@ -38,16 +40,11 @@ _WEIGHTS = np.array([[4.0, 0.8], [0.8, 1.0]])
 _NOISE, _FAR = 0.003, 3.0
 
 
-@dataclass(frozen=True)
-class Made:
-    """Fit of a simulated subject, with its true gain if known."""
+class Made(NamedTuple):
+    """Fit of a simulated subject, with its true gain."""
 
     result: FitResult
-    gain: Array | None
-
-
-def _pushes(rng: np.random.Generator, size: float, samples: int = _SAMPLES) -> Array:
-    return size * np.repeat(rng.choice([-1.0, 0.0, 1.0], samples // 10), 10)
+    gain: Array
 
 
 def subject(
@@ -72,7 +69,7 @@ def subject(
     true = np.array(solve_lqr(body, weights).K) if gain is None else gain
     trials: list[impc.Recording] = []
     while len(trials) < _TRIALS:
-        push = _pushes(rng, size, samples)
+        push = size * np.repeat(rng.choice([-1.0, 0.0, 1.0], samples // 10), 10)
         pushed = push + unknown * rng.standard_normal(samples)
         y = _linear(body, gain, pushed) if gain is not None else _moved(law, pushed)
         if not np.all(np.abs(y) < _FAR):  # A fall: draw again
@@ -107,42 +104,58 @@ def _softer(share: float) -> impc.Plant:
 
 def _fell(seed: int) -> Made:
     made = subject(seed)
-    return replace(made, result=replace(made.result, falls=("trial 3: fell at 5.1 s",)))
+    return made._replace(result=replace(made.result, falls=("trial 3: fell at 5.1 s",)))
 
 
+_without_weights = functools.partial(subject, size=0.15, gain=np.array([[1.5, 0.2]]), noise=3e-4)
 #: Kind -> function that makes a subject, right level, and words of the right headline.
 KINDS: dict[str, tuple[Callable[[int], Made], Level, str]] = {
     "explained": (subject, Level.GREEN, "explains this movement"),
-    "limit": (lambda seed: subject(seed, limit=0.7), Level.AMBER, "probably wrong"),
-    "noise in the loop": (lambda seed: subject(seed, unknown=1.0), Level.AMBER, "noise"),
-    "half": (lambda seed: subject(seed, wander=0.05), Level.RED, "less than half"),
-    "no weights": (
-        lambda seed: subject(seed, size=0.15, gain=np.array([[1.5, 0.2]]), noise=3e-4),
-        Level.AMBER,
-        "no cost weights",
-    ),
+    "limit": (functools.partial(subject, limit=0.7), Level.AMBER, "probably wrong"),
+    "noise in the loop": (functools.partial(subject, unknown=1.0), Level.AMBER, "noise"),
+    "half": (functools.partial(subject, wander=0.05), Level.RED, "less than half"),
+    "no weights": (_without_weights, Level.AMBER, "no cost weights"),
     "body": (lambda seed: subject(seed, plant=_softer(1.0)), Level.AMBER, "body"),
     "fell": (_fell, Level.AMBER, "fell"),
-    "never reached": (lambda seed: subject(seed, size=0.15), Level.GREEN, "never reached"),
+    "never reached": (functools.partial(subject, size=0.15), Level.GREEN, "never reached"),
     "weak": (
-        lambda seed: subject(seed, size=0.3, noise=0.015, samples=30, settle=0.2),
+        functools.partial(subject, size=0.3, noise=0.015, samples=30, settle=0.2),
         Level.AMBER,
         "do not determine",
     ),
-}  # fmt: skip
+}
 
 
-def _true_statements(result: FitResult) -> tuple[int, int]:
-    """Number of true comparisons, and of all decided ones."""
+def _true_statements(result: FitResult) -> list[bool]:
+    """Whether each decided comparison of cost is true."""
     states, sizes = result.given.plant.states, np.array(result.intent.sizes)
-    true = made = 0
+    scaled, true = _WEIGHTS * np.outer(sizes, sizes), []
     for item in decided(result):
         i, j = states.index(item.first), states.index(item.second)
-        scaled = _WEIGHTS * np.outer(sizes, sizes)
         value = scaled[i, i] - scaled[j, j] if item.kind == "order" else scaled[i, j]
-        made += 1
-        true += int((value > 0) == item.holds)
-    return true, made
+        true.append(bool((value > 0) == item.holds))
+    return true
+
+
+def _judged(task: tuple[str, int]) -> tuple[str, list[bool], list[bool]]:
+    """Wrong verdict or "right", intervals of reportable gains that cover, and comparisons."""
+    name, seed = task
+    make, level, words = KINDS[name]
+    result, gain = make(seed)
+    verdict, no = fit_verdict(result), forbidden(result)
+    held: list[bool] = []
+    if GAIN not in no:
+        rows = zip(gain.ravel(), named_gains(result), strict=False)
+        held = [bool(row.interval.low <= truth <= row.interval.high)
+                for truth, (_, row) in rows if row.determined]  # fmt: skip
+    true = _true_statements(result) if WEIGHTS not in no and name != "body" else []
+    right = verdict.level is level and words in verdict.headline
+    return "right" if right else f"{verdict.level.value}: {verdict.headline}", held, true
+
+
+def _count(lists: Iterable[list[bool]]) -> str:
+    items = list(itertools.chain(*lists))
+    return f"{sum(items)} of {len(items)}"
 
 
 def main() -> None:
@@ -151,33 +164,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     given = parser.parse_args()
-    inside = gains = true = made = 0
+    tasks = list(itertools.product(given.kinds, range(given.seeds)))
+    found = each(_judged, tasks)
     for name in given.kinds:
-        make, level, words = KINDS[name]
-        right, wrong = 0, Counter[str]()
-        for seed in range(given.seeds):
-            one = make(seed)
-            verdict = fit_verdict(one.result)
-            fits = verdict.level is level and words in verdict.headline
-            right += fits
-            if not fits:
-                wrong[f"{verdict.level.value}: {verdict.headline}"] += 1
-            no = forbidden(one.result)
-            if GAIN not in no and one.gain is not None:
-                for truth, (_, row) in zip(one.gain.ravel(), named_gains(one.result), strict=False):
-                    gains += row.determined
-                    inside += bool(
-                        row.determined and row.interval.low <= truth <= row.interval.high
-                    )
-            if WEIGHTS not in no and name != "body":
-                found = _true_statements(one.result)
-                true, made = true + found[0], made + found[1]
-        others = "; ".join(f"{count} {text}" for text, count in wrong.items())
-        print(f"{name:<20}{right} of {given.seeds}  {others}", flush=True)
+        said = Counter(one[0] for task, one in zip(tasks, found, strict=True) if task[0] == name)
+        others = "; ".join(f"{count} {text}" for text, count in said.items() if text != "right")
+        print(f"{name:<20}{said['right']} of {given.seeds}  {others}")
     fallen = fallen_verdict(("trial 1: fell at 3.2 s",))
     print(f"{'fell in all':<20}{fallen.level.value}: {fallen.headline}")
-    print(f"gains that may be reported: {inside} of {gains} intervals cover the true value")
-    print(f"comparisons of cost that may be reported: {true} of {made} are true")
+    print(f"intervals of reportable gains that cover: {_count(one[1] for one in found)}")
+    print(f"reportable comparisons of cost that are true: {_count(one[2] for one in found)}")
 
 
 if __name__ == "__main__":

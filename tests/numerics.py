@@ -38,7 +38,6 @@ FILES = (
     "tests/model/test_riccati.py",
     "tests/control/test_casadi_controller.py",
     "tests/control/test_solvers.py",
-    "tests/experiments/test_nonlinear_mpc.py",
     "tests/control/test_terminal_set.py",
     "tests/assess/test_input_limits.py",
     "tests/assess/test_bounded_weights.py",

@@ -19,18 +19,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.nonlinear_mpc import build_nonlinear_mpc, simulate_nonlinear
 from experiments.reference_mpc import solve_mpc
 from impc.control.casadi_controller import build_mpc
 from impc.control.controller import Controller
-from impc.control.simulation import scenario
 from impc.errors import InfeasibleError
 from impc.files.formats import write_table
 from impc.files.table import make_table
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.weights import Weights
-from tests.experiments.test_nonlinear_mpc import linear_step
 from tests.nonlinear.test_problem import TRUTH, made
 from tests.studies.cohort.carts import cart_plant, subject_trial
 
@@ -209,7 +206,7 @@ def test_results_are_those_of_the_folder_without(runs: tuple[Path, Path, list[st
 def test_ipopt_obeys_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, example_plant: Plant, example_bounds: Bounds
 ) -> None:
-    """Of the optimal control problem, of the row that cannot be kept, and of both controllers."""
+    """Of the optimal control problem, of the row that cannot be kept, and of the controller."""
     monkeypatch.chdir(tmp_path)
     Path("ipopt.opt").write_text(SETTINGS["ipopt.opt"])
     point = made()
@@ -217,8 +214,6 @@ def test_ipopt_obeys_no_file(
     with pytest.raises(InfeasibleError):
         made(signed=["limit"]).plan(TRUTH | {"limit": -1.0}, [1, 0])
     weights = Weights(np.eye(2), 1)
-    mpc = build_nonlinear_mpc(linear_step(example_plant), example_plant, weights, example_bounds, 3)
-    simulate_nonlinear(mpc, scenario(example_plant, [0.1, 0.1], 2))
     controller = Controller(example_plant, weights, example_bounds, 3)
     solve_mpc(build_mpc(controller, "ipopt"), [0.1, 0.1])
     assert os.listdir() == ["ipopt.opt"]

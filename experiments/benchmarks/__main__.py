@@ -1,4 +1,4 @@
-"""Run all benchmarks; write results.md, results.json and growth.{png,pdf} into this folder.
+"""Run all benchmarks; write results.md and results.json into this folder.
 
     python -m experiments.benchmarks [--runs 7]
 
@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from experiments.benchmarks.fits import fit_rows
 from experiments.benchmarks.growth import growth_rows
-from experiments.benchmarks.layers import layer_rows
 from experiments.benchmarks.likelihood import likelihood_rows
 from experiments.benchmarks.routes import route_rows
 from experiments.benchmarks.runner import runner_rows
@@ -28,7 +27,6 @@ _PARTS = {
     "fits": fit_rows,
     "growth": growth_rows,
     "routes": route_rows,
-    "layers": layer_rows,
     "likelihood": likelihood_rows,
     "runner": runner_rows,
 }
@@ -44,7 +42,7 @@ def main() -> None:
     with tqdm(_PARTS.items()) as parts:
         for name, measure in parts:
             parts.set_description(name)
-            rows += measure(chosen.runs, chosen.out)
+            rows += measure(chosen.runs)
             written = write_tables(rows, chosen.out, chosen.runs)  # so that no part is lost
     print(written)
 

@@ -15,24 +15,18 @@ from experiments.simulated_subjects import noisy_recordings
 from impc.arrays import frozen
 from impc.checking import replace
 from impc.inverse.search import refine_gain
-from impc.inverse.table31 import (
-    inverse_mpc,
-    inverse_mpc_reduced,
-    starting_weights,
-)
+from impc.inverse.table31 import inverse_mpc, inverse_mpc_reduced, starting_weights
 from impc.model.riccati import solve_lqr
 from impc.model.weights import weight_error
 from impc.studies.fit.first import FitProgress, first_fits
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from impc.inverse.estimates import Estimate
 
 __all__ = ["fit_rows"]
 
 
-def fit_rows(runs: int, _: Path) -> list[Row]:
+def fit_rows(runs: int) -> list[Row]:
     """Time the fits; each must reach the true gain, or for W1 the true weights."""
     return [*_seat(runs), *_wrong(runs), *_memory(), *_example(runs)]
 
@@ -59,24 +53,15 @@ def _seat(runs: int) -> list[Row]:
         },
         runs,
     )
-    unit = "one W2 simulation through CasADi conic qpOASES"
+    unit, own = "one W2 simulation through CasADi conic qpOASES", timings["qpoases"]
+    script = "CasADi mapaccum with DAQP under scipy.optimize.least_squares, same start"
     return [
+        compare("W2 fit from the Table 3.1 start, one trial", unit, timings["one"], own, 45),
         compare(
-            "W2 fit from the Table 3.1 start, one trial",
-            unit,
-            timings["one"],
-            timings["qpoases"],
-            45,
+            "W2 search from a gain 5 % off, one trial", script, timings["search"], timings["casadi"]
         ),
-        compare(
-            "W2 search from a gain 5 % off, one trial",
-            "CasADi mapaccum with DAQP under scipy.optimize.least_squares, same start",
-            timings["search"],
-            timings["casadi"],
-            None,
-        ),
-        compare("the Table 3.1 start itself", unit, timings["start"], timings["qpoases"], None),
-        compare("W2 fit, three trials", unit, timings["three"], timings["qpoases"], 110),
+        compare("the Table 3.1 start itself", unit, timings["start"], own),
+        compare("W2 fit, three trials", unit, timings["three"], own, 110),
         compare("W2 fit, 300 s", "W2 fit, 30 s", timings["long"], timings["one"], 10.5),
     ]
 
@@ -106,23 +91,17 @@ def _wrong(runs: int) -> list[Row]:
         runs,
     )
     what = "W2 fit, noise, a wrong scale of the push, which is named and fitted"
-    return [compare(what, "the same recorded right", timings["wrong"], timings["right"], None)]
+    return [compare(what, "the same recorded right", timings["wrong"], timings["right"])]
 
 
 def _memory() -> list[Row]:
     empty, short, long = (peak_megabytes("fit", seconds) for seconds in (0, 30, 300))
     million = peak_megabytes("jacobian", 1e4)
     note = f"{empty:.0f} MB of it before the fit"
+    both = f"{long:.0f} / {short:.0f} MB"
     return [
         Row("W2 fit, peak memory", "", short, 500, "MB", note),
-        Row(
-            "W2 fit, 300 s, peak memory",
-            "30 s",
-            long / short,
-            3,
-            "",
-            f"{long:.0f} / {short:.0f} MB",
-        ),
+        Row("W2 fit, 300 s, peak memory", "30 s", long / short, 3, "", both),
         Row("residual + exact Jacobian, 1e6 samples, peak memory", "", million, 1000, "MB", "W2"),
     ]
 
@@ -152,23 +131,17 @@ def _example(runs: int) -> list[Row]:
     )
     parts = zip(slow["direct"].seconds, slow["start"].seconds, strict=True)
     whole = Timing(tuple(a + b for a, b in parts))
+    script = "cvxpy under scipy.optimize.least_squares"
+    error = float(np.linalg.norm(gain - true))
     return [
-        compare(
-            "W1 direct fit",
-            "cvxpy under scipy.optimize.least_squares, same start",
-            slow["direct"],
-            slow["script"],
-            1 / 10,
-        ),
-        compare("W1 direct fit with its start", "the same", whole, slow["script"], None),
+        compare("W1 direct fit", f"{script}, same start", slow["direct"], slow["script"], 1 / 10),
+        compare("W1 direct fit with its start", "the same", whole, slow["script"]),
         Row(
             "gain error of cvxpy under least_squares",
             "",
-            float(np.linalg.norm(gain - true)),
-            None,
-            "",
-            f"{simulations} simulations; own: < 1e-6",
+            error,
+            note=f"{simulations} simulations; own: < 1e-6",
         ),
-        Row("W1 direct fit", "", timings["direct"].median, 0.1, "s", ""),
-        Row("W1 reduced fit", "", timings["reduced"].median, 0.1, "s", ""),
+        Row("W1 direct fit", "", timings["direct"].median, 0.1, "s"),
+        Row("W1 reduced fit", "", timings["reduced"].median, 0.1, "s"),
     ]

@@ -6,7 +6,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments.benchmarks.table import Row
 from experiments.benchmarks.timing import Timing, side_by_side
@@ -16,7 +15,6 @@ from impc.control.constraint_rows import directions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from experiments.benchmarks.workloads import Workload
 
@@ -27,8 +25,8 @@ _STATES = (10, 20, 30, 40)
 _INPUTS = (1, 2, 4, 6)
 
 
-def growth_rows(runs: int, folder: Path) -> list[Row]:
-    """Measure all three and plot."""
+def growth_rows(runs: int) -> list[Row]:
+    """Measure all three."""
     work = seat()
     sizes = {
         "horizon N (W2)": _measure({h: with_horizon(work, h) for h in _HORIZONS}, runs),
@@ -37,15 +35,12 @@ def growth_rows(runs: int, folder: Path) -> list[Row]:
             {m: chain_of_masses(12, inputs=m) for m in _INPUTS}, runs, moving=False
         ),
     }
-    _plot(sizes, folder)
     return [
         Row(
             f"time for {name}, {min(times)} to {max(times)}",
             str(min(times)),
             times[max(times)].median / times[min(times)].median,
-            None,
-            "",
-            ", ".join(f"{size}: {1e3 * item.median:.3g}" for size, item in times.items()),
+            note=", ".join(f"{size}: {1e3 * item.median:.3g}" for size, item in times.items()),
         )
         for name, times in sizes.items()
     ]
@@ -62,20 +57,3 @@ def _measure(works: dict[int, Workload], runs: int, *, moving: bool = True) -> d
             else partial(simulate_and_differentiate, work.controller, work.drives[0], along)
         )
     return {int(name): timing for name, timing in side_by_side(cases, runs).items()}
-
-
-def _plot(sizes: dict[str, dict[int, Timing]], folder: Path) -> None:
-    figure = Figure(figsize=(10.0, 2.8), layout="constrained")
-    for axes, (name, times) in zip(figure.subplots(1, 3), sizes.items(), strict=True):
-        medians = np.array([1e3 * item.median for item in times.values()])
-        spread = np.array([[1e3 * side for side in item.spread] for item in times.values()]).T
-        errors = np.abs(spread - medians)
-        axes.errorbar(list(times), medians, yerr=errors, marker="o", color="black", capsize=3)
-        axes.set(xscale="log", yscale="log", xlabel=name, ylabel="ms")
-        axes.set_xticks(list(times), [str(size) for size in times])
-        axes.set_yticks([5, 10, 20, 50], ["5", "10", "20", "50"])
-        axes.minorticks_off()
-        axes.grid(visible=True, alpha=0.3)
-    folder.mkdir(parents=True, exist_ok=True)
-    for kind in ("png", "pdf"):
-        figure.savefig(folder / f"growth.{kind}", dpi=200)

@@ -5,11 +5,8 @@ These rows only, in a minute: python -m experiments.benchmarks.likelihood
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["likelihood_rows"]
 
 
-def likelihood_rows(runs: int, _: Path) -> list[Row]:
+def likelihood_rows(runs: int) -> list[Row]:
     """Rows for three trials of 30 s at the limit, with derivatives by gain and initial states."""
     who, work = subject("seat", 0, "both", 90.0, 6.0), seat(3)
     problem = recorded(who, 0).problem
@@ -58,14 +55,14 @@ def likelihood_rows(runs: int, _: Path) -> list[Row]:
     met = "W2 simulation + exact Jacobian (gain, initial states), three trials"
     return [
         compare(f"{what}, processor time", met, timings["kept"], timings["W2"], 10.0),
-        compare("the same by the clock, trials side by side", met, wall["kept"], wall["W2"], None),
+        compare("the same by the clock, trials side by side", met, wall["kept"], wall["W2"]),
         compare(what, "the same subject's simulation, at no limit without noise",
-                timings["kept"], timings["person"], None),
+                timings["kept"], timings["person"]),
         compare("the same with any gain, ten numbers instead of five", met,
-                timings["free"], timings["W2"], None),
+                timings["free"], timings["W2"]),
         compare("three trials of a subject without a limit", met,
-                timings["no limit"], timings["W2"], None),
-        compare("the likelihood alone", met, timings["value"], timings["W2"], None),
+                timings["no limit"], timings["W2"]),
+        compare("the likelihood alone", met, timings["value"], timings["W2"]),
     ]  # fmt: skip
 
 
@@ -76,5 +73,5 @@ def _at_the_truth(who: Subject, problem: Problem) -> NoisyUnknowns:
 
 
 if __name__ == "__main__":
-    for row in likelihood_rows(7, Path()):
-        print(json.dumps(asdict(row), indent=1))
+    for row in likelihood_rows(7):
+        print(row)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from experiments.benchmarks.table import Row
@@ -12,13 +10,10 @@ from experiments.benchmarks.workloads import example, seat
 from impc.inverse.table31 import starting_weights
 from impc.model.weights import Weights
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 __all__ = ["route_rows"]
 
 
-def route_rows(_: int, __: Path) -> list[Row]:
+def route_rows(_: int) -> list[Row]:
     """Run each case once; the compared objective does not vary."""
     short, person = example(), seat()
     cases = {
@@ -30,16 +25,9 @@ def route_rows(_: int, __: Path) -> list[Row]:
     for name, (work, start) in cases.items():
         own = prox_linear(work.problem, start)
         other = smooth_surrogate(work.problem, start)
-        rows.append(
-            Row(
-                f"objective (3.6) of prox-linear, {name}",
-                "L-BFGS on a smooth surrogate",
-                own.objective / other.objective,
-                None,
-                "",
-                f"{_say(own)} / {_say(other)}",
-            )
-        )
+        what = f"objective (3.6) of prox-linear, {name}"
+        ratio, note = own.objective / other.objective, f"{_say(own)} / {_say(other)}"
+        rows.append(Row(what, "L-BFGS on a smooth surrogate", ratio, note=note))
     return rows
 
 

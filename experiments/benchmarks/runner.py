@@ -76,7 +76,7 @@ def _through(pool: Pool, folder: str) -> None:
     assert sorted(found) == list(range(_TASKS))
 
 
-def runner_rows(runs: int, _: Path) -> list[Row]:
+def runner_rows(runs: int) -> list[Row]:
     """Rows of the cohort client, local workers, and Dask workers."""
     runs = max(3, runs // 2)
     with tempfile.TemporaryDirectory() as folder, processes(2) as pool:
@@ -95,7 +95,7 @@ def runner_rows(runs: int, _: Path) -> list[Row]:
 def _dask_rows(runs: int, folder: str) -> list[Row]:
     if importlib.util.find_spec("distributed") is None:
         missing = "not installed: pip install 'impc[cohort]'"
-        return [Row(f"a task, {_DASK}", "", None, None, "ms", missing)]
+        return [Row(f"a task, {_DASK}", "", None, note=missing)]
     import distributed  # noqa: PLC0415
 
     make: Any = distributed.LocalCluster
@@ -114,5 +114,5 @@ def _row(name: str, timing: Timing, limit: float | None) -> Row:
 
 
 if __name__ == "__main__":
-    for row in runner_rows(7, Path()):
-        print(f"{row.what}: {row.value:.3f} {row.unit}" if row.value is not None else row.note)
+    for row in runner_rows(7):
+        print(row)

@@ -18,14 +18,12 @@ from impc.model.plant import Plant
 from plants.seated_subject import seated_balance_for
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from experiments.benchmarks.workloads import Workload
 
 __all__ = ["simulation_rows"]
 
 
-def simulation_rows(runs: int, _: Path) -> list[Row]:
+def simulation_rows(runs: int) -> list[Row]:
     """Time and compare; the states and derivatives of all must agree to 1e-9."""
     work = seat()
     controller, drive = work.controller, work.drives[0]
@@ -50,38 +48,22 @@ def simulation_rows(runs: int, _: Path) -> list[Row]:
         4 * runs,
     )
     states = {name: loop(controller.K) for name, loop in loops.items()}
-    slow = side_by_side(
-        {
-            "own Jacobian": lambda: simulate_and_differentiate(controller, drive, along),
-            **{
-                name: partial(graph, controller.K, states[name], seeds)
-                for name, graph in derivative.items()
-            },
-        },
-        max(3, runs // 2),
-    )
+    graphs = {
+        name: partial(graph, controller.K, states[name], seeds)
+        for name, graph in derivative.items()
+    }
+    own_run = partial(simulate_and_differentiate, controller, drive, along)
+    slow = side_by_side({"own": own_run, **graphs}, max(3, runs // 2))
     what = "W2 simulation + exact Jacobian in K (ten directions)"
-    own = timings["own Jacobian"]
+    own, qpoases = timings["own Jacobian"], "CasADi conic qpOASES, simulation only"
     return [
-        compare(what, "CasADi conic qpOASES, simulation only", own, timings["qpoases"], 0.35),
-        compare(what, "CasADi conic DAQP, simulation only", own, timings["daqp"], None),
+        compare(what, qpoases, own, timings["qpoases"], 0.35),
+        compare(what, "CasADi conic DAQP, simulation only", own, timings["daqp"]),
         *(
-            compare(
-                what,
-                f"CasADi's forward derivatives, {name}",
-                slow["own Jacobian"],
-                slow[name],
-                1 / 60,
-            )
+            compare(what, f"CasADi's forward derivatives, {name}", slow["own"], slow[name], 1 / 60)
             for name in derivative
         ),
-        compare(
-            "W2 simulation alone",
-            "CasADi conic qpOASES, simulation only",
-            timings["own simulation"],
-            timings["qpoases"],
-            None,
-        ),
+        compare("W2 simulation alone", qpoases, timings["own simulation"], timings["qpoases"]),
         _body_row(work, runs),
     ]
 
@@ -101,4 +83,4 @@ def _body_row(work: Workload, runs: int) -> Row:
     )
     timings = side_by_side({"body": moved, "linear": linear}, 4 * runs)
     what = "a seat's nonlinear body, simulation + exact Jacobian in twenty directions"
-    return compare(what, "the linear plant", timings["body"], timings["linear"], None)
+    return compare(what, "the linear plant", timings["body"], timings["linear"])

@@ -21,7 +21,6 @@ from impc.model.weights import weight_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from impc.arrays import Array
     from impc.inverse.estimates import Estimate
@@ -32,7 +31,7 @@ __all__ = ["solver_rows"]
 _FITS = ("daqp", "qpoases")
 
 
-def solver_rows(runs: int, _: Path) -> list[Row]:
+def solver_rows(runs: int) -> list[Row]:
     """Time and compare: trajectories to 1e-9, derivatives to 1e-8, gains of fits to 1e-6."""
     return [*_simulations(runs), *_example_fits(runs), *_seat_fits(max(3, runs // 2))]
 
@@ -66,19 +65,12 @@ def _simulations(runs: int) -> list[Row]:
 
     timings = side_by_side({**cases, "function": by_function}, runs)
     what = "W2 simulation + exact Jacobian in K (ten directions)"
-    return [
-        *(
-            compare(f"{what}, solver {name}", "compiled", timings[name], timings[COMPILED], None)
-            for name in SOLVERS
-        ),
-        compare(
-            "the same from closed_loop_function, a casadi.Function",
-            "compiled",
-            timings["function"],
-            timings[COMPILED],
-            None,
-        ),
+    rows = [
+        compare(f"{what}, solver {name}", "compiled", timings[name], timings[COMPILED])
+        for name in SOLVERS
     ]
+    function = "the same from closed_loop_function, a casadi.Function"
+    return [*rows, compare(function, "compiled", timings["function"], timings[COMPILED])]
 
 
 def _example_fits(runs: int) -> list[Row]:
@@ -91,9 +83,7 @@ def _example_fits(runs: int) -> list[Row]:
         {name: partial(inverse_mpc_reduced, problem) for name, problem in problems.items()}, runs
     )
     return [
-        compare(
-            f"W1 reduced fit, solver {name}", "compiled", timings[name], timings[COMPILED], None
-        )
+        compare(f"W1 reduced fit, solver {name}", "compiled", timings[name], timings[COMPILED])
         for name in SOLVERS
     ]
 
@@ -107,18 +97,12 @@ def _seat_fits(runs: int) -> list[Row]:
     found = {name: np.array(fit().gain) for name, fit in fits.items()}
     for name in _FITS:
         _require_close(found[name], found[COMPILED], 1e-6)
-    timings = side_by_side(dict(fits), runs)
-    return [
-        compare(
-            f"W2 fit, one trial, solver {name} (gains within "
-            f"{np.max(np.abs(found[name] - found[COMPILED])) / np.max(np.abs(found[name])):.0e})",
-            "compiled",
-            timings[name],
-            timings[COMPILED],
-            None,
-        )
-        for name in _FITS
-    ]
+    timings, rows = side_by_side(dict(fits), runs), []
+    for name in _FITS:
+        off = np.max(np.abs(found[name] - found[COMPILED])) / np.max(np.abs(found[name]))
+        what = f"W2 fit, one trial, solver {name} (gains within {off:.0e})"
+        rows.append(compare(what, "compiled", timings[name], timings[COMPILED]))
+    return rows
 
 
 def _require_close(found: Array, expected: Array, tolerance: float) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Timing", "ratio", "side_by_side"]
+__all__ = ["Timing", "side_by_side"]
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,3 @@ def side_by_side(
             if repeat:
                 seconds[name].append(elapsed)
     return {name: Timing(tuple(values)) for name, values in seconds.items()}
-
-
-def ratio(timings: dict[str, Timing], name: str, to: str) -> float:
-    """Median of one case over the median of another."""
-    return timings[name].median / timings[to].median

@@ -10,6 +10,7 @@ import numpy as np
 
 import plants
 from impc.checking import replace
+from impc.cli.seat import seat_weights
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 __all__ = ["Workload", "chain_of_masses", "example", "seat", "with_horizon"]
 
 _RATE = 100.0
-_DIRECTION = np.array([0.70, 0.65, 0.22, 0.20])
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,7 @@ def seat(trials: int = 1, seconds: float = 30.0, limit: float = 6.0) -> Workload
     Trials differ in the phase of the torque.
     """
     plant = Plant(plants.seated_balance_plant(), ["command"])
-    v = _DIRECTION / np.linalg.norm(_DIRECTION)
-    Q = 1e-2 * np.eye(plant.n)
-    Q[:4, :4] = 6e5 * np.outer(v, v) + np.diag([2e4, 2e4, 500, 500])
-    weights = Weights(Q, 1)
+    weights = seat_weights(plant)
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
     controller = Controller(plant, weights, bounds, 20, terminal_set=False)
     torques = [

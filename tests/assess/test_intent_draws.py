@@ -7,7 +7,6 @@ import pytest
 
 import impc
 from experiments.coverage import cart
-from experiments.cursor_tracking import ConditionResult, weight_ratio
 from impc.arrays import Array
 from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.weights_ranges import WeightsSummary, drawn_gains, summarise_weights
@@ -69,16 +68,3 @@ def test_a_parameter_that_stays_where_it_began_is_not_determined() -> None:
     assert not FittedParameter("lag", 0.08, 0.0812, 0.0812 * 1400).determined
     assert not FittedParameter("lag", 0.08, 0.0812, np.inf).determined
     assert FittedParameter("delay", 0.08, 0.09, 0.009).determined
-
-
-def test_the_ratio_of_prices_has_an_interval() -> None:
-    """A fall is reported only if all resampled fits agree."""
-    one = ConditionResult(
-        11.0, 9, 0.1, 0.08, True, False, [], [], [], [], [1.0, 1.0], 3, 1e6, 1e6, 1e6,
-        [5e5, 2e6], [1.0, 2.0], "", [], [], [],
-    )  # fmt: skip
-    other = impc.replace(one, blur=29.0, weight_of_error=1e3, resampled_weight=[1e2, 1e4])
-    assert "falls by a factor of 1e+03 (33 %: 200 to 5e+03)" in weight_ratio([one, other])
-    crossing = impc.replace(other, resampled_weight=[1e2, 1e7])
-    assert "is not distinguished from constant" in weight_ratio([one, crossing])
-    assert "is unknown" in weight_ratio([impc.replace(one, resampled_weight=[]), other])

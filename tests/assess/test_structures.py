@@ -13,7 +13,8 @@ import scipy.optimize
 
 import impc
 import plants
-from experiments.printed_intervals import carts, with_noise
+from experiments.driver import with_noise
+from experiments.printed_intervals import carts
 from experiments.structure_study import cart_person, seat_person
 from impc.arrays import Array
 from impc.assess.structured_weights import Tangent, tangent, weight_covariance

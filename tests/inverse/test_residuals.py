@@ -12,8 +12,9 @@ import scipy.linalg
 
 import impc
 from experiments import search_problems
-from experiments.printed_intervals import carts, with_noise
-from experiments.uncertain_body import HORIZON, noise
+from experiments.driver import first_order_noise, with_noise
+from experiments.printed_intervals import carts
+from experiments.uncertain_body import HORIZON
 from impc.arrays import Array
 from impc.inverse.laws import GainLaw, WeightLaw
 from impc.inverse.prediction import Correction, correction
@@ -48,7 +49,8 @@ def delay_and_limit() -> Case:
     for _ in range(2):
         push = pushes(rng, 0.3)
         y = law.simulate([0, 0, 0], disturbance=push).x[:-1, :1]
-        trials.append(impc.Recording(plant, y + 0.1 * y.std() * noise(rng, 400, 1, 0.0), push))
+        noise = 0.1 * y.std() * first_order_noise(rng, y.shape, 0.0, 200)
+        trials.append(impc.Recording(plant, y + noise, push))
     problem = posed(law, *trials, family=made, unknown_start=True)
     return of_gain(law, problem, [0.02, -0.01, 0.1, 0.03])
 

@@ -10,7 +10,8 @@ import pytest
 
 import impc
 import plants
-from experiments.printed_intervals import carts, with_noise
+from experiments.driver import with_noise
+from experiments.printed_intervals import carts
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.structured import fit_structure, search_from
 from tests.support import nelder_mead, posed, regulator

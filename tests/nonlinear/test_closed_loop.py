@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from experiments.peer_systems import SYSTEMS
-from experiments.seat_problem import DIRECTION, TRUTH, seat_problem
 from impc.arrays import Array
 from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
@@ -39,15 +39,31 @@ class Case:
 
 def seat_case() -> Case:
     """Tilted by 4 degrees: the torque is at its limit in part of every plan."""
-    plant = Plant(seated_balance_for(), ["command"])
+    system = seated_balance_for()
+    plant = Plant(system, ["command"])
+    v = np.array([0.70, 0.65, 0.22, 0.20])
+    truth = {"line": 6e5, "angle1": 2e4, "angle2": 2e4, "limit": 40.0}
+    line, *angles, limit = (ca.SX.sym(name) for name in truth)
+    x, u, d = ca.SX.sym("x", plant.n), ca.SX.sym("command"), ca.SX.sym("perturbation")
+    cost = line * ca.dot(ca.DM(v), x[:4]) ** 2 + ca.dot(ca.vertcat(*angles), x[:2] ** 2)
     Q = np.zeros((plant.n, plant.n))
-    Q[:4, :4] = TRUTH["line"] * np.outer(DIRECTION, DIRECTION)
-    Q[0, 0] += TRUTH["angle1"]
-    Q[1, 1] += TRUTH["angle2"]
-    problem = seat_problem(np.array(solve_lqr(plant, Weights(Q, 1)).P))
+    Q[:4, :4] = truth["line"] * np.outer(v, v)
+    Q[:2, :2] += np.diag([truth["angle1"], truth["angle2"]])
+    problem = OptimalControlProblem(
+        x,
+        u,
+        dict(zip(truth, (line, *angles, limit), strict=True)),
+        system.body()(x, ca.vertcat(u, d)),
+        cost + u**2,
+        20,
+        terminal_cost=ca.bilin(ca.DM(np.array(solve_lqr(plant, Weights(Q, 1)).P)), x, x),
+        constraints={"torque": ca.vertcat(u - limit, -u - limit)},
+        disturbances=d,
+        dt=plant.dt,
+    )
     x0 = np.zeros(plant.n)
     x0[0] = np.radians(4)
-    return Case(problem, problem.values(TRUTH | {"limit": 40.0}), x0, np.full((STEPS, 1), 5.0))
+    return Case(problem, problem.values(truth), x0, np.full((STEPS, 1), 5.0))
 
 
 def case_of(name: str) -> Case:

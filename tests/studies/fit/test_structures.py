@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.printed_intervals import carts, with_noise
+from experiments.driver import with_noise
+from experiments.printed_intervals import carts
 from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.checking import replace
 from impc.control.controller import Controller

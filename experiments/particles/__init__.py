@@ -1,1 +1,0 @@
-"""Particle likelihood of the sensorimotor model at a limit, compared with the filter."""
