@@ -195,7 +195,7 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         "names 4 columns, but the rows below have 8 values", text(csv_text(SHIFTED, ",", ","))
     ),
     "words in a column": (
-        "column 'seat' has text in 2 of 600 rows, the first 'overload' in line 12", lines(OVERLOAD)
+        "2 of 600 samples are missing or not finite, the first sample 11", lines(OVERLOAD)
     ),
     "column of words": (
         "is text, such as 'left' in line 2", text(SIDES, "trial.csv", ('"seat"', '"side"'))
@@ -261,8 +261,12 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         seat(time=changed("time", slice(101, 104), 1.0)),
     ),
     "clock that runs backward": (
-        "runs backward 1 times, the first from sample 300 to 301",
+        "begins again in sample 301 (0 after 2.99): the file holds 2 trials",
         seat(time=changed("time", slice(300, 600), SEAT["time"][:300])),
+    ),
+    "one time too early": (
+        "runs backward 1 times, the first from sample 300 to 301",
+        seat(time=changed("time", slice(300, 301), 2.98)),
     ),
     "missing time": (
         "has 1 missing times, the first in sample 8", seat(time=changed("time", 7, np.nan))

@@ -96,7 +96,10 @@ def test_a_sheet_that_is_hidden_is_none(tmp_path: Path) -> None:
     ("rows", "says"),
     [
         ([["t", "x"], [0, 1], [1, "high"]], "has text in 1 of 2 rows, the first 'high' in cell B3"),
-        ([["t", "x"], [0, "999"], [1, "1,000"]], "'1,000' in line 3 can be a decimal or thousands"),
+        (
+            [["t", "x"], [0, "999"], [1, "1,000"]],
+            "'1,000' in cell B3 can be a decimal or thousands",
+        ),
         ([["t", "x"], [0, 1], [1, datetime.date(2026, 1, 1)]], "has dates and numbers"),
         ([["only", "words"], ["a", "b"]], "has no rows of numbers"),
     ],
