@@ -216,9 +216,9 @@ def clock_fault(values: Array) -> tuple[str, str] | None:
         problem = f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}"
         return problem, "repair the clock, or give recording.rate instead"
     if starts := _starts(values):
-        told = ", ".join(f"{place + 1} ({values[place]:g} after {values[place - 1]:g})"
+        listed = ", ".join(f"{place + 1} ({values[place]:g} after {values[place - 1]:g})"
                          for place in starts[:3])  # fmt: skip
-        problem = f"begins again in sample {told}: the file holds {len(starts) + 1} trials"
+        problem = f"begins again in sample {listed}: the file holds {len(starts) + 1} trials"
         return problem, "save each trial as a file of its own"
     backward = steps <= 0
     if np.mean(steps == 0) > 0.5 and not (steps < 0).any():
