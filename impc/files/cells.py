@@ -78,9 +78,10 @@ def number(text: str, decimal: str) -> float | None:
 
 
 def certain(text: str, decimal: str) -> bool:
-    """Whether a text is a number with this `decimal` sign that is not only so by its thousands."""
-    known = number(text, decimal) is not None
-    return known and (decimal in text or bool(_NUMBERS[decimal][0].fullmatch(text)))
+    """Whether a text is a clock, or a number not only by its thousands with this `decimal` sign."""
+    if number(text, decimal) is None:
+        return clock(text) is not None
+    return decimal in text or bool(_NUMBERS[decimal][0].fullmatch(text))
 
 
 def kind_of(cell: Any, *decimals: str) -> int:

@@ -34,9 +34,10 @@ _NEXT = 3.0
 # many samples, in at most this many stretches.
 _LONGER, _STILL, _EPISODES = 4, 10, 20
 # A code of missing values is at least twice in a signal, in at most half of it, and this many
-# ranges of the others away: fewer if its digits are all nine, or it is an end of 16 bits.
+# ranges of the others away, which have so many levels. Fewer if all its digits are nine, or it is
+# a power of ten or an end of 16 or 32 bits, as written to seven digits.
 _TWICE, _LEVELS, _AWAY, _AWAY_CODE = 2, 10, 10.0, 1.0
-_CODE = re.compile(r"-?(9{2,}|9{2,}\.9+|1e\+\d+|32767|32768|65535|2147483647|2147483648)")
+_CODE = re.compile(r"-?(9{2,}|9{2,}\.9+|1e\+\d+|10{3,}|32767|32768|65535|2\.147484e\+09)")
 # Share of samples below which a signal may be written only where it changes, and least share of
 # values in it that are a change.
 _SPARSE, _CHANGES = 0.5, 0.9
@@ -155,11 +156,13 @@ def missing_code(values: Array) -> tuple[float, int] | None:
     finite = values[np.isfinite(values)]
     for code in (finite.min(), finite.max()) if len(finite) else ():
         rest, times = finite[finite != code], int(np.sum(finite == code))
-        if times < _TWICE or 2 * times >= len(finite) or len(np.unique(rest)) < _LEVELS:
+        usual = bool(_CODE.fullmatch(f"{code:.7g}"))
+        levels = _TWICE if usual else _LEVELS
+        if times < _TWICE or 2 * times >= len(finite) or len(np.unique(rest)) < levels:
             continue
         with np.errstate(over="ignore"):
             away, span = np.abs(rest - code).min(), np.ptp(rest)
-        if away > (_AWAY_CODE if _CODE.fullmatch(f"{code:.10g}") else _AWAY) * span:
+        if away > (_AWAY_CODE if usual else _AWAY) * span:
             return float(code), times
     return None
 
@@ -177,7 +180,7 @@ def coded(channel: Channel, raw: Array) -> None:
     """Reject a signal with a value that may mark missing samples; `raw` are those of the file."""
     if (found := missing_code(raw)) is None:
         return
-    code = f"{found[0]:.10g}"
+    code = f"{found[0]:.7g}"
     raise DataError(
         channel.name,
         f"is {code} in {found[1]} of {len(raw)} samples, far from all others",

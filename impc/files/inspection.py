@@ -28,7 +28,8 @@ def summary(table: Table, dt: float | None = None) -> str:
     lines += _clock_findings(table, dt)
     for name, values in table.columns.items():
         lines += [f"Column {name!r}: {asked} ({line})" for line, asked in questions(table, name)]
-        if (found := straight_lines(values)) is not None and rate_of(values) is None:
+        clock = rate_of(values) is not None or name in rejected_clocks(table)
+        if not clock and (found := straight_lines(values)) is not None:
             said = f"is a straight line from sample {found[0] + 1} to {found[1] + 1}"
             lines.append(f"Column {name!r} {said}: a gap that was filled by interpolation?")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]

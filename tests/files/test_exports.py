@@ -164,6 +164,17 @@ def test_times_as_text_are_a_clock(name: str, delimiter: str, tmp_path: Path) ->
     assert read_table(path).units == {"time": "s"}
 
 
+@pytest.mark.parametrize("ending", [".csv", ".txt"])
+def test_a_date_in_a_column_of_its_own(ending: str, tmp_path: Path) -> None:
+    """Separated by commas, or as all columns by blanks."""
+    clock, delimiter = at("%H:%M:%S.%f"), "," if ending == ".csv" else " "
+    lines = [delimiter.join(("2026-03-02", *row.split(","))) for row in text(clock).split()[1:]]
+    path = tmp_path / f"a{ending}"
+    path.write_text("\n".join([delimiter.join(("Date", "time", "tilt", "tap")), *lines]) + "\n")
+    require_signals(path)
+    assert read_table(path).skipped == {"Date": "holds dates without a time"}
+
+
 @pytest.mark.parametrize("name", [*CLOCKS, "dates", "times"])
 def test_a_workbook_has_the_same_clocks(name: str, tmp_path: Path) -> None:
     cells: list[Any] = list(CLOCKS.get(name, ()))
@@ -276,6 +287,8 @@ SAID: dict[str, tuple[tuple[str, Content], str]] = {
     ),
     "999": (coded(999), "(missing = 999)"),
     "99.99": (coded(99.99), "(missing = 99.99)"),
+    "of a push": (csv(tap=spoiled(TAP, -9999, *SOME)), "Column 'tap': -9999 in 15 of 300 samples"),
+    "single precision": (coded(float(np.float32(1e30))), "(missing = 1e+30)"),
     "1e30": (coded(1e30), "(missing = 1e+30)"),
     "16 bits": (book(spoiled(TILT, 32767, *SOME)), "(missing = 32767)"),
     "-1e6": (
