@@ -7,6 +7,7 @@ formula the saved value counts. Workbooks are written with openpyxl.
 
 from __future__ import annotations
 
+import html
 import io
 import re
 import zipfile
@@ -35,7 +36,7 @@ _ANY_LENGTH = 32_767  # characters of a cell
 _WIDEST, _LOOKED_AT = 100, 200  # column width in characters; rows that determine it
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 _RELATIONS = "xl/_rels/workbook.xml.rels"
-_HIDDEN = re.compile(rb"<row\b[^>]*\shidden=[\"'](?:1|true)[\"'][^>]*>")
+_HIDDEN = re.compile(rb"<(?:\w+:)?row\s[^>]*hidden=[\"'](?:1|true)[\"'][^>]*>")
 _HIDDEN_ODS = re.compile(rb"<table:table-row\b[^>]*\stable:visibility=[\"'](?:collapse|filter)")
 
 
@@ -85,7 +86,6 @@ class _Sheet:
     """Cells of a sheet from `corner` (row, column), the first that is not empty."""
 
     name: str
-    place: int  # among the sheets of the workbook
     rows: list[list[Any]]
     corner: tuple[int, int]
 
@@ -112,7 +112,7 @@ def _sheets(path: Path, largest: int) -> Iterator[_Sheet]:
             for place, found in enumerate(book.sheets_metadata):
                 if found.visible == calamine.SheetVisibleEnum.Visible:
                     sheet = book.get_sheet_by_index(place)
-                    yield _Sheet(found.name, place, sheet.to_python(), sheet.start or (0, 0))
+                    yield _Sheet(found.name, sheet.to_python(), sheet.start or (0, 0))
     except calamine.PasswordError:
         raise DataError(source, "is locked by a password", "save it without one") from None
 
@@ -164,27 +164,29 @@ def _hidden(path: Path, sheet: _Sheet, rows: range) -> str:
     with zipfile.ZipFile(path) as archive:
         if path.suffix.lower() == ".ods":
             parts = archive.read("content.xml").split(b"<table:table ")
-            found = len(_HIDDEN_ODS.findall(parts[1 + sheet.place]))
-            first = ""
+            own = [part for part in parts if _attribute(part, "table:name") == sheet.name]
+            count, first = sum(len(_HIDDEN_ODS.findall(part)) for part in own), ""
         else:
-            relations = {
-                _attribute(one, b"Id"): _attribute(one, b"Target")
-                for one in re.findall(rb"<Relationship\b[^>]*>", archive.read(_RELATIONS))
-            }
-            sheets = re.findall(rb"<sheet\b[^>]*>", archive.read("xl/workbook.xml"))
-            target = relations[_attribute(sheets[sheet.place], b"r:id")].removeprefix("/xl/")
-            text = archive.read(f"xl/{target}")
-            numbers = [int(_attribute(one, b"r") or 0) for one in _HIDDEN.findall(text)]
-            inside = [one for one in numbers if one - sheet.corner[0] in rows]
-            found, first = len(inside), f", the first {inside[0]}" if inside else ""
-    said = f"sheet {sheet.name!r} has {found} hidden rows{first}, which are read like the others"
-    return f"{said}: delete them in the file if they are not to count" if found else ""
+            tags = re.findall(rb"<(?:\w+:)?sheet\s[^>]*>", archive.read("xl/workbook.xml"))
+            own = [tag for tag in tags if _attribute(tag, "name") == sheet.name]
+            wanted = _attribute(own[0], r"\w+:id") if own else ""
+            tags = re.findall(rb"<(?:\w+:)?Relationship\s[^>]*>", archive.read(_RELATIONS))
+            named = [_attribute(tag, "Target") for tag in tags if _attribute(tag, "Id") == wanted]
+            files = [f"xl/{name.removeprefix('/xl/')}" for name in named]
+            content = [archive.read(name) for name in files if name in archive.namelist()]
+            found = [int(_attribute(tag, "r") or 0) - sheet.corner[0]
+                     for tag in _HIDDEN.findall(b"".join(content))]  # fmt: skip
+            inside = [number for number in found if number in rows]
+            count = len(inside)
+            first = f", the first {inside[0] + sheet.corner[0]}" if inside else ""
+    said = f"sheet {sheet.name!r} has {count} hidden rows{first}, which are read like the others"
+    return f"{said}: delete them in the file if they are not to count" if count else ""
 
 
-def _attribute(tag: bytes, name: bytes) -> str:
-    """Value of an attribute of an XML tag; empty without one."""
-    found = re.search(rb"\s" + name + rb"\s*=\s*[\"']([^\"']*)", tag)
-    return found[1].decode() if found else ""
+def _attribute(tag: bytes, name: str) -> str:
+    """Value of the first attribute of this name in an XML tag; empty without one."""
+    found = re.search(rf"(?:^|\s){name}\s*=\s*[\"']([^\"']*)".encode(), tag)
+    return html.unescape(found[1].decode()) if found else ""
 
 
 def _text(cell: Any) -> str:

@@ -14,7 +14,6 @@ from typing import Any
 
 import control
 import numpy as np
-import openpyxl
 import pytest
 from click.testing import CliRunner
 
@@ -27,7 +26,15 @@ from impc.files.formats import read_table
 from impc.files.plant_sources import PlantSource, make_plant
 from impc.files.reading import recording_of
 from impc.model.recordings import Recording
-from tests.files.samples import hdf5_mat, mat5_file, opaque_variable, save_mat
+from tests.files.hostile_files import repacked
+from tests.files.samples import (
+    hdf5_mat,
+    mat5_file,
+    ods_file,
+    opaque_variable,
+    save_mat,
+    workbook,
+)
 
 RATE, SAMPLES = 50, 300
 TIME = np.arange(SAMPLES) / RATE
@@ -86,22 +93,15 @@ SOME = tuple(range(50, 290, 17))
 THOUSANDS = 1000 * TILT
 
 
-def rows(
-    cells: Sequence[Sequence[Any]], hidden: Sequence[int] = (), sheet: str = "Data"
-) -> Callable[[Path], object]:
-    """A workbook of openpyxl."""
+def rows(cells: Sequence[Sequence[Any]], hidden: Sequence[int] = ()) -> Callable[[Path], object]:
+    return lambda path: workbook(path, hidden, Data=cells)
 
-    def write(path: Path) -> None:
-        book = openpyxl.Workbook()
-        page: Any = book.active
-        page.title = sheet
-        for row in cells:
-            page.append(list(row))
-        for number in hidden:
-            page.row_dimensions[number].hidden = True
-        book.save(path)
 
-    return write
+def filtered(path: Path) -> None:
+    """A workbook of LibreOffice, of which a filter hides a row."""
+    ods_file(path, {"Info": [["by", "hand"]], "Data": sheet_of(TIME.tolist())})
+    row, hides = b"<table:table-row", b'<table:table-row table:visibility="filter"'
+    repacked(path, content=lambda text: hides.join(text.rsplit(row, 1)))
 
 
 def sheet_of(clock: Sequence[Any], tilt: Sequence[Any] = TILT.tolist()) -> list[list[Any]]:
@@ -311,6 +311,7 @@ SAID: dict[str, tuple[tuple[str, Content], str]] = {
         book(hidden=range(50, 60)),
         "sheet 'Data' has 10 hidden rows, the first 50, which are read like the others",
     ),
+    "filtered": ((".ods", filtered), "sheet 'Data' has 1 hidden rows, which are read like"),
     "two blocks": ((".csv", "\n".join(VICON)), f"line 307 ('Trajectories') {ENDS}"),
     "a trial below": (
         (".csv", "\n".join([*BLOCK, "", *BLOCK])), f"line 303 ('time,tilt,tap') {ENDS}"

@@ -17,22 +17,13 @@ from impc.files.spreadsheet import workbook_bytes
 from impc.files.table import make_table
 from impc.studies.cohort.participants import read_participants
 from impc.studies.cohort.sheet import read_sheet
-from tests.files.samples import ods_file, pushed_seat
+from tests.files.samples import ods_file, pushed_seat, workbook
 
 SEAT = pushed_seat(50)
 
 
 def book(path: Path, rows: list[list[Any]], **others: list[list[Any]]) -> Path:
-    made = openpyxl.Workbook()
-    sheet: Any = made.active
-    for row in rows:
-        sheet.append(row)
-    for name, content in others.items():
-        more = made.create_sheet(name)
-        for row in content:
-            more.append(row)
-    made.save(path)
-    return path
+    return workbook(path, Sheet=rows, **others)
 
 
 def seat_rows(heads: list[str]) -> list[list[Any]]:
