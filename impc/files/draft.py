@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 # than `_SLOWEST` s, the longest of any movement recording.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
+_RISES = 0.9  # least part of the steps of a clock that are upward
 _HORIZON = 20
 _INPUT = "a recorded perturbation; delete this table if it was not recorded"
 # Units at the end of names, as in alpha_deg.
@@ -301,9 +302,10 @@ def rejected_clocks(table: Table) -> dict[str, tuple[str, str]]:
     found = {}
     for name, values in table.columns.items():
         fault = clock_fault(values)
-        named = named_clock(name, table.units.get(name, ""))
+        steps = np.diff(values[np.isfinite(values)])
+        rises = np.sum(steps > 0) >= _RISES * np.sum(steps != 0)
+        named = rises and named_clock(name, table.units.get(name, ""))
         if fault is None and named and rate_of(values) is None:
-            steps = np.diff(values)
             said = f"rises unevenly, in steps from {steps.min():.4g} to {steps.max():.4g}"
             fault = said, "export with a constant sampling rate, or give recording.rate instead"
         if fault is not None and (named or "trials" in fault[0]):

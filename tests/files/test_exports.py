@@ -25,6 +25,7 @@ from impc.files.draft import draft
 from impc.files.formats import read_table
 from impc.files.plant_sources import PlantSource, make_plant
 from impc.files.reading import recording_of
+from impc.files.table import make_table
 from impc.model.recordings import Recording
 from tests.files.hostile_files import repacked
 from tests.files.samples import (
@@ -337,6 +338,11 @@ def test_what_inspect_says(name: str, tmp_path: Path) -> None:
 
 
 # Answers to the questions -----------------------------------------------------------------------
+
+
+def test_a_signal_in_seconds_is_no_clock() -> None:
+    table = make_table("a", {"time": TIME, "reaction time": TILT, "lag_ms": TAP})
+    assert list(draft(table).signals) == ["reaction time", "lag_ms"]
 
 
 def stick() -> control.StateSpace:
