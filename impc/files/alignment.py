@@ -15,17 +15,21 @@ import scipy
 from impc.errors import DataError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from impc.arrays import Array
 
-_WORDS = {"time", "t", "zeit", "temps", "tiempo", "timestamp", "clock", "seconds", "sec"}
+_WORDS = {
+    *("time", "t", "zeit", "temps", "tiempo", "tempo", "tijd", "tid", "uhrzeit", "timestamp"),
+    *("clock", "seconds", "sec", "ms", "msec", "millis", "micros", "us", "elapsed"),
+}
 _SECONDS = ("s", "sec", "ms", "us")
 # Clocks are equal if they differ by less than this part of a step; a value is taken without
 # interpolation below the second; an interval of more than the third many steps is a gap.
 _SAME, _EXACT, _GAP = 1e-2, 1e-3, 1.5
 # Longest clock in any unit; least part of its steps that are within half of the usual one.
 _LONGEST, _EVEN = 1e30, 0.9
+_LOST, _TURN = 3.0, 10.0  # longest step of a counter that wraps, and least number between wraps
 _COMMON, _COVERED = 0.1, 0.5  # least part of the longest clock: common, and of a clock that counts
 
 
@@ -49,6 +53,25 @@ def rising(values: Array) -> Array:
             return time[:0]
         even = np.abs(steps - np.median(steps)) < 0.5 * np.median(steps)
     return time if even.mean() > _EVEN else time[:0]
+
+
+def unwrapped(values: Array, moduli: Sequence[float]) -> tuple[Array, float]:
+    """`values` (samples,) continued where they fall by one of the `moduli`, and that modulus or 0.
+
+    Every fall must be that modulus less at most three of the usual steps, which are far shorter.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    with np.errstate(all="ignore"):
+        steps = np.diff(values[known])
+        fell = steps < 0
+        usual = float(np.median(steps[~fell])) if fell.any() and not fell.all() else 0.0
+        for modulus in moduli if usual > 0 else ():
+            on = steps[fell] + modulus
+            if modulus >= _TURN * usual and (on > 0).all() and (on <= _LOST * usual).all():
+                made = values.copy()
+                made[known[1:]] += modulus * np.cumsum(fell)
+                return made, modulus
+    return values, 0.0
 
 
 def own_clocks(

@@ -7,6 +7,7 @@ Messages name file, signal and column, the number of samples, and the first of t
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,9 @@ from impc.errors import DataError, FallError, one_line
 from impc.levels import Level
 
 if TYPE_CHECKING:
-    from impc.arrays import Array, BoolArray
+    from collections.abc import Sequence
+
+    from impc.arrays import Array, BoolArray, IntArray
     from impc.errors import ImpcError
     from impc.files.units import Unit
 
@@ -30,6 +33,14 @@ _NEXT = 3.0
 # A sensor failed where it keeps a value this many times longer than elsewhere, for at least this
 # many samples, in at most this many stretches.
 _LONGER, _STILL, _EPISODES = 4, 10, 20
+# A code of missing values is at least twice in a signal, in at most half of it, and this many
+# ranges of the others away, which have so many levels. Fewer if all its digits are nine, or it is
+# a power of ten or an end of 16 or 32 bits, as written to seven digits.
+_TWICE, _LEVELS, _AWAY, _AWAY_CODE = 2, 10, 10.0, 1.0
+_CODE = re.compile(r"-?(9{2,}|9{2,}\.9+|1e\+\d+|10{3,}|32767|32768|65535|2\.147484e\+09)")
+# Share of samples below which a signal may be written only where it changes, and least share of
+# values in it that are a change.
+_SPARSE, _CHANGES = 0.5, 0.9
 # A jump is this many times the usual step; reported if it leads to one value this often.
 _JUMP, _AGAIN = 6, 3
 _BALANCED = 0.05  # share of a trial before a fall
@@ -114,6 +125,72 @@ def unit_of_the_file(channel: Channel, stated: Unit | None, overruled: bool) -> 
         "the file",
         f"correct {key}.unit, or set {key}.overrule_unit = true if the file is wrong",
     ).at(*channel.key("unit"))
+
+
+def without_codes(values: Array, codes: float | Sequence[float]) -> Array:
+    """`values` (samples,) with NaN where they are one of the `codes`."""
+    found = values.copy()
+    for code in np.atleast_1d(codes):
+        found[np.isclose(values, code, rtol=1e-6, atol=0)] = np.nan  # also in single precision
+    return found
+
+
+def held(values: Array) -> Array:
+    """`values` (samples,) with the last finite one where there is none."""
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    return np.asarray(values[last])
+
+
+def missing_code(values: Array) -> tuple[float, int] | None:
+    """Value of a column that may mark missing samples, and how often it occurs.
+
+    It is repeated and far from all others.
+    """
+    finite = values[np.isfinite(values)]
+    for code in (finite.min(), finite.max()) if len(finite) else ():
+        rest, times = finite[finite != code], int(np.sum(finite == code))
+        usual = bool(_CODE.fullmatch(f"{code:.7g}"))
+        levels = _TWICE if usual else _LEVELS
+        if times < _TWICE or 2 * times >= len(finite) or len(np.unique(rest)) < levels:
+            continue
+        with np.errstate(over="ignore"):
+            away, span = np.abs(rest - code).min(), np.ptp(rest)
+        if away > (_AWAY_CODE if usual else _AWAY) * span:
+            return float(code), times
+    return None
+
+
+def changes_only(values: Array) -> int:
+    """Number of samples of a column that is written only where it changes; 0 for the others."""
+    finite = np.isfinite(values)
+    written = values[finite]
+    if not len(written) or not finite[0] or len(written) > _SPARSE * len(values):
+        return 0
+    return len(written) if np.mean(np.diff(written) != 0) >= _CHANGES else 0
+
+
+def coded(channel: Channel, raw: Array) -> None:
+    """Reject a signal with a value that may mark missing samples; `raw` are those of the file."""
+    if (found := missing_code(raw)) is None:
+        return
+    code = f"{found[0]:.7g}"
+    raise DataError(
+        channel.name,
+        f"is {code} in {found[1]} of {len(raw)} samples, far from all others",
+        f"if that marks missing values, write missing = {code} in [signals.{channel.signal}], "
+        "otherwise missing = []",
+    ).at(*channel.key("missing"))
+
+
+def written_at_changes(channel: Channel, raw: Array) -> None:
+    """Reject a signal that may be written only where it changes, until someone says so."""
+    if written := changes_only(raw):
+        raise DataError(
+            channel.name,
+            f"has a value in {written} of {len(raw)} samples, each another one",
+            f"if it is written only where it changes, write held = true in "
+            f"[signals.{channel.signal}], otherwise held = false",
+        ).at(*channel.key("held"))
 
 
 def measurable(channel: Channel) -> Notice | None:
@@ -232,10 +309,7 @@ def stretches(channel: Channel) -> Notice | None:
     ends_of_range = (np.nanmin(values), np.nanmax(values))  # reported by `clipped`
     extreme = np.isin(values[starts], ends_of_range)
     lengths = np.where(extreme, 1, ends - starts)
-    sizes = np.sort(lengths)[::-1]
-    gaps = np.flatnonzero(sizes[:-1] >= _LONGER * sizes[1:])[:1]
-    if len(gaps) and gaps[0] < _EPISODES and sizes[gaps[0]] >= _STILL:
-        still = lengths >= sizes[gaps[0]]
+    if (still := _unusual(lengths)).any():
         first, often = int(starts[np.argmax(still)]), "stretch" if still.sum() == 1 else "stretches"
         return channel.finding(
             f" is constant in {still.sum()} {often}, {lengths[still].sum()} samples "
@@ -254,7 +328,43 @@ def stretches(channel: Channel) -> Notice | None:
     return channel.finding(
         f" jumps to {value:.6g} {channel.unit.written} and back {times.max()} times, "
         f"in {lost.sum()} samples, the first {channel.at(int(np.argmax(lost)))}: if it marks lost "
-        "samples, leave them empty in the file and set recording.fill_gaps"
+        f"samples, set signals.{channel.signal}.missing and recording.fill_gaps"
+    )
+
+
+def _unusual(lengths: IntArray) -> BoolArray:
+    """Which of the `lengths` of stretches are far longer than the others."""
+    sizes = np.sort(lengths)[::-1]
+    gaps = np.flatnonzero(sizes[:-1] >= _LONGER * sizes[1:])[:1]
+    few = len(gaps) and gaps[0] < _EPISODES and sizes[gaps[0]] >= _STILL
+    return lengths >= (sizes[gaps[0]] if few else np.inf)
+
+
+def straight_lines(values: Array) -> tuple[int, int, int] | None:
+    """First and last sample of a straight line far longer than usual, and how many there are."""
+    levels = np.unique(values[np.isfinite(values)])
+    if len(levels) < _STILL:
+        return None
+    with np.errstate(all="ignore"):  # of values beyond anything measured
+        close = 2.01 * float(np.diff(levels).min()) + 1e-12 * float(np.ptp(levels))
+        bends = np.flatnonzero(~(np.abs(np.diff(values, 2)) <= close)) + 1
+        starts, ends = np.append(0, bends), np.append(bends, len(values) - 1)
+        flat = ~(np.abs(values[ends] - values[starts]) > _STILL * close)
+    lines = _unusual(np.where(flat, 1, ends - starts))
+    place = int(np.argmax(lines))
+    return (int(starts[place]), int(ends[place]), int(lines.sum())) if lines.any() else None
+
+
+def straight(channel: Channel) -> Notice | None:
+    """Report stretches of a response that are a straight line between two samples."""
+    if (found := straight_lines(channel.values)) is None:
+        return None
+    first, last, count = found
+    return channel.finding(
+        f" is a straight line in {count} stretch{'es' if count > 1 else ''}, the first of "
+        f"{channel.time[last] - channel.time[first]:.4g} s from {channel.at(first)}: a gap that "
+        "was filled by interpolation? Cut it with recording.start and stop, or leave its samples "
+        "empty in the file and set recording.keep_gaps = true"
     )
 
 

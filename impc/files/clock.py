@@ -27,6 +27,9 @@ _APART = 0.02
 _UNITS = np.array([1, 60, 3600, 86400])  # of a clock, in s, times any power of ten
 # Deviation of a step from a whole multiple of the usual one, in periods, in a clock or counter.
 _UNEVEN = 0.05
+# A file holds at most this many trials of at least so many samples, with a clock of which this
+# share of steps is the usual one.
+_TRIALS, _TRIAL, _EVEN = 50, 10, 0.9
 # Relative difference above which two statements of the rate contradict each other.
 _RATE = 1e-3
 _TIME_UNIT = ("recording", "time_unit")
@@ -83,7 +86,8 @@ def _read(table: Table, recording: RecordingTable, fill_gaps: float) -> Clock:
     if unit.base != "second":
         problem, remedy = f"has the unit {unit.written!r}", 'write time_unit = "s" or "ms"'
         raise DataError(subject, problem, remedy).at("", *_TIME_UNIT)
-    _require_rising(subject, values)
+    if (fault := clock_fault(values)) is not None:
+        raise DataError(subject, *fault)
     time = values * unit.factor
     if (furthest := float(max(abs(time[0]), abs(time[-1])))) > _LONGEST:
         remedy = "correct the clock, or recording.time_unit"
@@ -204,26 +208,46 @@ def _rows_lost(table: Table, clock: Clock, chosen: str | None) -> tuple[str, ...
     return tuple(f"{table.source}: {one}" for one in found)
 
 
-def _require_rising(subject: str, values: Array) -> None:
-    missing = ~np.isfinite(values)
-    if missing.any():
-        raise DataError(
-            subject,
-            f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}",
-            "repair the clock, or give recording.rate instead",
-        )
-    with np.errstate(over="ignore"):  # steps beyond the largest float
-        backward = np.diff(values) <= 0
+def clock_fault(values: Array) -> tuple[str, str] | None:
+    """What is wrong with a clock, and what to do; None if it rises evenly."""
+    with np.errstate(all="ignore"):  # steps beyond the largest float
+        steps = np.diff(values)
+    if (missing := ~np.isfinite(values)).any():
+        problem = f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}"
+        return problem, "repair the clock, or give recording.rate instead"
+    if starts := _starts(values):
+        listed = ", ".join(f"{place + 1} ({values[place]:g} after {values[place - 1]:g})"
+                         for place in starts[:3])  # fmt: skip
+        problem = f"begins again in sample {listed}: the file holds {len(starts) + 1} trials"
+        return problem, "save each trial as a file of its own"
+    backward = steps <= 0
+    if np.mean(steps == 0) > 0.5 and not (steps < 0).any():
+        coarse = f"has only {len(np.unique(values))} times in {len(values)} samples"
+        return coarse, "export it with fractions of a second, or give recording.rate instead"
     if backward.any():
         first = int(np.argmax(backward))
-        step = values[first + 1] - values[first]
-        what = "is repeated" if step == 0 else "runs backward"
-        raise DataError(
-            subject,
+        what = "is repeated" if steps[first] == 0 else "runs backward"
+        problem = (
             f"{what} {backward.sum()} times, the first from sample {first + 1} to {first + 2} "
-            f"(at {values[first]:g})",
-            "remove the repeated rows, or give recording.rate instead",
+            f"(at {values[first]:g})"
         )
+        return problem, "remove the repeated rows, or give recording.rate instead"
+    return None
+
+
+def _starts(values: Array) -> list[int]:
+    """Samples in which a clock begins again; empty if it does not, or is no clock."""
+    with np.errstate(all="ignore"):
+        steps = np.diff(values)
+    falls = np.flatnonzero(steps <= 0)
+    if not 0 < len(falls) <= _TRIALS or not (steps > 0).any():
+        return []
+    usual = float(np.median(steps[steps > 0]))
+    even = np.abs(np.delete(steps, falls) - usual) < 0.5 * usual
+    parts = np.diff([0, *(falls + 1), len(values)])
+    back = steps[falls] < -2 * usual  # not a repeated row or a correction of the clock
+    whole = even.mean() > _EVEN and parts.min() >= _TRIAL and back.all()
+    return (falls + 1).tolist() if whole else []
 
 
 def _cut(source: str, time: Array, recording: RecordingTable) -> slice:

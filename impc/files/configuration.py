@@ -133,6 +133,10 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Without one it is half a recorded sample for a perturbation, 0 for other signals.
     command : bool, optional
         Whether the signal is a recorded command of the subject and not a disturbance.
+    missing : float or list of float, optional
+        Code of a missing value in the file, such as -9999; `[]` if no value is one.
+    held : bool, optional
+        Whether the column is written only where it changes: each value holds until the next one.
     target : str or float, optional
         Value that the subject regulates an output to: a column, or a constant; with unit, offset
         and sign of the signal.
@@ -146,6 +150,8 @@ class SignalTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     overrule_unit: bool = False
     shift: int | Finite | Annotated[str, msgspec.Meta(pattern=_SHIFT)] = 0
     command: bool = False
+    missing: Finite | tuple[Finite, ...] | None = None
+    held: bool | None = None
     target: str | Finite | None = None
 
     def delay(self, period: float) -> tuple[float, float | None]:

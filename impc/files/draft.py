@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.checking import replace
 from impc.errors import InputError
 from impc.files.alignment import named_clock, rising
-from impc.files.clock import counts_days
+from impc.files.checks import changes_only, missing_code
+from impc.files.clock import clock_fault, counts_days
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN, make_plant
 from impc.files.pulse import pulse
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 # than `_SLOWEST` s, the longest of any movement recording.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
+_RISES = 0.9  # least part of the steps of a clock that are upward
 _HORIZON = 20
 _INPUT = "a recorded perturbation; delete this table if it was not recorded"
 # Units at the end of names, as in alpha_deg.
@@ -53,11 +56,12 @@ class Guess:
     why: str  # Why this column; empty if the names agree
     unit: str  # FILL_IN if it is not known
     origin: str  # Where the unit comes from, or what is asked
+    asked: tuple[tuple[str, str], ...] = ()  # Further lines of TOML, each with its question
 
     @property
     def certain(self) -> bool:
         """Whether nothing is guessed and nothing is to be filled in."""
-        return not self.why and self.origin == _STATED
+        return not self.why and not self.asked and self.origin == _STATED
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +77,10 @@ class Draft:
 
     @property
     def guesses(self) -> int:
-        """Number of columns and units that are guessed."""
+        """Number of columns and units that are guessed, and of further questions."""
         known = [*self.signals.values(), *filter(None, [self.clock])]
         columns = sum(one.column != FILL_IN and bool(one.why) for one in known)
+        columns += sum(len(one.asked) for one in known)
         return columns + sum(one.unit != FILL_IN and one.origin != _STATED for one in known)
 
     @property
@@ -145,19 +150,39 @@ def draft(
     is the command. `arguments` of its function with their defaults, `FILL_IN` if there is none.
     """
     clock = clock_guess(table)
-    rest = [name for name in table.columns if not clock or name != clock.column]
+    clocks = {*rejected_clocks(table), *([clock.column] if clock else [])}
+    rest = [name for name in table.columns if name not in clocks]
     rest = rest or list(table.columns)
     chosen, names = {column: (column, "") for column in rest}, tuple(rest)
     if plant is not None:
         names = (*plant.outputs, *plant.controls[1:])
         chosen = _guessed(table, names, rest, plant)
     none = (FILL_IN, "no remaining column fits: enter its name")
-    signals = {name: guess_of(table, *chosen.get(name, none)) for name in names}
-    used = [one.column for one in signals.values()]
-    unused = tuple(name for name in rest if name not in used)
+    outputs = () if plant is None else plant.outputs
+    signals = {
+        name: replace(one, asked=questions(table, one.column, name not in outputs))
+        for name in names
+        if (one := guess_of(table, *chosen.get(name, none)))
+    }
+    used = [one.column for one in signals.values()] + ([clock.column] if clock else [])
+    unused = tuple(name for name in table.columns if name not in used)
     plain = {name: value for name, value in (arguments or {}).items()
              if isinstance(value, bool | int | float | str)}  # fmt: skip
     return Draft(table, plant, plain, clock, signals, unused)
+
+
+def questions(table: Table, column: str, held: bool = True) -> tuple[tuple[str, str], ...]:
+    """Lines of TOML that a column may need, and the question that each one answers."""
+    values = table.columns.get(column, np.empty(0))
+    found = []
+    if (code := missing_code(values)) is not None:
+        many = f"{code[0]:.7g} in {code[1]} of {len(values)} samples"
+        asked = f"{many}, far from all others: does it mark missing values?"
+        found.append((f"missing = {code[0]:.7g}", asked))
+    if held and (written := changes_only(values)):
+        asked = f"a value in {written} of {len(values)} samples: is it written only where it "
+        found.append(("held = true", f"{asked}changes, and holds until then?"))
+    return tuple(found)
 
 
 def drafted(table: Table, source: PlantSource | None) -> Draft:
@@ -256,6 +281,10 @@ _MORE = (
 def _clock_lines(table: Table, clock: Guess | None) -> list[str]:
     if clock is None and table.rate is not None:
         return [_line(f"# rate = {table.rate!r}", "samples per second, stated in the file")]
+    if clock is None and (rejected := rejected_clocks(table)):
+        said = [_line(f"# time = {_quoted(name)}", "; ".join(fault))
+                for name, fault in rejected.items()]  # fmt: skip
+        return [*said, _line("# rate = 1000.0", "samples per second, if no clock is right")]
     if clock is None:
         return [
             _line('# time = "..."', "no column rises evenly: name the clock column,"),
@@ -266,6 +295,22 @@ def _clock_lines(table: Table, clock: Guess | None) -> list[str]:
     span = f"from {values[0]:.6g} to {values[-1]:.6g}, in steps of {step:.6g}"
     unit = _line(f"time_unit = {_quoted(clock.unit)}", clock.origin)
     return [_line(f"time = {_quoted(clock.column)}", span), unit]
+
+
+def rejected_clocks(table: Table) -> dict[str, tuple[str, str]]:
+    """Columns that are clocks but rise unevenly: what is wrong with each, and what to do."""
+    found = {}
+    for name, values in table.columns.items():
+        fault = clock_fault(values)
+        steps = np.diff(values[np.isfinite(values)])
+        rises = np.sum(steps > 0) >= _RISES * np.sum(steps != 0)
+        named = rises and named_clock(name, table.units.get(name, ""))
+        if fault is None and named and rate_of(values) is None:
+            said = f"rises unevenly, in steps from {steps.min():.4g} to {steps.max():.4g}"
+            fault = said, "export with a constant sampling rate, or give recording.rate instead"
+        if fault is not None and (named or "trials" in fault[0]):
+            found[name] = fault
+    return found
 
 
 def clock_guess(table: Table) -> Guess | None:
@@ -325,6 +370,8 @@ def _idle(table: Table, column: str) -> str:
     values = values[np.isfinite(values)]
     if len(values) == 0 or np.ptp(values) == 0:
         return "constant"
+    if (fault := rejected_clocks(table).get(column)) is not None:
+        return f"a clock that {fault[0]}"
     return "" if rate_of(values) is None else "a clock or counter"
 
 
@@ -337,6 +384,10 @@ def _signal_lines(signal: str, guess: Guess, kind: str, plant: Plant | None) -> 
         _line(f"[signals.{key}]", kind),
         _line(column, guess.why) if guess.why else column,
         _line(f"unit = {_quoted(guess.unit)}", guess.origin),
+        *(
+            _line(f"# {line}", f"{question} Then remove the first #")
+            for line, question in guess.asked
+        ),
         _line("# limit = 12.0", "mechanical stop, in this unit"),
         _line("# offset = 0.0", "subtracted, in this unit"),
         _line("# sign = -1", f"if the sensor counts in the opposite direction{positive}"),

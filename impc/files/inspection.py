@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.errors import InputError
+from impc.files.checks import straight_lines
 from impc.files.clock import read_clock
 from impc.files.configuration import RecordingTable
-from impc.files.draft import clock_guess, rate_of
+from impc.files.draft import clock_guess, questions, rate_of, rejected_clocks
 from impc.files.table import in_columns
 from impc.files.units import si_unit
 
@@ -25,6 +26,12 @@ def summary(table: Table, dt: float | None = None) -> str:
     if table.rate is not None:
         lines.append(f"The file states a rate of {table.rate:g} samples per second.")
     lines += _clock_findings(table, dt)
+    for name, values in table.columns.items():
+        lines += [f"Column {name!r}: {asked} ({line})" for line, asked in questions(table, name)]
+        clock = rate_of(values) is not None or name in rejected_clocks(table)
+        if not clock and (found := straight_lines(values)) is not None:
+            said = f"is a straight line from sample {found[0] + 1} to {found[1] + 1}"
+            lines.append(f"Column {name!r} {said}: a gap that was filled by interpolation?")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
     lines += [f"Note: {note}" for note in table.notes]
     return "\n".join(lines)
@@ -57,7 +64,8 @@ def _clock_findings(table: Table, dt: float | None) -> list[str]:
         fill_gaps = longest if dt is None else None
         recording = RecordingTable(time=clock.column, time_unit=clock.unit, fill_gaps=fill_gaps)
     elif table.rate is None:
-        return []
+        faults = rejected_clocks(table).items()
+        return [f"{table.source}: clock {name!r} {'; '.join(fault)}" for name, fault in faults]
     try:
         used = read_clock(table, recording, dt or 0.0)
     except InputError as error:

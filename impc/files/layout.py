@@ -1,7 +1,8 @@
 """Find the block of numbers in rows of text or cells, and the names and units of its columns.
 
 Each cell is a number, a word or empty. The recording begins at the first row whose width and kinds
-continue below it. Names and units stand above: ``angle (deg)``, or a row of units.
+continue below it. Names and units stand above: ``angle (deg)``, or a row of units. A few rows of
+statistics may stand below it; more rows of numbers are an error, as they may be lost samples.
 """
 
 from __future__ import annotations
@@ -9,20 +10,26 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from itertools import chain
+from typing import TYPE_CHECKING, NamedTuple
 
 from impc.errors import DataError
+from impc.files.cells import EMPTY, NUMBER, WORD, require_no_thousands
+from impc.files.table import make_table
 from impc.files.units import is_unit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
-#: Kinds of a cell.
-EMPTY, NUMBER, WORD = 0, 1, 2
+    from impc.files.cells import Column
+    from impc.files.table import Table
+
 #: Rows among which the first row of numbers must be.
 HEAD = 100
 # Rows of one shape that make a recording; more if they begin with a word, as settings do.
 _SEVERAL, _NAMED = 3, 20
+# Rows of numbers below a recording that may be statistics: in all, and without a label.
+_BELOW, _UNLABELLED = 12, 3
 
 
 @dataclass
@@ -111,6 +118,110 @@ def first_block(rows: Sequence[Sequence[int]], alone: bool) -> Block | None:
             break
         best.first = above.first
     return best
+
+
+class Row(NamedTuple):
+    """A row from the first of a block on."""
+
+    place: str  # such as "line 12"
+    text: str
+    kinds: Sequence[int] | None  # None if it certainly fits
+    after_blank: bool = False
+    width: int = 0  # number of its fields
+
+
+class Extent(NamedTuple):
+    """Rows of a block, fields of its longest row, and a note on the rows below."""
+
+    rows: int
+    width: int
+    note: str = ""
+
+
+def extent(source: str, block: Block, rows: Iterable[Row], cut_short: bool) -> Extent:
+    """Extent of a `block` in its rows and those below; `cut_short`: the last line has no end."""
+    left: Iterator[Row] = iter(rows)
+    count, kept, width, blank = 0, 0, len(block.kinds), False
+    for row in left:
+        blank |= row.after_blank
+        if row.kinds is not None and not any(row.kinds):  # counts if rows of numbers follow it
+            count, blank = count + 1, True
+            continue
+        if row.kinds is not None and not block.fits(row.kinds, blank):
+            following = next(left, None)
+            beyond = following.kinds or block.kinds if following else ()
+            ends = block.ends_at(row.kinds, beyond, blank)
+            cut = following is None and cut_short and row.width < block.width
+            cut = cut and not re.match(r"[^\W\d_]{3}", row.text)
+            if ends and not cut:
+                _require_statistics(source, row, following, left)
+                note = f"{row.place} and all below are not read; they begin with "
+                return Extent(kept, width, f"{note}{row.text.strip()[:40]!r}")
+            if cut or row.width != len(block.kinds):
+                said = f"{row.place} has {row.width} values where the first row has "
+                said += f"{len(block.kinds)}{': the file ends in the middle of a row' * cut}"
+                raise DataError(source, said, "copy or export the file again")
+            left = chain([following] if following else [], left)
+        count, width, blank = count + 1, max(width, row.width), False
+        kept = count
+    return Extent(kept, width)
+
+
+def _require_statistics(source: str, end: Row, following: Row | None, left: Iterator[Row]) -> None:
+    """Require that few rows of numbers stand from row `end` on, most of them with a label."""
+    numbers = unlabelled = 0
+    for row in chain([end], [following] if following else [], left):
+        kinds = row.kinds or [NUMBER]
+        numbers += NUMBER in kinds
+        unlabelled += kinds[0] == NUMBER
+        if numbers > _BELOW or unlabelled > _UNLABELLED:
+            raise DataError(
+                source,
+                f"{end.place} ({end.text.strip()[:40]!r}) ends the recording, but more rows of "
+                f"numbers follow, such as {row.place} ({row.text.strip()[:40]!r})",
+                f"if they belong to it, correct {end.place}; otherwise export each block as a file "
+                "of its own",
+            )
+
+
+def table_of(
+    source: str,
+    above: Sequence[Sequence[str]],
+    columns: Sequence[Column],
+    where: Callable[[int, int], str],
+    texts: Callable[[int], Iterable[tuple[str, str]]],
+    *,
+    named_rows: bool,
+    notes: Sequence[str],
+    skipped: dict[str, str],
+) -> Table:
+    """Table of `columns` with the rows `above` them; `where` is the place of (row, column).
+
+    `texts` are the places and texts of a column, to tell decimals from thousands.
+    """
+    empty = [column.empty for column in columns]
+    heads = find_headings(source, above, empty, named_rows)
+    kept, units, said = {}, dict(heads.units), [*heads.notes]
+    for place, (name, column) in enumerate(zip(heads.names, columns, strict=True)):
+        known = name or f"column_{place + 1}"
+        if empty[place]:
+            skipped |= {name: "is empty"} if name else {}
+            continue
+
+        def at(row: int, place: int = place) -> str:
+            return where(row, place)
+
+        found, note = column.numbers(source, known, at)
+        said += [note] if note else []
+        if isinstance(found, str):
+            skipped[known] = found
+            continue
+        if column.grouped:
+            require_no_thousands(source, known, texts(place), column.decimal)
+        found.flags.writeable = False  # used without a copy
+        kept[known] = found
+        units |= {known: "s"} if column.timed else {}
+    return make_table(source, kept, units, None, skipped, (*said, *filter(None, notes)))
 
 
 # Lines that may end the settings of a file without headings (LabVIEW, OpenSim).
@@ -243,39 +354,3 @@ def _padded(row: Sequence[str], width: int) -> list[str]:
 
 def _bare(item: str) -> str:
     return item.strip("()[] ")
-
-
-def require_no_thousands(
-    source: str, names: Mapping[int, str], rows: Iterable[tuple[int, Sequence[str]]], sign: str
-) -> None:
-    """Reject a column whose decimal `sign` may be a thousands separator.
-
-    That is possible if the sign always stands before three digits and behind one to three that do
-    not begin with 0, while other values are whole numbers without it. Programs that write decimals
-    write 999.000 or 1. there. `names` by index in `rows`, which are (line number, fields).
-    """
-    grouped = re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:{re.escape(sign)}\d{{3}})+")
-    left = dict(names)
-    first: dict[int, tuple[int, str]] = {}
-    whole: set[int] = set()
-    for number, fields in rows:
-        for index in list(left):
-            item = fields[index].strip()
-            if sign not in item:
-                if item.lstrip("+-").isdigit():
-                    whole.add(index)
-            elif grouped.fullmatch(item):
-                first.setdefault(index, (number, item))
-            else:
-                del left[index]  # certainly decimals
-        if not left:
-            return
-    for index, name in left.items():
-        if index in whole and index in first:
-            line, item = first[index]
-            raise DataError(
-                source,
-                f"column {name!r} has whole numbers, and {item!r} in line {line} can be a decimal "
-                "or thousands",
-                "export it without thousands separators, or with equal decimals in every row",
-            )

@@ -27,8 +27,17 @@ if TYPE_CHECKING:
 
 _DEPTH = 8
 _LONGEST = 1_000_000  # characters of the names in a saved plant
-#: How to save a cell, table or object instead; ends a reason.
-AS_STRUCT = 'save a struct of vectors: s = table2struct(T, "ToScalar", true)'
+# How to save a class of MATLAB instead. Only MATLAB reads its objects: their format is not
+# documented, and the libraries that guess it change scipy (mat-io) or read one version.
+_INSTEAD = {
+    "timetable": 'save s = table2struct(timetable2table(T), "ToScalar", true), or writetimetable',
+    "timeseries": "save s.Time = ts.Time; s.Data = ts.Data",
+    "datetime": "save seconds(t - t(1))",
+    "duration": "save seconds(t)",
+    "cell": "save a struct of vectors, or writematrix(cell2mat(c))",
+    "string": "",
+}
+_TABLE = 'save a struct of vectors: s = table2struct(T, "ToScalar", true), or writetable'
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
@@ -58,17 +67,28 @@ def read_matrices(path: Path, _largest: int) -> dict[str, Array | list[str | Non
     return found
 
 
+def unread(kind: str) -> str:
+    """Reason why a value of a MATLAB class (such as table) has no column, and what to save."""
+    what = "is a cell array" if kind == "cell" else f"is a MATLAB {kind or 'object'}"
+    return "; ".join(filter(None, (what, _INSTEAD.get(kind, _TABLE))))
+
+
 def array_columns(name: str, array: Any) -> dict[str, Array] | str:
-    """Columns (samples,) of a real numeric array called `name`, or why it has none."""
+    """Columns (samples,) of a real numeric array called `name`, or why it has none.
+
+    Time is the longer side of a matrix, and the last of three dimensions (Simulink: m x n x N).
+    """
     if array.dtype.kind not in "fiub":
         return "is complex" if array.dtype.kind == "c" else "is not numeric"
     if array.size < 2:
         return f"is one number ({array.item():g})" if array.size else "is empty"
-    if array.ndim > 2:
-        return f"has {array.ndim} dimensions"
-    values = np.asarray(array, dtype=np.float64)
-    if values.ndim == 1 or 1 in values.shape:
-        return {name: values.ravel()}
+    values = np.asarray(array, dtype=np.float64).squeeze()
+    if values.ndim == 3 and values.shape[2] > values.shape[0] * values.shape[1]:
+        values = values.reshape(-1, values.shape[2], order="F")
+    if values.ndim > 2:
+        return f"has {values.ndim} dimensions, none of them much longer than the others"
+    if values.ndim == 1:
+        return {name: values}
     if values.shape[1] > values.shape[0]:
         values = values.T
     return {f"{name}_{index + 1}": column for index, column in enumerate(values.T)}
@@ -145,13 +165,12 @@ def _unreadable(value: Any) -> str:
     from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque  # noqa: PLC0415
 
     if isinstance(value, MatlabOpaque):
-        kind = _text(value, "s2") or "unknown class"
-        return f"is a MATLAB {kind}; {AS_STRUCT}, or writetable"
+        return unread(_text(value, "s2"))
     if isinstance(value, MatlabObject):
-        return f"is a MATLAB object of class {value.classname}; {AS_STRUCT}"
+        return unread(f"object of class {value.classname}")
     if isinstance(value, MatlabFunction) or not isinstance(value, np.ndarray):
         return "is sparse; save full(x)" if scipy.sparse.issparse(value) else "is not numeric"
-    kinds = {"U": "is text", "S": "is text", "O": f"is a cell array; {AS_STRUCT}, or cell2mat"}
+    kinds = {"U": "is text", "S": "is text", "O": unread("cell")}
     return kinds.get(value.dtype.kind, "")
 
 

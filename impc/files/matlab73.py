@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impc.errors import DataError
-from impc.files.matlab import AS_STRUCT, array_columns
+from impc.files.matlab import array_columns, unread
 from impc.files.table import make_table
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _collect(found: _Found, prefix: str, group: Any, depth: int) -> None:
         kind = _class_of(item)
         if isinstance(item, h5py.Group):
             if "MATLAB_object_decode" in item.attrs or kind not in ("struct", ""):
-                found.skipped[full] = f"is a MATLAB {kind}; {AS_STRUCT}, or writetable"
+                found.skipped[full] = unread(kind)
             elif depth >= _DEPTH:
                 raise DataError(found.source, f"{full} is nested too deep", "save plain vectors")
             else:
@@ -105,16 +105,13 @@ def _add(found: _Found, name: str, dataset: Any, kind: str) -> None:
 def _unreadable(dataset: Any, kind: str) -> str:
     """Reason why a dataset has no column, from its metadata; empty if it may have one."""
     if "MATLAB_object_decode" in dataset.attrs or kind not in (*_NUMERIC, ""):
-        reasons = {"char": "is text", "cell": f"is a cell array; {AS_STRUCT}, or cell2mat"}
-        return reasons.get(kind, f"is a MATLAB {kind}; {AS_STRUCT}, or writetable")
+        return "is text" if kind == "char" else unread(kind)
     if not dataset.size or _attribute(dataset, "MATLAB_empty"):
         return "is empty"
     if dataset.dtype.names is not None:
         return "is complex"
     if dataset.dtype.kind not in "fiub":
         return "is not numeric"
-    if dataset.ndim > 2:
-        return f"has {dataset.ndim} dimensions"
     return "" if dataset.id.get_storage_size() else "has no stored values, only a fill value"
 
 

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 #: Arguments of a plant that are measured for every subject.
 OWN = ("mass", "height")
+#: Key in [plant] with the outputs that are recorded, if not all are.
+OUTPUTS = "outputs"
 #: Table in [plant] with the uncertainty of its parameters, and its key for all of them.
 UNCERTAINTY, _ALL = "uncertainty", "all"
 # Largest number of parameters of a plant, and texts about them.
@@ -87,6 +89,22 @@ class PlantSource:
             choices = tuple(filter(None, more))
             found.append(Parameter(name, said, unit, value, known.get(name), choices, name in OWN))
         return tuple(found)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that are recorded, if [plant] lists them and the function does not.
+
+        A saved plant has all its names in the same key.
+        """
+        listed = self.arguments.get(OUTPUTS, ())
+        if not listed or Path(self.name).suffix in SAVED or OUTPUTS in self.defaults():
+            return ()
+        if not isinstance(listed, list | tuple) or not all(isinstance(one, str) for one in listed):
+            problem = "is no list of names"
+            raise InputError(f"[plant] {OUTPUTS}", problem, 'write outputs = ["angle"]').at(
+                "", "plant", OUTPUTS
+            )
+        return tuple(listed)
 
     def assumed(self) -> dict[str, object]:
         """Arguments of the subject (`OWN`) that keep the plant's typical value."""
@@ -227,13 +245,39 @@ def make_plant(
         remedy = "set command = true in [signals.NAME] of the command"
         raise PlantError(name, "all its inputs are recorded", remedy)
     with _refused_arguments(name), users_code(name, *_REFUSED):
-        return Plant(system, controls or None)
+        plant = Plant(system, controls or None)
+    return _recorded(plant, source.outputs) if source.outputs else plant
+
+
+def _recorded(plant: Plant, outputs: Sequence[str]) -> Plant:
+    """The plant with some of its outputs, which must determine the states that all of them do."""
+    where = f"[plant] {OUTPUTS}"
+    if unknown := [name for name in outputs if name not in plant.outputs]:
+        known = f"choose from {', '.join(plant.outputs)}"
+        raise InputError(where, f"has no output {unknown[0]!r}", known).at("", "plant", OUTPUTS)
+    kept = replace(plant, C=plant.C[[plant.outputs.index(name) for name in outputs]],
+                   outputs=tuple(outputs))  # fmt: skip
+    if any(_seen(plant, value) and not _seen(kept, value) for value in np.linalg.eigvals(plant.A)):
+        left = ", ".join(name for name in plant.outputs if name not in outputs)
+        problem = f"do not determine all states; that needs {left}"
+        raise InputError(where, problem, "record one more output").at("", "plant", OUTPUTS)
+    return kept
+
+
+def _seen(plant: Plant, eigenvalue: complex) -> bool:
+    """Whether the outputs show the motion with an `eigenvalue` (Popov-Belevitch-Hautus test)."""
+    scaled = plant.C / np.maximum(np.abs(plant.C).max(axis=1, keepdims=True), 1e-300)
+    pencil = np.vstack([plant.A - eigenvalue * np.eye(plant.n), scaled])
+    values = np.linalg.svd(pencil, compute_uv=False)
+    return bool(values[-1] > _UNSEEN * values[0])
 
 
 def made_by(source: PlantSource, **changed: float) -> Any:
     """Result of the source's function (plant or optimal control problem), some args `changed`."""
     arguments = {**source.arguments, **changed}
     arguments.pop(UNCERTAINTY, None)
+    if source.outputs:
+        arguments.pop(OUTPUTS)
     for key, value in arguments.items():
         if isinstance(value, str) and value == FILL_IN:
             problem = f"is still {FILL_IN!r}"
@@ -244,6 +288,8 @@ def made_by(source: PlantSource, **changed: float) -> Any:
         return source.make(**arguments)
 
 
+# Singular value of the pencil, relative to the largest, below which no output shows a motion.
+_UNSEEN = 1e-9
 # Relative difference of a derivative from differences of the plant.
 _SAME = 1e-3
 _REFUSED = (TypeError, ValueError, np.exceptions.ComplexWarning)

@@ -407,7 +407,7 @@ def faults_of(configuration: Configuration, plant: Plant) -> Iterator[InputError
             yield InputError(
                 f"signals.{name}",
                 f"is missing: the plant's outputs are {', '.join(plant.outputs)}",
-                "write a table [signals.NAME] for each",
+                "write a table [signals.NAME] for each, or [plant] outputs = [...] with the others",
             ).at(source, "signals", name)
     for name, entry in configuration.signals.items():
         if name in (*plant.outputs, *plant.disturbances, *controls):
@@ -487,6 +487,8 @@ def channel_of(
 ) -> checks.Channel:
     """Column of signal `name`, or of its target, in its own unit, after offset and sign."""
     column, values = column_of(table, getattr(entry, key), ("signals", name, key))
+    values = checks.without_codes(values, () if entry.missing is None else entry.missing)
+    values = checks.held(values) if entry.held else values
     # Overflow and signalling NaN become values that are not finite, reported below.
     with np.errstate(over="ignore", invalid="ignore"):
         used = entry.sign * (values[clock.rows] - entry.offset)
@@ -502,6 +504,11 @@ def _checked(
     keep: bool | None,
 ) -> list[Notice]:
     """All checks of a channel; faults that explain others come first."""
+    raw = table.columns[channel.column][clock.rows]
+    if entry.missing is None:
+        checks.coded(channel, raw)
+    if entry.held is None and not response:
+        checks.written_at_changes(channel, raw)
     found = [
         checks.unit_of_the_file(channel, stated_unit(table, channel.column), entry.overrule_unit),
         checks.measurable(channel),
@@ -512,6 +519,7 @@ def _checked(
         # A perturbation of two or three levels stays at its extremes by design.
         checks.clipped(channel) if response else None,
         checks.stretches(channel) if response else None,
+        checks.straight(channel) if response else None,
     ]
     return [one for one in found if one]
 

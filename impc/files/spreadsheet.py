@@ -7,7 +7,7 @@ formula the saved value counts. Workbooks are written with openpyxl.
 
 from __future__ import annotations
 
-import datetime
+import html
 import io
 import re
 import zipfile
@@ -18,19 +18,10 @@ import numpy as np
 
 from impc.errors import DataError, one_line
 from impc.extras import optional
-from impc.files.delimited import is_number, text_cell
-from impc.files.layout import (
-    EMPTY,
-    HEAD,
-    NUMBER,
-    WORD,
-    Block,
-    find_headings,
-    first_block,
-    require_no_thousands,
-    written_heading,
-)
-from impc.files.table import OTHER_SHEET, make_table
+from impc.files.cells import WORD, Column, kind_of
+from impc.files.delimited import text_cell
+from impc.files.layout import HEAD, Row, extent, first_block, table_of, written_heading
+from impc.files.table import OTHER_SHEET
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -38,15 +29,16 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from impc.arrays import Array
+    from impc.files.layout import Block
     from impc.files.table import Table
 
-_DAY = 86_400.0
 _LONGEST_NAME = 31  # characters of a sheet name
 _ANY_LENGTH = 32_767  # characters of a cell
 _WIDEST, _LOOKED_AT = 100, 200  # column width in characters; rows that determine it
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
-_TIMES = (datetime.datetime, datetime.date, datetime.time, datetime.timedelta)
+_RELATIONS = "xl/_rels/workbook.xml.rels"
+_HIDDEN = re.compile(rb"<(?:\w+:)?row\s[^>]*hidden=[\"'](?:1|true)[\"'][^>]*>")
+_HIDDEN_ODS = re.compile(rb"<table:table-row\b[^>]*\stable:visibility=[\"'](?:collapse|filter)")
 
 
 def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
@@ -73,7 +65,7 @@ def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
     chosen, block = (full or found)[0]
     skipped = {f"sheet {item.name}": OTHER_SHEET for item in sheets if item is not chosen}
     notes = (f"sheet {chosen.name!r} is read; other sheets have rows of numbers too",)
-    return _table(source, chosen, block, skipped, notes if len(full) > 1 else ())
+    return _table(path, chosen, block, skipped, notes if len(full) > 1 else ())
 
 
 def _block(sheet: _Sheet) -> Block | None:
@@ -81,14 +73,7 @@ def _block(sheet: _Sheet) -> Block | None:
 
 
 def _kinds(row: Sequence[Any]) -> list[int]:
-    return [_kind_of(cell) for cell in row]
-
-
-def _kind_of(cell: Any) -> int:
-    if isinstance(cell, str):
-        text = cell.strip()
-        return (NUMBER if any(is_number(text, mark) for mark in ".,") else WORD) if text else EMPTY
-    return WORD if isinstance(cell, bool) else NUMBER
+    return [kind_of(cell, ".", ",") for cell in row]
 
 
 def read_cells(path: Path, largest: int) -> dict[str, Any]:
@@ -133,120 +118,76 @@ def _sheets(path: Path, largest: int) -> Iterator[_Sheet]:
         raise DataError(source, "is locked by a password", "save it without one") from None
 
 
-def _body(sheet: _Sheet, block: Block) -> tuple[list[list[Any]], str]:
-    """Rows of a block, and a note on what stands below it."""
-    last, blank = block.first, False
-    for index, row in enumerate(sheet.rows[block.first :], start=block.first):
-        kinds = _kinds(row)
-        if not any(kinds):
-            blank = True
-            continue
-        if not block.fits(kinds, blank) and block.ends_at(kinds, _following(sheet, index), blank):
-            place = next(cell for cell, kind in enumerate(kinds) if kind)
-            where, what = sheet.cell(index, place), str(row[place])[:40]
-            note = f"row {where} and the rows below are not read; they begin with {what!r}"
-            return sheet.rows[block.first : last + 1], note
-        last, blank = index, False
-    return sheet.rows[block.first : last + 1], ""
-
-
-def _following(sheet: _Sheet, index: int) -> list[int]:
-    """Kinds of the next row that is not empty."""
-    below = (_kinds(sheet.rows[place]) for place in range(index + 1, len(sheet.rows)))
-    return next((kinds for kinds in below if any(kinds)), [])
-
-
 def _table(
-    source: str, sheet: _Sheet, block: Block, skipped: dict[str, str], notes: tuple[str, ...]
+    path: Path, sheet: _Sheet, block: Block, skipped: dict[str, str], notes: Sequence[str]
 ) -> Table:
-    rows, rest = _body(sheet, block)
-    above = [[_text(cell) for cell in row] for row in sheet.rows[: block.first]]
-    places = list(zip(*rows, strict=True))
-    empty = [all(cell == "" for cell in cells) for cells in places]
-    heads = find_headings(source, above, empty, named_rows=isinstance(rows[0][0], str))
-    units = dict(heads.units)
-    columns: dict[str, Array] = {}
-    for index, (name, cells) in enumerate(zip(heads.names, places, strict=True)):
-        if empty[index]:
-            skipped |= {name: "is empty"} if name else {}
-            continue
-        found = _column(source, sheet, (block.first, index), name, cells)
-        if isinstance(found, str):
-            skipped[name or f"column_{index + 1}"] = found
-            continue
-        columns[name or f"column_{index + 1}"] = found
-        if isinstance(cells[0], _TIMES):
-            units[name] = "s"
-    notes = (*heads.notes, *notes, *([rest] if rest else []))
-    return make_table(source, columns, units, None, skipped, notes)
+    source, first = str(path), block.first
+    rows = (
+        Row(f"row {index + 1 + sheet.corner[0]}", _joined(row), _kinds(row), width=len(row))
+        for index, row in enumerate(sheet.rows[first:], first)
+    )
+    body = extent(source, block, rows, cut_short=False)
+    cells = sheet.rows[first : first + body.rows]
+    columns = [_column(part) for part in zip(*cells, strict=True)]
+
+    def where(row: int, column: int) -> str:
+        return f"cell {sheet.cell(first + row, column)}"
+
+    def texts(column: int) -> Iterator[tuple[str, str]]:
+        for row, cell in enumerate(cells):
+            if isinstance(cell[column], str):
+                yield where(row, column), cell[column].strip()
+
+    above = [[_text(cell) for cell in row] for row in sheet.rows[:first]]
+    hidden = _hidden(path, sheet, range(first + 1, first + 1 + body.rows))
+    return table_of(
+        source, above, columns, where, texts, named_rows=isinstance(cells[0][0], str),
+        notes=[*notes, body.note, hidden], skipped=skipped,
+    )  # fmt: skip
 
 
-def _column(
-    source: str, sheet: _Sheet, corner: tuple[int, int], name: str, cells: Sequence[Any]
-) -> Array | str:
-    """Numbers of a column, or the reason why there are none."""
-    given = [cell for cell in cells if cell != ""]
-    if all(isinstance(cell, bool) for cell in given):
-        return "holds true and false"
-    texts = [cell.strip() for cell in given if isinstance(cell, str)]
-    mark = "," if any("," in text for text in texts) else "."
-    values = [_value(cell, mark) for cell in cells]
-    wrong = [place for place, value in enumerate(values) if value is None]
-    where = sheet.cell(corner[0] + (wrong or [0])[0], corner[1])
-    if len(wrong) == len(given):
-        return f"is text, such as {str(given[0])[:20]!r} in cell {where}"
-    if wrong:
-        problem = (
-            f"column {name!r} has text in {len(wrong)} of {len(cells)} rows, the first "
-            f"{str(cells[wrong[0]])[:20]!r} in cell {where}"
-        )
-        remedy = "correct those cells or save the column as numbers, without thousands separators"
-        raise DataError(source, problem, remedy)
-    lines = ((corner[0] + row + 1, [cell]) for row, cell in enumerate(map(str, cells)))
-    if texts:
-        require_no_thousands(source, {0: name}, lines, mark)
-    kinds = {_kind(cell) for cell in given}
-    if len(kinds) > 1:
-        problem = f"column {name!r} has {' and '.join(sorted(kinds))}"
-        raise DataError(source, problem, "save the column as numbers, all of one kind")
-    numbers = np.array(values, dtype=np.float64)
-    return numbers if kinds == {"numbers"} else numbers - numbers[0]
+def _joined(row: Sequence[Any]) -> str:
+    return " ".join(text for text in map(_text, row) if text)
 
 
-def _kind(cell: Any) -> str:
-    if isinstance(cell, datetime.time | datetime.timedelta):
-        return "times of the day"
-    return "dates" if isinstance(cell, datetime.date) else "numbers"
+def _column(cells: Sequence[Any]) -> Column:
+    """Column of cells, with the decimal sign by which fewer texts are words."""
+    texts = [cell.strip() for cell in cells if isinstance(cell, str)]
+    commas = any("," in text for text in texts)
+    words = {sign: sum(kind_of(text, sign) == WORD for text in texts) for sign in ",."}
+    found = Column(len(cells), "," if commas and words[","] <= words["."] else ".")
+    found.add([None if cell == "" else cell for cell in cells])
+    return found
 
 
-def _value(cell: Any, mark: str) -> float | None:
-    """Number of a cell: NaN if empty, times in s; None for a word."""
-    if isinstance(cell, str):
-        return _typed(cell.strip(), mark)
-    if isinstance(cell, bool):
-        return None
-    return _seconds(cell) if isinstance(cell, _TIMES) else float(cell)
+def _hidden(path: Path, sheet: _Sheet, rows: range) -> str:
+    """Note on hidden rows of a sheet among `rows`, which are counted from its first one."""
+    with zipfile.ZipFile(path) as archive:
+        if path.suffix.lower() == ".ods":
+            parts = archive.read("content.xml").split(b"<table:table ")
+            own = [part for part in parts if _attribute(part, "table:name") == sheet.name]
+            count, first = sum(len(_HIDDEN_ODS.findall(part)) for part in own), ""
+        else:
+            tags = re.findall(rb"<(?:\w+:)?sheet\s[^>]*>", archive.read("xl/workbook.xml"))
+            own = [tag for tag in tags if _attribute(tag, "name") == sheet.name]
+            wanted = _attribute(own[0], r"\w+:id") if own else ""
+            tags = re.findall(rb"<(?:\w+:)?Relationship\s[^>]*>", archive.read(_RELATIONS))
+            named = [_attribute(tag, "Target") for tag in tags if _attribute(tag, "Id") == wanted]
+            files = [f"xl/{name.removeprefix('/xl/')}" for name in named]
+            content = [archive.read(name) for name in files if name in archive.namelist()]
+            found = [int(_attribute(tag, "r") or 0) - sheet.corner[0]
+                     for tag in _HIDDEN.findall(b"".join(content))]  # fmt: skip
+            inside = [number for number in found if number in rows]
+            count = len(inside)
+            first = f", the first {inside[0] + sheet.corner[0]}" if inside else ""
+    said = f"sheet {sheet.name!r} has {count} hidden rows{first}, which are read like the others"
+    return f"{said}: delete them in the file if they are not to count" if count else ""
 
 
-def _typed(text: str, mark: str) -> float | None:
-    if not text:
-        return np.nan
-    if not is_number(text, mark):
-        return None
-    return np.nan if text.upper() in ("NA", "N/A", "NULL") else float(text.replace(",", "."))
-
-
-def _seconds(
-    time: datetime.datetime | datetime.date | datetime.time | datetime.timedelta,
-) -> float:
-    """Seconds since a moment that is the same for all values of a kind."""
-    if isinstance(time, datetime.timedelta):
-        return time.total_seconds()
-    if isinstance(time, datetime.time):
-        return time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6
-    if isinstance(time, datetime.datetime):
-        return time.replace(tzinfo=datetime.UTC).timestamp()
-    return _DAY * (time.toordinal() - datetime.date(1970, 1, 1).toordinal())
+def _attribute(tag: bytes, name: str) -> str:
+    """Value of the first attribute of this name in an XML tag; empty without one."""
+    found = re.search(rf"(?:^|\s){name}\s*=\s*[\"']([^\"']*)".encode(), tag)
+    return html.unescape(found[1].decode()) if found else ""
 
 
 def _text(cell: Any) -> str:

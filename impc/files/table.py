@@ -11,7 +11,7 @@ import numpy as np
 from impc.arrays import Frozen, frozen, with_shape
 from impc.checking import checked
 from impc.errors import DataError
-from impc.files.alignment import aligned, own_clocks
+from impc.files.alignment import aligned, own_clocks, rising, unwrapped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Why a sheet of a workbook is skipped.
 OTHER_SHEET = "is another sheet"
+# Where a counter of 8 to 32 bits begins anew, which may count units, thousandths or millionths.
+_WRAPS = tuple(2.0**bits / unit for bits in (8, 15, 16, 24, 31, 32) for unit in (1, 1e3, 1e6))
 _LONGEST = 160  # characters of a name, a unit or a reason, as used in messages and TOML
 
 
@@ -95,6 +97,7 @@ def make_table(
         raise DataError(source, "has two columns of one name", "give each its own name")
     units = {_line(name): _line(unit) for name, unit in (units or {}).items()}
     left_out = {_line(name): _line(reason) for name, reason in (skipped or {}).items()}
+    vectors, wrapped = _unwrapped(vectors)
     vectors, said = aligned(source, vectors, own_clocks(vectors, units))
     lengths = Counter(len(values) for values in vectors.values() if len(values) > 1)
     if not lengths:
@@ -112,7 +115,18 @@ def make_table(
         else:
             left_out[name] = f"has {len(values)} values where most columns have {usual}"
     stated = {name: unit for name, unit in units.items() if name in kept and unit}
-    return Table(source, kept, stated, rate, left_out, tuple(map(_line, (*notes, *said))))
+    return Table(source, kept, stated, rate, left_out, tuple(map(_line, (*notes, *wrapped, *said))))
+
+
+def _unwrapped(columns: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Columns of which counters that wrap are continued, and a note on each."""
+    found, notes = dict(columns), []
+    for name, values in columns.items():
+        made, wrap = unwrapped(values, _WRAPS)
+        if wrap and len(rising(made)) == len(made):
+            found[name] = made
+            notes.append(f"counter {name!r} begins anew at {wrap:.10g}: continued")
+    return found, notes
 
 
 def _line(text: str) -> str:

@@ -57,6 +57,8 @@ def _cells(name: str, guess: Guess) -> tuple[str, str, str, str, str]:
     if guess.unit == FILL_IN or "guess" in guess.origin:
         asked.append(f"unit: {guess.origin}")
         lines.append(f'{unit} = "{guess.unit}"')
+    lines += [line for line, _ in guess.asked]
+    asked += [question for _, question in guess.asked]
     answer = f"{place} {', '.join(lines)}" if lines else ""
     return guess.column, name, guess.unit, "; ".join(asked), answer
 

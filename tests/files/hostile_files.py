@@ -21,7 +21,7 @@ import numpy as np
 from tests.files.damaged_files import written, written_by_impc
 from tests.files.samples import hdf5_mat, mat5_array, mat5_element, mat5_file, ods_file
 
-__all__ = ["HOSTILE"]
+__all__ = ["HOSTILE", "repacked"]
 
 Make = Callable[[Path], Path]
 

@@ -12,6 +12,7 @@ from xml.sax.saxutils import escape
 
 import h5py
 import numpy as np
+import openpyxl
 import scipy.io
 import scipy.signal
 
@@ -29,6 +30,7 @@ __all__ = [
     "pushed_seat",
     "save_mat",
     "settings",
+    "workbook",
 ]
 
 #: Columns of `pushed_seat` as signals of `plants:seated_balance_plant`.
@@ -133,6 +135,20 @@ def mat5_element(kind: int, content: bytes, padded: bool = True) -> bytes:
     """An element of a v5 file: type, length and bytes, padded to eight."""
     end = bytes(-len(content) % 8) if padded else b""
     return struct.pack("<II", kind, len(content)) + content + end
+
+
+def workbook(path: Path, hidden: Sequence[int] = (), /, **sheets: Iterable[Sequence[Any]]) -> Path:
+    """A workbook of openpyxl; the `hidden` rows are those of its first sheet."""
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for name, rows in sheets.items():
+        sheet = book.create_sheet(name)
+        for row in rows:
+            sheet.append(list(row))
+    for number in hidden:
+        book.worksheets[0].row_dimensions[number].hidden = True
+    book.save(path)
+    return path
 
 
 def ods_file(path: Path, sheets: Mapping[str, Iterable[Sequence[float | str]]]) -> None:

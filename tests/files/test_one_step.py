@@ -114,12 +114,14 @@ def test_a_sensor_that_stands_still_is_found(tmp_path: Path) -> None:
 def test_samples_that_were_lost_and_written_as_a_number_are_found(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     angle, push = balanced(1)
-    for value in (0.0, -99.0):
-        lost = angle.copy()
-        lost[rng.choice(SAMPLES, 12, replace=False)] = value
-        findings = read(tmp_path, lost, push)[1]
-        (finding,) = (found for found in findings if f"jumps to {value:g} deg and back" in found)
-        assert "in 12 samples" in finding
+    lost, far = angle.copy(), angle.copy()
+    lost[rng.choice(SAMPLES, 12, replace=False)] = 0.0
+    findings = read(tmp_path, lost, push)[1]
+    (finding,) = (found for found in findings if "jumps to 0 deg and back" in found)
+    assert "in 12 samples" in finding
+    far[rng.choice(SAMPLES, 12, replace=False)] = -99.0
+    with pytest.raises(InputError, match=r"is -99 in 12 of 600 samples.*write missing = -99 in"):
+        read(tmp_path, far, push)
     lost = angle.copy()
     lost[100:120] = lost[300:315] = 0
     assert "is constant in 2 stretches, 35 samples in total" in read(tmp_path, lost, push)[1][0]

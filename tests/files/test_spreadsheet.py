@@ -17,22 +17,13 @@ from impc.files.spreadsheet import workbook_bytes
 from impc.files.table import make_table
 from impc.studies.cohort.participants import read_participants
 from impc.studies.cohort.sheet import read_sheet
-from tests.files.samples import ods_file, pushed_seat
+from tests.files.samples import ods_file, pushed_seat, workbook
 
 SEAT = pushed_seat(50)
 
 
 def book(path: Path, rows: list[list[Any]], **others: list[list[Any]]) -> Path:
-    made = openpyxl.Workbook()
-    sheet: Any = made.active
-    for row in rows:
-        sheet.append(row)
-    for name, content in others.items():
-        more = made.create_sheet(name)
-        for row in content:
-            more.append(row)
-    made.save(path)
-    return path
+    return workbook(path, Sheet=rows, **others)
 
 
 def seat_rows(heads: list[str]) -> list[list[Any]]:
@@ -96,7 +87,10 @@ def test_a_sheet_that_is_hidden_is_none(tmp_path: Path) -> None:
     ("rows", "says"),
     [
         ([["t", "x"], [0, 1], [1, "high"]], "has text in 1 of 2 rows, the first 'high' in cell B3"),
-        ([["t", "x"], [0, "999"], [1, "1,000"]], "'1,000' in line 3 can be a decimal or thousands"),
+        (
+            [["t", "x"], [0, "999"], [1, "1,000"]],
+            "'1,000' in cell B3 can be a decimal or thousands",
+        ),
         ([["t", "x"], [0, 1], [1, datetime.date(2026, 1, 1)]], "has dates and numbers"),
         ([["only", "words"], ["a", "b"]], "has no rows of numbers"),
     ],
