@@ -64,7 +64,7 @@ def read_table(path: Path | str, largest: int = LARGEST, sheet: str = "") -> Tab
     largest : int
         Largest size in bytes of the file, and of its arrays.
     sheet : str
-        Sheet of a workbook; by default the first one with rows of numbers.
+        Sheet of workbooks; by default the first one with rows of numbers.
 
     Returns
     -------
