@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, TypeVar
 
 import control
 import numpy as np
@@ -31,6 +31,7 @@ from impc.studies.cache import Steps
 from impc.studies.example.cases import CASES
 from impc.studies.pool import Answer, Task, answered
 
+Given = TypeVar("Given")
 #: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
 SEARCH = int(os.environ.get("IMPC_SEARCH", "1"))
 
@@ -49,6 +50,12 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Figure, "savefig", blank)
     patch.setattr(Figure, "draw_without_rendering", lambda _: None)
     patch.setattr("impc.reporting.style._set_literally", lambda _: None)
+
+
+def present(value: Given | None) -> Given:
+    """The value, which is there."""
+    assert value is not None
+    return value
 
 
 def nelder_mead(objective: Callable[[Any], float], start: np.ndarray, budget: int) -> float:
@@ -110,6 +117,14 @@ def slopes(problem: Problem, K: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, 
 def plant_of(A: Any, B: Any, C: Any = None, dt: float = 1.0) -> Plant:
     """A plant without disturbances; all states are outputs unless C is given."""
     return Plant(control.ss(A, B, np.eye(len(np.asarray(A))) if C is None else C, 0, dt))
+
+
+def named_plant(
+    A: Any, B: Any, C: Any, dt: float, states: str, inputs: str, outputs: str, **more: Any
+) -> Plant:
+    """A plant with names of its signals, each a word; the first input is the control."""
+    names: Any = {"states": states.split(), "inputs": inputs.split(), "outputs": outputs.split()}
+    return Plant(control.ss(A, B, C, 0, dt, **names), names["inputs"][:1], **more)
 
 
 def regulator(

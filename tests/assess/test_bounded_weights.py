@@ -21,7 +21,7 @@ from impc.assess.bounded_weights import (
 )
 from impc.assess.weights_ranges import pair_statements
 from impc.control.closed_loop import simulate
-from impc.inverse.solution_set import pair_blocks, split_blocks
+from impc.inverse.solution_set import split_blocks
 from impc.model.weights import condition_number
 
 SEED = 2
@@ -119,17 +119,6 @@ def test_statements_agree_with_sampled_members() -> None:
 def test_a_ratio_must_leave_room() -> None:
     with pytest.raises(impc.InputError, match="ratio"):
         set_of(example(), 1.0)
-
-
-def test_fibre_members_span_the_set() -> None:
-    """Every member is a combination of the basis of the space."""
-    found = set_of(seat(1, 1.0))
-    basis = pair_blocks(found.fibre.Q, found.fibre.R)
-    scaled = np.array([found.inverse @ X @ found.inverse.T for X in basis]).reshape(len(basis), -1)
-    seen = np.array([found.inverse @ X @ found.inverse.T for X in found.level])
-    seen = seen.reshape(len(seen), -1)
-    q, _ = np.linalg.qr(scaled.T)
-    np.testing.assert_allclose(q @ (q.T @ seen.T), seen.T, atol=1e-8)
 
 
 def test_signs_and_the_set_of_a_near_gain_are_those_of_whole_programs() -> None:

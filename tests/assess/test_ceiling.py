@@ -9,7 +9,7 @@ import impc
 from experiments.uncertain_body import cart
 from impc.arrays import Array
 from impc.assess.ceiling import ceiling
-from tests.support import posed, regulator
+from tests.support import posed, present, regulator
 
 
 def problem(pushes: list[Array], noise: float, seed: int = 0) -> tuple[impc.Problem, float]:
@@ -34,8 +34,7 @@ def push(seed: int, samples: int = 600) -> Array:
 def test_trials_with_the_same_perturbation() -> None:
     """Four trials; the interval covers the true share, and has the width of 20 draws."""
     posed, truth = problem([push(1)] * 4, 0.03)
-    found = ceiling(posed, 0.0)
-    assert found is not None
+    found = present(ceiling(posed, 0.0))
     assert found.repetitions == 4
     assert found.low[0] <= truth <= found.high[0]
     values = [
@@ -51,8 +50,7 @@ def test_trials_with_the_same_perturbation() -> None:
 def test_a_periodic_perturbation_in_one_trial() -> None:
     """Five periods: the first is excluded, four repetitions remain."""
     posed, truth = problem([np.tile(push(2, 150), 5)], 0.03)
-    found = ceiling(posed, 7.5)
-    assert found is not None
+    found = present(ceiling(posed, 7.5))
     assert found.repetitions == 4
     assert found.vaf[0] == pytest.approx(truth, abs=3.0)
 

@@ -13,8 +13,7 @@ import impc
 from experiments.printed_intervals import carts
 from impc.arrays import Array
 from impc.assess.expected import MULTIPLES, Expectation
-from impc.control.closed_loop import simulate
-from tests.support import differences
+from tests.support import differences, present
 
 NOISE = 0.03
 SAMPLES = 160
@@ -23,12 +22,9 @@ SAMPLES = 160
 @functools.cache
 def cart() -> tuple[impc.Plant, Array, Array]:
     """Cart with a gain, and a push up to its limit."""
-    plant = carts(1)
     push = np.repeat(np.random.default_rng(3).choice([-0.8, 0.0, 0.8], (16, 1)), 10, axis=0)
-    law = impc.Controller(
-        plant, impc.Weights(np.diag([4.0, 1.5]), 1), impc.Bounds(plant), 8, terminal_set=False
-    )
-    return plant, np.array(law.K), push
+    plant = carts(1)
+    return plant, np.array(impc.solve_lqr(plant, impc.Weights(np.diag([4.0, 1.5]), 1)).K), push
 
 
 def outputs(gain: Array, x0: Array, limit: float) -> Array:
@@ -36,18 +32,17 @@ def outputs(gain: Array, x0: Array, limit: float) -> Array:
     plant, _, push = cart()
     bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
     law = impc.Controller.from_gain(plant, gain.reshape(1, 2), bounds, 8, terminal_set=False)
-    run = simulate(law, impc.scenario(plant, x0, disturbance=push))
-    return np.asarray((run.x @ plant.C.T)[:SAMPLES, 0])
+    return law.simulate(x0, disturbance=push).outputs[:SAMPLES, 0]
 
 
 @functools.cache
-def cart_problem(family: impc.PlantFamily | None = None) -> impc.Problem:
+def cart_problem(family: impc.PlantFamily | None = None, limit: float = 1.0) -> impc.Problem:
     plant, gain, push = cart()
-    trial = impc.Recording(plant, outputs(gain, np.zeros(2), 1.0)[:, None], push)
+    trial = impc.Recording(plant, outputs(gain, np.zeros(2), limit)[:, None], push)
+    bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
     return impc.Problem(
-        plant, impc.Bounds(plant, u_min=-1, u_max=1), 8, [trial],
-        terminal_set=False, unknown_start=True, family=family,
-    )  # fmt: skip
+        plant, bounds, 8, [trial], terminal_set=False, unknown_start=True, family=family
+    )
 
 
 @functools.cache
@@ -86,11 +81,8 @@ def test_the_limit_is_known_as_least_squares_with_a_free_gain_says() -> None:
     others = np.hstack([on_gain, on_start])
     rest = on_limit - others @ np.linalg.lstsq(others, on_limit)[0]
     assert expected().limits[0] == pytest.approx(NOISE / np.linalg.norm(rest), rel=2e-5)
-    plant, gain, push = cart()
-    wide = impc.Bounds(plant, u_min=-9, u_max=9)  # never met
-    trial = impc.Recording(plant, outputs(gain, np.zeros(2), 9.0)[:, None], push)
-    problem = impc.replace(cart_problem(), bounds=wide, recordings=[trial])
-    assert np.isinf(impc.expected_intervals(problem, gain, NOISE).limits[0])
+    never_met = cart_problem(limit=9.0)
+    assert np.isinf(impc.expected_intervals(never_met, cart()[1], NOISE).limits[0])
 
 
 def test_several_trials_are_multiples_of_one() -> None:
@@ -127,8 +119,7 @@ def known_to(uncertainty: dict[str, float | str]) -> Expectation:
 def test_an_exact_body_and_one_that_is_measured_are_those_of_their_own_problems() -> None:
     found, exact = known_to(STATED), expected()
     assert exact.exact is None
-    assert found.exact is not None
-    assert found.exact == pytest.approx(exact.deviations, rel=1e-6)
+    assert present(found.exact) == pytest.approx(exact.deviations, rel=1e-6)
     for place, name in enumerate(STATED):
         fall = 1 - known_to(STATED | {name: 0.0}).deviations / found.deviations
         assert found.narrower[..., place] == pytest.approx(fall, abs=1e-6)
@@ -152,8 +143,6 @@ def test_a_gain_that_is_not_identified_has_no_standard_error() -> None:
 
 
 def test_what_cannot_be_meant_is_refused() -> None:
-    problem, gain = cart_problem(), cart()[1]
-    with pytest.raises(impc.InputError, match="deviation"):
-        impc.expected_intervals(problem, gain, 0.0)
-    with pytest.raises(impc.InputError, match="root"):
-        impc.expected_intervals(problem, gain, NOISE, root=1.0)
+    for noise, root, said in ((0.0, 0.0, "deviation"), (NOISE, 1.0, "root")):
+        with pytest.raises(impc.InputError, match=said):
+            impc.expected_intervals(cart_problem(), cart()[1], noise, root=root)

@@ -21,8 +21,6 @@ from tests.assess.cart_fits import cart_fit, cart_gain, cart_problem
 from tests.support import posed, regulator
 
 SEED = 4
-
-
 both_roots = pytest.mark.parametrize("root", [0.0, 0.9], ids=["white", "coloured"])
 
 
@@ -122,9 +120,8 @@ def test_what_is_not_determined_has_no_end() -> None:
     plant, trial = impc.Plant(system, ["force"]), noisy_trial(SEED, 0.0)
     again = impc.Recording(plant, trial.outputs, trial.disturbance)
     settings = impc.FitSettings(horizon=10, u_max=1.0)
-    estimate = printed_gain.gain_estimate(
-        fit_controller(impc.fit_problem(plant, [again], settings))
-    )
+    fitted = fit_controller(impc.fit_problem(plant, [again], settings))
+    estimate = printed_gain.gain_estimate(fitted)
     names = printed_gain.entry_names(plant)
     assert np.isinf(profile_likelihood(estimate, names[2]).high)
     assert np.isfinite(profile_likelihood(estimate, names[0]).high)
@@ -153,7 +150,7 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(root: float) 
     assert np.all(np.abs(found.K - at.K) > 0.01 * whole.covariance.entries)
 
 
-@pytest.mark.parametrize("root", [0.0, 0.9])
+@both_roots
 def test_drawn_residuals_have_the_colour_of_the_given(root: float) -> None:
     """Variance, cross-correlation and autocorrelation; 40 draws of 2 x 2000 samples."""
     given = [first_order(root, 2000, SEED), first_order(root, 1500, SEED + 1)]

@@ -5,14 +5,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-import control
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
 
 import impc
-import plants
 from experiments.driver import with_noise
 from experiments.printed_intervals import carts
 from experiments.structure_study import cart_person, seat_person
@@ -22,9 +20,9 @@ from impc.assess.structures import structure_test
 from impc.assess.weight_profiles import LocalQuadratic, WeightProfiles
 from impc.inverse.residuals import residual_only
 from impc.inverse.structured import search_from
-from tests.support import differences, posed
+from tests.inverse.test_structured_fit import seat_problem
+from tests.support import differences, named_plant, posed, regulator
 
-BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 SEAT = np.log([6e3, 9e3, 6e2, 4e2])
 
 
@@ -52,10 +50,8 @@ def fitted_seat() -> Tangent:
 @functools.cache
 def fitted_scalar() -> Tangent:
     """Unstable plant with so much noise that linearisation has no lower end."""
-    names = {"inputs": ["u", "d"], "states": ["x"], "outputs": ["x"]}
-    plant = impc.Plant(control.ss([[1.2]], [[1, 1]], [[1]], 0, 1, **names), ["u"])
-    structure, bounds = impc.Structure(plant, ["x"]), impc.Bounds(plant, u_min=-1.8, u_max=1.8)
-    law = impc.Controller(plant, structure.weights(np.zeros(1)), bounds, 5, terminal_set=False)
+    plant = named_plant([[1.2]], [[1, 1]], [[1]], 1, "x", "u d", "x")
+    structure, law = impc.Structure(plant, ["x"]), regulator(plant, 1, 1.8, 5)
     push = np.repeat([1.0, -1.0, 0.0, 1.0, 0.0, -1.0], 40)
     x = law.simulate([0.0], disturbance=push).x[:-1]
     noise = 8.0 * np.random.default_rng(0).standard_normal(x.shape)
@@ -66,16 +62,9 @@ def fitted_scalar() -> Tangent:
 @pytest.mark.parametrize("kind", ["diagonal", "full"])
 def test_the_seat_identifies_four_cost_weights(kind: str) -> None:
     """Of four, or of ten with products: the controller predicts over the delay."""
-    plant = impc.Plant(plants.seated_balance_plant(), ["command"])
-    structure, full = impc.Structure(plant, kind, over=BODY), kind == "full"
+    full = kind == "full"
     cost_weights = np.concatenate([SEAT / 2, np.zeros(6)]) if full else SEAT
-    weights = structure.weights(cost_weights)
-    truth = impc.Controller(plant, weights, impc.Bounds(plant), 20, terminal_set=False)
-    torque = plants.ternary_torque(duration=10.0, rate=100)
-    run = truth.simulate(np.zeros(plant.n), disturbance=torque)
-    noise = 1e-9 * np.random.default_rng(0).standard_normal((1000, 2))
-    trial = impc.Recording(plant, (run.x @ plant.C.T)[:-1] + noise, torque)
-    problem = posed(truth, trial, terminal_set=False, unknown_start=True)
+    _, problem, structure = seat_problem(kind, cost_weights, 1e-9)
     found = weight_covariance(tangent(structure, problem, cost_weights))
     assert found.rank == 4
     if full:
@@ -134,17 +123,17 @@ def test_an_interval_ends_where_the_misfit_has_grown(
 def _least(at: Tangent, value: float) -> float:
     """Least squares over all weights but the first, initial states free, on the recordings."""
 
-    def reduced(others: Array) -> tuple[Array, Array]:
+    def reduced(others: Array) -> Array:
+        """Residual, and its derivatives by the other weights."""
         place = tangent(at.structure, at.problem, np.append(value, others))
         columns = np.column_stack([place.residual, place.on_cost_weights[:, 1:]])
-        left = place.without_nuisance(columns) / at.noise
-        return left[:, 0], left[:, 1:]
+        return place.without_nuisance(columns) / at.noise
 
     def residual(others: Array) -> Array:
-        return reduced(others)[0]
+        return reduced(others)[:, 0]
 
     def slopes(others: Array) -> Array:
-        return reduced(others)[1]
+        return reduced(others)[:, 1:]
 
     starts = [np.array(at.cost_weights)[1:]]
     if len(starts[0]) == 0:
@@ -206,10 +195,8 @@ def test_the_statistic_is_the_one_step_fall_of_the_misfit() -> None:
 
 def test_nothing_to_test_where_prices_make_every_gain() -> None:
     """One cart: two cost weights and a gain of two entries."""
-    plant, start = carts(1), np.log([4.0, 1.0])
-    structure, bounds = impc.Structure(plant), impc.Bounds(plant, u_min=-1, u_max=1)
-    truth = impc.Controller(plant, structure.weights(start), bounds, 6, terminal_set=False)
-    rng = np.random.default_rng(2)
+    structure, start, rng = impc.Structure(carts(1)), np.log([4.0, 1.0]), np.random.default_rng(2)
+    truth = regulator(carts(1), np.diag([4.0, 1.0]), 1, 6)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], (60, 1)), 10, axis=0)
     problem = posed(truth, with_noise(truth, push, rng, 90.0, 0.0), terminal_set=False)
     found = structure_test(ended(problem, structure, start))

@@ -1,10 +1,15 @@
-"""The README, the pages and the package keep to the vocabulary and to short sentences."""
+"""Vocabulary and sentences of the pages, version and licence, and labels of axes."""
 
 from __future__ import annotations
 
 import re
+import tomllib
 
+import pytest
+
+from impc.reporting.style import new_figure
 from tests.documents.blocks import PAGES, ROOT
+from tests.labelled_axes import require_labels
 
 _PRIVATE = re.compile(
     r"\b(told|tells|untold|wandering|judged|stands at|but for what|all but none)\b"
@@ -26,3 +31,48 @@ def test_no_sentence_is_too_long() -> None:
         text = re.sub(r"\]\([^)]*\)", "]", text)  # targets of links
         sentences = re.split(r"(?<=[.!?:;])\**\)?\s|\n\s*\n", text)
         assert [one for one in sentences if len(one.split()) > _LONGEST] == [], page
+
+
+def test_version_licence_and_changelog_agree() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    said = dict(re.findall(r'^([a-z-]+): *"?([^"\n]+)"?$', citation, flags=re.M))
+    assert said["version"] == project["version"]
+    assert said["license"] == project["license"] == "BSD-3-Clause"
+    assert "BSD 3-Clause" in (ROOT / "LICENSE").read_text(encoding="utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## \[(.+?)\]", changes, flags=re.M)[0] == project["version"]
+
+
+def test_the_demo_installs_what_the_project_needs_in_the_versions_of_the_whole_lock() -> None:
+    small, whole = (
+        set(re.findall(r"^([\w.-]+==\S+)", (ROOT / name).read_text(encoding="utf-8"), flags=re.M))
+        for name in ("requirements-demo.lock", "requirements.lock")
+    )
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed = {re.split(r"[<>=]", one)[0] for one in project["dependencies"]} | {"setuptools"}
+    assert small < whole
+    assert needed <= {one.split("==")[0] for one in small}
+
+
+def test_units_are_asked_for() -> None:
+    figure = new_figure(3.0, 2.0)
+    ax = figure.subplots()
+    ax.plot([0, 1], [0, 1])
+    with pytest.raises(AssertionError, match="no label"):
+        require_labels(figure)
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel("angle")
+    with pytest.raises(AssertionError, match="'angle' does not end in a unit"):
+        require_labels(figure)
+    ax.set_ylabel("angle (deg)")
+    require_labels(figure)
+
+
+def test_names_need_no_unit() -> None:
+    figure = new_figure(3.0, 2.0)
+    ax = figure.subplots()
+    ax.plot([0, 1], [0, 1])
+    ax.set_xticks([0, 1], ["first", "second"])
+    ax.set_ylabel("VAF (%)")
+    require_labels(figure)

@@ -23,6 +23,7 @@ from tests.support import (
     example_problem,
     plant_of,
     posed,
+    present,
     regulator,
 )
 from tests.support import random_problem as saturated_problem
@@ -60,8 +61,7 @@ def test_known_problems(kind: str, slow: bool) -> None:
 
 def test_a_stick_that_falls_with_any_other_gain_ends_at_its_gain() -> None:
     """50 samples a second, error 0.02 degrees; no other regulator can be simulated."""
-    known = stick_problem(418)
-    assert known is not None
+    known = present(stick_problem(418))
     found, (trial,) = fit_controller(known.problem), known.problem.recordings
     assert found.noise <= refine_gain(known.problem, known.K, known.S).misfit * (1 + 1e-4)
     for one in (found, inverse_mpc_reduced(known.problem)):
@@ -126,21 +126,6 @@ def test_the_rank_is_that_of_the_derivative() -> None:
     values = np.linalg.svd(left, compute_uv=False)
     assert found.fit.rank <= np.count_nonzero(values > 1e-7 * values[0])
     assert found.fit.rank >= np.count_nonzero(values > 1e-3 * values[0])
-
-
-@pytest.mark.full
-def test_a_start_that_is_not_the_first_sample_is_searched() -> None:
-    """The initial state is free if the first output is noisy, and fixed if it is exact."""
-    plant = plant_of(HELD.A, HELD.B, [[1, 0]])
-    law = regulator(plant, np.eye(2), 1, 4)
-    x = law.simulate([1.5, 0.5], 40).x
-    noisy = x[:, :1] + 0.01 * np.random.default_rng(4).standard_normal((41, 1))
-    problem = posed(law, impc.Recording(plant, noisy))
-    assert problem.unknown_start
-    found = impc.fit(problem)
-    assert np.allclose(found.problem.recordings[0].x0, [1.5, 0.5], atol=0.05)
-    assert np.allclose(found.gain, law.K, rtol=0.1)
-    assert not posed(regulator(HELD, np.eye(2), 1, 4), impc.Recording(HELD, x)).unknown_start
 
 
 @pytest.mark.parametrize(("x0", "horizon"), [((-1.9, -2.6), 2), ((0.6, 1.4), 1)])

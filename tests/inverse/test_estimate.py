@@ -1,4 +1,4 @@
-"""Text, table, figure and file of an estimate."""
+"""Text, table, figure and file of an estimate; intervals that reach over several ends."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ast
 import inspect
 import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,16 @@ import pytest
 
 import impc
 import plants
-from experiments.coverage import cart, noisy_trial
+from experiments.coverage import cart
+from impc.arrays import frozen
+from impc.assess.printed_gain import GainEstimate, covariance_intervals, gain_estimate
 from impc.attached_methods import METHODS, PROPERTIES
+from impc.inverse.ends import relative_error, several_ends
+from impc.inverse.estimates import SearchEnd
+from impc.inverse.minimiser import Ended
+from impc.inverse.refit import refit
 from impc.nonlinear.fit import OptimalControlEstimate
+from tests.assess.cart_fits import cart_fit, uncertain_fit
 from tests.inverse.test_targets_and_gaps import gapped
 from tests.support import posed, regulator
 
@@ -28,8 +36,7 @@ mpl.use("Agg")
 
 @pytest.fixture(scope="module")
 def found() -> impc.Estimate:
-    trials = [noisy_trial(seed, 0.0) for seed in (1, 2)]
-    return impc.fit(impc.fit_problem(cart(), trials, impc.FitSettings(horizon=10, u_max=1.0)))
+    return cart_fit(1, 2)
 
 
 def scalar(a: float = 0.9, **more: Any) -> impc.Plant:
@@ -83,12 +90,20 @@ def test_a_plot_has_what_was_recorded_and_simulated(found: impc.Estimate) -> Non
         found.plot(axes=axes[:1])
 
 
-@pytest.mark.parametrize("kind", ["plain", "gaps, targets, offsets and commands"])
-def test_a_saved_estimate_is_the_same(found: impc.Estimate, tmp_path: Path, kind: str) -> None:
-    found = found if kind == "plain" else gapped(0.6)[1]
-    again = impc.load(found.save(tmp_path / "found.json"))
+@pytest.mark.parametrize(
+    "made",
+    [lambda: cart_fit(1, 2), lambda: gapped(0.6)[1], uncertain_fit],
+    ids=["plain", "gaps, targets, offsets and commands", "uncertain body and other ends"],
+)
+def test_a_saved_estimate_is_the_same(made: Callable[[], impc.Estimate], tmp_path: Path) -> None:
+    found = made()
+    again = impc.load(found.save(tmp_path / "found.json"), family=found.problem.family)
     assert isinstance(again, impc.Estimate)
     assert again.misfit == found.misfit
+    assert found.rivals or made is not uncertain_fit
+    for end, saved in zip(found.rivals, again.rivals, strict=True):
+        np.testing.assert_array_equal(saved.K, end.K)
+        assert saved.objective == end.objective
     np.testing.assert_array_equal(again.gain, found.gain)
     np.testing.assert_array_equal(again.problem.starts, found.problem.starts)
     np.testing.assert_array_equal(again.problem.errors, found.problem.errors)
@@ -216,3 +231,54 @@ def test_the_declared_methods_are_those_that_are_attached(owner: type) -> None:
         given = [(ast.unparse(one.args).split(", ")[1:], ast.unparse(one.returns or one))
                  for one in (node, function)]  # fmt: skip
         assert given[0] == given[1]
+
+
+def with_rivals(*rises: tuple[float, float]) -> GainEstimate:
+    """The estimate with ends at multiples of the gain, so much higher."""
+    found = uncertain_fit()
+    at = found.problem
+    lowest = refit(at, found.gain, found.metric).objective
+    rivals = tuple(
+        SearchEnd(frozen(scale * found.gain), frozen(found.metric), at.starts, at.logarithms,
+                  at.errors, lowest + rise, Ended.CONVERGED)
+        for scale, rise in rises
+    )  # fmt: skip
+    return gain_estimate(impc.replace(found, rivals=rivals))
+
+
+def test_the_lowest_end_is_first_and_starts_only_add() -> None:
+    found = uncertain_fit()
+    first = refit(found.problem, 1.1 * found.gain, found.metric)
+    ends = several_ends(found.problem, [first])
+    values = [end.objective for end in ends]
+    assert values == sorted(values)
+    assert len(ends) > 1
+    assert any(end is first for end in ends)
+
+
+def test_the_relative_error_is_that_of_the_largest_entry() -> None:
+    """The noise of these carts is white, so that it agrees with the printed standard error."""
+    found = uncertain_fit()
+    estimate = gain_estimate(found)
+    end = refit(found.problem, found.gain, found.metric)
+    ratios = np.ravel(np.array(estimate.covariance.entries) / np.abs(np.array(estimate.K)))
+    assert np.min(np.abs(relative_error(end) / ratios - 1)) < 0.15
+
+
+def test_intervals_reach_over_ends_within_noise_and_no_further() -> None:
+    found = uncertain_fit()
+    alone, joined = with_rivals(), with_rivals((1.3, 2.0), (2.0, 60.0))
+    assert len(joined.rivals) == 1
+    single = covariance_intervals(alone, alone.covariance, "sandwich")
+    both = covariance_intervals(joined, joined.covariance, "sandwich")
+    for one, other in zip(single[: found.gain.size], both, strict=False):
+        assert one.value is not None
+        assert one.value == other.value
+        assert other.low <= one.low
+        assert other.high >= one.high
+        assert other.low < 1.3 * one.value < other.high
+        assert not other.low < 2.0 * one.value < other.high
+    far = with_rivals((2.2, 1.0))
+    over_far = covariance_intervals(far, far.covariance, "sandwich")[0]
+    assert over_far.identified
+    assert (single[0].determined, over_far.determined) == (True, False)

@@ -19,6 +19,7 @@ from tests.support import (
     extrapolated_jacobian,
     nelder_mead,
     plant_of,
+    present,
     random_plant,
     random_weights,
 )
@@ -133,8 +134,7 @@ def test_gradient_agrees_with_differences(seed: int, n: int, m: int, dt: float) 
     at = space.start + 0.1 * rng.normal(size=space.start.shape)
 
     def gain(parameters: Array) -> Array:
-        solution = space.solution(parameters)
-        assert solution is not None
+        solution = present(space.solution(parameters))
         return solution.K
 
     found = space.jacobian(at)

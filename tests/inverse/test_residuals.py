@@ -18,7 +18,6 @@ from experiments.uncertain_body import HORIZON
 from impc.arrays import Array
 from impc.inverse.laws import GainLaw, WeightLaw
 from impc.inverse.prediction import Correction, correction
-from impc.inverse.problem import Problem
 from impc.inverse.residuals import residual_or_reason
 from impc.inverse.unknowns import Unknowns, linear_at
 from impc.model.signal_errors import KINDS
@@ -26,13 +25,13 @@ from tests.inverse import test_signal_errors as signals
 from tests.inverse import test_targets_and_gaps as targets
 from tests.inverse.test_structured_fit import pushed
 from tests.inverse.test_uncertain_body import family, pushes, seat_family
-from tests.support import extrapolated_jacobian, posed, random_problem, regulator
+from tests.support import extrapolated_jacobian, posed, present, random_problem, regulator
 
 Case = tuple[Unknowns, Array]
 
 
 def of_gain(
-    law: impc.Controller, problem: Problem, logarithms: Any = None, errors: Any = None
+    law: impc.Controller, problem: impc.Problem, logarithms: Any = None, errors: Any = None
 ) -> Case:
     """Gain, metric and all that is unknown, somewhere near the truth."""
     space = Unknowns(problem, GainLaw(problem, np.array(law.K), np.array(law.S)))
@@ -57,8 +56,7 @@ def delay_and_limit() -> Case:
 
 def nonlinear_body() -> Case:
     """The seat with its 13 stated parameters, at 4 Nm."""
-    made = seat_family()
-    assert made is not None
+    made = present(seat_family())
     plant = made.make(made.nominal)
     assert plant.body is not None
     v, Q = np.array([0.70, 0.65, 0.22, 0.20]), 1e-2 * np.eye(10)
@@ -133,8 +131,7 @@ def test_every_column_of_the_search_is_a_difference(name: str) -> None:
         return np.concatenate([found.K.ravel(), len(found.S) * found.S.ravel() / np.trace(found.S)])
 
     def simulated(z: Array) -> Array:
-        found = space.residual(z)
-        assert found is not None
+        found = present(space.residual(z))
         return found
 
     found = np.array([space.pulled(z, one) for one in np.eye(len(residual))])
@@ -168,8 +165,7 @@ def test_the_corrected_loop_is_the_recursion(ratio: float) -> None:
 
 def test_the_filter_is_steady_and_stable() -> None:
     """The filter gain solves the Riccati equation (checked by iterating the covariance)."""
-    known = search_problems.random_problem(3, half=True)
-    assert known is not None
+    known = present(search_problems.random_problem(3, half=True))
     problem, plant = known.problem, known.problem.plant
     M = correction(problem, 1.0).M
     loop = (np.eye(plant.n) - M @ plant.C) @ plant.A
@@ -185,8 +181,7 @@ def test_the_filter_is_steady_and_stable() -> None:
 
 
 def test_no_correction_is_the_simulation() -> None:
-    known = search_problems.random_problem(5)
-    assert known is not None
+    known = present(search_problems.random_problem(5))
     problem = known.problem
     nothing = Correction(np.zeros((problem.plant.n, len(problem.output_scale))))
     law = GainLaw(problem, np.array(known.K), np.array(known.S))

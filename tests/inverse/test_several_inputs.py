@@ -21,7 +21,7 @@ from impc.inverse.search import fit_gain, refine_gain
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.inverse.unknowns import Unknowns
 from impc.model.weights import condition_number
-from tests.support import extrapolated_jacobian, plant_of, posed, random_problem, regulator
+from tests.support import extrapolated_jacobian, plant_of, posed, present, random_problem, regulator
 
 FULL, SLOW = pytest.mark.full, pytest.mark.slow
 # Largest misfit of reported weights relative to the recorded outputs.
@@ -163,8 +163,7 @@ def test_the_family_of_metrics_is_that_of_weights(m: int, seed: int) -> None:
 @pytest.mark.parametrize(("m", "seed"), [(2, 4), (2, 12), (3, 5), (3, 40), (3, 67), (3, 89)])
 def test_inactive_samples_determine_the_gain(m: int, seed: int) -> None:
     controller, problem = random_problem(seed, m)
-    found = pair_of_inactive_samples(problem)
-    assert found is not None
+    found = present(pair_of_inactive_samples(problem))
     truth = problem.plant.B @ controller.K
     assert np.max(np.abs(problem.plant.B @ found[0] - truth)) < 1e-7 * np.max(np.abs(truth))
 

@@ -1,4 +1,4 @@
-"""Errors of recorded signals are unknowns, and are found."""
+"""Errors of recorded signals are unknowns; stated timing is a prior of a time shift."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 import impc
-from impc.model.signal_errors import CLOCK, KINDS, distorted, undistorted
+from impc.arrays import Array, frozen
+from impc.assess.printed_gain import GainEstimate, gain_estimate
+from impc.inverse.problem import simulated
+from impc.model.signal_errors import CLOCK, KINDS, SHIFT, distorted, undistorted
+from tests.assess.cart_fits import joint_covariance
 from tests.support import posed, regulator
 
 DT, SAMPLES = 0.02, 300
@@ -134,3 +138,76 @@ def test_a_fit_takes_the_jumps_that_predict_better(finer: bool) -> None:
     np.testing.assert_array_equal(taken.disturbance[:SAMPLES], means if finer else held)
     assert taken.finer.size == 0
     assert found.gain == pytest.approx(law.K, rel=0.1)
+
+
+LATE = 0.4  # samples
+
+
+def timed(deviation: float) -> impc.Problem:
+    """Recordings whose push acts later than recorded, with a stated standard deviation."""
+    law, recordings, errors = controller(), [], np.zeros((5, 1))
+    errors[SHIFT] = LATE
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        push = np.repeat(rng.choice([-2.0, 2.0], SAMPLES // 10), 10)[:, None]
+        run = law.simulate([0.05, 0.0], disturbance=distorted(push, errors, held=True))
+        y = run.x + 0.005 * rng.standard_normal(run.x.shape)
+        timing = {"push": deviation} if deviation else None
+        recordings.append(impc.Recording(law.plant, y, push, timing=timing))
+    return posed(law, *recordings, unknown_start=True, terminal_set=False)
+
+
+@pytest.fixture(scope="module")
+def estimate() -> GainEstimate:
+    return gain_estimate(impc.fit(timed(DT / 2)))
+
+
+def test_a_push_with_uncertain_timing_is_moved_to_where_it_acts(estimate: GainEstimate) -> None:
+    ((kind, name, values),) = estimate.problem.fitted_errors
+    halves = 1.96 * DT * np.array(estimate.covariance.shifts)[0]
+    assert (kind, name) == ("shift", "push")
+    assert np.all(np.abs(values - LATE * DT) < halves)
+    assert np.all(halves < LATE * DT)
+
+
+def test_a_push_with_a_known_time_stays() -> None:
+    assert timed(0.0).signal_errors == ()
+    tight = impc.fit(timed(DT / 1000))
+    values = tight.problem.errors[:, SHIFT, 2]
+    assert np.all(np.abs(values) < 0.02)
+    assert tight.misfit > 1.1 * impc.fit(timed(DT / 2)).misfit
+
+
+def test_the_covariance_is_that_of_the_joint_curvature(estimate: GainEstimate) -> None:
+    """The unknowns of each trial are its initial state and the shift, known to half a sample."""
+    size, states = estimate.K.size, estimate.problem.searched_states
+    places = [size + states, size + 2 * states + 1]
+    found, cov = joint_covariance(estimate, dict.fromkeys(places, 0.5))
+    expected = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(np.ravel(found.entries), expected[:size], rtol=1e-6)
+    np.testing.assert_allclose(np.ravel(found.shifts), expected[places], rtol=1e-6)
+
+
+def test_placed_signals_simulate_as_before(estimate: GainEstimate) -> None:
+    placed, K, S = estimate.problem.with_signals_placed(), estimate.K, estimate.S
+    assert placed.signal_errors == ()
+    assert placed.unlikely == 0
+    pair = [simulated(one, np.array(K), np.array(S)) for one in (estimate.problem, placed)]
+    for before, after in zip(*pair, strict=True):
+        np.testing.assert_allclose(after.x, before.x, atol=1e-12)
+
+
+def test_the_prior_counts_in_the_objective() -> None:
+    problem = timed(DT / 2)
+    errors = np.array(problem.errors)
+    errors[:, SHIFT, 2] = [0.5, -1.0]
+    moved = problem.at(np.array(problem.starts), np.zeros(0), errors)
+    assert moved.unlikely == pytest.approx(1.0**2 + 2.0**2)
+
+
+@pytest.mark.parametrize(("name", "value"), [("wind", 0.1), ("push", -1.0), ("push", np.inf)])
+def test_a_timing_that_cannot_be_is_refused(name: str, value: float) -> None:
+    law = controller()
+    y: Array = frozen(np.zeros((20, 2)))
+    with pytest.raises(impc.DataError, match=name):
+        impc.Recording(law.plant, y, timing={name: value})

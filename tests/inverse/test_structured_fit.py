@@ -1,20 +1,29 @@
-"""Cost weights of a structure: exact recovery, zero cost weights, and noisy fits."""
+"""Cost weights of a structure: exact, zero and noisy; the span of the gains of its weights."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import control
 import numpy as np
 import pytest
+import scipy.linalg
 
 import impc
 import plants
+from experiments.benchmarks.workloads import seat
 from experiments.driver import with_noise
 from experiments.printed_intervals import carts
+from impc.arrays import Array
+from impc.inverse.laws import GainLaw
+from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.structured import fit_structure, search_from
-from tests.support import nelder_mead, posed, regulator
+from impc.inverse.unknowns import Unknowns
+from impc.output_feedback.simulation import simulate_person
+from tests.support import extrapolated_slope, named_plant, nelder_mead, posed, present, regulator
 
 BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 ONE = np.log([4.0, 1.0])
@@ -34,15 +43,24 @@ def size_of(problem: impc.Problem, structure: impc.Structure, cost_weights: Any)
     return misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))[0]
 
 
-def test_the_prices_of_the_seat_without_noise() -> None:
-    """Ten seconds, from a gain that is 5 % wrong; the search starts at Bryson's rule."""
+def seat_problem(
+    kind: str, cost_weights: Any, noise: float = 0.0
+) -> tuple[impc.Controller, impc.Problem, impc.Structure]:
+    """Ten seconds of the seat without a limit, under weights over angles and rates."""
     plant = impc.Plant(plants.seated_balance_plant(), ["command"])
-    shape, wanted = impc.Structure(plant, "diagonal", over=BODY), np.log([6e3, 9e3, 6e2, 4e2])
-    truth = regulator(plant, shape.weights(wanted).Q, np.inf, 20)
+    shape, rng = impc.Structure(plant, kind, over=BODY), np.random.default_rng(0)
+    truth = regulator(plant, shape.weights(cost_weights).Q, np.inf, 20)
     torque = plants.ternary_torque(duration=10.0, rate=100)
-    run = truth.simulate(np.zeros(plant.n), disturbance=torque)
-    trial = impc.Recording(plant, run.outputs[:-1], torque)
-    problem = posed(truth, trial, terminal_set=False, unknown_start=True, structure=shape)
+    y = truth.simulate(np.zeros(plant.n), disturbance=torque).outputs[:-1]
+    trial = impc.Recording(plant, y + noise * rng.standard_normal(y.shape), torque)
+    given: Any = {"terminal_set": False, "unknown_start": True, "structure": shape}
+    return truth, posed(truth, trial, **given), shape
+
+
+def test_the_prices_of_the_seat_without_noise() -> None:
+    """From a gain that is 5 % wrong; the search starts at Bryson's rule."""
+    wanted = np.log([6e3, 9e3, 6e2, 4e2])
+    truth, problem, shape = seat_problem("diagonal", wanted)
     found = fit_structure(problem, shape, 1.05 * truth.K, np.array(truth.S))
     assert np.max(np.abs(found.cost_weights - wanted)) < 1e-6
     assert found.misfit < 1e-9 * np.sqrt(2000)
@@ -89,8 +107,7 @@ def test_the_method_of_the_registry() -> None:
     trial = impc.Recording(plant, truth.simulate([0, 0], disturbance=push).outputs[:-1], push)
     found = impc.fit(posed(truth, trial, terminal_set=False, structure=structure), "structured")
     assert found.explained
-    assert found.cost_weights is not None
-    np.testing.assert_allclose(found.cost_weights, ONE, atol=1e-6)
+    np.testing.assert_allclose(present(found.cost_weights), ONE, atol=1e-6)
     np.testing.assert_allclose(found.stage_weights.Q, np.diag([4.0, 1.0]), rtol=1e-6)
     without = impc.fit(posed(truth, trial, terminal_set=False), "structured")
     assert without.K is None
@@ -109,3 +126,127 @@ def test_no_regulator_that_can_be_simulated() -> None:
     problem = posed(truth, trial, terminal_set=False)
     with pytest.raises(impc.SolverError, match="no controller of this structure can be simulated"):
         fit_structure(problem, impc.Structure(plant), np.array(truth.K), np.array(truth.S))
+
+
+_BODY = np.array([[1.0, 0.1], [0.05, 0.98]])
+_LATE = 3
+_Q = np.diag([6.0, 1.0, 0, 0, 0])
+
+
+def late_body() -> impc.Plant:
+    """Unstable body of two states; the command arrives three samples late."""
+    A = np.zeros((2 + _LATE, 2 + _LATE))
+    A[:2, :2], A[:2, 2], A[2:-1, 3:] = _BODY, [0.0, 0.1], np.eye(_LATE - 1)
+    inputs = np.zeros((len(A), 2))
+    inputs[-1, 0], inputs[1, 1] = 1.0, 0.1
+    return named_plant(A, inputs, np.eye(5)[:1], 0.1, "p v late_3 late_2 late_1", "u push", "p")
+
+
+def weighed(plant: impc.Plant, rng: np.random.Generator) -> Array:
+    """Gain of random weights on the body, by scipy's Riccati solver."""
+    root = rng.normal(size=(2, 2))
+    Q = scipy.linalg.block_diag(root @ root.T, np.zeros((_LATE, _LATE)))
+    P = scipy.linalg.solve_discrete_are(plant.A, plant.B, Q, np.eye(1))
+    return np.asarray(np.linalg.solve(1 + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A))
+
+
+def spanned(structure: impc.Structure, plant: impc.Plant, gain: Array) -> Array:
+    return regulators_alone(plant, structure, natural_coordinates(plant, gain)[0])
+
+
+def outside(found: Array, gain: Array) -> float:
+    """Share of a gain outside the span."""
+    rows, row = found.reshape(len(found), -1), np.ravel(gain)
+    left = row - np.linalg.lstsq(rows.T, row, rcond=None)[0] @ rows
+    return float(np.linalg.norm(left) / np.linalg.norm(row))
+
+
+@pytest.mark.parametrize("features", ["full", "diagonal", ["p", "v"], ["p", "v - p", "p + v"]])
+def test_over_a_delay_the_controller_predicts(features: str | list[str]) -> None:
+    """K = K_b (A^3, A^2 b, A b, b) for all cost weights of the body: two dimensions of five."""
+    plant, rng = late_body(), np.random.default_rng(0)
+    over = ["p", "v"] if isinstance(features, str) else None
+    found = spanned(impc.Structure(plant, features, over=over), plant, weighed(plant, rng))
+    assert len(found) == 2
+    b = plant.A[:2, 2:3]
+    powers = [np.linalg.matrix_power(_BODY, k) for k in range(_LATE + 1)]
+    predicted = np.hstack([powers[_LATE], *(powers[k] @ b for k in range(_LATE - 1, -1, -1))])
+    for _ in range(5):
+        gain = weighed(plant, rng)
+        on_body = np.linalg.lstsq(predicted.T, gain[0], rcond=None)[0]
+        np.testing.assert_allclose(on_body @ predicted, gain[0], rtol=1e-9)
+        assert outside(found, gain) < 1e-9
+    assert outside(found, np.eye(5)[4]) > 0.1  # a gain on the delay alone is outside
+
+
+def test_on_the_seat_five_dimensions_hold_them_all() -> None:
+    """Weights over angles and rates, from 0.01 to 100 times those of the benchmark."""
+    work = seat(1, 2.0)
+    plant, rng = work.controller.plant, np.random.default_rng(2)
+    structure = impc.Structure(plant, "full", over=plant.states[:4])
+    first = np.array(work.controller.K)
+    found, (T, _) = spanned(structure, plant, first), natural_coordinates(plant, first)
+    assert len(found) == 5
+    root = np.linalg.cholesky(np.array(work.weights.Q)[:4, :4])
+    for size in (0.01, 1.0, 100.0):
+        mixed = root @ (np.eye(4) + 0.5 * np.tril(rng.normal(size=(4, 4))))
+        Q = scipy.linalg.block_diag(size * mixed @ mixed.T, np.zeros((6, 6)))
+        natural, row = found[:, 0] @ T, regulator(plant, Q, np.inf, 1).K[0] @ T
+        # Measured: 1e-4; the sampled Padé delay is not exactly all-pass.
+        assert np.linalg.norm(row - natural.T @ (natural @ row)) < 5e-4 * np.linalg.norm(row)
+
+
+@functools.cache
+def late_trials() -> tuple[impc.Controller, tuple[impc.Recording, ...]]:
+    plant = late_body()
+    law, rng, trials = regulator(plant, _Q, 1, 8, 0.2), np.random.default_rng(4), []
+    person = impc.Observer(plant, ["p", "v"], motor=0.1, sensory=0.02)
+    for seed in range(2):
+        push = np.repeat(rng.choice([-0.6, 0.0, 0.6], 40), 10)
+        found = simulate_person(law, person, push, recorder=0.005, seed=seed)
+        assert np.any(np.abs(found.u) >= 1 - 1e-9)
+        trials.append(impc.Recording(plant, found.outputs, push))
+    return law, tuple(trials)
+
+
+def late_problem(**given: object) -> impc.Problem:
+    law, trials = late_trials()
+    return posed(law, *trials, terminal_set=False, unknown_start=True, **given)
+
+
+def test_a_structure_that_prices_every_state_keeps_no_gain_out() -> None:
+    plant = late_body()
+    shape = impc.Structure(plant, ["p", "v"])
+    family = impc.PlantFamily(lambda _: plant, ["mass"], [1.0])
+    assert kept_to(late_problem()) is None
+    assert kept_to(late_problem(structure=impc.Structure(plant, "diagonal"))) is None
+    assert kept_to(late_problem(structure=shape)) is shape
+    assert kept_to(late_problem(structure=shape, family=family)) is None
+
+
+@pytest.mark.full
+def test_a_person_is_searched_within_the_span() -> None:
+    """Three unknowns fewer, a predicting gain, and derivatives equal to finite differences."""
+    problem = late_problem(structure=impc.Structure(late_body(), ["p", "v"]))
+    person = impc.Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
+    first = impc.fit(problem)
+    found = impc.fit_output_feedback(first, person)
+    assert found.converged
+    assert found.space.gain == 2
+    np.testing.assert_allclose(found.K, late_trials()[0].K, rtol=0.3)
+    closed = np.abs(np.linalg.eigvals(problem.plant.A - problem.plant.B @ found.K))
+    np.testing.assert_allclose(np.sort(closed)[:_LATE], 0, atol=1e-3)  # cube root of 1e-15
+    step = np.random.default_rng(5).normal(size=len(found.theta))
+    slope = extrapolated_slope(
+        lambda t: np.array([found.space.value(found.theta + t * step)]), 1e-3
+    )[0]
+    assert found.identified.gradient @ step == pytest.approx(slope, rel=1e-6)
+
+
+def test_the_search_begins_next_to_the_gain_that_is_given() -> None:
+    structure = impc.Structure(late_body(), ["p", "v"])
+    problem = late_problem(structure=structure)
+    gain = weighed(problem.plant, np.random.default_rng(6))
+    law = GainLaw(problem, gain, np.eye(1), spanned(structure, problem.plant, gain))
+    space = Unknowns(problem, law)
+    np.testing.assert_allclose(space.unpack(space.start).K, gain, rtol=1e-8)

@@ -6,14 +6,14 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import control
 import numpy as np
 import pytest
 
 import impc
+from experiments.coverage import true_controller
 from impc.arrays import Array
 from tests.control.hanging_body import pendulum
-from tests.support import plant_of, posed, regulator
+from tests.support import named_plant, plant_of, posed, regulator
 
 STEPS, HORIZON = 80, 6
 TRUE = np.diag([4.0, 0.3])
@@ -21,11 +21,8 @@ TRUE = np.diag([4.0, 0.3])
 
 def cart() -> impc.Plant:
     """Mass on a weak spring with a push and wind as disturbances."""
-    system = control.ss(
-        [[1, 0.1], [-0.02, 0.97]], [[0, 0], [0.1, 0.1]], np.eye(2), 0, 0.1,
-        states=["x", "v"], inputs=["push", "wind"], outputs=["x", "v"],
-    )  # fmt: skip
-    return impc.Plant(system, controls=["push"])
+    A, B = [[1, 0.1], [-0.02, 0.97]], [[0, 0], [0.1, 0.1]]
+    return named_plant(A, B, np.eye(2), 0.1, "x v", "push wind", "x v")
 
 
 def steps(seed: int) -> Array:
@@ -39,12 +36,9 @@ TARGET = {"x": steps(1)}
 
 
 def recorded(
-    plant: impc.Plant,
-    limit: float,
-    target: dict[str, Any] = TARGET,
-    wind: Any = WIND,
+    plant: impc.Plant, limit: float, target: dict[str, Any] = TARGET, wind: Any = WIND,
     Q: Any = TRUE,
-) -> tuple[impc.Controller, Any]:
+) -> tuple[impc.Controller, Any]:  # fmt: skip
     law = regulator(plant, Q, limit, HORIZON)
     return law, law.simulate([0.5, 0.0], disturbance=wind, target=target)
 
@@ -166,12 +160,25 @@ def two_inputs() -> tuple[impc.Controller, impc.Problem]:
     return law, posed(law, impc.Recording(plant, run.x, target=target))
 
 
-@pytest.mark.parametrize("made", [observer_rate, nonlinear_body, contradicted_start, two_inputs])
+def releases() -> tuple[impc.Controller, impc.Problem]:
+    """Trials that only their unknown initial states drive."""
+    law, trials = true_controller(), []
+    for x0 in ([0.4, 0.0], [-0.2, 0.3], [0.3, 0.1]):
+        trials.append(impc.Recording(law.plant, law.simulate(x0, 100).outputs[:100]))
+    settings = impc.FitSettings(horizon=10, u_max=1.0)
+    return law, impc.fit_problem(law.plant, trials, settings)
+
+
+@pytest.mark.parametrize(
+    "made", [observer_rate, nonlinear_body, contradicted_start, two_inputs, releases]
+)
 def test_the_gain_is_found(made: Callable[[], tuple[impc.Controller, impc.Problem]]) -> None:
     law, problem = made()
-    assert problem.unknown_start == (made in {nonlinear_body, contradicted_start})
+    assert problem.unknown_start == (made in {nonlinear_body, contradicted_start, releases})
     found = impc.fit(problem)
     assert found.explained
     assert found.gain == pytest.approx(np.array(law.K), abs=1e-6)
     if made is observer_rate:
         assert found.intervals().loc["rate", "value"] == pytest.approx(1.5, abs=1e-5)
+    if made is releases:
+        np.testing.assert_allclose(found.problem.recordings[1].x0, [-0.2, 0.3], atol=1e-7)

@@ -7,21 +7,18 @@ from typing import Any
 import control
 import numpy as np
 import pytest
-import scipy.linalg
 
 import impc
-from experiments.uncertain_body import HORIZON, LIMIT, Person, cart, cart_person
+from experiments.uncertain_body import HORIZON, cart
 from impc.arrays import Array
-from impc.assess.covariance import gain_covariance
-from impc.assess.long_run_covariance import ResidualNoise
 from impc.assess.printed_gain import GainEstimate, gain_estimate
 from impc.files.plant_sources import PlantSource, plant_family_of, plant_source
 from impc.inverse.laws import GainLaw
-from impc.inverse.problem import noise_of_residual
 from impc.inverse.residuals import residual_only
 from impc.inverse.unknowns import Unknowns
 from impc.model.plant_family import plant_differential
-from tests.support import posed, regulator, slopes
+from tests.assess.cart_fits import joint_covariance, uncertain_cart, uncertain_fit
+from tests.support import posed, present, regulator
 
 KNOWN: dict[str, float | str] = {"fall": "3 %", "damp": "3 %", "extra_delay": 0.02, "u_max": "5 %"}
 SEAT = "plants:seated_balance_for"
@@ -41,15 +38,9 @@ def pushes(rng: np.random.Generator, size: float, count: int = 25, held: int = 1
     return np.asarray(size * np.repeat(rng.choice([-1.0, 0, 1], count), held))
 
 
-def person(seed: int = 1, error: str = "none") -> Person:
-    found = cart_person(seed, 99, 0.0, error)
-    assert found is not None
-    return found
-
-
 @pytest.fixture(scope="module")
 def fitted() -> GainEstimate:
-    return gain_estimate(impc.fit(person().problem))
+    return gain_estimate(uncertain_fit())
 
 
 def test_values_of_delay_and_limit_are_in_their_units() -> None:
@@ -58,26 +49,15 @@ def test_values_of_delay_and_limit_are_in_their_units() -> None:
     law = regulator(plant, np.eye(3), 0.42, HORIZON)
     problem = posed(law, impc.Recording(plant, np.ones((9, 1))), family=made)
     assert problem.parameter_names == ("fall", "damp", "extra_delay", "u_max.u")
-    assert problem.family is not None
-    values = problem.family.values(np.log([1.0, 1.0, 1.5, 1.1]))
+    values = present(problem.family).values(np.log([1.0, 1.0, 1.5, 1.1]))
     np.testing.assert_allclose(values, [1.0, 1.0, 0.5 * 0.05, 1.1 * 0.42])
     moved = problem.at(problem.starts, np.log([1.0, 1.0, 1.0, 1.1]))
     np.testing.assert_allclose(moved.bounds.u_max, [1.1 * 0.42])
 
 
 def test_the_covariance_is_that_of_the_joint_curvature(fitted: GainEstimate) -> None:
-    """White residuals: inverse of J'J / s^2 + prior from all columns; to 1e-6."""
-    problem, K, S = fitted.problem, np.array(fitted.K), np.array(fitted.S)
-    residual, on_gain, on_parameters, own = slopes(problem, K, S)
-    own = scipy.linalg.block_diag(*np.split(own, np.cumsum(problem.trial_sizes)[:-1]))
-    J = np.hstack([on_gain, on_parameters, own])
-    s = noise_of_residual(problem, residual)
-    H = J.T @ J / s**2
-    H[2:4, 2:4] += np.diag(1 / 0.03**2 * np.ones(2))
-    cov = np.linalg.inv(H)
+    linear, cov = joint_covariance(fitted, {2: 0.03, 3: 0.03})
     expected = np.sqrt(np.diag(cov))
-    white = ResidualNoise(np.zeros(2), s**2 * np.eye(2)[None])
-    linear = gain_covariance(problem, K, S, lambda _residuals, _fitted: white)
     np.testing.assert_allclose(linear.entries.ravel(), expected[:2], rtol=1e-6)
     np.testing.assert_allclose(linear.parameters, expected[2:4], rtol=1e-6)
     shares = cov[:2, 2:4] ** 2 / np.outer(np.diag(cov)[:2], np.diag(cov)[2:4])
@@ -105,7 +85,7 @@ def test_intervals_hold_where_they_do_not_for_an_exact_body() -> None:
     """Both coefficients 3 % off, four carts: 8 of 8 entries covered, 2 of 8 if taken as exact."""
     held = {"stated": 0, "exact": 0}
     for seed in (0, 4, 5, 6):
-        problem, truth, _ = person(seed, "plant")
+        problem, truth, _ = uncertain_cart(seed, "plant")
         for name, one in (("stated", problem), ("exact", problem.with_body_fixed())):
             found = impc.fit(one).intervals().iloc[:2]
             held[name] += int(((found.low <= truth[0]) & (truth[0] <= found.high)).sum())
@@ -135,7 +115,7 @@ def test_a_search_stays_where_the_plant_can_be_stabilised() -> None:
 
 def test_an_uncertainty_of_zero_is_none() -> None:
     """Identical to the fit without the family."""
-    nothing, free, given = family(fall=0, damp="0 %"), family(extra_delay=0), person().problem
+    nothing, free, given = family(fall=0, damp="0 %"), family(extra_delay=0), uncertain_cart()[0]
     assert nothing.names == ()
     assert free.names == ("fall", "damp")
     assert free.make(free.nominal).n == 2
@@ -144,17 +124,6 @@ def test_an_uncertainty_of_zero_is_none() -> None:
         impc.fit(impc.Problem(*asked, unknown_start=True, family=made)) for made in (None, nothing)
     )
     np.testing.assert_array_equal(one.gain, other.gain)
-
-
-def test_exact_recordings_of_the_nominal_body_are_explained() -> None:
-    made = family(fall="3 %", damp="3 %")
-    plant = made.make(made.nominal)
-    law = regulator(plant, np.diag([4.0, 1.0]), LIMIT, HORIZON, terminal_set=True)
-    push = pushes(np.random.default_rng(0), 0.25)
-    trial = impc.Recording(plant, law.simulate([0, 0], disturbance=push).x[:-1, :1], push)
-    found = impc.fit(posed(law, trial, family=made, unknown_start=True))
-    assert found.explained
-    np.testing.assert_allclose(found.gain, law.K, rtol=1e-5)
 
 
 def test_what_a_file_states_replaces_the_plants_own() -> None:
@@ -204,8 +173,7 @@ def test_derivatives_that_a_plant_offers_are_compared_with_its_matrices() -> Non
         pull = 0.1 / mass**2
         return {"mass": ([[0.0, 0.0], [pull, 0.0]], [[0.0], [-pull]])}
 
-    made = plant_family_of(offering(right), [], [])
-    assert made is not None
+    made = present(plant_family_of(offering(right), [], []))
     found = plant_differential(made, np.array([0.1]))
     np.testing.assert_allclose(found.B[1, 0, 0], -0.1 / (2 * np.exp(0.1)))
     wrong: list[tuple[Any, str]] = [
@@ -229,7 +197,6 @@ def test_a_delay_needs_a_plant_that_can_have_one() -> None:
     bounds, trial = impc.Bounds(cart(), u_min=-1, u_max=1), impc.Recording(cart(), np.ones((9, 1)))
     with pytest.raises(impc.InputError, match=r"family.make\(family.nominal\)"):
         impc.Problem(cart(), bounds, 5, [trial], family=family(extra_delay=0.02))
-    late = seat_family(extra_delay=0.01)
-    assert late is not None
+    late = present(seat_family(extra_delay=0.01))
     with pytest.raises(impc.PlantError, match="model the delay in the body"):
         late.make(late.nominal)

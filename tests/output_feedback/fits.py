@@ -5,49 +5,40 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-import control
 import numpy as np
 
+import impc
 from impc.arrays import Array
-from impc.control.controller import Controller
-from impc.inverse.estimates import Estimate
-from impc.inverse.methods import fit
-from impc.inverse.problem import Problem
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.recordings import Recording
-from impc.model.weights import Weights
-from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback
-from impc.output_feedback.observer import Observer
+from impc.output_feedback.fit import OutputFeedbackFit
 from impc.output_feedback.simulation import simulate_person
+from tests import support
+from tests.support import named_plant, regulator
 
 
-def cart() -> Plant:
-    system = control.ss(
-        [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]], [[1, 0]], 0, 0.05,
-        states=["x", "v"], inputs=["u", "d"], outputs=["x"],
-    )  # fmt: skip
-    return Plant(system, ["u"])
+def cart() -> impc.Plant:
+    A, B = [[1, 0.05], [0, 0.98]], [[0, 0], [0.05, 0.05]]
+    return named_plant(A, B, [[1, 0]], 0.05, "x v", "u d", "x")
 
 
-def law(limit: float) -> Controller:
-    bounds = Bounds(cart(), u_min=-limit, u_max=limit)
-    return Controller(cart(), Weights(np.diag([8.0, 1.0]), 1), bounds, 5, terminal_set=False)
+def law(limit: float) -> impc.Controller:
+    return regulator(cart(), np.diag([8.0, 1.0]), limit, 5)
 
 
-def trials(person: Observer, recorder: float, limit: float, count: int = 2) -> list[Recording]:
+def trials(
+    person: impc.Observer, recorder: float, limit: float, count: int = 2
+) -> list[impc.Recording]:
     rng, found = np.random.default_rng(3), []
     for seed in range(count):
         push = np.repeat(rng.choice([-0.7, 0.0, 0.7], 40), 10)
         run = simulate_person(law(limit), person, push, recorder=recorder, seed=seed)
         assert run.reached == len(push)
-        found.append(Recording(cart(), run.outputs, push))
+        found.append(impc.Recording(cart(), run.outputs, push))
     return found
 
 
-def posed(person: Observer, recorder: float, limit: float, count: int = 2) -> Problem:
-    recordings, bounds = trials(person, recorder, limit, count), law(limit).bounds
-    return Problem(cart(), bounds, 5, recordings, terminal_set=False, unknown_start=True)
+def posed(person: impc.Observer, recorder: float, limit: float, count: int = 2) -> impc.Problem:
+    recordings = trials(person, recorder, limit, count)
+    return support.posed(law(limit), *recordings, terminal_set=False, unknown_start=True)
 
 
 class Case(NamedTuple):
@@ -60,8 +51,8 @@ class Case(NamedTuple):
     sensed: tuple[str, ...] = ("x",)
     start: tuple[float, ...] | None = None  # noise SDs at which the fit starts
 
-    def person(self) -> Observer:
-        return Observer(cart(), self.sensed, motor=self.motor, sensory=self.sensory)
+    def person(self) -> impc.Observer:
+        return impc.Observer(cart(), self.sensed, motor=self.motor, sensory=self.sensory)
 
 
 CASES = {
@@ -75,15 +66,15 @@ CASES = {
 
 
 @functools.cache
-def least_squares(name: str) -> tuple[Observer, Estimate]:
+def least_squares(name: str) -> tuple[impc.Observer, impc.Estimate]:
     person = CASES[name].person()
-    return person, fit(posed(person, 0.01, CASES[name].limit, CASES[name].trials))
+    return person, impc.fit(posed(person, 0.01, CASES[name].limit, CASES[name].trials))
 
 
 @functools.cache
 def fitted(name: str) -> OutputFeedbackFit:
     (person, first), start = least_squares(name), CASES[name].start
-    return fit_output_feedback(first, person.with_levels(np.array(start)) if start else person)
+    return impc.fit_output_feedback(first, person.with_levels(np.array(start)) if start else person)
 
 
 def unknown_truth(found: OutputFeedbackFit, levels: list[float], limit: float) -> Array:

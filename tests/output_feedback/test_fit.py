@@ -7,30 +7,21 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace as replaced
 
-import control
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+import impc
 from impc.arrays import Array
-from impc.checking import replace
-from impc.control.controller import Controller
-from impc.errors import ImpcError, InputError, SolverError
-from impc.inverse.methods import fit
 from impc.inverse.search import refine_gain
 from impc.inverse.structured import fit_structured
-from impc.model.foresight import with_observer
-from impc.model.plant import Plant
-from impc.model.plant_family import PlantFamily
-from impc.model.structure import Structure
 from impc.output_feedback import likelihood
-from impc.output_feedback.fit import OutputFeedbackFit, fit_output_feedback, reml_slope
+from impc.output_feedback.fit import OutputFeedbackFit, reml_slope
 from impc.output_feedback.intervals import person_covariance
 from impc.output_feedback.models import PersonModel, decode_model, encode_model
-from impc.output_feedback.observer import Observer
 from impc.output_feedback.unknowns import NoisyUnknowns
 from tests.output_feedback.fits import cart, fitted, law, least_squares, posed
-from tests.support import extrapolated_slope
+from tests.support import extrapolated_slope, named_plant, present
 
 pytestmark = pytest.mark.full
 
@@ -38,7 +29,7 @@ pytestmark = pytest.mark.full
 def unknowns() -> NoisyUnknowns:
     """Gain, initial states of both trials, and noise SDs, at the start of a search."""
     person, first = least_squares("limited")
-    return fit_output_feedback(first, person, max_evaluations=1).space
+    return impc.fit_output_feedback(first, person, max_evaluations=1).space
 
 
 def check_slope(value: Callable[[Array], float], gradient: Array, theta: Array) -> None:
@@ -54,20 +45,20 @@ def check_slope(value: Callable[[Array], float], gradient: Array, theta: Array) 
 def unknowns_with_free_parameters() -> NoisyUnknowns:
     """The same, and friction, the scale of the output, and the rate of an observer."""
 
-    def make(values: Array) -> Plant:
+    def make(values: Array) -> impc.Plant:
         friction, scale, rate = map(float, values)
-        system = control.ss(
-            [[1, 0.05], [0, 1 - friction]], [[0, 0], [0.05, 0.05]], [[scale, 0]], 0, 0.05,
-            states=["x", "v"], inputs=["u", "d"], outputs=["x"],
-        )  # fmt: skip
-        return with_observer(Plant(system, ["u"]), [rate])
+        A, B = [[1, 0.05], [0, 1 - friction]], [[0, 0], [0.05, 0.05]]
+        plant = named_plant(A, B, [[scale, 0]], 0.05, "x v", "u d", "x")
+        return impc.with_observer(plant, [rate])
 
     first = least_squares("limited")[1]
-    family = PlantFamily(make, ["friction", "scale", "rate"], [0.02, 1.0, 0.5])
+    family = impc.PlantFamily(make, ["friction", "scale", "rate"], [0.02, 1.0, 0.5])
     plant = make(family.nominal)
-    posed = replace(first.problem, plant=plant, family=family, logarithms=np.zeros(3))
-    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02, walk=0.2)
-    return fit_output_feedback(replace(first, problem=posed), person, max_evaluations=1).space
+    posed = impc.replace(first.problem, plant=plant, family=family, logarithms=np.zeros(3))
+    person = impc.Observer(cart(), ["x"], motor=0.15, sensory=0.02, walk=0.2)
+    return impc.fit_output_feedback(
+        impc.replace(first, problem=posed), person, max_evaluations=1
+    ).space
 
 
 @pytest.mark.parametrize("make", [unknowns, unknowns_with_free_parameters])
@@ -100,7 +91,7 @@ def test_trials_side_by_side_say_what_they_say_one_after_the_other(
 ) -> None:
     person, first = least_squares("limited")
     found = replaced(first, problem=posed(person, 0.01, 0.9, 6))
-    space = fit_output_feedback(found, person, max_evaluations=1).space
+    space = impc.fit_output_feedback(found, person, max_evaluations=1).space
     beside = [space.identified(space.start) for _ in range(5)]
     monkeypatch.setattr(likelihood, "ThreadPoolExecutor", lambda _: ThreadPoolExecutor(1))
     alone = space.identified(space.start)
@@ -125,10 +116,10 @@ def test_a_person_is_found_and_told_better_than_without_the_noise() -> None:
 
 def test_a_level_that_is_zero_or_known_is_not_searched() -> None:
     person, first = least_squares("limited")
-    seeing = fit_output_feedback(first, Observer(cart(), motor=0.4))
+    seeing = impc.fit_output_feedback(first, impc.Observer(cart(), motor=0.4))
     assert seeing.observer.share[0] == 0
     assert np.all(seeing.observer.process == 0)
-    held, free = fit_output_feedback(first, person, held=["sensory"]), fitted("limited")
+    held, free = impc.fit_output_feedback(first, person, held=["sensory"]), fitted("limited")
     assert held.observer.sensory[0] == person.sensory[0]
     assert held.space.names == seeing.space.names == ["motor u", "recorder x"]
     assert free.count == held.count + 1
@@ -142,18 +133,18 @@ def test_a_level_that_cannot_be_squared_has_no_likelihood(logarithm: float) -> N
     theta = space.start.copy()
     theta[space.own] = logarithm
     for said in (space.identified, space.value):
-        with pytest.raises(SolverError, match="noise SD: is out of range"):
+        with pytest.raises(impc.SolverError, match="noise SD: is out of range"):
             said(theta)
 
 
 def test_without_noise_in_the_loop_it_is_the_fit_of_least_squares() -> None:
     """W, V -> 0: the same gain to 1e-6, if neither has a prior."""
-    found = fit(posed(Observer(cart()), 0.01, 0.9))
+    found = impc.fit(posed(impc.Observer(cart()), 0.01, 0.9))
     least = refine_gain(found.problem, np.array(found.gain), np.array(found.metric))
-    start = replace(found, K=least.K, problem=least.problem)
-    tiny = Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
-    for person in (Observer(cart()), tiny):
-        likely = fit_output_feedback(start, person, recorder=np.array([0.01]), spread=np.inf)
+    start = impc.replace(found, K=least.K, problem=least.problem)
+    tiny = impc.Observer(cart(), ["x", "v"], motor=1e-9, sensory=1e-9)
+    for person in (impc.Observer(cart()), tiny):
+        likely = impc.fit_output_feedback(start, person, recorder=np.array([0.01]), spread=np.inf)
         assert likely.converged
         np.testing.assert_allclose(likely.K, least.K, rtol=1e-6)
         np.testing.assert_allclose(likely.problem.starts, least.problem.starts, atol=1e-6)
@@ -164,7 +155,7 @@ def test_a_gain_that_cannot_be_the_persons_is_left_behind(along: int, units: flo
     """Regression: started 3 whitened units away, a search ended at 10 times the gain."""
     near, (person, first) = fitted("limited"), least_squares("limited")
     far = np.array(first.gain) + units * near.space.gain_law.gains[along]
-    found = fit_output_feedback(replaced(first, K=far), person)
+    found = impc.fit_output_feedback(replaced(first, K=far), person)
     assert found.converged
     deviations = np.array(person_covariance(near, "expected").entries)
     assert np.all(np.abs(np.array(found.K) - near.K) < 0.1 * deviations)
@@ -172,24 +163,24 @@ def test_a_gain_that_cannot_be_the_persons_is_left_behind(along: int, units: flo
 
 def test_what_cannot_be_estimated_is_an_error() -> None:
     person, first = least_squares("limited")
-    with pytest.raises(ImpcError, match="no start has a likelihood"):
-        fit_output_feedback(first, Observer(cart(), ["v"], sensory=0.1, motor=0.4))
-    with pytest.raises(InputError, match="held: got 'noise'; give some of motor, share"):
-        fit_output_feedback(first, person, held=["noise"])
+    with pytest.raises(impc.ImpcError, match="no start has a likelihood"):
+        impc.fit_output_feedback(first, impc.Observer(cart(), ["v"], sensory=0.1, motor=0.4))
+    with pytest.raises(impc.InputError, match="held: got 'noise'; give some of motor, share"):
+        impc.fit_output_feedback(first, person, held=["noise"])
     # All samples would be conditioned on, and the fit would be the prior.
-    with pytest.raises(InputError, match="counted: got 400, but the shortest trial has 400"):
-        fit_output_feedback(first, person, counted=400)
+    with pytest.raises(impc.InputError, match="counted: got 400, but the shortest trial has 400"):
+        impc.fit_output_feedback(first, person, counted=400)
 
 
 def test_prices_of_a_structure_are_searched_and_stored() -> None:
     person, first = least_squares("limited")
-    structure = Structure(cart(), ["x", "v"])
-    problem = replace(first.problem, structure=structure)
-    found = fit_output_feedback(fit_structured(problem, structure, first), person)
+    structure = impc.Structure(cart(), ["x", "v"])
+    problem = impc.replace(first.problem, structure=structure)
+    found = impc.fit_output_feedback(fit_structured(problem, structure, first), person)
     assert found.cost_weights is not None
     assert found.converged
     weights = structure.weights(found.cost_weights)
-    there = Controller(cart(), weights, first.problem.bounds, 5, terminal_set=False)
+    there = impc.Controller(cart(), weights, first.problem.bounds, 5, terminal_set=False)
     np.testing.assert_allclose(there.K, found.K, rtol=1e-9)
     # In two trials of 20 s cost weights are known to within a factor of two.
     assert np.all(np.abs(np.array(found.cost_weights) - np.log([8.0, 1.0])) < 1.0)
@@ -202,8 +193,7 @@ def test_a_stored_fit_is_the_one_that_was_fitted() -> None:
 
 def check_stored(fit: OutputFeedbackFit) -> None:
     kept = json.loads(json.dumps(encode_model(PersonModel("one", fit, ""))))
-    again = decode_model("one", fit.problem, fit.space.request.observer, kept).fit
-    assert again is not None
+    again = present(decode_model("one", fit.problem, fit.space.request.observer, kept).fit)
     for name in ("K", "S", "recorder", "theta", "unseen"):
         assert_array_equal(getattr(again, name), getattr(fit, name))
     assert (again.value, again.log_likelihood) == (fit.value, fit.log_likelihood)

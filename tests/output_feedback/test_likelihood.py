@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import control
 import numpy as np
 import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
+import impc
 from impc.control.closed_loop import simulate
-from impc.control.constraint_rows import directions
-from impc.control.controller import Controller
-from impc.control.simulation import scenario
-from impc.errors import SolverError
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.recordings import Recording
 from impc.output_feedback.compiled_filter import Likelihood
 from impc.output_feedback.likelihood import (
     NoiseDirections,
@@ -24,9 +17,9 @@ from impc.output_feedback.likelihood import (
     joint_likelihoods,
     prepare_filter,
 )
-from impc.output_feedback.observer import Observer, believed_filter
+from impc.output_feedback.observer import believed_filter
 from impc.output_feedback.simulation import PersonTrial, joint_loop, simulate_person
-from tests.support import extrapolated_slope
+from tests.support import extrapolated_slope, named_plant, plant_of
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -49,21 +42,20 @@ class Someone(NamedTuple):
     horizon: int = 5
     start: tuple[float, float] = (0.05, -0.02)
 
-    def plant(self) -> Plant:
-        system = control.ss(
-            [[1, 0.1], [0, 1]], [[0, 0], [0.1, 0.1]], [[1, 0]], 0, 0.1,
-            states=["x", "v"], inputs=["u", "d"], outputs=["x"],
-        )  # fmt: skip
-        return Plant(system, ["u"])
+    def plant(self) -> impc.Plant:
+        A, B = [[1, 0.1], [0, 1]], [[0, 0], [0.1, 0.1]]
+        return named_plant(A, B, [[1, 0]], 0.1, "x v", "u d", "x")
 
-    def controller(self) -> Controller:
+    def controller(self) -> impc.Controller:
         plant = self.plant()
-        bounds = Bounds(plant, u_min=-self.limit, u_max=self.limit)
-        return Controller.from_gain(plant, [self.gain], bounds, self.horizon, terminal_set=False)
+        bounds = impc.Bounds(plant, u_min=-self.limit, u_max=self.limit)
+        return impc.Controller.from_gain(
+            plant, [self.gain], bounds, self.horizon, terminal_set=False
+        )
 
-    def observer(self) -> Observer:
+    def observer(self) -> impc.Observer:
         sensed = ["x", "v"][: len(self.sensory)]
-        return Observer(
+        return impc.Observer(
             self.plant(), sensed, motor=self.motor, share=self.share, process=self.process,
             sensory=self.sensory, walk=self.walk, persistence=self.persistence,
         )  # fmt: skip
@@ -102,8 +94,8 @@ def likelihood(
     return joint_likelihoods(filter_of(who, slopes=slopes), [trial_of(who, outputs)], counted)[0]
 
 
-def trial_of(who: Someone, outputs: Array) -> Recording:
-    return Recording(who.plant(), outputs, push(len(outputs)), who.start)
+def trial_of(who: Someone, outputs: Array) -> impc.Recording:
+    return impc.Recording(who.plant(), outputs, push(len(outputs)), who.start)
 
 
 def filter_of(who: Someone, *, slopes: bool = False) -> PreparedFilter:
@@ -118,7 +110,7 @@ def filter_of(who: Someone, *, slopes: bool = False) -> PreparedFilter:
         for column, group in enumerate([[0], [1], [2, 3], *each, walk, [-1]], 2):
             along[group, column] = levels[group]
     noise = NoiseDirections(along, min(q, 9))
-    about = directions(law, q, K=gain, x0=start)
+    about = impc.directions(law, q, K=gain, x0=start)
     return prepare_filter(law, person, np.array([who.recorder]), about, noise)
 
 
@@ -221,7 +213,7 @@ def test_a_perturbation_that_does_not_persist_is_noise_to_the_person() -> None:
     """The subject's filter has process noise E walk^2 E' and predicts no disturbance."""
     fades = Someone(process=0.0, walk=0.2, persistence=0.0)
     plant = fades.plant()
-    moved = Observer(plant, ["x", "v"], motor=np.hypot(0.3, 0.2), sensory=[0.02, 0.05])
+    moved = impc.Observer(plant, ["x", "v"], motor=np.hypot(0.3, 0.2), sensory=[0.02, 0.05])
     found = believed_filter(plant, fades.observer()).L
     np.testing.assert_allclose(found[:2], believed_filter(plant, moved).L, rtol=1e-10)
     np.testing.assert_allclose(found[2:], 0, atol=1e-14)
@@ -260,7 +252,7 @@ def test_the_limit_of_no_noise_is_the_simulation() -> None:
     """W, V -> 0: the innovations are recorded minus simulated outputs."""
     who = SATURATING._replace(motor=1e-9, process=0.0, sensory=(1e-9, 1e-9))
     rng = np.random.default_rng(7)
-    run = simulate(who.controller(), scenario(who.plant(), who.start, disturbance=push(200)))
+    run = simulate(who.controller(), impc.scenario(who.plant(), who.start, disturbance=push(200)))
     outputs = run.x[:200, :1] + who.recorder * rng.standard_normal((200, 1))
     found = likelihood(who, outputs)
     np.testing.assert_allclose(found.innovations, outputs - run.x[:200, :1], rtol=0, atol=1e-9)
@@ -277,13 +269,15 @@ def test_who_does_what_is_believed_errs_as_the_filter_says() -> None:
 
 
 def test_an_expectation_without_a_command_is_an_error() -> None:
-    plant = Plant(control.ss([[2.0]], [[1.0]], [[1.0]], 0, 1))
-    law = Controller.from_gain(plant, [[1.5]], Bounds(plant, u_max=1, u_min=-1), 30,
+    plant = plant_of([[2.0]], [[1.0]])
+    law = impc.Controller.from_gain(plant, [[1.5]], impc.Bounds(plant, u_max=1, u_min=-1), 30,
                                terminal_set=False)  # fmt: skip
     nothing = NoiseDirections(np.zeros((4, 0)), 0)
-    prepared = prepare_filter(law, Observer(plant), np.array([1.0]), directions(law, 0), nothing)
-    with pytest.raises(SolverError, match="in the prediction of the filter"):
-        joint_likelihoods(prepared, [Recording(plant, np.zeros((60, 1)), x0=[3.0])])
+    prepared = prepare_filter(
+        law, impc.Observer(plant), np.array([1.0]), impc.directions(law, 0), nothing
+    )
+    with pytest.raises(impc.SolverError, match="in the prediction of the filter"):
+        joint_likelihoods(prepared, [impc.Recording(plant, np.zeros((60, 1)), x0=[3.0])])
 
 
 def particles(who: Someone, outputs: Array, count: int, seed: int) -> float:
@@ -340,16 +334,12 @@ def test_a_target_of_a_cart_only_moves_the_origin(limit: float) -> None:
     """A recording about a target has the same likelihood and gradient as one about rest."""
     who = Someone(limit=limit)
     y = recorded(who, 200).outputs
-    aim: dict[str, Any] = {
-        "x0": [0.4, 0],
-        "target": {"x": 0.4},
-        "recorder": who.recorder,
-        "seed": 1,
-    }
-    there = simulate_person(who.controller(), who.observer(), push(200), **aim).outputs
+    aim: dict[str, Any] = {"x0": [0.4, 0], "target": {"x": 0.4}, "seed": 1}
+    person = who.controller(), who.observer(), push(200)
+    there = simulate_person(*person, recorder=who.recorder, **aim).outputs
     np.testing.assert_allclose(there, y + 0.4, atol=1e-9)
     prepared = filter_of(who, slopes=True)
-    moved = Recording(
+    moved = impc.Recording(
         who.plant(), y + 0.4, push(200), np.add(who.start, [0.4, 0.0]), target={"x": 0.4}
     )
     rest, aimed = joint_likelihoods(prepared, [trial_of(who, y), moved])

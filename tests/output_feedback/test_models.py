@@ -11,36 +11,29 @@ import msgspec
 import numpy as np
 import pytest
 
+import impc
 from impc.arrays import frozen
-from impc.checking import replace
-from impc.control.simulation import Status
-from impc.errors import InputError
-from impc.inverse.methods import fit
-from impc.model.recordings import Recording
-from impc.model.structure import Structure
 from impc.output_feedback import doubts
 from impc.output_feedback.fit import OutputFeedbackFit
 from impc.output_feedback.intervals import person_covariance
 from impc.output_feedback.models import (
-    PersonModel,
     PersonReport,
     asked_observer,
     person_report,
     prediction_errors,
 )
-from impc.output_feedback.observer import Observer
 from impc.reporting.document import Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.rendering import plain
-from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.first import FitProgress
 from impc.studies.fit.memory import open_memory
-from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.subject import fit_recordings, stages
-from tests.inverse.test_regulator_span import late_body, late_problem
+from tests.inverse.test_structured_fit import late_body, late_problem
 from tests.output_feedback import fits
 from tests.output_feedback.fits import cart, fitted, least_squares, posed
 from tests.output_feedback.test_fit import check_stored
+from tests.support import kept_names, present
 
 pytestmark = pytest.mark.full
 
@@ -55,9 +48,11 @@ TABLE: dict[str, Any] = {
 
 
 @functools.cache
-def trials() -> list[Recording]:
+def trials() -> list[impc.Recording]:
     """A subject whose sensory noise is half the size of the movement."""
-    return fits.trials(Observer(cart(), ["x", "v"], motor=0.05, sensory=[0.05, 0.1]), 0.002, 0.9)
+    return fits.trials(
+        impc.Observer(cart(), ["x", "v"], motor=0.05, sensory=[0.05, 0.1]), 0.002, 0.9
+    )
 
 
 @functools.cache
@@ -65,9 +60,8 @@ def reported(*, profiles: bool = False) -> tuple[PersonReport, list[str]]:
     """The report, and the stages of the fit."""
     settings = fit_settings(TABLE | {"observer": {"sensed": ["x", "v"], "profiles": profiles}})
     without = fit_settings({key: item for key, item in TABLE.items() if key != "observer"})
-    problem, heard = fit_problem(cart(), trials(), settings), list[str]()
-    report = fit_recordings(problem, settings, FitProgress(heard.append)).person
-    assert report is not None
+    problem, heard = impc.fit_problem(cart(), trials(), settings), list[str]()
+    report = present(fit_recordings(problem, settings, FitProgress(heard.append)).person)
     assert tuple(heard) == stages(problem, settings)
     assert len(heard) - len(stages(problem, without)) == len(report.models) + 1
     return report, heard
@@ -75,8 +69,7 @@ def reported(*, profiles: bool = False) -> tuple[PersonReport, list[str]]:
 
 def report_and_fit() -> tuple[PersonReport, OutputFeedbackFit]:
     report, _ = reported()
-    assert report.fit is not None
-    return report, report.fit
+    return report, present(report.fit)
 
 
 def findings(section: Section) -> dict[str, Finding]:
@@ -96,8 +89,8 @@ def test_errors_ahead_are_those_that_the_filter_expects() -> None:
 
 
 def test_without_limit_and_perturbation_there_are_three_models() -> None:
-    person = Observer(cart(), ["x"], motor=0.15, sensory=0.02)
-    report = person_report(fit(posed(person, 0.01, np.inf, 1)), person, np.zeros(0))
+    person = impc.Observer(cart(), ["x"], motor=0.15, sensory=0.02)
+    report = person_report(impc.fit(posed(person, 0.01, np.inf, 1)), person, np.zeros(0))
     assert [item.name for item in report.models] == [
         "estimates, perturbation known",
         "sees every state, noise in the loop",
@@ -112,8 +105,9 @@ def test_without_limit_and_perturbation_there_are_three_models() -> None:
 
 
 def test_who_cannot_estimate_has_a_reason() -> None:
-    asked = Observer(cart(), ["v"], motor=0.15, sensory=0.02)
-    report = person_report(fit(posed(Observer(cart()), 0.01, np.inf, 1)), asked, np.zeros(0))
+    asked = impc.Observer(cart(), ["v"], motor=0.15, sensory=0.02)
+    problem = posed(impc.Observer(cart()), 0.01, np.inf, 1)
+    report = person_report(impc.fit(problem), asked, np.zeros(0))
     assert report.models[0].fit is None
     assert "no stationary Kalman filter" in report.models[0].reason
     assert report.covariance is None
@@ -123,9 +117,9 @@ def test_who_cannot_estimate_has_a_reason() -> None:
 
 def test_a_structure_is_set_beside_any_gain() -> None:
     """Behind a delay: the same recordings, with fewer unknowns and hardly less likelihood."""
-    problem = late_problem(structure=Structure(late_body(), ["p", "v"]))
-    person = Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
-    report = person_report(fit(problem), person, np.zeros(0))
+    problem = late_problem(structure=impc.Structure(late_body(), ["p", "v"]))
+    person = impc.Observer(problem.plant, ["p", "v"], motor=0.1, sensory=[0.02, 0.02])
+    report = person_report(impc.fit(problem), person, np.zeros(0))
     found = {item.name: item.fit for item in report.models}
     kept, free = report.fit, found["estimates, perturbation known, any gain"]
     assert kept is not None
@@ -133,16 +127,15 @@ def test_a_structure_is_set_beside_any_gain() -> None:
     assert free.count == kept.count + 3
     # Twice their difference is chi-squared of three, .5 for what is not the largest to the end.
     assert -0.5 < free.log_likelihood - kept.log_likelihood < 6
-    assert report.covariance is not None
-    assert np.all(report.covariance.entries < person_covariance(free).entries)
+    assert np.all(present(report.covariance).entries < person_covariance(free).entries)
     check_stored(kept)
 
 
 def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> None:
     """`test_subject.py` has checkpoints of the other parts of a fit."""
     person, found = least_squares("limited")
-    settings = FitSettings(horizon=5, u_max=0.9)
-    stopped, computed = "sees every state, noise in the loop", []
+    settings = impc.FitSettings(horizon=5, u_max=0.9)
+    stopped = "sees every state, noise in the loop"
 
     def interrupt(name: str) -> None:
         if name == stopped:
@@ -152,20 +145,12 @@ def test_persons_of_an_interrupted_fit_are_not_fitted_again(tmp_path: Path) -> N
     memory = open_memory(tmp_path, found.problem, settings)
     with pytest.raises(KeyboardInterrupt):
         person_report(found, person, np.zeros(0), done=interrupt, remember=memory.get)
-    again = open_memory(tmp_path, found.problem, settings)
-
-    def counted(name: str, compute: Any, decode: Any, encode: Any) -> PersonModel:
-        def counting() -> PersonModel:
-            computed.append(name)
-            model: PersonModel = compute()
-            return model
-
-        model: PersonModel = again.get(name, counting, decode, encode)
-        return model
-
-    report = person_report(found, person, np.zeros(0), remember=counted)
-    names = [model.name for model in whole.models]
-    assert computed == names[names.index(stopped) + 1 :] != []
+    again, names = (
+        open_memory(tmp_path, found.problem, settings),
+        [one.name for one in whole.models],
+    )
+    assert kept_names(again) == set(names[: names.index(stopped) + 1]) < set(names)
+    report = person_report(found, person, np.zeros(0), remember=again.get)
     np.testing.assert_array_equal(report.entries, whole.entries)
     np.testing.assert_array_equal(report.levels, whole.levels)
     assert [one.criterion for one in report.models] == [one.criterion for one in whole.models]
@@ -181,13 +166,13 @@ def test_who_senses_with_noise_is_preferred_to_who_sees_all() -> None:
     undecided = f"The recordings do not decide between the models “{asked}” and “{asked}, no limit”"
     assert report.sentences()[0] == f"{undecided} (AIC differs by 0.0)."
     assert report.preferred
-    unsettled = replace(first, fit=replace(fit, converged=False))
-    for other in (unsettled, replace(first, fit=None)):
-        assert not replace(report, models=(other, *report.models[1:])).preferred
-    alone = replace(report, models=(first,)).sentences()[0]
+    unsettled = impc.replace(first, fit=impc.replace(fit, converged=False))
+    for other in (unsettled, impc.replace(first, fit=None)):
+        assert not impc.replace(report, models=(other, *report.models[1:])).preferred
+    alone = impc.replace(report, models=(first,)).sentences()[0]
     assert alone == "No other model of sensing could be fitted for comparison."
-    best = replace(report.models[1], fit=replace(fit, log_likelihood=1e6))
-    beaten = replace(report, models=(first, best))
+    best = impc.replace(report.models[1], fit=impc.replace(fit, log_likelihood=1e6))
+    beaten = impc.replace(report, models=(first, best))
     assert not beaten.preferred
     assert f"“{best.name}” explains" in beaten.sentences()[0]
 
@@ -196,8 +181,8 @@ def test_what_is_said_of_gains_noise_and_limits(monkeypatch: pytest.MonkeyPatch)
     report, fit = report_and_fit()
 
     def said(intervals: list[list[float]], *, loose: bool = False) -> str:
-        settled = replace(fit, converged=not loose)
-        return " ".join(replace(report, entries=np.array(intervals), fit=settled).sentences())
+        settled = impc.replace(fit, converged=not loose)
+        return " ".join(impc.replace(report, entries=np.array(intervals), fit=settled).sentences())
 
     both, one = [[1.0, 2.0], [-2.0, -1.0]], [[1.0, 2.0], [-1.0, 3.0]]
     assert "of 2 of 2 gains" in said(both)
@@ -207,8 +192,12 @@ def test_what_is_said_of_gains_noise_and_limits(monkeypatch: pytest.MonkeyPatch)
     assert "did not converge" in said(both, loose=True)
     assert not any("80 to 95 %" in line for line in report.sentences())
     terms = fit.identified
-    limited = [one._replace(status=np.full_like(one.status, Status.ACTIVE)) for one in terms.trials]
-    met = replace(report, fit=replace(fit, identified=replace(terms, trials=limited)))
+    limited = [
+        one._replace(status=np.full_like(one.status, impc.Status.ACTIVE)) for one in terms.trials
+    ]
+    met = impc.replace(
+        report, fit=impc.replace(fit, identified=impc.replace(terms, trials=limited))
+    )
     assert any("80 to 95 %" in line for line in met.sentences())
     assert met.data()["at_limit"] is True
     monkeypatch.setattr(doubts, "confusion", lambda _: 0.95)
@@ -223,11 +212,11 @@ def test_a_model_whose_prediction_errors_are_not_white_is_doubted() -> None:
     assert fit.doubts == ()
     terms = fit.identified
     summed = [one._replace(innovations=np.cumsum(one.innovations, axis=0)) for one in terms.trials]
-    wrong = replace(fit, identified=replace(terms, trials=summed))
+    wrong = impc.replace(fit, identified=impc.replace(terms, trials=summed))
     doubt, *_ = wrong.doubts
     assert doubt.startswith("Prediction errors of x are autocorrelated: the model is incomplete")
-    assert doubt in replace(report, fit=wrong).sentences()
-    assert "did not converge" in replace(fit, converged=False).doubts[0]
+    assert doubt in impc.replace(report, fit=wrong).sentences()
+    assert "did not converge" in impc.replace(fit, converged=False).doubts[0]
 
 
 def test_the_section_and_result_json_have_the_same_numbers() -> None:
@@ -243,8 +232,7 @@ def test_the_section_and_result_json_have_the_same_numbers() -> None:
     assert (kept["known"], kept["at_limit"], kept["sensed"]) == (True, False, ["x", "v"])
     assert np.array(kept["errors_ahead"]).shape == (len(kept["ahead"]), 1)
     np.testing.assert_allclose(kept["K"], fit.K)
-    table = found["person_gain"].table
-    assert table is not None
+    table = present(found["person_gain"].table)
     np.testing.assert_allclose([table["maximum_likelihood"]], kept["K"])  # no angles
     np.testing.assert_allclose(table[["low", "high"]], kept["K_intervals"][0])
 
@@ -273,22 +261,18 @@ def test_intervals_follow_the_likelihood_where_asked() -> None:
     ],
 )
 def test_an_interval_without_end_says_so(ends: list[float], words: list[str]) -> None:
-    found = findings(replace(reported()[0], entries=frozen([ends, ends])).section())
+    found = findings(impc.replace(reported()[0], entries=frozen([ends, ends])).section())
     assert [row[2:4] for row in found["person_gain"].rows] == [words, words]
 
 
 def test_settings_of_a_person() -> None:
     table = {"observer": {"sensed": ["x"], "known": False, "share": True, "motor": False}}
-    asked = fit_settings(table).observer
-    assert asked is not None
+    asked = present(fit_settings(table).observer)
     given = msgspec.structs.asdict(asked)
     del given["profiles"]
     person, walk = asked_observer(cart(), trials(), **given)
-    assert person.walk is not None
     # A push of one of three sizes every tenth sample: steps of .7 or 1.4, most of them none.
-    np.testing.assert_allclose(walk, person.walk)
+    np.testing.assert_allclose(walk, present(person.walk))
     assert 0.1 < walk[0] < 0.7
     assert person.motor[0] == 0 < person.share[0]
-    with pytest.raises(InputError, match=r"\[fit.observer\] senses: is not a setting"):
-        fit_settings({"observer": {"senses": ["x"]}})
-    assert FitSettings().observer is None
+    assert impc.FitSettings().observer is None

@@ -4,33 +4,27 @@ from __future__ import annotations
 
 from typing import Any
 
-import control
 import numpy as np
 import pytest
 import scipy.linalg
 
-from impc.errors import InputError, SolverError
-from impc.model.plant import Plant
+import impc
 from impc.output_feedback.observer import (
-    Observer,
     believed_filter,
     believed_matrices,
     filter_changes,
     stationary_filter,
 )
-from tests.support import extrapolated_slope, random_weights
+from tests.support import extrapolated_slope, named_plant, random_weights
 
 
-def cart() -> Plant:
-    system = control.ss(
-        [[1, 0.1], [0, 0.9]], [[0, 0], [0.1, 0.2]], [[2, 0], [0, 1]], 0, 0.1,
-        states=["x", "v"], inputs=["u", "d"], outputs=["seen", "v"],
-    )  # fmt: skip
-    return Plant(system, ["u"])
+def cart() -> impc.Plant:
+    A, B = [[1, 0.1], [0, 0.9]], [[0, 0], [0.1, 0.2]]
+    return named_plant(A, B, [[2, 0], [0, 1]], 0.1, "x v", "u d", "seen v")
 
 
 def test_signals_are_states_and_outputs_by_name() -> None:
-    person = Observer(cart(), ["x", "seen - v"], sensory=[0.1, 0.2], motor=1)
+    person = impc.Observer(cart(), ["x", "seen - v"], sensory=[0.1, 0.2], motor=1)
     np.testing.assert_array_equal(person.C, [[1, 0], [2, -1]])
     assert person.names(cart()) == (
         "motor u", "share u", "process x", "process v", "sensory x", "sensory seen - v"
@@ -38,12 +32,12 @@ def test_signals_are_states_and_outputs_by_name() -> None:
 
 
 def test_levels_are_read_and_written_in_one_order() -> None:
-    person = Observer(cart(), ["x"], motor=1, share=0.2, process=[3, 4], sensory=5, walk=6)
+    person = impc.Observer(cart(), ["x"], motor=1, share=0.2, process=[3, 4], sensory=5, walk=6)
     np.testing.assert_array_equal(person.levels, [1, 0.2, 3, 4, 5, 6])
     twice = person.with_levels(2 * person.levels)
     np.testing.assert_array_equal(twice.levels, 2 * person.levels)
     assert twice.walk is not None
-    known = Observer(cart(), ["x"], motor=1, sensory=5)
+    known = impc.Observer(cart(), ["x"], motor=1, sensory=5)
     assert known.with_levels(known.levels).walk is None
 
 
@@ -58,12 +52,12 @@ def test_levels_are_read_and_written_in_one_order() -> None:
     ],
 )
 def test_what_cannot_be_meant_is_refused(given: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        Observer(cart(), **given)  # type: ignore[arg-type]
+    with pytest.raises(impc.InputError, match=message):
+        impc.Observer(cart(), **given)  # type: ignore[arg-type]
 
 
 def test_a_perturbation_that_is_not_known_is_a_state_of_the_belief() -> None:
-    person = Observer(cart(), ["x"], motor=0.3, sensory=0.1, walk=0.5)
+    person = impc.Observer(cart(), ["x"], motor=0.3, sensory=0.1, walk=0.5)
     F, C, Q, R = believed_matrices(cart(), person)
     np.testing.assert_allclose(F, np.array([[1.0, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(C, [[1, 0, 0]])
@@ -79,8 +73,8 @@ def test_a_perturbation_that_is_not_known_is_a_state_of_the_belief() -> None:
 
 
 def test_who_is_never_disturbed_and_does_not_decay_has_no_filter() -> None:
-    with pytest.raises(SolverError, match="no stationary Kalman filter"):
-        believed_filter(cart(), Observer(cart(), ["v"], motor=1, sensory=1))
+    with pytest.raises(impc.SolverError, match="no stationary Kalman filter"):
+        believed_filter(cart(), impc.Observer(cart(), ["v"], motor=1, sensory=1))
 
 
 @pytest.mark.parametrize("radius", [0.7, 0.99, 1.3])
@@ -139,5 +133,5 @@ def test_derivatives_equal_differences() -> None:
     ],
 )
 def test_where_there_is_no_filter(F: Any, C: Any, Q: Any, R: Any) -> None:
-    with pytest.raises(SolverError, match="no stationary Kalman filter"):
+    with pytest.raises(impc.SolverError, match="no stationary Kalman filter"):
         stationary_filter(*(np.array(one, dtype=np.float64) for one in (F, C, Q, R)))

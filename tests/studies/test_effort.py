@@ -10,23 +10,15 @@ import psutil
 import pytest
 from click.testing import CliRunner
 
+import impc
 import impc.cli.console
 import impc.studies.cohort.engine
 import impc.studies.fit.subject
 from impc.arrays import Array, IntArray
-from impc.checking import replace
 from impc.cli.console import require_consent
 from impc.cli.main import main
 from impc.control.closed_loop import prepare_loop
-from impc.control.constraint_rows import directions
-from impc.control.controller import Controller
 from impc.control.named_solver import SOLVERS
-from impc.errors import InputError
-from impc.inverse.problem import Problem
-from impc.model.bounds import Bounds
-from impc.model.recordings import Recording
-from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights
 from impc.studies.effort import (
     Effort,
     fit_effort,
@@ -34,7 +26,6 @@ from impc.studies.effort import (
     select_evaluations,
     selection_effort,
 )
-from impc.studies.fit.settings import FitSettings
 from impc.studies.selection.analysis import select_study
 from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.model import ParametricModel, Trial, sensitivity
@@ -51,15 +42,15 @@ from tests.support import random_plant
 def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) -> None:
     """Compare with the memory allocated by NumPy for rows and derivatives."""
     plant = random_plant(np.random.default_rng(5), n, m, 0.95)
-    bounds = Bounds(plant, u_min=-1, u_max=1)
-    trial = Recording(plant, np.ones((50, n)))
-    problem = Problem(plant, bounds, horizon, (trial,), terminal_set=False)
-    stated = fit_effort(problem, FitSettings(horizon=horizon)).gigabytes * 1e9
-    K = solve_lqr(plant, Weights(np.eye(n), np.eye(m))).K
-    controller = Controller.from_gain(plant, K, bounds, horizon, terminal_set=False)
+    bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    trial = impc.Recording(plant, np.ones((50, n)))
+    problem = impc.Problem(plant, bounds, horizon, (trial,), terminal_set=False)
+    stated = fit_effort(problem, impc.FitSettings(horizon=horizon)).gigabytes * 1e9
+    K = impc.solve_lqr(plant, impc.Weights(np.eye(n), np.eye(m))).K
+    controller = impc.Controller.from_gain(plant, K, bounds, horizon, terminal_set=False)
     tracemalloc.start()
     try:
-        prepare_loop(controller, directions(controller, n * m + m * m + n))
+        prepare_loop(controller, impc.directions(controller, n * m + m * m + n))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -68,15 +59,18 @@ def test_memory_is_told_to_its_order_of_magnitude(n: int, m: int, horizon: int) 
 
 def test_time_grows_with_what_is_asked() -> None:
     plant = random_plant(np.random.default_rng(5), 4, 1, 0.95)
-    bounds = Bounds(plant, u_min=-1, u_max=1)
-    trials = (Recording(plant, np.ones((3000, 4))),) * 3
-    problem = Problem(plant, bounds, 20, trials, terminal_set=False)
-    usual = fit_effort(problem, FitSettings(replicates=1000, profiles=["a"], horizons=[10])).seconds
+    bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+    trials = (impc.Recording(plant, np.ones((3000, 4))),) * 3
+    problem = impc.Problem(plant, bounds, 20, trials, terminal_set=False)
+    usual = fit_effort(
+        problem, impc.FitSettings(replicates=1000, profiles=["a"], horizons=[10])
+    ).seconds
     assert 60 < usual < 7200
-    assert fit_effort(problem, FitSettings(replicates=10**6)).seconds > 7200
-    plain = fit_effort(problem, FitSettings()).seconds
+    assert fit_effort(problem, impc.FitSettings(replicates=10**6)).seconds > 7200
+    plain = fit_effort(problem, impc.FitSettings()).seconds
     slower = [
-        fit_effort(replace(problem, solver=name), FitSettings()).seconds / plain for name in SOLVERS
+        fit_effort(impc.replace(problem, solver=name), impc.FitSettings()).seconds / plain
+        for name in SOLVERS
     ]
     assert min(slower) > 5
     assert max(slower) > 50  # IPOPT's
@@ -85,10 +79,10 @@ def test_time_grows_with_what_is_asked() -> None:
 def test_consent(monkeypatch: pytest.MonkeyPatch) -> None:
     require_consent(Effort(60, 0.1), given=False)
     require_consent(Effort(1e9, 0.1), given=True)
-    with pytest.raises(InputError, match=r"would take about 2\.78e\+05 hours.*or pass --yes"):
+    with pytest.raises(impc.InputError, match=r"would take about 2\.78e\+05 hours.*or pass --yes"):
         require_consent(Effort(1e9, 0.1), given=False)
     machine = psutil.virtual_memory().total / 1e9
-    with pytest.raises(InputError, match="more than this machine has"):
+    with pytest.raises(impc.InputError, match="more than this machine has"):
         require_consent(Effort(60, machine + 1), given=True)
 
 
@@ -126,7 +120,7 @@ def test_evaluations_of_a_selection_are_told_to_their_order_of_magnitude(which: 
         model = head_model()
         trials = tuple(head_trials(model, np.array(model.typical), 0.8, 3, count=1))
     calls = 0
-    plain = replace(model, jacobian=None)
+    plain = impc.replace(model, jacobian=None)
 
     def counted(theta: Array, given: Array, free: IntArray) -> tuple[Array, Array]:
         nonlocal calls
@@ -136,7 +130,7 @@ def test_evaluations_of_a_selection_are_told_to_their_order_of_magnitude(which: 
         outputs, derivative = sensitivity(plain, theta, given, free)
         return outputs, derivative / model.gain[free]
 
-    watched = replace(model, jacobian=counted)
+    watched = impc.replace(model, jacobian=counted)
     settings = SelectSettings(replicates=20, starts=2, least=1)
     select_study({"1": trials}, settings, in_turn(watched))
     assert 1 / 10 < select_evaluations(settings) / calls < 10

@@ -15,7 +15,7 @@ import distributed
 import pytest
 from distributed.security import Security
 
-from impc.errors import InputError, OutputError
+import impc
 from impc.studies import scheduler as module
 from impc.studies.cache import Cache
 from impc.studies.pool import Task, run
@@ -79,6 +79,16 @@ def test_a_scheduler_with_certificates(
     assert [found[f"many {number}"].content for number in range(50)] == list(range(50))
 
 
+def require_refused(says: str, address: str | None, *given: Path | None) -> None:
+    """The cluster is refused before anything is done, in one line."""
+    with (
+        pytest.raises(impc.InputError, match=says) as caught,
+        connected(Cluster(address, None, *given)),
+    ):
+        pytest.fail("entered")
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("missing", [0, 1, 2])
 def test_certificates_that_are_missing(
     missing: int, files: tuple[Path, Path, Path], tmp_path: Path
@@ -86,37 +96,19 @@ def test_certificates_that_are_missing(
     given: list[Path | None] = list(files)
     for other, says in ((None, "needs --tls-"), (tmp_path / "none.pem", "is not a file")):
         given[missing] = other
-        with (
-            pytest.raises(InputError, match=says),
-            connected(Cluster("tls://127.0.0.1:9", None, *given)),
-        ):
-            pytest.fail("entered")
-    with (
-        pytest.raises(InputError, match="takes no certificates"),
-        connected(Cluster("tcp://127.0.0.1:9", None, *files)),
-    ):
-        pytest.fail("entered")
-    with (
-        pytest.raises(InputError, match="without --scheduler"),
-        connected(Cluster(None, None, *files)),
-    ):
-        pytest.fail("entered")
+        require_refused(says, "tls://127.0.0.1:9", *given)
+    require_refused("takes no certificates", "tcp://127.0.0.1:9", *files)
+    require_refused("without --scheduler", None, *files)
 
 
 def test_certificates_of_somebody_else(
     scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_PATIENCE", "1s")
-    others = certificates(tmp_path)
-    broken = tmp_path / "broken.pem"
+    others, broken = certificates(tmp_path), tmp_path / "broken.pem"
     broken.write_text("no certificate")
     for given in (others, (broken, *others[1:])):
-        with (
-            pytest.raises(InputError, match="does not answer") as caught,
-            connected(Cluster(scheduler.scheduler_address, None, *given)),
-        ):
-            pytest.fail("entered")
-        assert "\n" not in str(caught.value)
+        require_refused("does not answer", scheduler.scheduler_address, *given)
 
 
 def test_a_scheduler_that_is_lost(
@@ -130,6 +122,6 @@ def test_a_scheduler_that_is_lost(
             scheduler.close()
             future.result()
 
-    with pytest.raises(OutputError, match="was lost") as caught:
+    with pytest.raises(impc.OutputError, match="was lost") as caught:
         lose()
     assert "\n" not in str(caught.value)

@@ -12,7 +12,7 @@ the fits leave to a common value, (sum 1 / variance)^-1/2. With equal shares, as
 without a standard error, the tests are Welch's and Student's. Hartung and Knapp's error is
 not used: a gain that the recordings do not determine stays near the start of the search, so that it
 deviates less than its variance says. In simulated groups of 5 to 20 people with a third of such
-fits their 95 % interval covers 85 to 92 %, this one 94 to 97 % (test_weighted_means.py).
+fits their 95 % interval covers 85 to 92 %, this one 94 to 97 % (test_comparison.py).
 
     group         means of people over visits, Welch's degrees of freedom; effect: Hedges' g
     visit         people with both visits, mean of differences over their SD

@@ -8,14 +8,9 @@ from typing import Any
 import control
 import numpy as np
 
+import impc
 from experiments.coverage import cart
-from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
-from impc.control.feasibility import require_complete
-from impc.control.simulation import scenario
-from impc.model.bounds import Bounds
-from impc.model.recordings import Recording
-from impc.model.weights import Weights
+from tests.support import regulator
 
 __all__ = ["cart_plant", "subject_trial", "write_study"]
 
@@ -29,19 +24,14 @@ def cart_plant(drag: float = 0.3) -> Any:
     return control.c2d(control.ss(A, B, [[1.0, 0.0]], 0, **names), _DT)
 
 
-def subject_trial(seed: int, cost_weight: float = 4.0) -> Recording:
+def subject_trial(seed: int, cost_weight: float = 4.0) -> impc.Recording:
     """A trial of a subject with Q = diag(cost weight, 1), with white noise of a fifth."""
-    plant, rng = cart(), np.random.default_rng(seed)
-    bounds = Bounds(plant, u_min=-1, u_max=1)
-    weights = Weights(np.diag([cost_weight, 1.0]), 1)
-    controller = Controller(plant, weights, bounds, 10, terminal_set=False)
+    law, rng = regulator(cart(), np.diag([cost_weight, 1.0]), 1, 10), np.random.default_rng(seed)
     push = np.repeat(rng.choice([-0.8, 0.0, 0.8], _SAMPLES // 10), 10)
-    run = require_complete(
-        controller, simulate(controller, scenario(plant, np.zeros(2), disturbance=push))
-    )
-    clean = (run.x @ plant.C.T)[:_SAMPLES]
+    run = impc.require_complete(law, law.simulate([0.0, 0.0], disturbance=push))
+    clean = run.outputs[:_SAMPLES]
     noise = 0.2 * np.sqrt(np.mean(clean**2)) * rng.standard_normal(clean.shape)
-    return Recording(plant, clean + noise, push)
+    return impc.Recording(law.plant, clean + noise, push)
 
 
 def write_study(

@@ -1,21 +1,29 @@
-"""Comparison of groups, visits and conditions against SciPy; uncertain gains; outliers."""
+"""Comparisons against SciPy; weighted means: uncertain gains, outliers, coverage."""
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
 
+import impc
 from experiments.coverage import cart
 from impc.inverse.noisy_fit import fit_controller
-from impc.studies.cohort.comparison import Comparison, compare_cohort, in_order, outlying
-from impc.studies.fit.asked import fit_problem
-from impc.studies.fit.settings import FitSettings
+from impc.studies.cohort.comparison import (
+    Comparison,
+    compare_cohort,
+    in_order,
+    outlying,
+    t_test,
+    weighted_mean,
+)
 from tests.studies.cohort.carts import subject_trial
 
 SEED = 15
-SETTINGS = FitSettings(horizon=10, u_max=1.0)
+SETTINGS = impc.FitSettings(horizon=10, u_max=1.0)
 
 
 def compared(units: pd.DataFrame, reference: str = "") -> tuple[Comparison, ...]:
@@ -96,7 +104,7 @@ def cohort_p(seed: int, difference: float, subjects: int = 10) -> float:
             4.0 * (difference if group == "b" else 1.0) * np.exp(0.2 * rng.standard_normal())
         )
         trial = subject_trial(int(rng.integers(2**31)), float(cost_weight))
-        fitted = fit_controller(fit_problem(cart(), [trial], SETTINGS))
+        fitted = fit_controller(impc.fit_problem(cart(), [trial], SETTINGS))
         rows.append((str(number), "1", "", group, fitted.gain[0, 0]))
     units = pd.DataFrame(rows, columns=["subject", "visit", "condition", "group", "K.force.x"])
     (found,) = compared(units)
@@ -196,3 +204,83 @@ def test_far_gains_are_found_and_uncertain_small_ones_are_not() -> None:
     assert far[3] == pytest.approx(100 / 800)
     units["K.u.x"] = 20 * np.random.default_rng(3).standard_normal(10)
     assert outlying(units, ["K.u.x"]).notna().sum() == 0  # about zero no ratio has a meaning
+
+
+ASKED = Comparison("group", "K.u.x", "", "a", "b")
+
+
+def cohort(rng: np.random.Generator, n: int, between: float, near: float) -> list[pd.DataFrame]:
+    """Values and variances of two groups of `n` without a difference.
+
+    A third of the fits are 3 to 10 times less certain; their errors are `near` times what their
+    variances say.
+    """
+    groups = []
+    for _ in "ab":
+        uncertain = np.arange(n) < round(n / 3)
+        errors = np.where(uncertain, rng.uniform(3, 10, n), 1.0)
+        own = errors * np.where(uncertain, near, 1.0) * rng.standard_normal(n)
+        values = between * rng.standard_normal(n) + own
+        groups.append(pd.DataFrame({"value": values, "variance": errors**2}))
+    return groups
+
+
+def differences(groups: list[list[pd.DataFrame]], weighted: bool) -> tuple[float, float]:
+    """Share of intervals with the true difference of zero, and their median width."""
+    found = [
+        t_test(ASKED, [weighted_mean(one["value"], weighted * one["variance"]) for one in pair])
+        for pair in groups
+    ]
+    covered = np.mean([item.low <= 0 <= item.high for item in found])
+    return float(covered), float(np.median([item.high - item.low for item in found]))
+
+
+@pytest.mark.parametrize(
+    ("n", "between", "near", "cohorts"),
+    [
+        (8, 1.0, 1.0, 1000),  # the share covered has a standard error of 0.7 %
+        *(
+            pytest.param(*case, 2000, marks=pytest.mark.full)
+            for case in itertools.product([5, 20], [0.5, 2.0], [1.0, 0.2])
+        ),
+    ],
+)
+def test_intervals_cover_and_are_narrow(n: int, between: float, near: float, cohorts: int) -> None:
+    """93.7 to 97.2 %; with right variances at most 0.7 times the unweighted width."""
+    rng = np.random.default_rng([1, n] if cohorts == 2000 else 0)
+    drawn = [cohort(rng, n, between, near) for _ in range(cohorts)]
+    covered, width = differences(drawn, weighted=True)
+    assert 0.93 <= covered < 0.975
+    if near == 1.0:
+        assert width < 0.7 * differences(drawn[:200], weighted=False)[1]
+
+
+def test_undetermined_gains_that_agree_are_not_known_well() -> None:
+    """Six values near the start of the search, each known to +- 2000: their mean is to +- 800."""
+    values = pd.Series([470.0, 480.0, 460.0, 475.0, 465.0, 470.0])
+    low, _, high = weighted_mean(values, pd.Series(np.full(6, 1000.0**2))).ends
+    assert (high - low) / 2 == pytest.approx(1.96 * 1000 / np.sqrt(6), rel=1e-3)
+
+
+def test_equal_errors_are_students_t() -> None:
+    values = np.random.default_rng(2).standard_normal(7)
+    for variances in (np.zeros(7), np.full(7, 0.01), np.full(7, 1e-30)):
+        found = weighted_mean(pd.Series(values), pd.Series(variances))
+        assert found.value == pytest.approx(values.mean())
+        assert found.error == pytest.approx(scipy.stats.sem(values))
+        assert found.freedom == pytest.approx(6.0)
+        assert found.people == pytest.approx(7.0)
+
+
+def test_shares_are_inverse_variances_plus_the_variance_between_people() -> None:
+    """DerSimonian and Laird by hand; a negative variance between people is zero."""
+    values, variances = np.array([0.0, 4.0, 2.0]), np.array([1.0, 4.0, 4.0])
+    w = 1 / variances
+    q = w @ (values - w @ values / w.sum()) ** 2
+    between = (q - 2) / (w.sum() - w @ w / w.sum())
+    found = weighted_mean(pd.Series(values), pd.Series(variances))
+    assert found.between == pytest.approx(between)
+    assert found.value == pytest.approx(np.average(values, weights=1 / (variances + between)))
+    found = weighted_mean(pd.Series(values) / 4, pd.Series(variances))
+    assert found.between == 0.0
+    assert found.value == pytest.approx(np.average(values / 4, weights=w))

@@ -9,8 +9,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from impc.checking import replace
-from impc.errors import InputError, OutputError, SolverError
+import impc
 from impc.files.disk import IN_ITS_PLACE
 from impc.reporting.writer import owned
 from impc.studies.cohort import engine
@@ -51,15 +50,15 @@ def test_tables_hold_what_was_kept(tmp_path: Path) -> None:
 def test_other_settings_are_refused_before_anything_is_done(tmp_path: Path) -> None:
     filled(tmp_path)
     assert open_store(tmp_path, TASKS).digests == DIGESTS
-    later = TASKS | {NAMES[1]: replace(TASKS[NAMES[1]], digest="of another horizon")}
-    with pytest.raises(InputError, match="other recordings or with other settings"):
+    later = TASKS | {NAMES[1]: impc.replace(TASKS[NAMES[1]], digest="of another horizon")}
+    with pytest.raises(impc.InputError, match="other recordings or with other settings"):
         open_store(tmp_path, later)
     (tmp_path / "units" / NAMES[1] / "fit.json").unlink()
     open_store(tmp_path, later)
 
 
 def refusing(*_: Any) -> dict[str, Any]:
-    raise SolverError("gain", "no regulator can be simulated", "see the recording")
+    raise impc.SolverError("gain", "no regulator can be simulated", "see the recording")
 
 
 def run_and_report(folder: Path, monkeypatch: pytest.MonkeyPatch, fit: Any, draw: Any) -> Failures:
@@ -130,7 +129,7 @@ def test_what_stands_in_the_place_of_the_log_is_to_be_moved(what: str, tmp_path:
     """The message does not ask for disk space."""
     path = tmp_path / "cohort.log"
     path.mkdir() if what == "folder" else path.symlink_to("/dev/full")
-    with pytest.raises(OutputError, match=r"cohort\.log: cannot be written") as caught:
+    with pytest.raises(impc.OutputError, match=r"cohort\.log: cannot be written") as caught:
         Store(tmp_path, DIGESTS).log("run")
     assert "\n" not in str(caught.value)
     assert caught.value.remedy == IN_ITS_PLACE

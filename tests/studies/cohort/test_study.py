@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from impc.errors import InputError
+import impc
 from impc.files.plant_sources import PlantSource, plant_source
 from impc.studies.cohort.study import Study, read_study
 from impc.studies.cohort.tasks import study_tasks, unused_columns
@@ -139,7 +139,7 @@ FAULTS = [
 def test_faults_are_one_sentence(tmp_path: Path, text: str, rows: str, match: str) -> None:
     touch(tmp_path, "1.csv", "1.mat", "a b.txt", "a-b.txt")
     (tmp_path / "t.csv").write_bytes(rows.encode())
-    with pytest.raises(InputError, match=match) as caught:
+    with pytest.raises(impc.InputError, match=match) as caught:
         read_study(study(tmp_path, text))
     assert str(caught.value).isprintable()
 
@@ -147,7 +147,7 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, rows: str, match: st
 @pytest.mark.parametrize("name", [b"s1\xff.csv", b"s1\n2.csv", b"s1\x1b[2J.csv"])
 def test_file_names_that_are_no_text(tmp_path: Path, name: bytes) -> None:
     (tmp_path / os.fsdecode(name)).write_text("x")
-    with pytest.raises(InputError, match="is no name") as caught:
+    with pytest.raises(impc.InputError, match="is no name") as caught:
         read_study(study(tmp_path, 'recordings = "s{subject}.csv"'))
     assert str(caught.value).isprintable()
 
@@ -190,7 +190,7 @@ PEOPLE = [
 def test_participants(tmp_path: Path, text: str, expected: str | dict[str, float | str]) -> None:
     path = with_people(tmp_path, text)
     if isinstance(expected, str):
-        with pytest.raises(InputError, match=expected):
+        with pytest.raises(impc.InputError, match=expected):
             read_study(path)
     else:
         assert read_study(path).units[0].person == pytest.approx(expected)
@@ -200,7 +200,7 @@ def test_all_faults_of_participants_are_said_at_once(tmp_path: Path) -> None:
     path = with_people(tmp_path, "")
     rows = ["Proband;Gruppe;Maße;Masse (kg)", "1;a;;ca. 70", "1;a/b;;70", ";a;;nan", "2;a;;71,5"]
     (tmp_path / "p.csv").write_bytes("\n".join(rows).encode("cp1252"))
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(impc.InputError) as caught:
         read_study(path)
     for part in (
         "row 2, mass: 'ca. 70'", "row 3, group: 'a/b' is no name", "row 3: two rows of subject 1",
@@ -212,7 +212,7 @@ def test_all_faults_of_participants_are_said_at_once(tmp_path: Path) -> None:
 def test_what_the_plant_refuses_is_said_before_any_fit(tmp_path: Path) -> None:
     text = "subject,mass,height,sex\n1,70,178,m\n2,70,1.8,f\n3,70,1.8,d\n"
     source = plant_source("plants:seated_balance_for", {})
-    with pytest.raises(InputError, match=r"row 2 \(1\): .*height.*row 4 \(3\): .*sex"):
+    with pytest.raises(impc.InputError, match=r"row 2 \(1\): .*height.*row 4 \(3\): .*sex"):
         study_tasks(read_study(with_people(tmp_path, text, *"123")), source)
 
 
@@ -239,5 +239,5 @@ def test_an_unknown_reference_is_refused(tmp_path: Path) -> None:
     touch(tmp_path, "1_EO.csv", "1_EC.csv")
     text = 'recordings = "{subject}_{condition}.csv"\nreference = '
     assert read_study(study(tmp_path, f"{text}'EC'")).reference == "EC"
-    with pytest.raises(InputError, match=r"'eyes' is no group, .*; use one of EC, EO"):
+    with pytest.raises(impc.InputError, match=r"'eyes' is no group, .*; use one of EC, EO"):
         read_study(study(tmp_path, f"{text}'eyes'"))

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impc.checking import replace
-from impc.errors import InputError
+import impc
 from impc.files.plant_sources import plant_source
 from impc.studies.cohort.comparison import compare_cohort
 from impc.studies.cohort.engine import Store
@@ -16,6 +15,7 @@ from impc.studies.cohort.study import Study, read_study
 from impc.studies.cohort.tables import cohort_tables
 from impc.studies.cohort.tasks import fit_unit, study_tasks
 from tests.studies.cohort.carts import write_study
+from tests.support import present
 
 pytestmark = pytest.mark.full
 
@@ -30,7 +30,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Store]:
     path.write_text(path.read_text() + STRUCTURE)
     study = read_study(path)
     source = plant_source("tests.studies.cohort.carts:cart_plant", {})
-    tasks, failed = study_tasks(replace(study, plant=source.name), source)
+    tasks, failed = study_tasks(impc.replace(study, plant=source.name), source)
     assert failed == {}
     store = Store(folder / "out", {name: task.digest for name, task in tasks.items()})
     for name, task in tasks.items():
@@ -47,8 +47,7 @@ def test_prices_hold_the_truth_and_the_groups_differ(fitted: tuple[Study, Store]
     assert np.sum((low - 0.2 < truth) & (truth < high + 0.2)) == len(units) == 6
     assert np.sum(units["structure_refused"]) <= 1
     study, store = fitted
-    kept = store.fit(study.units[0].name)
-    assert kept is not None
+    kept = present(store.fit(study.units[0].name))
     compared = [name for name, column in kept["shown"].items() if column["compared"]]
     assert compared[:2] == ["log_cost_weight.x[0]", "log_cost_weight.x[1]"]
     found = {
@@ -68,6 +67,6 @@ def test_a_structure_that_loses_its_plant_names_why(tmp_path: Path) -> None:
     path.write_text(path.read_text() + '[fit.structure]\nQ = ["x[2]"]\n')
     study = read_study(path)
     source = plant_source("tests.studies.cohort.carts:cart_plant", {})
-    tasks, _ = study_tasks(replace(study, plant=source.name), source)
-    with pytest.raises(InputError, match="expected a name"):
+    tasks, _ = study_tasks(impc.replace(study, plant=source.name), source)
+    with pytest.raises(impc.InputError, match="expected a name"):
         fit_unit(next(iter(tasks.values())))

@@ -17,6 +17,7 @@ from impc.studies.cohort.study import Study, Unit
 from impc.studies.cohort.verdict import cohort_verdict
 from impc.studies.fit.verdict import UNDETERMINED
 from tests.studies.cohort.made_up import column, gain_column
+from tests.support import present
 
 GAIN = "K.command.theta1"
 COLUMNS = {
@@ -67,13 +68,19 @@ HEADLINES: list[tuple[dict[str, Any], str]] = [
         "At visit 2 people answer 1° of seat tilt with 0.872 N m more torque than at visit 1.",
     ),
     ({"shift": 0.0}, "No difference in a gain between the groups was found."),
+    (
+        {"shift": -139.0, "wide": tuple(range(9))},
+        "Gains are known well enough in too few people for a comparison.",
+    ),
+    ({"shift": 0.0, "red": tuple(range(20))}, "No fit of this study can be used."),
 ]
 
 
 @pytest.mark.parametrize(("given", "headline"), HEADLINES)
 def test_headlines(given: dict[str, Any], headline: str) -> None:
     found = cohort_verdict(cohort(**given))
-    assert (found.level, found.headline) == (Level.GREEN, headline)
+    level = Level.AMBER if "wide" in given else Level.RED if "red" in given else Level.GREEN
+    assert (found.level, found.headline) == (level, headline)
 
 
 def test_numbers_of_a_difference_and_no_claim_of_equality_without_one() -> None:
@@ -89,8 +96,7 @@ def test_numbers_of_a_difference_and_no_claim_of_equality_without_one() -> None:
 def test_all_usable_fits_count_and_uncertain_ones_little() -> None:
     made = cohort(-139.0, wide=(0, 1), red=(19,))
     made.units.loc[0, GAIN] = 5000.0
-    lead = made.lead
-    assert lead is not None
+    lead = present(made.lead)
     assert lead.n == 19
     kept = made.units.drop(index=[0, 1, 19])
     means = kept.groupby("group")[GAIN].mean()
@@ -116,8 +122,7 @@ def test_fits_far_from_their_group_are_named_and_tried_without() -> None:
         Unit(row["subject"], "0", "", (), row["group"])
         for row in made.units.to_dict("records")
     ))  # fmt: skip
-    table = subjects(study, made).table
-    assert table is not None
+    table = present(subjects(study, made).table)
     marked = table[table["why"].str.startswith("Look at it: a gain is")]
     assert marked["subject"].tolist() == ["3", "15"]
     assert marked["value"].tolist() == pytest.approx([3000 * np.pi / 180] * 2)
@@ -130,8 +135,7 @@ def test_the_reference_is_subtracted() -> None:
         group=made.units["group"].map({"first": "LBP", "second": "control"})
     )
     for reference, first in (("", "control"), ("LBP", "LBP")):
-        table = comparisons(Cohort(renamed, COLUMNS, {}, reference)).table
-        assert table is not None
+        table = present(comparisons(Cohort(renamed, COLUMNS, {}, reference)).table)
         assert table["compared"].iloc[0].endswith(f" - {first}")
         assert (table["difference"].iloc[0] > 0) == (first == "control")
         row = table.iloc[0]
@@ -140,6 +144,7 @@ def test_the_reference_is_subtracted() -> None:
 
 
 def test_warnings_make_it_amber_and_are_tried_without() -> None:
+    """One does not, and a fit that determines no gain is no warning of the study."""
     assert cohort_verdict(cohort(-139.0, warned=(3,))).level is Level.GREEN
     made = cohort(-139.0, warned=(3, 4, 12, 13))
     found = cohort_verdict(made)
@@ -148,24 +153,12 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
     assert alert.title == "4 of 20 fits have a warning"
     assert "Without fits with a warning it is 2.6 N m/° less" in alert.found
     assert "n = 16" in alert.found
-
-
-def test_fits_that_determine_no_gain_are_no_warning_of_the_study() -> None:
-    made = cohort(-139.0, warned=(3, 4, 12, 13))
     units = made.units.assign(kind=made.units["kind"].where(made.units.index != 3, UNDETERMINED))
     assert Cohort(units, COLUMNS, {}).warned == 3
     assert cohort_verdict(Cohort(units.drop(index=[12, 13]), COLUMNS, {})).level is Level.GREEN
 
 
-def test_too_few_gains_are_no_comparison() -> None:
-    found = cohort_verdict(cohort(-139.0, wide=tuple(range(9))))
-    assert found.level is Level.AMBER
-    assert "known well enough in too few people" in found.headline
-
-
-def test_no_usable_fit_is_red() -> None:
-    made = cohort(0.0, red=tuple(range(20)))
-    assert cohort_verdict(made).level is Level.RED
+def test_a_study_of_which_nothing_was_fitted_is_red() -> None:
     assert cohort_verdict(Cohort(pd.DataFrame(), {}, {"sub-1": "no"})).level is Level.RED
 
 
@@ -186,7 +179,6 @@ def test_cost_weights_are_compared_as_ratios() -> None:
     made = Cohort(units.assign(structure_refused=False), weight, {})
     headline = cohort_verdict(made).headline
     assert headline.startswith("The cost weight of seat tilt is 0.5 times as high in the second")
-    table = comparisons(made).table
-    assert table is not None
+    table = present(comparisons(made).table)
     row = table[table["measure"] == "cost weight of seat tilt"].iloc[0]
     assert (row["difference"], row["unit"]) == (pytest.approx(0.5, rel=0.01), "ratio")

@@ -5,36 +5,31 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.coverage import cart, noisy_trial, true_controller
+import impc
+from experiments.coverage import true_controller
 from experiments.printed_intervals import carts, fit, noisy_recording, regulator
 from impc.assess.covariance import gain_covariance
 from impc.assess.long_run_covariance import white_noise
 from impc.assess.printed_gain import gain_estimate
 from impc.assess.profiles import profile_likelihood
-from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.first import FitProgress
 from impc.studies.fit.result import FitResult
-from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.uncertainty import fit_alternatives
 from tests.assess.cart_fits import cart_fit, cart_problem
+from tests.support import present
 
 SEEDS = (11, 12)
-EXTRAS = FitSettings(
-    horizon=10,
-    u_max=1.0,
-    replicates=20,
-    profiles=["K.force.x[1]"],
-    unknown_limit=True,
+EXTRAS = impc.FitSettings(
+    horizon=10, u_max=1.0, replicates=20, profiles=["K.force.x[1]"], unknown_limit=True,
     horizons=[1, 10, 20],
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def result() -> FitResult:
-    trials = [noisy_trial(seed, 0.0) for seed in SEEDS]
     heard: list[str] = []
-    problem = fit_problem(cart(), trials, EXTRAS)
+    problem = cart_problem(*SEEDS)
     found = fit_recordings(problem, EXTRAS, FitProgress(heard.append))
     assert tuple(heard) == stages(problem, EXTRAS)
     return found
@@ -54,8 +49,7 @@ def test_every_interval_holds_the_truth(result: FitResult) -> None:
 
 @pytest.mark.full
 def test_the_set_of_weights_is_described(result: FitResult) -> None:
-    found = result.uncertainty.weights
-    assert found is not None
+    found = present(result.uncertainty.weights)
     Q = result.intent.reported.weights.Q
     for item in found.entries:
         i, j = (result.fitted.problem.plant.states.index(n) for n in (item.first, item.second))

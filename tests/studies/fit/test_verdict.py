@@ -4,37 +4,33 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import control
 import numpy as np
 import pytest
 
+import impc
 from impc.assess.lack_of_fit import LackOfFit, ModelError
-from impc.checking import replace
-from impc.control.controller import Controller
 from impc.files.plant_sources import plant_source
 from impc.inverse.minimiser import Ended
 from impc.levels import Level
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.recordings import Recording
-from impc.model.weights import Weights
 from impc.reporting.document import Copy
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import angles_in
 from impc.reporting.style import VERMILLION, page_style
 from impc.studies.charts import trajectories
-from impc.studies.fit.asked import fit_problem
-from impc.studies.fit.body_words import added_sentence
+from impc.studies.fit.body_words import added_sentence, remedy_words
 from impc.studies.fit.facts import named_gains
 from impc.studies.fit.figures import movement_figure, shown_window, statements_figure
 from impc.studies.fit.first import FitProgress
 from impc.studies.fit.report import fallen_report, fit_report
 from impc.studies.fit.result import FittedParameter
-from impc.studies.fit.settings import FitSettings, missing
+from impc.studies.fit.settings import missing
 from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.verdict import GAIN, WEIGHTS, fit_verdict, forbidden
+from tests.support import regulator
 
 if TYPE_CHECKING:
     from impc.studies.fit.result import FitResult
@@ -45,22 +41,19 @@ SEED = 20264
 @cache
 def fitted(limit: float) -> FitResult:
     """A perturbed cart with little recording noise and a limited command."""
-    cart = control.c2d(control.ss([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0]], [[0, 0]]), 0.1)
-    cart = control.ss(
-        cart.A, cart.B, cart.C, cart.D, 0.1, states=["place", "speed"], inputs=["pull", "push"],
-        outputs=["place"],
-    )  # fmt: skip
+    cart = control.ss([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0]], 0, states=["place", "speed"],
+                      inputs=["pull", "push"], outputs=["place"])  # fmt: skip
     units = {"place": "m", "speed": "m/s", "pull": "m/s^2", "push": "m/s^2"}
     words = {"place": "place of the cart", "pull": "pull of the rope"}
-    plant = Plant(cart, ["pull"], units, words)
-    law = Controller(plant, Weights([[4, 0], [0, 1]], 1), Bounds(plant, u_max=1.0, u_min=-1.0), 5)
+    plant = impc.Plant(control.c2d(cart, 0.1), ["pull"], units, words)
+    law = regulator(plant, np.diag([4.0, 1.0]), 1, 5, terminal_set=True)
     rng = np.random.default_rng(SEED)
     push = 1.2 * np.repeat(rng.choice([-1.0, 0.0, 1.0], 30), 5)[:, None]
-    moved = law.simulate([0.0, 0.0], disturbance=push, steps=len(push))
-    outputs = moved.x[: len(push), :1] + 0.005 * rng.standard_normal((len(push), 1))
-    settings = FitSettings(u_max=limit, horizon=5, methods=["inverse_lqr_output"])
+    outputs = law.simulate([0.0, 0.0], disturbance=push).outputs[:-1]
+    outputs = outputs + 0.005 * rng.standard_normal(outputs.shape)
+    settings = impc.FitSettings(u_max=limit, horizon=5, methods=["inverse_lqr_output"])
     heard: list[str] = []
-    problem = fit_problem(plant, [Recording(plant, outputs, push)], settings)
+    problem = impc.fit_problem(plant, [impc.Recording(plant, outputs, push)], settings)
     result = fit_recordings(problem, settings, FitProgress(heard.append))
     assert tuple(heard) == stages(problem, settings)
     return result
@@ -68,11 +61,17 @@ def fitted(limit: float) -> FitResult:
 
 def explained(limit: float = 1.0) -> FitResult:
     """A fit without warnings; the result of the model test is dropped."""
-    return replace(fitted(limit), lack=(None,))
+    return impc.replace(fitted(limit), lack=(None,))
+
+
+def model_error(name: str = "delay", size: float = 1.0, deviation: float = 0.1) -> LackOfFit:
+    """A test of the model that points to one error."""
+    return LackOfFit((ModelError(name, 1e-5, 11.5, size, deviation),), alarm=True, untestable=())
 
 
 def test_a_fit_that_nothing_speaks_against() -> None:
     result = explained()
+    assert not len(result.inverse_mpc.held_out)  # of a single trial
     verdict = fit_verdict(result)
     assert (verdict.level, list(verdict.alerts)) == (Level.GREEN, [])
     assert "1 m/s^2 explains this movement" in verdict.headline
@@ -89,8 +88,7 @@ def test_a_fit_that_nothing_speaks_against() -> None:
 
 
 def test_an_error_of_the_model_forbids_gains() -> None:
-    alarm = LackOfFit((ModelError("delay", 1e-5, 11.5, 1.0, 0.1),), alarm=True, untestable=())
-    result = replace(fitted(1.0), lack=(alarm,))
+    result = impc.replace(fitted(1.0), lack=(model_error(),))
     verdict = fit_verdict(result)
     assert verdict.level is Level.AMBER
     assert "a delay of the command of 100 ± 10 ms (p < 0.0001)" in verdict.alerts[0].found
@@ -105,7 +103,38 @@ def test_an_error_of_the_model_forbids_gains() -> None:
     page = report.page()
     # The numbers are only in a folded part that says so.
     assert "(do not report)" in page.partition('id="feedback-gain"')[2][:900]
-    assert added_sentence(replace(result, lack=(alarm, None))).startswith("The residuals of a")
+    added = added_sentence(impc.replace(result, lack=(model_error(), None)))
+    assert added.startswith("The residuals of a")
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "words"),
+    [
+        ("shift.place", 1.0, "a time shift of the place of the cart"),
+        ("shift.place", 1.0, "(it is recorded 100 ± 10 ms too late)"),
+        ("shift.push", -0.4, "(it acts 40 ± 10 ms earlier than recorded)"),
+        ("scale.place", -0.2, "an error of scale of the place of the cart (by -20 ± 10 %)"),
+        ("offset.place", 0.02, "an offset of the place of the cart (p"),  # of one trial, in m
+        ("clock.place", 1e-3, "a clock error of the place of the cart (by +0.1 ± 10 %)"),
+        ("limit", 0.05, "another limit of the command, by +5.0 ± 10.0 %"),
+    ],
+)
+def test_an_error_is_said_with_its_size(name: str, size: float, words: str) -> None:
+    """At 10 samples/s, with a standard error of 0.1."""
+    result = impc.replace(fitted(1.0), lack=(model_error(name, size),))
+    assert words in fit_verdict(result).alerts[0].found
+
+
+def test_a_corrected_error_is_said_with_its_remedy() -> None:
+    problem = SimpleNamespace(fitted_errors=[("clock", "place", [-1e-4, -3e-4])])
+    result: Any = SimpleNamespace(
+        given=fitted(1.0).given, estimate=SimpleNamespace(problem=problem)
+    )
+    said = remedy_words(result, ModelError("clock.place", 1e-9, 20.0, -2e-4, 1e-5))
+    assert said == (
+        "Correct the place of the cart for a clock error of \u22120.02 %, in the file or at the "
+        "device."
+    )
 
 
 @pytest.mark.parametrize(
@@ -116,9 +145,11 @@ def test_an_unconfirmed_gain_at_no_minimum_is_said(
     ended: Ended, unconfirmed: bool, said: bool
 ) -> None:
     result = explained()
-    fit = replace(result.fitted, fit=replace(result.fitted.fit, unconfirmed=unconfirmed))
-    methods = (*result.methods[:-1], replace(result.inverse_mpc, estimate=fit))
-    result = replace(result, methods=methods, estimate=replace(result.estimate, ended=ended))
+    fit = impc.replace(result.fitted, fit=impc.replace(result.fitted.fit, unconfirmed=unconfirmed))
+    methods = (*result.methods[:-1], impc.replace(result.inverse_mpc, estimate=fit))
+    result = impc.replace(
+        result, methods=methods, estimate=impc.replace(result.estimate, ended=ended)
+    )
     page = fit_report(result, Provenance()).page()
     assert ("did not end at a minimum, and no search from another start confirmed" in page) == said
 
@@ -134,7 +165,7 @@ def test_no_limit_and_a_limit_that_is_not_reached() -> None:
 
 def test_a_fall_is_said_and_counted() -> None:
     falls = ("trial_2.csv: the subject fell at 5.1 s",)
-    verdict = fit_verdict(replace(explained(), falls=falls))
+    verdict = fit_verdict(impc.replace(explained(), falls=falls))
     assert verdict.level is Level.AMBER
     assert "1 of 2 trials" in verdict.headline
     page = fallen_report(falls, Provenance()).page()
@@ -144,41 +175,40 @@ def test_a_fall_is_said_and_counted() -> None:
 
 def test_a_limit_that_the_recordings_contradict() -> None:
     """A warning if the estimated limit is far from the given one, beyond its uncertainty."""
-    alarm = LackOfFit((ModelError("limit", 1e-5, 11.5, -0.3, 0.01),), alarm=True, untestable=())
-    result = explained()
-    added = replace(result, lack=(alarm, None))
+    low, result = model_error("limit", -0.3, 0.01), explained()
+    added = impc.replace(result, lack=(low, None))
     names = tuple(result.given.plant.controls)
     for value, level in ((0.7, Level.AMBER), (1.002, Level.GREEN)):
         item = FittedParameter(f"u_max.{names[0]}", 1.0, value, 5e-4, 0.3, 0.0)
-        found = fit_verdict(replace(added, parameters=(item,)))
+        found = fit_verdict(impc.replace(added, parameters=(item,)))
         assert found.level is level
         assert ("probably wrong" in found.headline) == (level is Level.AMBER)
     close = FittedParameter(f"u_max.{names[0]}", 1.0, 0.95, 5e-4, 0.05, 0.0)
-    assert fit_verdict(replace(result, parameters=(close,))).level is Level.GREEN
+    assert fit_verdict(impc.replace(result, parameters=(close,))).level is Level.GREEN
     # Not estimated, but the residuals of the last fit still point to it.
-    doubted = fit_verdict(replace(result, lack=(alarm,)))
+    doubted = fit_verdict(impc.replace(result, lack=(low,)))
     assert any("u_max" in remedy for remedy in doubted.alerts[0].todo)
     assert not any("limit" in claim.text for claim in doubted.may)
 
 
 def test_what_is_not_given_is_said_with_what_that_excludes() -> None:
     source = plant_source("plants:seated_balance_for", {"mass": 70.0})
-    assert missing(FitSettings(), source) == (
+    assert missing(impc.FitSettings(), source) == (
         "Not given: u_max: without a limit of the command, inverse MPC equals inverse LQR; "
         "the subject's own height: the gains assume height 1.66."
     )
-    assert missing(FitSettings(u_max=6.0, free=["height"]), source) == ""
+    assert missing(impc.FitSettings(u_max=6.0, free=["height"]), source) == ""
     cursor = plant_source("plants:cursor_plant", {})
-    assert missing(FitSettings(u_max=6.0), cursor) == ""
+    assert missing(impc.FitSettings(u_max=6.0), cursor) == ""
 
 
 def test_angles_are_shown_as_is_asked() -> None:
     """Units of angles in the figures of a fit."""
     result = fitted(1.0)
-    turned = replace(result.given.plant, units=(("place", "rad"), ("pull", "rad/s^2")))
+    turned = impc.replace(result.given.plant, units=(("place", "rad"), ("pull", "rad/s^2")))
     own = result.inverse_mpc
-    problem = replace(own.estimate.problem, plant=turned)
-    shown = replace(own, estimate=replace(own.estimate, problem=problem))
+    problem = impc.replace(own.estimate.problem, plant=turned)
+    shown = impc.replace(own, estimate=impc.replace(own.estimate, problem=problem))
     for angles, label, factor in (("degrees", "°", 180 / np.pi), ("radians", "rad", 1.0)):
         with angles_in(angles), page_style():
             ax = movement_figure(shown, 0).axes[0]
@@ -233,13 +263,3 @@ def test_a_range_of_one_value_is_drawn() -> None:
     marked = [line for line in ax.lines if line.get_marker() == "|"]
     assert [float(np.asarray(line.get_xdata())[0]) for line in marked] == at
     assert len(at) == 1
-
-
-@pytest.mark.parametrize("vaf", [40.0, 60.0])
-def test_little_is_called_little(vaf: float) -> None:
-    plain = explained()
-    poor = replace(plain.inverse_mpc, vaf=np.array([vaf]))
-    result = replace(plain, methods=(*plain.methods[:-1], poor))
-    verdict = fit_verdict(result)
-    assert (verdict.level is Level.RED) == (vaf < 50)
-    assert ("less than half" in verdict.headline) == (vaf < 50)

@@ -1,11 +1,17 @@
-"""Intraclass correlations against published tables, pingouin, and simulation."""
+"""ICC, analysis of variance and trends against tables, pingouin, statsmodels and simulation."""
 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
+import scipy.stats
+import statsmodels.api as sm
+from statsmodels.formula.api import ols
 
-from impc.errors import DataError
+import impc
+from impc.arrays import Array
+from impc.studies.reliability.anova import learning_trend, visit_anova
 from impc.studies.reliability.icc import Form, icc, mean_squares, measurement_error
 
 FORMS: tuple[Form, ...] = ("A,1", "A,k")
@@ -27,19 +33,13 @@ def study(
     )
 
 
-def test_mean_squares_of_shrout_and_fleiss() -> None:
-    """Table 3 of Shrout and Fleiss."""
+def test_mean_squares_and_estimates_of_shrout_and_fleiss() -> None:
+    """Tables 3 and 4 of Shrout and Fleiss."""
     found = mean_squares(SHROUT_FLEISS)
-    assert found.subjects == pytest.approx(11.24, abs=5e-3)
-    assert found.within == pytest.approx(6.26, abs=5e-3)
-    assert found.occasions == pytest.approx(32.49, abs=5e-3)
-    assert found.error == pytest.approx(1.02, abs=5e-3)
-
-
-@pytest.mark.parametrize(("form", "value"), [("A,1", 0.29), ("A,k", 0.62)])
-def test_estimates_of_shrout_and_fleiss(form: Form, value: float) -> None:
-    """Table 4 of Shrout and Fleiss."""
-    assert icc(SHROUT_FLEISS, form).value == pytest.approx(value, abs=5e-3)
+    squares = found.subjects, found.within, found.occasions, found.error
+    assert squares == pytest.approx((11.24, 6.26, 32.49, 1.02), abs=5e-3)
+    for form, value in zip(FORMS, (0.29, 0.62), strict=True):
+        assert icc(SHROUT_FLEISS, form).value == pytest.approx(value, abs=5e-3)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -77,6 +77,7 @@ def test_perfect_agreement_and_no_variance() -> None:
     for form in FORMS:
         found = icc(same, form)
         assert (found.value, found.low, found.high) == (1.0, 1.0, 1.0)
+    assert icc(same, "A,k", method="generalised").low == 1.0
     assert np.isnan(icc(np.ones((4, 3)), "A,1").value)
 
 
@@ -166,17 +167,14 @@ def test_generalised_intervals_cover_where_visits_differ_much(form: Form) -> Non
 def test_generalised_intervals_are_not_random() -> None:
     found = icc(SHROUT_FLEISS, "A,1", method="generalised")
     assert found == icc(SHROUT_FLEISS, "A,1", method="generalised"), "nothing in it is random"
-    same = np.repeat(np.arange(5.0)[:, None], 3, axis=1)
-    assert icc(same, "A,k", method="generalised").low == 1.0
 
 
-@pytest.mark.parametrize(
-    ("scores", "match"),
-    [(np.ones((5, 1)), "1 occasion"), (np.ones((1, 3)), "1 subject")],
-)
-def test_too_little_is_a_sentence(scores: np.ndarray, match: str) -> None:
-    with pytest.raises(DataError, match=match):
-        icc(scores)
+def test_too_little_is_a_sentence() -> None:
+    for shape, match in (((5, 1), "1 occasion"), ((1, 3), "1 subject")):
+        with pytest.raises(impc.DataError, match=match):
+            icc(np.ones(shape))
+    with pytest.raises(impc.DataError, match="same at all visits"):
+        visit_anova(np.ones((4, 3)))
 
 
 #: What pingouin 0.7.0 prints (GPL: not a dependency) for the tables of `pingouin_table`.
@@ -202,3 +200,45 @@ def test_pingouin_prints_the_same(size: tuple[int, int, int], form: Form) -> Non
     assert found.value == pytest.approx(value, abs=5e-7)
     assert found.low == pytest.approx(low, abs=5.001e-3)
     assert found.high == pytest.approx(high, abs=5.001e-3)
+
+
+SEED = 5
+
+
+def scores(subjects: int = 12, visits: int = 3, shift: float = 0.4) -> Array:
+    rng = np.random.default_rng(SEED)
+    table = rng.standard_normal((subjects, 1)) + 0.5 * rng.standard_normal((subjects, visits))
+    return np.asarray(table + shift * np.arange(visits))
+
+
+def test_anova_is_that_of_a_two_way_model() -> None:
+    """Against statsmodels' ordinary analysis of variance with subjects as a factor."""
+    table = scores()
+    long = pd.DataFrame(
+        [(i, j, table[i, j]) for i in range(12) for j in range(3)], columns=["s", "v", "y"]
+    )
+    found = visit_anova(table)
+    expected = sm.stats.anova_lm(ols("y ~ C(s) + C(v)", long).fit())
+    assert pytest.approx(expected.loc["C(v)", "F"]) == found.F
+    assert found.p == pytest.approx(expected.loc["C(v)", "PR(>F)"])
+
+
+def test_greenhouse_geisser_of_a_published_matrix() -> None:
+    """epsilon = k^2 (mean diagonal - mean)^2 / ((k-1)(sum s^2 - 2k sum rows^2 + k^2 mean^2))."""
+    table = scores(subjects=9)
+    S = np.cov(table, rowvar=False)
+    k = 3
+    above = k**2 * (np.mean(np.diag(S)) - S.mean()) ** 2
+    below = (k - 1) * (np.sum(S**2) - 2 * k * np.sum(S.mean(axis=1) ** 2) + k**2 * S.mean() ** 2)
+    found, epsilon = visit_anova(table), above / below
+    expected = scipy.stats.f.sf(found.F, 2 * epsilon, 16 * epsilon)
+    assert found.p_corrected == pytest.approx(expected)
+
+
+def test_learning_trend() -> None:
+    found = learning_trend(scores(200, 3, 0.4))
+    assert found.low < 0.4 < found.high
+    assert found.p < 1e-10
+    two = scores(10, 2)
+    expected = scipy.stats.ttest_rel(two[:, 1], two[:, 0])
+    assert learning_trend(two).p == pytest.approx(expected.pvalue)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.signal
 
+import impc
 import plants
 from impc.arrays import Array
-from impc.errors import DataError
 from impc.studies.reliability.analysis import cmc
 from impc.studies.reliability.measures import band_energy, passband, rms, transfer_function
 
@@ -47,7 +47,7 @@ def test_passband_of_an_input_that_is_cut_inside_its_period() -> None:
 
 
 def test_an_empty_passband_is_a_sentence() -> None:
-    with pytest.raises(DataError, match="is constant"):
+    with pytest.raises(impc.DataError, match="is constant"):
         passband(np.ones(500), RATE)
 
 

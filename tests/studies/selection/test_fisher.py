@@ -8,12 +8,11 @@ import tracemalloc
 import numpy as np
 import pytest
 
+import impc
 import impc.studies.selection.fisher
 import plants
 from experiments.reproduction.selection import kronecker_sensitivity
 from experiments.selection_claims import exhaustive
-from impc.checking import replace
-from impc.errors import DataError, InputError
 from impc.studies.selection.estimation import estimate, free_indices, multi_start
 from impc.studies.selection.fisher import (
     fisher_information,
@@ -31,19 +30,13 @@ TRIALS = head_trials(MODEL, NOMINAL, 0.8226, SEED)
 FOUND = fisher_information(MODEL, NOMINAL, TRIALS)
 
 
-def test_sensitivities_against_differences() -> None:
-    """Central differences of 1e-4 in normalised units: 1e-6 of the largest."""
+def test_sensitivities_against_differences_and_the_kronecker_recursion() -> None:
+    """Central differences of 1e-4 in normalised units: 1e-6 of the largest; (A.3): 1e-8."""
     given = TRIALS[0].input
     _, exact = sensitivity(MODEL, NOMINAL, given)
-    _, differences = sensitivity(replace(MODEL, jacobian=None), NOMINAL, given)
+    _, differences = sensitivity(impc.replace(MODEL, jacobian=None), NOMINAL, given)
     scale = np.max(np.abs(exact), axis=0) + 1e-6 * np.max(np.abs(exact))
     assert np.all(np.abs(differences - exact) <= 1e-6 * scale)
-
-
-def test_sensitivities_against_the_kronecker_recursion() -> None:
-    """(A.3): 1e-8."""
-    given = TRIALS[0].input
-    _, exact = sensitivity(MODEL, NOMINAL, given)
     matrices = plants.head_neck_matrices()
     recursion = kronecker_sensitivity(matrices, NOMINAL, 1 / 60, given) * MODEL.gain
     np.testing.assert_allclose(recursion, exact, atol=1e-8 * np.max(np.abs(exact)))
@@ -132,13 +125,12 @@ def test_models_are_checked() -> None:
     def one(p: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.asarray(u * p[0])
 
-    with pytest.raises(InputError, match="is outside"):
-        parametric_model(["a"], [0], [1], [2], one)
-    with pytest.raises(InputError, match="low < high"):
-        parametric_model(["a"], [1], [1], [1], one)
-    with pytest.raises(InputError, match="unknown name"):
+    for low, typical, said in ((0, 2, "is outside"), (1, 1, "low < high")):
+        with pytest.raises(impc.InputError, match=said):
+            parametric_model(["a"], [low], [1], [typical], one)
+    with pytest.raises(impc.InputError, match="unknown name"):
         free_indices(MODEL, ["mass"])
-    with pytest.raises(DataError, match="the list is empty"):
+    with pytest.raises(impc.DataError, match="the list is empty"):
         estimate(MODEL, [], (0,), NOMINAL)
 
 
@@ -147,7 +139,7 @@ def test_subsets_beyond_number_are_refused_and_not_begun(monkeypatch: pytest.Mon
     monkeypatch.setattr(impc.studies.selection.fisher, "_MOST", 2000)
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match="more than 2000 subsets keep a variance of 2"):
+        with pytest.raises(impc.InputError, match="more than 2000 subsets keep a variance of 2"):
             largest_subsets([np.eye(40)], 2.0)
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:

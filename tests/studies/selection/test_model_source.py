@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impc.errors import DataError
+import impc
 from impc.studies.cache import Cache
 from impc.studies.pool import Result
 from impc.studies.scheduler import Cluster, connected
@@ -57,5 +57,5 @@ def test_workers_give_the_same_and_it_is_kept(tmp_path: Path) -> None:
 def test_a_fault_on_a_worker_is_its_sentence_and_whose_it_is(tmp_path: Path) -> None:
     source = model_source("tests.studies.selection.dosing:blood_model", {})
     run = on_pool(ThisProcess(), source, Cache(tmp_path))
-    with pytest.raises(DataError, match=r"^a: .*the list is empty"):
+    with pytest.raises(impc.DataError, match=r"^a: .*the list is empty"):
         run(refit_subsets, FITS, {"a": ((), SUBSETS)})

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import impc
 from impc.arrays import Array
 from impc.assess.long_run_covariance import residual_noise, white_noise
 from impc.cli.main import main
-from impc.errors import InputError
 from impc.studies.selection.estimation import estimate, estimate_with_prior
 from impc.studies.selection.model import Trial, parametric_model
 from impc.studies.selection.report import note_of, read_truths
@@ -117,9 +117,9 @@ def test_deviations_are_checked_and_default_to_a_quarter_of_the_range() -> None:
     given = ["a"], [0.0], [4.0], [1.0], lambda p, u: u * p
     assert parametric_model(*given).deviation == [1.0]
     for wrong in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="deviation"):
+        with pytest.raises(impc.InputError, match="deviation"):
             parametric_model(*given, deviation=[wrong])
-    with pytest.raises(InputError, match="one per parameter"):
+    with pytest.raises(impc.InputError, match="one per parameter"):
         parametric_model(*given, deviation=[1.0, 1.0])
 
 

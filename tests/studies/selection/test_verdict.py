@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impc.errors import DataError
+import impc
 from impc.reporting.document import Checks, Copy, Report
 from impc.reporting.rendering import number
 from impc.studies.selection.analysis import select_study
@@ -118,5 +118,5 @@ def test_the_interval_of_an_icc_decides_not_the_icc(
 
 
 def test_one_person_has_no_key_parameters() -> None:
-    with pytest.raises(DataError, match="1 subjects with all visits, and 2 visits"):
+    with pytest.raises(impc.DataError, match="1 subjects with all visits, and 2 visits"):
         keyed(0.1, 1)
