@@ -263,3 +263,20 @@ def test_a_range_of_one_value_is_drawn() -> None:
     marked = [line for line in ax.lines if line.get_marker() == "|"]
     assert [float(np.asarray(line.get_xdata())[0]) for line in marked] == at
     assert len(at) == 1
+
+
+def test_weights_that_fit_as_well_forbid_a_gain_that_excludes_them() -> None:
+    """Two trials of 15 s in a laboratory: 220 by standard errors, 24.7 by the likelihood."""
+    result = explained()
+    ours = impc.replace(
+        result.weights_test, statistic=220.0, likelihood_ratio=24.7, freedom=10, p_value=0.006
+    )
+    found = fit_verdict(impc.replace(result, weights_test=ours))
+    assert found.level is Level.AMBER
+    assert "less certain than its interval" in found.headline
+    assert "(chi-squared 24.7)" in found.alerts[0].found
+    assert {GAIN, WEIGHTS} <= forbidden(impc.replace(result, weights_test=ours))
+    both = impc.replace(ours, likelihood_ratio=200.0, p_value=1e-9)
+    rejected = impc.replace(result, weights_test=both)
+    assert "no cost weights explain it" in fit_verdict(rejected).headline
+    assert GAIN not in forbidden(rejected)
