@@ -33,8 +33,6 @@ from plants._checks import finite_number
 from plants._units import with_uncertainty, with_units
 from plants.actuation import delayed_muscle
 
-__all__ = ["cursor_plant", "pursuit_plant"]
-
 _ARGUMENTS = {
     "delay": ("visuomotor delay", "s"),
     "lag": ("lag of the hand", "s"),

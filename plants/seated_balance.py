@@ -36,18 +36,7 @@ from plants._checks import finite_number
 from plants._units import with_units
 from plants.actuation import delayed_muscle
 from plants.seated_drawing import seated_lines
-from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
-
-__all__ = [
-    "SeatedBalanceLimits",
-    "SeatedBalanceParameters",
-    "body_dynamics",
-    "continuous_seated_balance_plant",
-    "mass_matrix",
-    "nonlinear_dynamics",
-    "seated_balance_plant",
-    "seated_balance_slopes",
-]
+from plants.seated_parameters import SeatedBalanceParameters
 
 _BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 _INPUTS = ("command", "perturbation")
@@ -259,24 +248,6 @@ def _body_rate(p: Any, state: ca.SX, inputs: ca.SX) -> Any:
         gravity2 + coupling * rate1**2 + lumbar + u,
     )
     return ca.vertcat(rate1, rate2, ca.solve(_mass(p, angle), moments))
-
-
-def mass_matrix(parameters: SeatedBalanceParameters | None = None) -> ca.Function:
-    """Return the mass matrix of the two bodies as a function of their angles.
-
-    Parameters
-    ----------
-    parameters : SeatedBalanceParameters, optional
-        The defaults if omitted.
-
-    Returns
-    -------
-    casadi.Function
-        (angles (2) in rad) -> M (2, 2) in kg m^2, symmetric and positive definite.
-    """
-    angles = ca.SX.sym("angles", 2)
-    matrix = _mass(parameters or SeatedBalanceParameters(), angles[0] - angles[1])
-    return ca.Function("mass_matrix", [angles], [matrix], ["angles"], ["M"])
 
 
 def _mass(p: Any, angle: ca.SX) -> ca.SX:

@@ -92,7 +92,7 @@ def _tables(result: dict[str, Any]) -> list[Entry]:
 
 
 def _figures(result: dict[str, Any]) -> list[Entry]:
-    sequence = np.array(ternary_sequence(5))
+    sequence = np.array(ternary_sequence())
     half = len(sequence) // 2
     opposite = bool(np.all(sequence[:half] == -sequence[half:]))
     band = result["passband"]

@@ -50,12 +50,3 @@ def test_chain_ends_in_the_muscle_torque_without_feedthrough() -> None:
     assert chain.D == 0.0
     assert chain.response(0.0) == pytest.approx(1.0, abs=1e-13)
     np.testing.assert_allclose(delayed_muscle(DELAY, MUSCLE, 0).A, [[-1 / MUSCLE]])
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [("delay", (0.0, 0.06, 5)), ("time_constant", (0.08, -1.0, 5)), ("order", (0.08, 0.06, 2.0))],
-)
-def test_bad_chains_are_refused_by_name(name: str, arguments: tuple[float, float, int]) -> None:
-    with pytest.raises(ValueError, match=rf"^{name}: expected .*, got .*; "):
-        delayed_muscle(*arguments)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import control
 import numpy as np
 import pytest
-import scipy.integrate
 
 import plants
 
@@ -38,23 +37,9 @@ def test_a_step_command_gives_the_position_of_a_delayed_lag() -> None:
     response = control.forced_response(
         system, time, np.vstack([np.ones_like(time), np.zeros_like(time)])
     )
-
-    def position(t: float) -> float:
-        s = max(t - delay, 0.0)
-        return float(s**2 / 2 - lag * s + lag**2 * (1 - np.exp(-s / lag)))
-
-    exact = np.array([position(t) for t in time])
+    s = np.maximum(time - delay, 0.0)
+    exact = s**2 / 2 - lag * s + lag**2 * (1 - np.exp(-s / lag))
     np.testing.assert_allclose(response.outputs[0], exact, atol=2e-3 * exact[-1])
-    check, _ = scipy.integrate.quad(lambda s: (1 - s) * (1 - np.exp(-s / lag)), 0, 1)
-    assert position(1 + delay) == pytest.approx(check)
-
-
-@pytest.mark.parametrize(
-    "arguments", [{"delay": 0}, {"lag": -1}, {"sample_time": 0}, {"delay_order": -1}]
-)
-def test_bad_arguments(arguments: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(arguments)).replace("delay_order", "order")):
-        plants.cursor_plant(**arguments)  # type: ignore[arg-type]
 
 
 def test_the_pursued_hand_answers_whole_samples_late() -> None:
@@ -68,11 +53,3 @@ def test_the_pursued_hand_answers_whole_samples_late() -> None:
     exact = since - lag * (1 - np.exp(-since / lag))
     np.testing.assert_allclose(response.outputs[0], exact, atol=1e-14)
     np.testing.assert_array_equal(system.B[:, 1], [-dt, *np.zeros(delay + 1)])
-
-
-@pytest.mark.parametrize(
-    "arguments", [{"delay": 0}, {"delay": 1.5}, {"delay": True}, {"lag": 0}, {"sample_time": -1}]
-)
-def test_bad_arguments_of_the_pursued_hand(arguments: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        plants.pursuit_plant(**arguments)  # type: ignore[arg-type]

@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 
 import plants
-from plants import HEAD_NECK_FIXED, TABLE_4_3
+from plants import HEAD_NECK_FIXED, table_4_3_column
 
-NOMINAL = np.array([float(value or 0) for value in TABLE_4_3["nominal"]])
-
-
-def column(name: str) -> np.ndarray:
-    return np.array(
-        [
-            base if value is None else value
-            for value, base in zip(TABLE_4_3[name], NOMINAL, strict=True)
-        ],
-        dtype=float,
-    )
+NOMINAL = table_4_3_column("nominal")
 
 
 def loop(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -43,7 +33,7 @@ REFERENCE = {
 @pytest.mark.parametrize("name", REFERENCE)
 def test_margins_of_the_columns_of_table_4_3(name: str) -> None:
     """From the blocks with an exact delay, and from the one fraction with Padé's: 2 %."""
-    theta = column(name)
+    theta = table_4_3_column(name)
     crossover, margin, gain, dc, band, peak = REFERENCE[name]
     w = np.geomspace(1e-2, 60, 200_000)
     L = loop(theta, w)
