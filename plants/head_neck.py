@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plants._checks import finite_number, whole_number
-from plants._units import with_units
+from plants._units import with_signals
 from plants.actuation import pade_delay
 
 #: An axis of the head, for annotations.
@@ -175,9 +175,8 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw") -> Any:
         finite_number(item.name, float(value), f"give it in {item.unit}")
     A, B, C = (item.full() for item in head_neck_matrices(axis)(given))
     names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
-    words = {"reference": "target angle", "head": "head angle"}
-    units = dict.fromkeys(words, "rad")
-    return with_units(control.ss(A, B, C, 0, **names), units, words)
+    signals = {"reference": ("rad", "target angle"), "head": ("rad", "head angle")}
+    return with_signals(control.ss(A, B, C, 0, **names), signals)
 
 
 def step_reference(

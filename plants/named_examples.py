@@ -11,7 +11,7 @@ from typing import Any
 import control
 import numpy as np
 
-from plants._units import with_units
+from plants._units import with_signals
 
 
 def yalmip_example() -> Any:
@@ -30,4 +30,4 @@ def yalmip_example() -> Any:
     names: dict[str, Any] = {"states": ["x1", "x2"], "inputs": ["u"], "outputs": ["x1", "x2"]}
     A, B = [[2.0, -1.0], [1.0, 0.2]], [[1.0], [0.0]]
     system = control.ss(A, B, np.eye(2), np.zeros((2, 1)), dt=1.0, name="yalmip", **names)
-    return with_units(system, dict.fromkeys(("x1", "x2", "u"), "1"))
+    return with_signals(system, dict.fromkeys(("x1", "x2", "u"), ("1",)))
