@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
     from experiments.peer_systems import PeerSystem
     from impc.arrays import Array
+    from impc.nonlinear.closed_loop import OptimalRecording
     from impc.nonlinear.combinations import Combination, Combinations
-    from impc.nonlinear.recordings import OptimalRecording
 
 __all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from", "identified_error"]
 
