@@ -85,7 +85,7 @@ def _information(
         Entry(
             "(A.1)",
             "Discrete state space with white measurement noise.",
-            ("impc.studies.selection.linear:linear_functions",),
+            ("impc.studies.selection.model:linear_functions",),
             f"{matrices.size1_out(0)} states, sampled exactly; {len(outputs)} samples a trial.",
             Verdict.REPRODUCED,
         ),

@@ -164,8 +164,8 @@ def _claims(result: dict[str, Any]) -> list[Entry]:
         "Claim, 2.3",
         "Learning: RMS fell over visits with eyes open and with vibration, energy with vibration.",
         (
-            "impc.studies.reliability.anova:visit_anova",
-            "impc.studies.reliability.anova:learning_trend",
+            "impc.studies.reliability.icc:visit_anova",
+            "impc.studies.reliability.icc:learning_trend",
         ),
         f"Least of the twelve p values {least:.2f}.",
         kind(least <= _SIGNIFICANT),
@@ -228,7 +228,7 @@ def _p_values(result: dict[str, Any], item: str, measure: str, quoted: str) -> E
         item,
         f"Means over visits, and p values of the analysis of variance (lower and upper body):"
         f" {quoted}.",
-        ("impc.studies.reliability.anova:visit_anova",),
+        ("impc.studies.reliability.icc:visit_anova",),
         f"p: {found}.",
         Verdict.LOST,
         "The means are lost; p values belong to the thirty subjects. The simulated ones do not"

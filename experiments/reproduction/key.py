@@ -62,7 +62,7 @@ def _key_equations(yaw: dict[str, Any]) -> list[Entry]:
             "(5.6), (5.7)",
             "Reliability of a subset: its least ICC(A,k); at least .75.",
             (
-                "impc.studies.selection.key_parameters:key_parameters",
+                "impc.studies.selection.analysis:key_parameters",
                 "impc.studies.reliability.icc:icc",
             ),
             f"Least of all candidates {least:.2f}. impc asks for the lower end of the 95 %"
@@ -150,7 +150,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Three key parameters of twelve, in yaw and in pitch (names lost).",
-            ("impc.studies.selection.key_parameters:key_parameters",),
+            ("impc.studies.selection.analysis:key_parameters",),
             "; ".join(f"{name}: {', '.join(axis['chosen'])}" for name, axis in both.items()) + ".",
             kind(all(len(axis["chosen"]) == 3 for axis in both.values())),
             _FORTY,
@@ -158,7 +158,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Feasible at ICC of .75: one in yaw (diversity 2), three in pitch (3, 2, 2).",
-            ("impc.studies.selection.key_parameters:key_parameters",),
+            ("impc.studies.selection.analysis:key_parameters",),
             "; ".join(
                 f"{name}: {len(items)} (diversity {', '.join(str(i['pathways']) for i in items)})"
                 for name, items in kept.items()
@@ -171,7 +171,7 @@ def _key_claims(yaw: dict[str, Any], pitch: dict[str, Any]) -> list[Entry]:
         Entry(
             "Claim, 5.3",
             "Mean VAF above 69 %.",
-            ("impc.studies.selection.key_parameters:key_parameters",),
+            ("impc.studies.selection.analysis:key_parameters",),
             "; ".join(
                 f"{name}: {min(i['mean_vaf_percent'] for i in items):.1f} to"
                 f" {max(i['mean_vaf_percent'] for i in items):.1f} %"

@@ -11,7 +11,7 @@ from statsmodels.formula.api import ols
 
 from impc.arrays import Array
 from impc.errors import DataError
-from impc.studies.reliability.anova import learning_trend, visit_anova
+from impc.studies.reliability.icc import learning_trend, visit_anova
 
 SEED = 5
 
