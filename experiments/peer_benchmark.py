@@ -27,8 +27,8 @@ from impc.nonlinear.plan import SOLVERS
 if TYPE_CHECKING:
     from experiments.peer_systems import PeerSystem
     from impc.arrays import Array
+    from impc.nonlinear.closed_loop import OptimalRecording
     from impc.nonlinear.combinations import Combination
-    from impc.nonlinear.recordings import OptimalRecording
 
 __all__ = ["LOOPS", "Outcome", "coverage", "demonstration", "fit_from"]
 

@@ -1,7 +1,7 @@
 """Plants as `control.StateSpace` with named signals and units; independent of impc."""
 
-from plants.actuation import LinearSystem, delayed_muscle, pade_delay
-from plants.anthropometry import SeatLayout, from_anthropometry
+from plants.actuation import delayed_muscle, pade_delay
+from plants.anthropometry import from_anthropometry
 from plants.cursor import cursor_plant, pursuit_plant
 from plants.head_neck import (
     HEAD_NECK_FIXED,
@@ -15,39 +15,24 @@ from plants.head_neck import (
     table_4_3_column,
 )
 from plants.integration import runge_kutta_step
-from plants.named_examples import (
-    bbm_example,
-    cannon_example,
-    unstable_integrator_example,
-    yalmip_example,
-)
+from plants.named_examples import yalmip_example
 from plants.seated_balance import (
     body_dynamics,
     continuous_seated_balance_plant,
-    mass_matrix,
     nonlinear_dynamics,
     seated_balance_plant,
 )
-from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
-from plants.seated_subject import (
-    seated_balance_for,
-    seated_balance_step_for,
-    seated_parameters_for,
-)
-from plants.ternary import maximal_recurrence, ternary_sequence, ternary_torque
+from plants.seated_parameters import SeatedBalanceParameters
+from plants.seated_subject import seated_balance_for, seated_balance_step_for, seated_parameters_for
+from plants.ternary import ternary_sequence, ternary_torque
 
 __all__ = [
     "HEAD_NECK_FIXED",
     "HEAD_NECK_PARAMETERS",
     "TABLE_4_3",
     "HeadNeckParameter",
-    "LinearSystem",
-    "SeatLayout",
-    "SeatedBalanceLimits",
     "SeatedBalanceParameters",
-    "bbm_example",
     "body_dynamics",
-    "cannon_example",
     "continuous_seated_balance_plant",
     "cursor_plant",
     "delayed_muscle",
@@ -55,8 +40,6 @@ __all__ = [
     "head_neck_matrices",
     "head_neck_model",
     "head_neck_plant",
-    "mass_matrix",
-    "maximal_recurrence",
     "nonlinear_dynamics",
     "pade_delay",
     "pursuit_plant",
@@ -69,6 +52,5 @@ __all__ = [
     "table_4_3_column",
     "ternary_sequence",
     "ternary_torque",
-    "unstable_integrator_example",
     "yalmip_example",
 ]

@@ -7,8 +7,6 @@ from numbers import Integral, Real
 
 import numpy as np
 
-__all__ = ["Array", "finite_number", "whole_number"]
-
 #: An array of float64.
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 

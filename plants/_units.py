@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["with_uncertainty", "with_units"]
 
-
-def with_units(
-    system: Any,
-    units: dict[str, str],
-    words: dict[str, str] | None = None,
-    directions: dict[str, str] | None = None,
-) -> Any:
-    """Attach `units`, `words` and what is positive (`directions`) by signal name."""
-    system.units = units
-    system.words = words or {}
-    system.directions = directions or {}
+def with_signals(system: Any, signals: Mapping[str, tuple[str, ...]]) -> Any:
+    """Attach the unit of each signal and, where given, its words and what is positive."""
+    for place, kind in enumerate(("units", "words", "directions")):
+        given = {name: each[place] for name, each in signals.items() if len(each) > place}
+        setattr(system, kind, given)
     return system
 
 

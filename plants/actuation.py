@@ -15,8 +15,6 @@ import numpy as np
 
 from plants._checks import Array, finite_number, whole_number
 
-__all__ = ["MAX_DELAY_ORDER", "LinearSystem", "delayed_muscle", "pade_delay"]
-
 #: Largest order of a Padé approximant; order 10 is exact to 1e-15 if delay times frequency is 1.6.
 MAX_DELAY_ORDER = 20
 

@@ -18,13 +18,10 @@ Assumptions
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from plants._checks import finite_number
-from plants.seated_parameters import Quantities, SeatedBalanceParameters, quantity
-
-__all__ = ["DE_LEVA", "SeatLayout", "Segment", "from_anthropometry"]
+from plants.seated_parameters import SeatedBalanceParameters
 
 Sex = Literal["male", "female"]
 
@@ -90,52 +87,19 @@ DE_LEVA: dict[str, tuple[float, dict[str, Segment]]] = {
 }
 
 
-@dataclass(frozen=True)
-class SeatLayout(Quantities):
-    """Geometry of seat and posture; all values are assumed, not measured.
-
-    The last three values and the seat's centre are chosen within a plausible range such that a man
-    of 79.7 kg and 1.66 m has the default `SeatedBalanceParameters`.
-
-    Attributes
-    ----------
-    seat_mass : float
-        Mass of the seat, kg.
-    seat_radius : float
-        Radius of gyration of the seat in the frontal plane, m.
-    seat_centre : float
-        Height of the centre of mass of the seat above the pivot, m.
-    pivot_depth : float
-        Depth of the pivot below the surface of the seat, m.
-    hip_height : float
-        Height of the hip joints above the surface of the seat, m.
-    upper_arm_height, forearm_height : float
-        Heights of the centres of mass of the upper arms and of the folded forearms and hands
-        above the lumbar joint, m at the mean height of the sample.
-    shoulder : float
-        Distance of the upper arms from the midline, m at the mean height of the sample.
-    leg : float
-        Distance of the legs from the midline, m.
-    foot_drop : float
-        Depth of the centre of mass of the foot below the ankle (lateral malleolus), m.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite, or one other than seat_centre, pivot_depth, upper_arm_height and
-        forearm_height is negative.
-    """
-
-    seat_mass: float = quantity(20.0, "kg", "chosen", least=0.0)
-    seat_radius: float = quantity(0.25, "m", "chosen", least=0.0)
-    seat_centre: float = quantity(-0.02, "m", "chosen")
-    pivot_depth: float = quantity(0.05, "m", "chosen")
-    hip_height: float = quantity(0.09, "m", "chosen", least=0.0)
-    upper_arm_height: float = quantity(0.25, "m", "chosen")
-    forearm_height: float = quantity(0.20, "m", "chosen")
-    shoulder: float = quantity(0.20, "m", "chosen", least=0.0)
-    leg: float = quantity(0.09, "m", "chosen", least=0.0)
-    foot_drop: float = quantity(0.03, "m", "chosen", least=0.0)
+# Geometry of seat and posture, all assumed. The heights of the arms, the breadth of the shoulders,
+# the depth of the foot and the seat's centre are chosen within a plausible range such that a man of
+# 79.7 kg and 1.66 m has the default `SeatedBalanceParameters`.
+# Seat: mass (kg), radius of gyration in the frontal plane, and centre of mass above the pivot, m.
+_SEAT_MASS, _SEAT_RADIUS, _SEAT_CENTRE = 20.0, 0.25, -0.02
+# Depth of the pivot below the surface of the seat, and height of the hip joints above it, m.
+_PIVOT, _HIP = 0.05, 0.09
+# Centres of mass of the upper arms and of the folded forearms and hands above the lumbar joint, and
+# distance of the upper arms from the midline, m at the mean height of the sample.
+_UPPER_ARM, _FOREARM, _SHOULDER = 0.25, 0.20, 0.20
+# Distance of the legs from the midline, and of the foot's centre of mass below the ankle (lateral
+# malleolus), m.
+_LEG, _FOOT_DROP = 0.09, 0.03
 
 
 class _Part(NamedTuple):
@@ -147,9 +111,7 @@ class _Part(NamedTuple):
     radius: float
 
 
-def from_anthropometry(
-    mass: float, height: float, sex: Sex = "male", layout: SeatLayout | None = None
-) -> SeatedBalanceParameters:
+def from_anthropometry(mass: float, height: float, sex: Sex = "male") -> SeatedBalanceParameters:
     """Estimate masses, lengths and inertias; the other parameters keep their defaults.
 
     Parameters
@@ -160,8 +122,6 @@ def from_anthropometry(
         Standing height in m, from 1 to 2.5; the fractions are for adults.
     sex : {"male", "female"}
         Sample of de Leva.
-    layout : SeatLayout, optional
-        Geometry of seat and posture.
 
     Returns
     -------
@@ -171,8 +131,7 @@ def from_anthropometry(
     Raises
     ------
     ValueError
-        If an argument is out of range, or the layout puts the lumbar joint below the pivot or the
-        upper body below the joint.
+        If an argument is out of range.
 
     Notes
     -----
@@ -182,35 +141,34 @@ def from_anthropometry(
     height = finite_number("height", height, "give it in m", least=1.0, most=2.5)
     if sex not in DE_LEVA:
         raise ValueError(f"sex: expected one of {list(DE_LEVA)}, got {sex!r:.60}; give one of them")
-    layout = layout or SeatLayout()
     mean_height, segments = DE_LEVA[sex]
     scale = height / mean_height
     sized = {
         name: each._replace(mass=each.mass * mass, length=each.length * scale)
         for name, each in segments.items()
     }
-    hip = layout.pivot_depth + layout.hip_height
-    m1, l1, J1 = _combine(_lower_body(sized, layout, hip))
-    m2, l2, J2 = _combine(_upper_body(sized, layout, scale))
+    hip = _PIVOT + _HIP
+    m1, l1, J1 = _combine(_lower_body(sized, hip))
+    m2, l2, J2 = _combine(_upper_body(sized, scale))
     l12 = hip + sized["lower trunk"].length
     return SeatedBalanceParameters(m1=m1, m2=m2, l1=l1, l2=l2, l12=l12, J1=J1, J2=J2)
 
 
-def _lower_body(segments: dict[str, Segment], layout: SeatLayout, hip: float) -> list[_Part]:
+def _lower_body(segments: dict[str, Segment], hip: float) -> list[_Part]:
     """Pelvis, legs and seat; heights relative to the pivot."""
     pelvis, thigh, shank, foot = (segments[s] for s in ("lower trunk", "thigh", "shank", "foot"))
     ankle = hip - shank.length
     knee_to_centre = shank.centre * shank.length
     return [
         _standing(pelvis, hip + (1 - pelvis.centre) * pelvis.length),
-        _pointing_forwards(thigh, hip, layout.leg),
-        _standing(shank, hip - knee_to_centre, layout.leg, sides=2),
-        _pointing_forwards(foot, ankle - layout.foot_drop, layout.leg),
-        _Part(layout.seat_mass, layout.seat_centre, 0.0, layout.seat_radius),
+        _pointing_forwards(thigh, hip),
+        _standing(shank, hip - knee_to_centre, _LEG, sides=2),
+        _pointing_forwards(foot, ankle - _FOOT_DROP),
+        _Part(_SEAT_MASS, _SEAT_CENTRE, 0.0, _SEAT_RADIUS),
     ]
 
 
-def _upper_body(segments: dict[str, Segment], layout: SeatLayout, scale: float) -> list[_Part]:
+def _upper_body(segments: dict[str, Segment], scale: float) -> list[_Part]:
     """Trunk above the navel, head and arms; heights relative to the lumbar joint."""
     parts = []
     end = 0.0
@@ -218,10 +176,10 @@ def _upper_body(segments: dict[str, Segment], layout: SeatLayout, scale: float) 
         segment = segments[name]
         parts.append(_standing(segment, end + (1 - segment.centre) * segment.length))
         end += segment.length
-    upper_arm, forearm = layout.upper_arm_height * scale, layout.forearm_height * scale
+    forearm = _FOREARM * scale
     return [
         *parts,
-        _standing(segments["upper arm"], upper_arm, layout.shoulder * scale, sides=2),
+        _standing(segments["upper arm"], _UPPER_ARM * scale, _SHOULDER * scale, sides=2),
         _standing(segments["forearm"], forearm, sides=2),
         _standing(segments["hand"], forearm, sides=2),
     ]
@@ -232,9 +190,9 @@ def _standing(segment: Segment, height: float, lateral: float = 0.0, sides: int 
     return _Part(sides * segment.mass, height, lateral, segment.across * segment.length)
 
 
-def _pointing_forwards(segment: Segment, height: float, lateral: float) -> _Part:
+def _pointing_forwards(segment: Segment, height: float) -> _Part:
     """Pair of segments that point forwards."""
-    return _Part(2 * segment.mass, height, lateral, segment.along * segment.length)
+    return _Part(2 * segment.mass, height, _LEG, segment.along * segment.length)
 
 
 def _combine(parts: list[_Part]) -> tuple[float, float, float]:

@@ -30,10 +30,8 @@ import numpy as np
 import scipy.linalg
 
 from plants._checks import finite_number
-from plants._units import with_uncertainty, with_units
+from plants._units import with_signals, with_uncertainty
 from plants.actuation import delayed_muscle
-
-__all__ = ["cursor_plant", "pursuit_plant"]
 
 _ARGUMENTS = {
     "delay": ("visuomotor delay", "s"),
@@ -158,31 +156,15 @@ def _tracking(
     `command` has the unit of the command and of the stages, and its words.
     """
     A, B = matrices
-    unit, asked = command
-    speed = f"{length}/s"
-    system = control.ss(
-        A,
-        B,
-        np.eye(1, len(A)),
-        np.zeros((1, 2)),
-        dt=sample_time,
-        name=name,
-        states=["error", "velocity", *stages],
-        inputs=["command", "target_rate"],
-        outputs=["error"],
-    )
-    units = {"error": length, "velocity": speed, "target_rate": speed, "command": unit}
-    words = {
-        "error": "distance from the target",
-        "velocity": "cursor velocity",
-        "command": asked,
-        "target_rate": "target velocity",
+    names: dict[str, Any] = {"inputs": ["command", "target_rate"], "outputs": ["error"]}
+    names |= {"states": ["error", "velocity", *stages], "name": name}
+    system = control.ss(A, B, np.eye(1, len(A)), np.zeros((1, 2)), dt=sample_time, **names)
+    speed, there = f"{length}/s", "if the cursor is on the positive side of the target"
+    signals = {
+        "error": (length, "distance from the target", there),
+        "velocity": (speed, "cursor velocity", "if the cursor moves to the positive side"),
+        "command": (*command, "if it drives the cursor to the positive side"),
+        "target_rate": (speed, "target velocity", "if the target moves to the positive side"),
+        **{stage: (command[0], words) for stage, words in stages.items()},
     }
-    directions = {
-        "error": "if the cursor is on the positive side of the target",
-        "velocity": "if the cursor moves to the positive side",
-        "command": "if it drives the cursor to the positive side",
-        "target_rate": "if the target moves to the positive side",
-    }
-    units = {**units, **dict.fromkeys(stages, unit)}
-    return with_units(system, units, {**words, **stages}, directions)
+    return with_signals(system, signals)

@@ -22,8 +22,8 @@ reduces the range of the companion form's coefficients from 1e9 to 1e4. The fast
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+import itertools
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import control
@@ -31,30 +31,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plants._checks import finite_number, whole_number
-from plants._units import with_units
+from plants._units import with_signals
 from plants.actuation import pade_delay
-
-__all__ = [
-    "HEAD_NECK_FIXED",
-    "HEAD_NECK_PARAMETERS",
-    "TABLE_4_3",
-    "Axis",
-    "HeadNeckParameter",
-    "head_neck_matrices",
-    "head_neck_model",
-    "head_neck_plant",
-    "step_reference",
-    "table_4_3_column",
-]
 
 #: An axis of the head, for annotations.
 Axis = Literal["yaw", "pitch"]
 _SCALE = 3.0  # rad/s
 
 
-@dataclass(frozen=True)
-class HeadNeckParameter:
-    """A candidate parameter: unit, bounds, pathway and source.
+class HeadNeckParameter(NamedTuple):
+    """A candidate parameter of the loop.
 
     Attributes
     ----------
@@ -66,8 +52,6 @@ class HeadNeckParameter:
         Bounds, in that unit.
     pathway : str
         Pathway of the loop to which it belongs.
-    source : str
-        Source of name and bounds.
     """
 
     name: str
@@ -76,13 +60,12 @@ class HeadNeckParameter:
     low: float
     high: float
     pathway: str
-    source: str
 
 
-_BOUNDS = "names: dissertation, table 4.2; bounds: likely, consistent with its interval widths"
-#: The twelve candidate parameters of chapters 4 and 5, in their order.
+#: The twelve candidate parameters of chapters 4 and 5, in their order. Names: dissertation, table
+#: 4.2; bounds: likely, consistent with its interval widths.
 HEAD_NECK_PARAMETERS = tuple(
-    HeadNeckParameter(*row, _BOUNDS)
+    HeadNeckParameter(*row)
     for row in (
         ("Kvis", "visual gain", "N m/rad", 50.0, 1000.0, "visual"),
         ("Kvcr", "vestibular gain", "N m s^2/rad", 500.0, 10000.0, "vestibular"),
@@ -138,7 +121,7 @@ def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
         If the axis is unknown or the order is out of range.
     """
     if axis not in ("yaw", "pitch"):
-        raise ValueError(f"axis: expected yaw or pitch, got {axis!r:.60}")
+        raise ValueError(f"axis: expected yaw or pitch, got {axis!r:.60}; give one of them")
     order = whole_number("delay_order", delay_order, "5 is usual", least=1, most=10)
     theta = ca.SX.sym("theta", len(HEAD_NECK_PARAMETERS))
     kvis, tau = theta[0], theta[3]
@@ -146,16 +129,11 @@ def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
     lead = denominator[-1]
     a = [coefficient / lead for coefficient in denominator[:-1]]
     n = len(a)
-    inner = ca.SX.zeros(n, n)
-    for row in range(n - 1):
-        inner[row, row + 1] = 1
-    for column in range(n):
-        inner[n - 1, column] = -a[column]
+    inner = ca.SX(np.eye(n, k=1))
+    inner[n - 1, :] = ca.horzcat(*(-coefficient for coefficient in a))
     seen = ca.SX.zeros(1, n)
-    for column, coefficient in enumerate(numerator):
-        seen[0, column] = coefficient / lead
-    enters = ca.SX.zeros(n, 1)
-    enters[n - 1] = 1
+    seen[: len(numerator)] = ca.horzcat(*(coefficient / lead for coefficient in numerator))
+    enters = ca.SX(np.eye(n)[:, -1:])
     delay = pade_delay(1.0, order)  # for one second; rescaled in time by `rate`
     rate = 1 / (tau * _SCALE)
     D = np.asarray(delay.A)
@@ -173,15 +151,15 @@ def head_neck_matrices(axis: Axis = "yaw", delay_order: int = 5) -> ca.Function:
     )
 
 
-def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order: int = 5) -> Any:
+def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw") -> Any:
     """Return the closed loop from reference to head angle as a continuous control.StateSpace.
 
     Parameters
     ----------
     values : array_like
         Parameters (12,), in the order and units of `HEAD_NECK_PARAMETERS`.
-    axis, delay_order
-        See `head_neck_matrices`.
+    axis : {"yaw", "pitch"}
+        Axis of rotation; gravity acts in pitch only.
 
     Raises
     ------
@@ -190,14 +168,15 @@ def head_neck_plant(values: NDArray[np.float64], axis: Axis = "yaw", delay_order
     """
     given = np.asarray(values, dtype=np.float64)
     if given.shape != (len(HEAD_NECK_PARAMETERS),):
-        raise ValueError(f"values: expected 12 numbers, got an array of shape {given.shape}")
+        raise ValueError(
+            f"values: expected 12 numbers, got shape {given.shape}; give one a parameter"
+        )
     for item, value in zip(HEAD_NECK_PARAMETERS, given, strict=True):
         finite_number(item.name, float(value), f"give it in {item.unit}")
-    A, B, C = (item.full() for item in head_neck_matrices(axis, delay_order)(given))
+    A, B, C = (item.full() for item in head_neck_matrices(axis)(given))
     names: dict[str, Any] = {"inputs": ["reference"], "outputs": ["head"]}
-    words = {"reference": "target angle", "head": "head angle"}
-    units = dict.fromkeys(words, "rad")
-    return with_units(control.ss(A, B, C, 0, **names), units, words)
+    signals = {"reference": ("rad", "target angle"), "head": ("rad", "head angle")}
+    return with_signals(control.ss(A, B, C, 0, **names), signals)
 
 
 def step_reference(
@@ -267,11 +246,7 @@ def _product(one: list[Any], other: list[Any]) -> list[Any]:
 
 
 def _sum(*polynomials: list[Any]) -> list[Any]:
-    found: list[Any] = [0] * max(map(len, polynomials))
-    for polynomial in polynomials:
-        for power, item in enumerate(polynomial):
-            found[power] = found[power] + item
-    return found
+    return [sum(each) for each in itertools.zip_longest(*polynomials, fillvalue=0)]
 
 
 def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
@@ -280,15 +255,16 @@ def head_neck_model(axis: Axis = "yaw", delay_order: int = 5) -> dict[str, Any]:
     Typical values are the nominal column of table 4.3, deviations between people its SDs. For
     `axis`, `delay_order` and errors see `head_neck_matrices`.
     """
+    names, meanings, units, low, high, pathways = zip(*HEAD_NECK_PARAMETERS, strict=True)
     return {
-        "names": [item.name for item in HEAD_NECK_PARAMETERS],
-        "low": [item.low for item in HEAD_NECK_PARAMETERS],
-        "high": [item.high for item in HEAD_NECK_PARAMETERS],
+        "names": names,
+        "low": low,
+        "high": high,
         "typical": [float(value) for value in TABLE_4_3["nominal"] if value is not None],
         "deviation": list(_BETWEEN_PEOPLE),
-        "pathways": [item.pathway for item in HEAD_NECK_PARAMETERS],
-        "meanings": [item.meaning for item in HEAD_NECK_PARAMETERS],
-        "units": [item.unit for item in HEAD_NECK_PARAMETERS],
+        "pathways": pathways,
+        "meanings": meanings,
+        "units": units,
         "inputs": ["reference"],
         "outputs": ["head"],
         "rate": 60.0,

@@ -5,11 +5,12 @@ Source: Hairer, Nørsett and Wanner 1993, section II.1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import casadi as ca
 
 from plants._checks import Array, finite_number, whole_number
-
-__all__ = ["runge_kutta_step", "with_linear_part"]
 
 
 def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> ca.Function:
@@ -36,17 +37,20 @@ def runge_kutta_step(dynamics: ca.Function, step: float, substeps: int = 1) -> c
     """
     step = finite_number("step", step, "give it in seconds", above=0.0)
     substeps = whole_number("substeps", substeps, "1 is usual", least=1, most=10_000)
-    start = ca.MX.sym("state", *dynamics.size_in(0))
+    start = state = ca.MX.sym("state", *dynamics.size_in(0))
     held = ca.MX.sym("input", *dynamics.size_in(1))
-    h = step / substeps
-    state = start
     for _ in range(substeps):
-        k1 = dynamics(state, held)
-        k2 = dynamics(state + h / 2 * k1, held)
-        k3 = dynamics(state + h / 2 * k2, held)
-        k4 = dynamics(state + h * k3, held)
-        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        state = one_step(lambda at, _: dynamics(at, held), state, step / substeps)
     return ca.Function("runge_kutta_step", [start, held], [state], ["state", "input"], ["next"])
+
+
+def one_step(rate: Callable[[Any, float], Any], state: Any, h: float) -> Any:
+    """State after a Runge-Kutta step of `h` s; `rate` takes the state and the share of the step."""
+    k1 = rate(state, 0.0)
+    k2 = rate(state + h / 2 * k1, 0.5)
+    k3 = rate(state + h / 2 * k2, 0.5)
+    k4 = rate(state + h * k3, 1.0)
+    return state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def with_linear_part(step: ca.Function, A: Array, B: Array) -> ca.Function:

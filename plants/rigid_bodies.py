@@ -11,8 +11,6 @@ from typing import Any
 
 import casadi as ca
 
-__all__ = ["cart_pole", "quadrotor", "robot_arm", "rocket", "rotation"]
-
 GRAVITY = 10.0  # m/s^2, as in the benchmark
 
 

@@ -33,35 +33,24 @@ import numpy as np
 import scipy.linalg
 
 from plants._checks import finite_number
-from plants._units import with_units
+from plants._units import with_signals
 from plants.actuation import delayed_muscle
 from plants.seated_drawing import seated_lines
-from plants.seated_parameters import SeatedBalanceLimits, SeatedBalanceParameters
+from plants.seated_parameters import SeatedBalanceParameters
 
-__all__ = [
-    "SeatedBalanceLimits",
-    "SeatedBalanceParameters",
-    "body_dynamics",
-    "continuous_seated_balance_plant",
-    "mass_matrix",
-    "nonlinear_dynamics",
-    "seated_balance_plant",
-    "seated_balance_slopes",
-]
-
-_BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
-_INPUTS = ("command", "perturbation")
-_BODY_WORDS = ("seat tilt", "trunk tilt", "seat velocity", "trunk velocity")
-_INPUT_WORDS = ("commanded torque", "perturbation torque")
-_DIRECTIONS = {
-    "theta1": "to the right: the right edge of the seat goes down",
-    "theta2": "to the right: the head goes to the right",
-    "theta1_rate": "to the right",
-    "theta2_rate": "to the right",
-    "muscle_torque": "to the right: it turns the trunk to the right and the seat to the left",
-    "command": "to the right: it turns the trunk to the right and the seat to the left",
-    "perturbation": "to the right: it turns the right edge of the seat down",
+_TURNS = "to the right: it turns the trunk to the right and the seat to the left"
+_PUSHES = "to the right: it turns the right edge of the seat down"
+# Name of a signal -> unit, words, and what is positive.
+_SIGNALS: dict[str, tuple[str, ...]] = {
+    "theta1": ("rad", "seat tilt", "to the right: the right edge of the seat goes down"),
+    "theta2": ("rad", "trunk tilt", "to the right: the head goes to the right"),
+    "theta1_rate": ("rad/s", "seat velocity", "to the right"),
+    "theta2_rate": ("rad/s", "trunk velocity", "to the right"),
+    "muscle_torque": ("N m", "muscle torque", _TURNS),
+    "command": ("N m", "commanded torque", _TURNS),
+    "perturbation": ("N m", "perturbation torque", _PUSHES),
 }
+_BODY, _TORQUE, _INPUTS = list(_SIGNALS)[:4], list(_SIGNALS)[4], list(_SIGNALS)[5:]
 
 
 def seated_balance_plant(
@@ -261,24 +250,6 @@ def _body_rate(p: Any, state: ca.SX, inputs: ca.SX) -> Any:
     return ca.vertcat(rate1, rate2, ca.solve(_mass(p, angle), moments))
 
 
-def mass_matrix(parameters: SeatedBalanceParameters | None = None) -> ca.Function:
-    """Return the mass matrix of the two bodies as a function of their angles.
-
-    Parameters
-    ----------
-    parameters : SeatedBalanceParameters, optional
-        The defaults if omitted.
-
-    Returns
-    -------
-    casadi.Function
-        (angles (2) in rad) -> M (2, 2) in kg m^2, symmetric and positive definite.
-    """
-    angles = ca.SX.sym("angles", 2)
-    matrix = _mass(parameters or SeatedBalanceParameters(), angles[0] - angles[1])
-    return ca.Function("mass_matrix", [angles], [matrix], ["angles"], ["M"])
-
-
 def _mass(p: Any, angle: ca.SX) -> ca.SX:
     lower = p.J1 + p.m1 * p.l1**2 + p.m2 * p.l12**2
     upper = p.J2 + p.m2 * p.l2**2
@@ -288,32 +259,16 @@ def _mass(p: Any, angle: ca.SX) -> ca.SX:
 
 
 def _named(A: Any, B: Any, sample_time: float, name: str, p: SeatedBalanceParameters) -> Any:
-    n = A.shape[0]
-    delays = [f"delay_{k}" for k in range(1, n - 4)]
-    units = {
-        **dict(zip(_BODY, ("rad", "rad", "rad/s", "rad/s"), strict=True)),
-        **dict.fromkeys([*delays, "muscle_torque", *_INPUTS], "N m"),
+    n = len(A)
+    delays: dict[str, tuple[str, ...]] = {
+        f"delay_{k}": ("N m", f"neural delay, state {k}") for k in range(1, n - 4)
     }
-    system = control.ss(
-        A,
-        B,
-        np.eye(2, n),
-        np.zeros((2, 2)),
-        dt=sample_time,
-        name=name,
-        states=[*_BODY, *delays, "muscle_torque"],
-        inputs=list(_INPUTS),
-        outputs=list(_BODY[:2]),
-    )
-    words = {
-        **dict(zip(_BODY, _BODY_WORDS, strict=True)),
-        **{name: f"neural delay, state {k}" for k, name in enumerate(delays, 1)},
-        "muscle_torque": "muscle torque",
-        **dict(zip(_INPUTS, _INPUT_WORDS, strict=True)),
-    }
+    names: dict[str, Any] = {"inputs": _INPUTS, "outputs": _BODY[:2], "name": name}
+    names["states"] = [*_BODY, *delays, _TORQUE]
+    system = control.ss(A, B, np.eye(2, n), np.zeros((2, 2)), dt=sample_time, **names)
     system.gravity = {
         "theta1": p.gravity * (p.m1 * p.l1 + p.m2 * p.l12),
         "theta2": p.gravity * p.m2 * p.l2,
     }
     system.drawing = functools.partial(seated_lines, p)
-    return with_units(system, units, words, _DIRECTIONS)
+    return with_signals(system, _SIGNALS | delays)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from plants._checks import Array
     from plants.seated_parameters import SeatedBalanceParameters
 
-__all__ = ["seated_lines"]
-
 # Seat above its pivot, half its breadth, and size of the mark of the pivot, m.
 _SEAT, _BREADTH, _MARK = 0.05, 0.25, 0.06
 # Neck, shoulders, half their breadth, and centre and radius of the head, in multiples of l2: trunk

@@ -1,20 +1,17 @@
-"""Parameters and limits of the seated-balance plant with their sources.
+"""Parameters of the seated-balance plant with their sources.
 
 They replace those of Table 3.2, which are not available.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from plants._checks import finite_number
 
-__all__ = ["Quantities", "SeatedBalanceLimits", "SeatedBalanceParameters", "quantity"]
 
-
-def quantity(
+def _quantity(
     default: float, unit: str, origin: str, known: Any = 0.0, words: str = "", **limit: float
 ) -> Any:
     """Declare a dataclass field with unit, origin, uncertainty, words and limits in its metadata.
@@ -26,26 +23,8 @@ def quantity(
     return field(default=default, metadata=about)
 
 
-class Quantities:
-    """Base class of frozen dataclasses that checks all fields and converts them to float."""
-
-    @property
-    def uncertainty(self) -> dict[str, float | str]:
-        """Standard deviations by name, of positive quantities that are not exact."""
-        each = fields(self)  # type: ignore[arg-type]  # the subclasses are dataclasses
-        known = {one.name: one.metadata["known"] for one in each}
-        return {name: how for name, how in known.items() if how and getattr(self, name) > 0}
-
-    def __post_init__(self) -> None:
-        for each in fields(self):  # type: ignore[arg-type]  # the subclasses are dataclasses
-            given = getattr(self, each.name)
-            unit = each.metadata["unit"]
-            number = finite_number(each.name, given, f"give it in {unit}", **each.metadata["limit"])
-            object.__setattr__(self, each.name, number)  # the dataclass is frozen
-
-
 @dataclass(frozen=True)
-class SeatedBalanceParameters(Quantities):
+class SeatedBalanceParameters:
     """Parameters of a person on a tilting seat: bodies, joint, robot, delay, muscle.
 
     The lower body (pelvis, legs and seat) turns about the pivot of the seat, the upper body (trunk
@@ -106,51 +85,41 @@ class SeatedBalanceParameters(Quantities):
         stiffness, damping and gravity are not negative.
     """
 
-    m1: float = quantity(60.6, "kg", "regressed", "3 %", "mass of pelvis, legs and seat", above=0.0)
-    m2: float = quantity(39.1, "kg", "regressed", "4 %", "mass of trunk, head and arms", above=0.0)
-    l1: float = quantity(
+    m1: float = _quantity(
+        60.6, "kg", "regressed", "3 %", "mass of pelvis, legs and seat", above=0.0
+    )
+    m2: float = _quantity(39.1, "kg", "regressed", "4 %", "mass of trunk, head and arms", above=0.0)
+    l1: float = _quantity(
         0.058, "m", "regressed", 0.015, "centre of mass of the lower body above the pivot"
     )
-    l2: float = quantity(
+    l2: float = _quantity(
         0.263, "m", "regressed", "5 %", "centre of the trunk above the joint", above=0.0
     )
-    l12: float = quantity(0.279, "m", "regressed", "5 %", "lumbar joint above the pivot", above=0.0)
-    J1: float = quantity(2.53, "kg m²", "regressed", "12 %", "inertia of the lower body", above=0.0)
-    J2: float = quantity(1.34, "kg m²", "regressed", "12 %", "inertia of the upper body", above=0.0)
-    k_h: float = quantity(30.0, "N m/rad", "measured", "35 %", "lumbar stiffness", least=0.0)
-    c_h: float = quantity(2.5, "N m s/rad", "chosen", "50 %", "lumbar damping", least=0.0)
-    k_r: float = quantity(120.0, "N m/rad", "chosen", "2 %", "stiffness of the seat", least=0.0)
-    c_r: float = quantity(5.0, "N m s/rad", "chosen", "5 %", "damping of the seat", least=0.0)
-    tau_d: float = quantity(0.08, "s", "chosen", 0.01, "delay from command to muscle", above=0.0)
-    tau_m: float = quantity(0.06, "s", "chosen", "25 %", "time constant of the muscle", above=0.0)
-    gravity: float = quantity(9.81, "m/s²", "chosen", 0.0, "acceleration of gravity", least=0.0)
+    l12: float = _quantity(
+        0.279, "m", "regressed", "5 %", "lumbar joint above the pivot", above=0.0
+    )
+    J1: float = _quantity(
+        2.53, "kg m²", "regressed", "12 %", "inertia of the lower body", above=0.0
+    )
+    J2: float = _quantity(
+        1.34, "kg m²", "regressed", "12 %", "inertia of the upper body", above=0.0
+    )
+    k_h: float = _quantity(30.0, "N m/rad", "measured", "35 %", "lumbar stiffness", least=0.0)
+    c_h: float = _quantity(2.5, "N m s/rad", "chosen", "50 %", "lumbar damping", least=0.0)
+    k_r: float = _quantity(120.0, "N m/rad", "chosen", "2 %", "stiffness of the seat", least=0.0)
+    c_r: float = _quantity(5.0, "N m s/rad", "chosen", "5 %", "damping of the seat", least=0.0)
+    tau_d: float = _quantity(0.08, "s", "chosen", 0.01, "delay from command to muscle", above=0.0)
+    tau_m: float = _quantity(0.06, "s", "chosen", "25 %", "time constant of the muscle", above=0.0)
+    gravity: float = _quantity(9.81, "m/s²", "chosen", 0.0, "acceleration of gravity", least=0.0)
 
+    @property
+    def uncertainty(self) -> dict[str, float | str]:
+        """Standard deviations by name, of positive quantities that are not exact."""
+        known = {each.name: each.metadata["known"] for each in fields(self)}
+        return {name: how for name, how in known.items() if how and getattr(self, name) > 0}
 
-@dataclass(frozen=True)
-class SeatedBalanceLimits(Quantities):
-    """Limits of motion and command, symmetric about upright and rest.
-
-    Attributes
-    ----------
-    theta1 : float
-        Angle of the seat at its mechanical stops, rad. Measured: 12 degrees in the dissertation.
-    theta2 : float
-        Angle of the upper body, rad. Chosen: 15 degrees.
-    theta1_rate, theta2_rate : float
-        Angular velocities, rad/s. Chosen.
-    command : float
-        Lumbar torque, N m. Chosen: about half of a man's maximum sideways (McNeill 1980, low
-        confidence). A perturbation of 5 N m never reaches it; the benchmark with saturation uses
-        6 N m.
-
-    Raises
-    ------
-    ValueError
-        If a limit is not a positive finite number.
-    """
-
-    theta1: float = quantity(math.radians(12.0), "rad", "measured", above=0.0)
-    theta2: float = quantity(math.radians(15.0), "rad", "chosen", above=0.0)
-    theta1_rate: float = quantity(1.5, "rad/s", "chosen", above=0.0)
-    theta2_rate: float = quantity(1.5, "rad/s", "chosen", above=0.0)
-    command: float = quantity(70.0, "N m", "chosen", above=0.0)
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            remedy, limit = f"give it in {each.metadata['unit']}", each.metadata["limit"]
+            number = finite_number(each.name, getattr(self, each.name), remedy, **limit)
+            object.__setattr__(self, each.name, number)  # the dataclass is frozen

@@ -10,15 +10,20 @@ from dataclasses import asdict, fields, replace
 from typing import Any
 
 import casadi as ca
+import numpy as np
+import scipy.linalg
 
 from plants._units import with_uncertainty
+from plants.actuation import delayed_muscle
 from plants.anthropometry import DE_LEVA, Sex, from_anthropometry
-from plants.integration import runge_kutta_step, with_linear_part
-from plants.seated_balance import nonlinear_dynamics, seated_balance_plant, seated_balance_slopes
-from plants.seated_body import seated_balance_body
+from plants.integration import one_step, runge_kutta_step, with_linear_part
+from plants.seated_balance import (
+    body_dynamics,
+    nonlinear_dynamics,
+    seated_balance_plant,
+    seated_balance_slopes,
+)
 from plants.seated_parameters import SeatedBalanceParameters
-
-__all__ = ["seated_balance_for", "seated_balance_step_for", "seated_parameters_for"]
 
 _ARGUMENTS = {
     "mass": ("body mass", "kg"),
@@ -84,8 +89,7 @@ def seated_balance_for(
     system = seated_balance_plant(found, sample_time, delay_order)
 
     def body() -> ca.Function:
-        step = seated_balance_body(found, sample_time, delay_order)
-        return with_linear_part(step, system.A, system.B)
+        return with_linear_part(_body(found, sample_time, delay_order), system.A, system.B)
 
     system.body = body  # made only on demand: takes 0.05 s
     system.slopes = functools.partial(seated_balance_slopes, found, sample_time, delay_order)
@@ -119,3 +123,28 @@ def seated_balance_step_for(
     """
     found = seated_parameters_for(mass, height, sex, **parameters)
     return runge_kutta_step(nonlinear_dynamics(found, delay_order), sample_time)
+
+
+def _body(parameters: SeatedBalanceParameters, sample_time: float, delay_order: int) -> ca.Function:
+    """Function of one sample of the nonlinear plant, with delay and muscle solved exactly.
+
+    Both are linear and driven only by the held command, so the torque at the nodes of a Runge-Kutta
+    step has a closed form. Only the two bodies are integrated, and the step need not resolve the
+    fast delay states.
+    """
+    chain = delayed_muscle(parameters.tau_d, parameters.tau_m, delay_order)
+    bodies, n = body_dynamics(parameters), len(chain.B)
+    state, inputs = ca.SX.sym("state", 4 + n), ca.SX.sym("input", 2)
+    generator = np.block([[chain.A, chain.B[:, None]], [np.zeros((1, n + 1))]]) * sample_time
+    held = ca.vertcat(state[4:], inputs[0])
+
+    def after(share: float) -> ca.SX:
+        """Delay and muscle after a share of the sample; the last entry is the torque."""
+        return ca.DM(scipy.linalg.expm(generator * share)[:n]) @ held
+
+    def rate(body: ca.SX, share: float) -> ca.SX:
+        return bodies(body, ca.vertcat(after(share)[n - 1], inputs[1]))
+
+    ahead = ca.vertcat(one_step(rate, state[:4], sample_time), after(1.0))
+    names = ["state", "input"], ["next"]
+    return ca.Function("seated_balance_body", [state, inputs], [ahead], *names, {"cse": True})

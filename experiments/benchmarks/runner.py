@@ -17,9 +17,8 @@ from experiments.benchmarks.timing import Timing, side_by_side
 from impc.files.configuration import Configuration, RecordingTable
 from impc.reporting.writer import owned
 from impc.studies.cache import Cache
-from impc.studies.cohort.engine import Store, run_study
 from impc.studies.cohort.study import Study, Unit
-from impc.studies.cohort.tasks import FitTask, fit_unit
+from impc.studies.cohort.tasks import FitTask, Store, fit_unit, run_study
 from impc.studies.pool import Task, processes, run
 from impc.studies.scheduler import Cluster, connected
 

@@ -12,7 +12,8 @@ from impc.assess.variance_accounted_for import vaf
 from impc.inverse.inverse_lqr import inverse_lqr_lmi
 from impc.model.plant import Plant
 from plants.actuation import delayed_muscle
-from plants.seated_balance import SeatedBalanceParameters, continuous_seated_balance_plant
+from plants.seated_balance import continuous_seated_balance_plant
+from plants.seated_parameters import SeatedBalanceParameters
 
 if TYPE_CHECKING:
     from experiments.reproduction.evidence import Evidence

@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 
     from impc.files.configuration import Configuration
     from impc.files.plant_sources import PlantSource
-    from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Study, Unit
-    from impc.studies.cohort.tasks import FitTask
+    from impc.studies.cohort.tasks import Failures, FitTask, Store
     from impc.studies.reliability.analysis import Trials
     from impc.studies.scheduler import Cluster
 
@@ -59,10 +58,13 @@ def command(
     the same command continues from the last finished task.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.studies.cohort.engine import open_store  # noqa: PLC0415
     from impc.studies.cohort.report import write_report  # noqa: PLC0415
     from impc.studies.cohort.study import read_study  # noqa: PLC0415
-    from impc.studies.cohort.tasks import study_tasks, unused_columns  # noqa: PLC0415
+    from impc.studies.cohort.tasks import (  # noqa: PLC0415
+        open_store,
+        study_tasks,
+        unused_columns,
+    )
     from impc.studies.fit.settings import fit_settings, require_used  # noqa: PLC0415
 
     study = read_study(study_file)
@@ -92,8 +94,11 @@ def _run(
 ) -> Failures:
     """Run the remaining tasks with a progress bar; an interruption prints what is kept."""
     from impc.cli.console import require_consent  # noqa: PLC0415
-    from impc.studies.cohort.engine import run_study, work_kept  # noqa: PLC0415
-    from impc.studies.cohort.tasks import unit_effort  # noqa: PLC0415
+    from impc.studies.cohort.tasks import (  # noqa: PLC0415
+        run_study,
+        unit_effort,
+        work_kept,
+    )
     from impc.studies.scheduler import connected  # noqa: PLC0415
 
     kept, total = work_kept(study, store)

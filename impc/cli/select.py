@@ -179,7 +179,7 @@ def key_command(
     from impc.reporting.writer import write_files  # noqa: PLC0415
     from impc.studies.effort import key_evaluations, selection_effort  # noqa: PLC0415
     from impc.studies.reliability.icc import GOOD  # noqa: PLC0415
-    from impc.studies.selection.key_parameters import key_parameters  # noqa: PLC0415
+    from impc.studies.selection.analysis import key_parameters  # noqa: PLC0415
     from impc.studies.selection.key_report import key_report  # noqa: PLC0415
     from impc.studies.selection.settings import select_settings  # noqa: PLC0415
 

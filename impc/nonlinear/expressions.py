@@ -3,16 +3,15 @@
 Every function has the arguments (x, u, d, theta) and is expanded to SX, which evaluates fastest.
 """
 
-# ruff: noqa: D102 - members of `Stages` are described in `OptimalControlProblem`
-
 from __future__ import annotations
 
-from collections.abc import Hashable
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
+from impc.arrays import BoolArray, Frozen
 from impc.checking import asked
 from impc.errors import InputError
 
@@ -20,25 +19,36 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
 
-class Stages(Hashable, Protocol):
-    """What plans, loops and recordings read of an `OptimalControlProblem`."""
+@dataclass(frozen=True, init=False, eq=False)
+class Stages(Frozen):
+    """Functions and names of a problem, as plans and loops use them (`OptimalControlProblem`)."""
+
+    horizon: int
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    disturbance_names: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+    rows: tuple[str, ...]
+    terminal_rows: tuple[str, ...]
+    positive: BoolArray
+    units: dict[str, str]
+    dt: float | None
+    functions: tuple[Any, ...]
 
     @property
-    def horizon(self) -> int: ...
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.state_names)
+
     @property
-    def n(self) -> int: ...
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.input_names)
+
     @property
-    def m(self) -> int: ...
-    @property
-    def disturbance_count(self) -> int: ...
-    @property
-    def parameter_names(self) -> tuple[str, ...]: ...
-    @property
-    def rows(self) -> tuple[str, ...]: ...
-    @property
-    def terminal_rows(self) -> tuple[str, ...]: ...
-    @property
-    def functions(self) -> tuple[Any, ...]: ...
+    def disturbance_count(self) -> int:
+        """Number of disturbances."""
+        return len(self.disturbance_names)
 
 
 _COMPARISONS = (ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR)

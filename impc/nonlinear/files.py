@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from impc.files.clock import Clock
     from impc.files.configuration import Configuration
     from impc.files.table import Table
+    from impc.nonlinear.closed_loop import OptimalRecording
     from impc.nonlinear.problem import OptimalControlProblem
-    from impc.nonlinear.recordings import OptimalRecording
 
 
 class ParameterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -35,8 +35,8 @@ from impc.nonlinear.search import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from impc.nonlinear.closed_loop import OptimalRecording
     from impc.nonlinear.problem import OptimalControlProblem
-    from impc.nonlinear.recordings import OptimalRecording
     from impc.nonlinear.search import Evaluation
     from impc.reporting.document import Report
     from impc.reporting.provenance import Provenance

@@ -13,6 +13,7 @@ from impc.arrays import Frozen
 from impc.inverse.estimates import Status
 from impc.levels import Level
 from impc.nonlinear.combinations import interval
+from impc.nonlinear.search import Residuals
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.rendering import number, sentence_case
@@ -231,8 +232,7 @@ def optimal_report(fit: OptimalFit, provenance: Provenance) -> Report:
 
 def _status(estimate: OptimalControlEstimate) -> Status:
     """Status of the search."""
-    recorded = [np.hstack([one.x[1:], one.u]) / estimate.scales for one in estimate.recordings]
-    size = sum(float(np.nansum(item**2)) for item in recorded)
+    size = Residuals(estimate.problem, estimate.recordings, "", estimate.scales).size
     if float(estimate.residual @ estimate.residual) <= _EXACT**2 * size:
         return Status.EXPLAINED
     return Status.SETTLED if estimate.settled else Status.STOPPED

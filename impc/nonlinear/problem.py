@@ -15,11 +15,17 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from impc.arrays import Array, BoolArray, Expression, Frozen, finite_array
+from impc.arrays import Array, BoolArray, Expression, finite_array
 from impc.checking import asked, checked
 from impc.errors import InputError
-from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
+from impc.nonlinear.closed_loop import (
+    ClosedLoop,
+    OptimalRecording,
+    closed_loop_from,
+    optimal_recording,
+)
 from impc.nonlinear.expressions import (
+    Stages,
     function_of,
     names_of,
     require_influence,
@@ -27,7 +33,6 @@ from impc.nonlinear.expressions import (
     symbols_of,
 )
 from impc.nonlinear.plan import Plan, solve_plan
-from impc.nonlinear.recordings import OptimalRecording, optimal_recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -38,7 +43,7 @@ _LONGEST = 10_000  # stages; the size of the program is proportional
 
 
 @dataclass(frozen=True, init=False, eq=False)
-class OptimalControlProblem(Frozen):
+class OptimalControlProblem(Stages):
     """An optimal control problem with unknown parameters.
 
     Parameters
@@ -114,18 +119,6 @@ class OptimalControlProblem(Frozen):
     #: Message of commands for linear plants.
     no_plant = ("is an optimal control problem", "use `impc fit`, which accepts one")
 
-    horizon: int
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    disturbance_names: tuple[str, ...]
-    parameter_names: tuple[str, ...]
-    rows: tuple[str, ...]
-    terminal_rows: tuple[str, ...]
-    positive: BoolArray
-    units: dict[str, str]
-    dt: float | None
-    functions: tuple[Any, ...]
-
     @checked(horizon=(1, _LONGEST))
     def __init__(
         self,
@@ -181,21 +174,6 @@ class OptimalControlProblem(Frozen):
             "terminal_rows": terminal_rows, "units": given, "dt": dt, "functions": functions,
             "positive": _fixed([name not in signed for name in names]),
         })  # fmt: skip
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return len(self.state_names)
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.input_names)
-
-    @property
-    def disturbance_count(self) -> int:
-        """Number of disturbances."""
-        return len(self.disturbance_names)
 
     @checked(horizon=(1, _LONGEST))
     def with_horizon(self, horizon: int) -> OptimalControlProblem:

@@ -25,8 +25,8 @@ from impc.nonlinear.plan import Plan, nearby_plan, solve_plan, solved_plan
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from impc.nonlinear.closed_loop import OptimalRecording
     from impc.nonlinear.problem import OptimalControlProblem
-    from impc.nonlinear.recordings import OptimalRecording
 
 #: Unexplained share of squares above which the plans may be of another kind: a cart-pole that does
 #: not swing up leaves 0.8, noise of 16 dB leaves 0.025.

@@ -37,48 +37,34 @@ def trajectories(
     drawn, plant = [fit for fit in fits if fit.runs], problem.plant
     curves: list[dict[str, Any]] = [{"label": "recorded", "color": "--rec", "dash": []}]
     for k, fit in enumerate(drawn):
-        label = METHODS[fit.name].label
-        curves.append(
-            {"label": label, "color": _COLOURS[k % 6], "dash": _DASHES[k // 6 + (k > 0) % 4]}
-        )
+        dash = _DASHES[k // 6 + (k > 0) % 4]
+        curves.append({"label": METHODS[fit.name].label, "color": _COLOURS[k % 6], "dash": dash})
     samples = sum(problem.recordings[index].samples for index in trials)
     stride = -(-samples * len(curves) * (len(plant.outputs) + plant.m) // _MOST)
-    return {
-        "curves": curves,
-        "trials": [
-            {
-                "label": label,
-                "step": plant.dt * stride,
-                "panels": _panels(problem, drawn, k, stride),
-            }
-            for k, label in trials.items()
-        ],
-    }
+    found = [
+        {"label": label, "step": plant.dt * stride, "panels": _panels(problem, drawn, k, stride)}
+        for k, label in trials.items()
+    ]
+    return {"curves": curves, "trials": found}
 
 
 def _panels(
     problem: Problem, fits: Sequence[MethodFit], trial: int, stride: int
 ) -> list[dict[str, Any]]:
     plant, bounds, given = problem.plant, problem.bounds, problem.recordings[trial]
-    runs = [until_its_end(plant, fit.runs[trial]) for fit in fits]
     unknown = np.full((given.samples, plant.m), np.nan)
-    outputs = [given.corrected, *(y for y, _ in runs)]
-    commands = [given.commands if len(given.commands) else unknown, *(u for _, u in runs)]
+    pairs = [(given.corrected, given.commands if len(given.commands) else unknown)]
+    pairs += [until_its_end(plant, fit.runs[trial]) for fit in fits]
+    curves, none = [np.hstack(pair) for pair in pairs], np.full(len(plant.outputs), np.nan)
+    limits = np.array([[*none, *bounds.u_min], [*none, *bounds.u_max]])
     panels = []
-    for names, curves, limited in (
-        (plant.outputs, outputs, False),
-        (plant.controls, commands, True),
-    ):
-        for column, name in enumerate(names):
-            factor = shown_unit(plant, name)[0]
-            limits = [bounds.u_min[column], bounds.u_max[column]] if limited else []
-            panels.append(
-                {
-                    "label": axis_label(plant, name),
-                    "limits": [float(factor * one) for one in limits if np.isfinite(one)],
-                    "curves": [short(factor * part[::stride, column]) for part in curves],
-                }
-            )
+    for column, name in enumerate((*plant.outputs, *plant.controls)):
+        factor = shown_unit(plant, name)[0]
+        panels.append({
+            "label": axis_label(plant, name),
+            "limits": [float(factor * one) for one in limits[:, column] if np.isfinite(one)],
+            "curves": [short(factor * part[::stride, column]) for part in curves],
+        })  # fmt: skip
     return panels
 
 

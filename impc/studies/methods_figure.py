@@ -8,18 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from impc.assess.assessments import ASSESSMENTS
+from impc.reporting import style
 from impc.reporting.shown_units import shown_unit, signal_name
-from impc.reporting.style import (
-    BLUE,
-    FORBIDDEN,
-    HALF,
-    INK,
-    MUTED,
-    RULE,
-    VERMILLION,
-    new_figure,
-    plain_log,
-)
 from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:
@@ -77,13 +67,13 @@ def largest_commands(fit: MethodFit) -> tuple[float, float, str]:
 def methods_figure(fits: Sequence[MethodFit]) -> Figure:
     """Unexplained variance of each output (dots, log axis) and largest command (bars)."""
     shown = by_score(fits)
-    figure = new_figure(HALF, 0.9 + 0.42 * len(shown))
+    figure = style.new_figure(style.HALF, 0.9 + 0.42 * len(shown))
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
     left.set_yticks(range(len(shown)), [method_label(fit.name) for fit in shown])
     right.set_yticks([])
     for ax in (left, right):
         ax.set_ylim(len(shown) - 0.4, -0.6)
-        ax.tick_params(axis="y", length=0, labelcolor=INK)
+        ax.tick_params(axis="y", length=0, labelcolor=style.INK)
     _unexplained(left, shown)
     _commands(right, shown)
     if len(shown[0].estimate.problem.plant.outputs) > 1:
@@ -92,24 +82,24 @@ def methods_figure(fits: Sequence[MethodFit]) -> Figure:
 
 
 def _colour(fit: MethodFit) -> str:
-    return BLUE if fit.keeps_bounds else MUTED
+    return style.BLUE if fit.keeps_bounds else style.MUTED
 
 
 def _unexplained(ax: Axes, fits: Sequence[MethodFit]) -> None:
     plant = fits[0].estimate.problem.plant
     left = np.array([np.maximum(100 - explained(fit), _ROUNDING) for fit in fits])
     ax.set_xscale("log")
-    ax.hlines(range(len(fits)), left.min(axis=1), left.max(axis=1), color=RULE, zorder=0)
+    ax.hlines(range(len(fits)), left.min(axis=1), left.max(axis=1), color=style.RULE, zorder=0)
     for place, (name, marker) in enumerate(zip(plant.outputs, itertools.cycle(_MARKERS))):
         for row, fit in enumerate(fits):
             ax.plot(left[row, place], row, marker, color=_colour(fit), markersize=7)
-        ax.plot([], [], marker, color=MUTED, label=signal_name(plant, name))
+        ax.plot([], [], marker, color=style.MUTED, label=signal_name(plant, name))
     for row, fit in enumerate(fits):
         fell = first_fall(fit)
         missing = "no prediction" if np.any(np.isnan(left[row])) else ""
         text = missing if np.isnan(fell) else f"stops at {fell:.1f} s"
-        ax.text(0.02, row, text, transform=ax.get_yaxis_transform(), va="center", color=MUTED)
-    plain_log(ax.xaxis)
+        ax.text(0.02, row, text, transform=ax.get_yaxis_transform(), va="center", color=style.MUTED)
+    style.plain_log(ax.xaxis)
     ax.set_title("Variance not explained (%)", pad=18)
 
 
@@ -119,11 +109,11 @@ def _commands(ax: Axes, fits: Sequence[MethodFit]) -> None:
     sizes = {k: row[0] for k, row in enumerate(rows) if np.isnan(first_fall(fits[k]))}
     end = 1.3 * max([*sizes.values(), limit if np.isfinite(limit) else 0.0, 1e-12])
     if np.isfinite(limit):
-        ax.axvspan(limit, end, color=FORBIDDEN, linewidth=0, zorder=0)
-        ax.axvline(limit, color=VERMILLION, linewidth=1, linestyle="--")
+        ax.axvspan(limit, end, color=style.FORBIDDEN, linewidth=0, zorder=0)
+        ax.axvline(limit, color=style.VERMILLION, linewidth=1, linestyle="--")
         side = "left" if limit < end / 2 else "right"
         ax.text(limit if side == "left" else end, -0.55, " beyond the limit", ha=side,
-                color=VERMILLION, va="bottom", fontsize=10)  # fmt: skip
+                color=style.VERMILLION, va="bottom", fontsize=10)  # fmt: skip
     for row, size in sizes.items():
         ax.barh(row, size, 0.42, color=_colour(fits[row]), linewidth=0)
         ax.annotate(f"{size:.3g}", (size, row), (5, 0), textcoords="offset points", va="center")

@@ -136,17 +136,13 @@ def controller_findings(fits: Sequence[MethodFit]) -> list[Finding]:
         if fit.estimate.weights is not None
         for entry in weight_entries(plant, fit.estimate.weights)
     ]
-    heads = ["gain_on", "number", "unit", "method", "value"]
-    gain = "Gain: opposing command per unit of each state, in units of the plant, no intervals."
-    cost = "Cost weights, scaled to 1 for the first command, without intervals."
-    tables = (
-        pd.DataFrame(gains, columns=heads),
-        pd.DataFrame(costs, columns=["matrix", "first", "second", "unit", "method", "value"]),
-    )
-    return [
-        Finding("gain", tables[0], gain, hidden=hidden),
-        Finding("weights", tables[1], cost, hidden=hidden),
-    ]
+    last = ["unit", "method", "value"]
+    gain = pd.DataFrame(gains, columns=["gain_on", "number", *last])
+    cost = pd.DataFrame(costs, columns=["matrix", "first", "second", *last])
+    said = "Gain: opposing command per unit of each state, in units of the plant, no intervals."
+    scaled = "Cost weights, scaled to 1 for the first command, without intervals."
+    return [Finding("gain", gain, said, hidden=hidden),
+            Finding("weights", cost, scaled, hidden=hidden)]  # fmt: skip
 
 
 def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, str, float]]:

@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 
 import impc
+from impc.files.table import Table
 from tests.app.serving import ROOT, german, serving
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def accessible(page: Page) -> None:
     page.set_viewport_size({"width": 1500, "height": 900})
 
 
-def workbook(table: impc.Table, path: Path) -> None:
+def workbook(table: Table, path: Path) -> None:
     """The columns of a table as numbers in a sheet, with the units in the headings."""
     heads = {name: f"{name} [{table.units[name]}]" if name in table.units else name
              for name in table.columns}  # fmt: skip

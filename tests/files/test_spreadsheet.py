@@ -15,8 +15,7 @@ from impc.errors import DataError, InputError, OutputError
 from impc.files.formats import read_table, write_table
 from impc.files.spreadsheet import workbook_bytes
 from impc.files.table import make_table
-from impc.studies.cohort.participants import read_participants
-from impc.studies.cohort.sheet import read_sheet
+from impc.studies.cohort.participants import read_participants, read_sheet
 from tests.files.samples import ods_file, pushed_seat, workbook
 
 SEAT = pushed_seat(50)

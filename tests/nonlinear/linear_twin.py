@@ -9,8 +9,6 @@ from impc.control.controller import Controller
 from impc.model.weights import Weights
 from impc.nonlinear.problem import OptimalControlProblem
 
-__all__ = ["linear_twin"]
-
 
 def linear_twin(
     controller: Controller, weights: Weights
@@ -34,16 +32,10 @@ def linear_twin(
     for _ in range(10):
         W = ca.inv(ca.SX.eye(n) + G @ P)
         step, G, P = step @ W @ step, G + step @ W @ G @ step.T, P + step.T @ P @ W @ step
-    limits = {
-        f"{side}{k}": sign * (u[k] - float(bound))
-        for side, sign, bounds in (
-            ("upper", 1, controller.bounds.u_max),
-            ("lower", -1, controller.bounds.u_min),
-        )
-        for k, bound in enumerate(bounds)
-    }
+    bounds = controller.bounds
+    over = ca.vertcat(u - ca.DM(bounds.u_max), ca.DM(bounds.u_min) - u)
     problem = OptimalControlProblem(
         x, u, theta, A @ x + B @ u, ca.bilin(Q, x, x) + ca.bilin(ca.DM(R), u, u),
-        controller.horizon, terminal_cost=ca.bilin(P, x, x), constraints=limits,
+        controller.horizon, terminal_cost=ca.bilin(P, x, x), constraints={"input": over},
     )  # fmt: skip
     return problem, dict.fromkeys(names, 1.0)

@@ -16,6 +16,7 @@ from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
+from impc.nonlinear.closed_loop import OptimalRecording
 from impc.nonlinear.fit import fit_optimal_control
 from impc.nonlinear.problem import OptimalControlProblem
 from tests.nonlinear.linear_twin import linear_twin
@@ -71,15 +72,15 @@ def test_a_linear_loop_has_the_weights_of_the_linear_route(limit: float) -> None
     np.testing.assert_allclose([found.theta["q0"], found.theta["q1"]], 1, rtol=1e-6)
 
 
-def point(disturbed: bool = False) -> OptimalControlProblem:
-    """A point with drag and limited force."""
+def point(disturbed: bool = False, size: float = 1.0) -> OptimalControlProblem:
+    """A point with drag and limited force; its cost is multiplied by `size`."""
     x, u, d = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("d")
     drag, price, limit = ca.SX.sym("drag"), ca.SX.sym("price"), ca.SX.sym("limit")
     force = u + d if disturbed else u
     return OptimalControlProblem(
         x, u, {"drag": drag, "price": price, "limit": limit},
         next_state=x + 0.1 * ca.vertcat(x[1], force - drag * x[1] * ca.fabs(x[1])),
-        stage_cost=price * x[0] ** 2 + u**2, terminal_cost=price * x[0] ** 2,
+        stage_cost=size * (price * x[0] ** 2 + u**2), terminal_cost=size * price * x[0] ** 2,
         constraints={"force": ca.vertcat(u - limit, -u - limit)}, horizon=15,
         disturbances=d if disturbed else None, signed=["drag"],
     )  # fmt: skip
@@ -89,32 +90,28 @@ TRUTH = {"drag": 0.3, "price": 5.0, "limit": 1.2}
 START = {"drag": 0.1, "price": 8.0, "limit": 1.0}
 
 
+def recorded(problem: OptimalControlProblem) -> OptimalRecording:
+    plan = problem.plan(TRUTH, [1.0, 0.5], mu=1e-12)
+    return problem.recorded_plan(plan.x, plan.u)
+
+
 @pytest.mark.full
-def test_several_recordings_of_both_kinds_with_missing_samples_and_disturbances() -> None:
+def test_recordings_of_both_kinds_with_missing_samples_disturbances_and_unknown_starts() -> None:
     problem = point(disturbed=True)
     d = 0.5 * np.sin(np.arange(25.0))[:, None]
     loop = problem.closed_loop(TRUTH, [1.0, 0.5], 25, d=d)
-    plan = problem.plan(TRUTH, [-0.5, 1.0])
-    x = loop.x.copy()
-    x[5:9, 1] = np.nan
+    gap, late = loop.x.copy(), loop.x.copy()
+    gap[5:9, 1] = late[0] = np.nan
     found = fit_optimal_control(
-        problem, [problem.recorded_loop(x, d=d), problem.recorded_plan(plan.x, plan.u)], START
-    )
+        problem,
+        [problem.recorded_loop(gap, d=d), recorded(problem),
+         problem.recorded_loop(late, loop.u, d=d, x0=[0.8, 0.8], unknown_start=True)],
+        START,
+    )  # fmt: skip
     for name, value in TRUTH.items():
         assert found.theta[name] == pytest.approx(value, rel=1e-6)
     assert found.combinations.unidentified == ()
-
-
-@pytest.mark.full
-def test_an_unknown_initial_state_is_found_with_the_parameters() -> None:
-    problem = point()
-    loop = problem.closed_loop(TRUTH, [1.0, 0.5], 25)
-    x = loop.x.copy()
-    x[0] = np.nan
-    recording = problem.recorded_loop(x, loop.u, x0=[0.8, 0.8], unknown_start=True)
-    found = fit_optimal_control(problem, [recording], START)
-    np.testing.assert_allclose(found.x0[0], [1.0, 0.5], atol=1e-7)
-    assert found.theta["drag"] == pytest.approx(0.3, rel=1e-6)
+    np.testing.assert_allclose(found.x0[2], [1.0, 0.5], atol=1e-7)
 
 
 @pytest.mark.full
@@ -135,22 +132,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert 79 <= held <= 90
 
 
-def test_solvers_find_the_same() -> None:
-    problem = point()
-    plan = problem.plan(TRUTH, [1.0, 0.5])
-    recording = problem.recorded_plan(plan.x, plan.u)
-    found = [
-        fit_optimal_control(problem, [recording], START, solver=name).theta
-        for name in ("ipopt", "fatrop")
-    ]
-    for other in found[1:]:
-        assert other == pytest.approx(found[0], rel=1e-8)
-
-
 def test_what_cannot_be_fitted_is_refused_in_a_line() -> None:
-    problem = point()
-    plan = problem.plan(TRUTH, [1.0, 0.5])
-    recording = problem.recorded_plan(plan.x, plan.u)
+    problem, arm = point(), SYSTEMS["robot arm"]()
+    recording, plan = recorded(problem), arm.problem.plan(arm.truth, arm.x0)
     with pytest.raises(DataError, match="recordings: is empty; give at least one"):
         fit_optimal_control(problem, [], START)
     with pytest.raises(InputError, match="recordings: belong to another problem"):
@@ -159,16 +143,13 @@ def test_what_cannot_be_fitted_is_refused_in_a_line() -> None:
         fit_optimal_control(problem, [recording], START, solver="knitro")
     with pytest.raises(InputError, match="'mu_steps'; its arguments are problem, recordings, sta"):
         fit_optimal_control(problem, [recording], START, mu_steps=(0.1,))  # type: ignore[call-arg]
+    with pytest.raises(InputError, match="starts: got 0; give a whole number of at least"):
+        fit_optimal_control(problem, [recording], START, starts=0)
     with pytest.raises(InputError, match="level: got 95; give one between 0 and 1"):
         fit_optimal_control(problem, [recording], TRUTH).intervals(95)
-
-
-def test_an_infeasible_start_names_the_constraint_and_the_sample() -> None:
-    arm = SYSTEMS["robot arm"]()
-    plan = arm.problem.plan(arm.truth, arm.x0)
-    recording = arm.problem.recorded_plan(plan.x, plan.u)
+    far, shown = arm.truth | {"max_q": 2.3}, arm.problem.recorded_plan(plan.x, plan.u)
     with pytest.raises(InfeasibleError, match=r"constraint angle\[1\]: no plan .* at sample 1"):
-        fit_optimal_control(arm.problem, [recording], arm.truth | {"max_q": 2.3})
+        fit_optimal_control(arm.problem, [shown], far)
 
 
 @pytest.mark.full
@@ -181,32 +162,18 @@ def test_another_start_is_tried_where_the_first_has_no_plan() -> None:
     found = fit_optimal_control(arm.problem, [recording], start, starts=4)
     assert found.loss < 1e-10
     assert found.start == start
-    with pytest.raises(InputError, match="starts: got 0; give a whole number of at least"):
-        fit_optimal_control(arm.problem, [recording], start, starts=0)
 
 
 def test_the_size_of_the_cost_does_not_matter() -> None:
     """The cost times 1e-3 gives the same result, with a smaller mu."""
-    u = ca.SX.sym("u")
-    x, price, limit = ca.SX.sym("x", 2), ca.SX.sym("price"), ca.SX.sym("limit")
-    problem = OptimalControlProblem(
-        x, u, {"price": price, "limit": limit}, next_state=x + 0.1 * ca.vertcat(x[1], u),
-        stage_cost=1e-3 * (price * x[0] ** 2 + u**2), horizon=15,
-        constraints={"force": ca.vertcat(u - limit, -u - limit)},
-    )  # fmt: skip
-    plan = problem.plan({"price": 5.0, "limit": 0.8}, [1.0, 0.5], mu=1e-12)
-    found = fit_optimal_control(
-        problem, [problem.recorded_plan(plan.x, plan.u)], {"price": 2.0, "limit": 3.0}
-    )
-    assert found.theta == pytest.approx({"price": 5.0, "limit": 0.8}, rel=1e-4)
+    problem = point(size=1e-3)
+    found = fit_optimal_control(problem, [recorded(problem)], START | {"limit": 3.0})
+    assert found.theta == pytest.approx(TRUTH, rel=1e-4)
 
 
 def test_a_search_that_is_stopped_says_so() -> None:
     problem = point()
-    plan = problem.plan(TRUTH, [1.0, 0.5])
-    found = fit_optimal_control(
-        problem, [problem.recorded_plan(plan.x, plan.u)], START, evaluations=3
-    )
+    found = fit_optimal_control(problem, [recorded(problem)], START, evaluations=3)
     assert not found.settled
     assert found.evaluations <= 3
 

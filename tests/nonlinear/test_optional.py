@@ -56,13 +56,12 @@ def test_of_the_core_only_the_door_the_commands_and_the_studies_name_it() -> Non
 
 @pytest.mark.full
 def test_the_rest_works_without_the_folder(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(
-        "import impc\ndef own():\n    return impc.OptimalControlProblem\n"
-    )
-    (tmp_path / "own.toml").write_text(
-        '[recording]\ntime = "t"\n[signals.x]\ncolumn = "x"\nunit = "m"\n'
-    )
-    (tmp_path / "own.csv").write_text("t,x\n0,1\n1,2\n")
+    for name, text in {
+        "own.py": "import impc\ndef own():\n    return impc.OptimalControlProblem\n",
+        "own.toml": '[recording]\ntime = "t"\n[signals.x]\ncolumn = "x"\nunit = "m"\n',
+        "own.csv": "t,x\n0,1\n1,2\n",
+    }.items():
+        (tmp_path / name).write_text(text)
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
 
     def run(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:

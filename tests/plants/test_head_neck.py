@@ -6,19 +6,9 @@ import numpy as np
 import pytest
 
 import plants
-from plants import HEAD_NECK_FIXED, TABLE_4_3
+from plants import HEAD_NECK_FIXED, table_4_3_column
 
-NOMINAL = np.array([float(value or 0) for value in TABLE_4_3["nominal"]])
-
-
-def column(name: str) -> np.ndarray:
-    return np.array(
-        [
-            base if value is None else value
-            for value, base in zip(TABLE_4_3[name], NOMINAL, strict=True)
-        ],
-        dtype=float,
-    )
+NOMINAL = table_4_3_column("nominal")
 
 
 def loop(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -43,7 +33,7 @@ REFERENCE = {
 @pytest.mark.parametrize("name", REFERENCE)
 def test_margins_of_the_columns_of_table_4_3(name: str) -> None:
     """From the blocks with an exact delay, and from the one fraction with Padé's: 2 %."""
-    theta = column(name)
+    theta = table_4_3_column(name)
     crossover, margin, gain, dc, band, peak = REFERENCE[name]
     w = np.geomspace(1e-2, 60, 200_000)
     L = loop(theta, w)
@@ -54,28 +44,26 @@ def test_margins_of_the_columns_of_table_4_3(name: str) -> None:
     assert 1 / abs(L[crossing]) == pytest.approx(gain, rel=0.02)
     system = plants.head_neck_plant(theta)
     assert np.all(system.poles().real < 0)
-    T = np.array([system(1j * value) for value in np.geomspace(1e-2, 20, 4000)])
+    closed = np.geomspace(1e-2, 20, 4000)
+    T = np.array([system(1j * value) for value in closed])
     assert abs(system(0)) == pytest.approx(dc, rel=0.02)
     assert np.max(np.abs(T)) == pytest.approx(peak, rel=0.02)
     below = np.flatnonzero(np.abs(T) < abs(system(0)) / np.sqrt(2))[0]
-    assert np.geomspace(1e-2, 20, 4000)[below] / (2 * np.pi) == pytest.approx(band, rel=0.02)
+    assert closed[below] / (2 * np.pi) == pytest.approx(band, rel=0.02)
 
 
-def test_the_fraction_is_the_diagram() -> None:
-    """Closed loop against L / (1 + L) with the exact delay, up to 10 rad/s: 1e-4."""
-    system = plants.head_neck_plant(NOMINAL)
+def test_the_fraction_is_the_diagram_and_pitch_feels_gravity() -> None:
+    """Closed loop against L / (1 + L) with the exact delay, up to 10 rad/s: 1e-4.
+
+    In pitch the DC gain is Kvis / (Kvis + Kccr + K - m g l), .838 in the reference.
+    """
     w = np.geomspace(1e-3, 10, 200)
-    L = loop(NOMINAL, w)
-    found = np.array([system(1j * value) for value in w])
-    np.testing.assert_allclose(found, L / (1 + L), rtol=1e-4)
-
-
-def test_pitch_feels_gravity() -> None:
-    """DC gain Kvis / (Kvis + Kccr + K - m g l), .838 in the reference for its m and l."""
+    L, system = loop(NOMINAL, w), plants.head_neck_plant(NOMINAL)
+    np.testing.assert_allclose([system(1j * value) for value in w], L / (1 + L), rtol=1e-4)
     system = plants.head_neck_plant(NOMINAL, "pitch")
     assert np.all(system.poles().real < 0)
     m, lever = HEAD_NECK_FIXED["m"][0], HEAD_NECK_FIXED["l"][0]
-    kvis, kccr, k = NOMINAL[0], NOMINAL[2], NOMINAL[11]
+    kvis, kccr, k = NOMINAL[[0, 2, 11]]
     expected = kvis / (kvis + kccr + k - m * 9.81 * lever)
     assert abs(system(0)) == pytest.approx(expected)
     assert expected == pytest.approx(0.838, abs=2e-3)

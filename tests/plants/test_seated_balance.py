@@ -17,16 +17,15 @@ from plants import (
     delayed_muscle,
     nonlinear_dynamics,
     runge_kutta_step,
+    seated_balance_for,
     seated_balance_plant,
+    seated_balance_step_for,
+    seated_parameters_for,
     ternary_torque,
 )
+from plants._checks import Array
 from plants.seated_balance import seated_balance_slopes
-
-
-def random_numbers() -> np.random.Generator:
-    seed = int(np.random.default_rng().integers(2**31))
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
+from tests.support import extrapolated_slope
 
 
 def random_parameters(rng: np.random.Generator) -> SeatedBalanceParameters:
@@ -38,21 +37,16 @@ def random_parameters(rng: np.random.Generator) -> SeatedBalanceParameters:
 
 
 def test_slopes_of_the_matrices_are_differences() -> None:
-    p = random_parameters(random_numbers())
-    found, h = seated_balance_slopes(p, 0.01, 5), 1e-4
-    for name, slopes in found.items():
+    p = random_parameters(np.random.default_rng(7))
+    for name, slopes in seated_balance_slopes(p, 0.01, 5).items():
         value = getattr(p, name)
-        ends = [
-            seated_balance_plant(replace(p, **{name: value * (1 + step)}), 0.01, 5)
-            for step in (h, -h, h / 2, -h / 2)
-        ]
-        for letter, slope in zip("AB", slopes, strict=True):
-            far, near = (
-                (getattr(ends[k], letter) - getattr(ends[k + 1], letter)) / (2 * h * value)
-                for k in (0, 2)
-            )
-            differences = (8 * near - far) / 3  # errors of order h^4
-            np.testing.assert_allclose(slope, differences, atol=1e-6 * np.max(np.abs(slope)))
+
+        def moved(t: float, name: str = name, value: float = value) -> Array:
+            plant = seated_balance_plant(replace(p, **{name: value + t}), 0.01, 5)
+            return np.hstack([plant.A, plant.B])
+
+        slope, differences = np.hstack(slopes), extrapolated_slope(moved, 1e-2 * value)
+        np.testing.assert_allclose(slope, differences, atol=1e-6 * np.max(np.abs(slope)))
 
 
 def energies(p: SeatedBalanceParameters) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -71,7 +65,7 @@ def energies(p: SeatedBalanceParameters) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 
 def test_equations_are_those_of_lagrange() -> None:
-    rng = random_numbers()
+    rng = np.random.default_rng(7)
     for _ in range(5):
         p = random_parameters(rng)
         state, kinetic, potential = energies(p)
@@ -92,97 +86,81 @@ def test_equations_are_those_of_lagrange() -> None:
 
 
 def test_linearisation_is_the_central_difference_of_the_nonlinear_equations() -> None:
-    rng = random_numbers()
+    rng = np.random.default_rng(7)
     for p in (SeatedBalanceParameters(), random_parameters(rng)):
-        dynamics = nonlinear_dynamics(p)
-        plant = continuous_seated_balance_plant(p)
+        plant, dynamics = continuous_seated_balance_plant(p), nonlinear_dynamics(p)
         exact = np.hstack([plant.A, plant.B])
-        # Richardson's combination of two steps: the error of a single central difference at its
-        # best step is about 1e-10 of the largest entry, near the 1e-8 wanted.
-        for column in range(12):
-            unit = np.eye(12)[column]
+        for unit, column in zip(np.eye(12), exact.T, strict=True):
 
-            def slope(h: float, unit: Any = unit, dynamics: Any = dynamics) -> Any:
-                ends = [dynamics(s * h * unit[:10], s * h * unit[10:]).full() for s in (1, -1)]
-                return (ends[0] - ends[1])[:, 0] / (2 * h)
+            def moved(t: float, unit: Array = unit, dynamics: Any = dynamics) -> Array:
+                return np.asarray(dynamics(t * unit[:10], t * unit[10:]).full()[:, 0])
 
-            difference = (4 * slope(1e-3) - slope(2e-3)) / 3
-            np.testing.assert_allclose(difference, exact[:, column], rtol=1e-8, atol=1e-8)
+            found = extrapolated_slope(moved)
+            np.testing.assert_allclose(found, column, rtol=1e-8, atol=1e-8)
 
 
-def test_four_state_numbers_of_the_reference() -> None:
+def test_numbers_of_the_reference() -> None:
     plant = continuous_seated_balance_plant()
-    A, Bu, Bd = plant.A[:4, :4], plant.A[:4, -1], plant.B[:4, 1]
+    A = plant.A[:4, :4]
     np.testing.assert_allclose(
         A[2:], [[-7.959, -5.419, -2.478, 1.1419], [13.0633, 21.3689, 2.376, -1.4282]], atol=5.1e-5
     )
-    np.testing.assert_allclose(Bu, [0, 0, -0.4568, 0.5713], atol=5e-5)
-    np.testing.assert_allclose(Bd, [0, 0, 0.2672, -0.1896], atol=5e-5)
+    np.testing.assert_allclose(plant.A[:4, -1], [0, 0, -0.4568, 0.5713], atol=5e-5)
+    np.testing.assert_allclose(plant.B[:4, 1], [0, 0, 0.2672, -0.1896], atol=5e-5)
     poles = sorted(np.linalg.eigvals(A), key=lambda pole: (pole.real, pole.imag))
     np.testing.assert_allclose(poles, [-5.376, -1.211 - 1.811j, -1.211 + 1.811j, 3.892], atol=6e-4)
     p = SeatedBalanceParameters()
     assert (p.m1 * p.l1 + p.m2 * p.l12) * p.gravity == pytest.approx(141.5, abs=0.05)
     assert p.m2 * p.l2 * p.gravity == pytest.approx(100.9, abs=0.05)
+    sampled = seated_balance_plant()
+    assert np.abs(np.linalg.eigvals(sampled.A)).max() == pytest.approx(1.0397, abs=5e-5)
+    reach = [np.linalg.matrix_power(sampled.A, k) @ sampled.B[:, :1] for k in range(10)]
+    table = np.hstack(reach) / np.linalg.norm(np.hstack(reach), axis=1, keepdims=True)  # no units
+    assert np.linalg.matrix_rank(table) == 10
 
 
-def test_ten_state_numbers_of_the_reference() -> None:
-    plant = seated_balance_plant()
-    assert np.abs(np.linalg.eigvals(plant.A)).max() == pytest.approx(1.0397, abs=5e-5)
-    B = plant.B[:, :1]
-    reach = np.hstack([np.linalg.matrix_power(plant.A, k) @ B for k in range(10)])
-    reach /= np.linalg.norm(reach, axis=1, keepdims=True)  # the units of the states differ
-    assert np.linalg.matrix_rank(reach) == 10
+def test_the_intent_of_the_reference_has_its_gain_and_extremes() -> None:
+    """Under the ternary torque.
 
-
-def intent_gain(plant: Any, delay_weight: float) -> tuple[Any, float]:
-    """Gain and closed-loop radius of the reference's intent."""
-    direction = np.array([0.70, 0.65, 0.22, 0.20])
+    The reference weights the delay states by 1e-2 in the companion form, where they are so small
+    that this is no weight at all: 0 here.
+    """
+    plant, direction = seated_balance_plant(), np.array([0.70, 0.65, 0.22, 0.20])
     direction /= np.linalg.norm(direction)
-    Q = np.diag([2e4, 2e4, 500.0, 500.0, *[delay_weight] * 5, 1e-2])
+    Q = np.diag([2e4, 2e4, 500.0, 500.0, *[0.0] * 5, 1e-2])
     Q[:4, :4] += 6e5 * np.outer(direction, direction)
     B = plant.B[:, :1]
     P = scipy.linalg.solve_discrete_are(plant.A, B, Q, np.eye(1))
-    K = np.linalg.solve(1 + B.T @ P @ B, B.T @ P @ plant.A)
-    return K[0], float(np.abs(np.linalg.eigvals(plant.A - B @ K)).max())
-
-
-def test_gain_of_the_intent_is_that_of_the_reference() -> None:
-    # The reference weights the delay states by 1e-2 in the companion form, where they are so
-    # small that this is no weight at all: 0 here. The same 1e-2 on these states moves the gain of
-    # the body by 8e-4 of itself.
-    plant = seated_balance_plant()
-    expected = [814.34, 1478.09, 325.57, 365.90]
-    K, radius = intent_gain(plant, 0.0)
-    np.testing.assert_allclose(K[:4], expected, atol=5.1e-3)
+    K = np.linalg.solve(1 + B.T @ P @ B, B.T @ P @ plant.A)[0]
+    np.testing.assert_allclose(K[:4], [814.34, 1478.09, 325.57, 365.90], atol=5.1e-3)
     assert K[9] == pytest.approx(2.561, abs=5e-4)
+    radius = np.abs(np.linalg.eigvals(plant.A - np.outer(B, K))).max()
     assert radius == pytest.approx(0.9677, abs=5e-5)
-    K, radius = intent_gain(plant, 1e-2)
-    np.testing.assert_allclose(K[:4], expected, rtol=1e-3)
-    assert radius == pytest.approx(0.9677, abs=5e-5)
-
-
-def test_balance_under_the_ternary_torque_has_the_reference_extremes() -> None:
-    K, _ = intent_gain(seated_balance_plant(), 0.0)
-    step = runge_kutta_step(nonlinear_dynamics(), 0.01)
-    torque = ternary_torque()
-    states = np.zeros((len(torque) + 1, 10))
-    commands = np.zeros(len(torque))
-    for k, d in enumerate(torque):
-        commands[k] = -K @ states[k]
-        states[k + 1] = step(states[k], [commands[k], d]).full()[:, 0]
-    extremes = np.degrees(np.abs(states[:, :2]).max(axis=0))
+    step, states = runge_kutta_step(nonlinear_dynamics(), 0.01), [np.zeros(10)]
+    for d in ternary_torque():
+        states.append(step(states[-1], [-K @ states[-1], d]).full()[:, 0])
+    extremes = np.degrees(np.abs(states).max(axis=0)[:2])
     np.testing.assert_allclose(extremes, [6.96, 5.20], atol=6e-3)
-    assert np.abs(commands).max() == pytest.approx(9.5, abs=0.05)
-    correlation = np.corrcoef(states[:, 0], states[:, 1])[0, 1]
+    assert np.abs(states[:-1] @ K).max() == pytest.approx(9.5, abs=0.05)
+    correlation = np.corrcoef(np.array(states)[:, 0], np.array(states)[:, 1])[0, 1]
     assert correlation == pytest.approx(-0.984, abs=1e-3)
 
 
-def test_sampled_plant_is_the_nonlinear_plant_for_small_motions() -> None:
-    plant = seated_balance_plant(sample_time=0.02)
-    step = runge_kutta_step(nonlinear_dynamics(), 0.02, substeps=40)
-    rng = random_numbers()
-    x, w = 1e-4 * rng.normal(size=10), 1e-4 * rng.normal(size=2)
-    np.testing.assert_allclose(step(x, w).full()[:, 0], plant.A @ x + plant.B @ w, atol=1e-10)
+def test_sampled_plants_are_the_nonlinear_plant() -> None:
+    """For small motions the linear one; for large ones a person's body, to the error of a step."""
+    person = seated_balance_for(sample_time=0.02)
+    fine = runge_kutta_step(nonlinear_dynamics(seated_parameters_for()), 0.02, substeps=40)
+    rng = np.random.default_rng(7)
+    x, w = rng.normal(size=10), rng.normal(size=2)
+    small = fine(1e-4 * x, 1e-4 * w).full()[:, 0]
+    np.testing.assert_allclose(small, 1e-4 * (person.A @ x + person.B @ w), atol=1e-10)
+    far = 0.2 * x
+    expected = fine(far, w).full()[:, 0]
+    np.testing.assert_allclose(person.body()(far, w).full()[:, 0], expected, atol=1e-5)
+    step = seated_balance_step_for(sample_time=0.0005)
+    for _ in range(40):
+        far = step(far, w).full()[:, 0]
+    np.testing.assert_allclose(far, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [0, 1, 5, 8])
@@ -204,15 +182,6 @@ def test_names_and_order_of_the_signals(order: int) -> None:
     np.testing.assert_allclose(continuous.A[4:, 4:], chain.A, atol=1e-12)
     np.testing.assert_allclose(continuous.B[4:, 0], chain.B, atol=1e-12)
     assert not np.any(continuous.B[:4, 0])
-
-
-def test_bad_sample_time_and_order_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^sample_time: "):
-        seated_balance_plant(sample_time=0.0)
-    with pytest.raises(ValueError, match=r"^order: "):
-        seated_balance_plant(delay_order=21)
-    with pytest.raises(ValueError, match=r"^substeps: "):
-        runge_kutta_step(nonlinear_dynamics(), 0.01, substeps=0)
 
 
 @pytest.mark.parametrize(

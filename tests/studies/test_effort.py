@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import impc
 import impc.cli.console
-import impc.studies.cohort.engine
+import impc.studies.cohort.tasks
 import impc.studies.fit.subject
 from impc.arrays import Array, IntArray
 from impc.cli.console import require_consent
@@ -26,8 +26,7 @@ from impc.studies.effort import (
     select_evaluations,
     selection_effort,
 )
-from impc.studies.selection.analysis import select_study
-from impc.studies.selection.key_parameters import key_parameters
+from impc.studies.selection.analysis import key_parameters, select_study
 from impc.studies.selection.model import ParametricModel, Trial, sensitivity
 from impc.studies.selection.model_source import model_source
 from impc.studies.selection.settings import SelectSettings
@@ -173,6 +172,6 @@ def test_a_cohort_for_days_ends_at_once(tmp_path: Path, monkeypatch: pytest.Monk
     def begun(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(impc.studies.cohort.engine, "run_study", begun)
+    monkeypatch.setattr(impc.studies.cohort.tasks, "run_study", begun)
     done = CliRunner().invoke(main, [*words, "--yes"])
     assert done.exit_code == 130, done.output

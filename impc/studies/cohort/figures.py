@@ -6,18 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.reporting import style
 from impc.reporting.rendering import number, sentence_case
-from impc.reporting.style import (
-    BLUE,
-    HALF,
-    INK,
-    MUTED,
-    RULE,
-    VERMILLION,
-    new_figure,
-    panels,
-    plain_log,
-)
 from impc.studies.cohort.comparison import mean_of
 from impc.studies.cohort.unit_result import LOGARITHM
 from impc.studies.fit.facts import between
@@ -42,7 +32,7 @@ def forest(cohort: Cohort) -> Figure:
         units = units[units["condition"] == lead.condition]
     blocks = units.sort_values("value", ascending=False).groupby(label)
     rows = len(units) + len(blocks)
-    figure = new_figure(HALF, float(np.clip(0.9 + 0.16 * rows, 2.6, 6.4)))
+    figure = style.new_figure(style.HALF, float(np.clip(0.9 + 0.16 * rows, 2.6, 6.4)))
     ax, at = figure.subplots(), 0.0
     if cohort.measure.startswith(LOGARITHM):
         ax.set_xscale("log")
@@ -52,8 +42,9 @@ def forest(cohort: Cohort) -> Figure:
     pad = 0.6 * (high - low) or 1.0  # wider intervals are cut off
     ax.set_xlim(*ax.xaxis.get_transform().inverted().transform([low - pad, high + pad]))
     if ax.get_xscale() == "log":
-        plain_log(ax.xaxis)
+        style.plain_log(ax.xaxis)
     across: Any = {"transform": ax.get_yaxis_transform(), "va": "center"}
+    small = {"fontsize": 9} | across
     for block, part in blocks:
         title = f"{label.capitalize()} {block!s}" if block else "All people"
         ax.text(0, at, title, weight="bold", **across)
@@ -63,10 +54,10 @@ def forest(cohort: Cohort) -> Figure:
         for row in part.to_dict("records"):
             at -= 1
             if rows <= _NAMED:
-                ax.text(-0.015, at, row["subject"], ha="right", fontsize=9, color=MUTED, **across)
-            ax.plot([row["low"], row["high"]], [at, at], color=BLUE, linewidth=1.3)
+                ax.text(-0.015, at, row["subject"], ha="right", color=style.MUTED, **small)
+            ax.plot([row["low"], row["high"]], [at, at], color=style.BLUE, linewidth=1.3)
             known, far = row["determined"], np.isfinite(row["far"])
-            colour = VERMILLION if far else BLUE if known else MUTED
+            colour = style.VERMILLION if far else style.BLUE if known else style.MUTED
             ax.plot(np.clip(row["value"], *ax.get_xlim()), at, "s" if far else "o", color=colour,
                     markersize=4.5, markerfacecolor=colour if known else "none")  # fmt: skip
         at -= 1.6
@@ -83,8 +74,8 @@ def _mean(ax: Axes, ends: Array, at: float, rows: int, across: Any) -> None:
     """Draw the mean over people with its interval behind their rows."""
     low, value, high = ends
     height = [at - rows - 0.3, at - 0.5]
-    ax.fill_betweenx(height, low, high, color=RULE, linewidth=0, zorder=0)
-    ax.plot([value, value], height, color=INK, linewidth=1.2, zorder=1)
+    ax.fill_betweenx(height, low, high, color=style.RULE, linewidth=0, zorder=0)
+    ax.plot([value, value], height, color=style.INK, linewidth=1.2, zorder=1)
     ax.text(1, at, f"mean {number(value)} ({between(low, high)})", ha="right", **across)
 
 
@@ -92,4 +83,4 @@ def subject_figure(fit: Mapping[str, Any]) -> Figure:
     """Recorded and modelled outputs of a unit's first trial, from its stored `fit`."""
     run = fit["trajectory"]
     signals = [(one["label"], one["recorded"], one["simulated"]) for one in run["signals"]]
-    return panels(signals, run["dt"], "Time (s)")
+    return style.panels(signals, run["dt"], "Time (s)")

@@ -30,8 +30,8 @@ from impc.studies.fit.facts import between
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from impc.studies.cohort.engine import Failures, Store
     from impc.studies.cohort.study import Study, Unit
+    from impc.studies.cohort.tasks import Failures, Store
 
 _BESIDE = {
     "units": "All numbers of every fit, angles in radians.",

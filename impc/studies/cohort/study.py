@@ -29,8 +29,12 @@ from impc.errors import InputError
 from impc.files.configuration import Configuration, read_configuration
 from impc.files.formats import FORMATS
 from impc.files.reading import require_distinct
-from impc.studies.cohort.participants import Participant, read_participants
-from impc.studies.cohort.sheet import checked_name, read_sheet
+from impc.studies.cohort.participants import (
+    Participant,
+    checked_name,
+    read_participants,
+    read_sheet,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -24,8 +24,8 @@ from impc.studies.cohort.study import LABELS
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from impc.studies.cohort.engine import Store
     from impc.studies.cohort.study import Study
+    from impc.studies.cohort.tasks import Store
 
 
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:

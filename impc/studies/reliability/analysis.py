@@ -18,14 +18,22 @@ negative, the CMC is NaN: curves differ more between trials than between frequen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impc.errors import DataError
-from impc.studies.reliability.anova import Anova, Trend, learning_trend, visit_anova
-from impc.studies.reliability.icc import Icc, MeasurementError, icc, measurement_error
+from impc.studies.reliability.icc import (
+    Anova,
+    Icc,
+    MeasurementError,
+    Trend,
+    icc,
+    learning_trend,
+    measurement_error,
+    visit_anova,
+)
 from impc.studies.reliability.measures import band_energy, passband, rms, transfer_function
 
 if TYPE_CHECKING:
@@ -36,7 +44,6 @@ if TYPE_CHECKING:
 
 #: Name of a measure -> description.
 MEASURES = {"rms": "sway (RMS about upright)", "energy": "energy in the band"}
-_NONE = float("nan")
 
 
 @dataclass(frozen=True)
@@ -61,12 +68,14 @@ class MeasureResult:
     unit: str  # Of the scores: the output's, squared for energy
     scores: Array  # (subjects, visits), NaN if missing
     # ICC(A,k) between visits with the generalised interval, and with that of McGraw and Wong
-    icc: Icc
-    icc_f: Icc
-    error: MeasurementError  # SEM and minimal detectable change (95 %) of the score of one visit
-    anova: Anova
-    trend: Trend  # Change from visit to visit (learning)
-    notes: tuple[str, ...]  # Reasons for missing results
+    icc: Icc = field(default_factory=Icc)
+    icc_f: Icc = field(default_factory=Icc)
+    # SEM and minimal detectable change (95 %) of the score of one visit
+    error: MeasurementError = field(default_factory=MeasurementError)
+    anova: Anova = field(default_factory=Anova)
+    # Change from visit to visit (learning)
+    trend: Trend = field(default_factory=Trend)
+    notes: tuple[str, ...] = ()  # Reasons for missing results
 
     @property
     def name(self) -> str:
@@ -126,20 +135,14 @@ def analyse(trials: Trials) -> Reliability:
         notes.append(f"Trials have {samples} to {max(lengths)} samples; all were cut to {samples}.")
     # Of each cell: inputs (trials, samples) and outputs (trials, samples, p).
     cells = {
-        key: (
-            np.stack([torque[:samples] for torque, _ in cell]),
-            np.stack([outputs[:samples] for _, outputs in cell]),
-        )
+        key: [np.stack([signal[:samples] for signal in each]) for each in zip(*cell, strict=True)]
         for key, cell in trials.cells.items()
     }
     band = passband(next(iter(cells.values()))[0][0], rate)
     # Of each trial: scores by measure (trials, p), and transfer function (trials, frequencies, p).
     scores = {
-        "rms": {key: rms(outputs) for key, (_, outputs) in cells.items()},
-        "energy": {
-            key: band_energy(outputs, rate, band.low, band.high)
-            for key, (_, outputs) in cells.items()
-        },
+        "rms": {key: rms(y) for key, (_, y) in cells.items()},
+        "energy": {key: band_energy(y, rate, band.low, band.high) for key, (_, y) in cells.items()},
     }
     curves = {
         key: np.stack([
@@ -148,49 +151,43 @@ def analyse(trials: Trials) -> Reliability:
         ])
         for key, cell in cells.items()
     }  # fmt: skip
-    measures, cmc = [], []
+    measures, agreement = [], []
     for condition in conditions:
         keys = [[(subject, visit, condition) for visit in visits] for subject in subjects]
         for place, (output, signal) in enumerate(trials.outputs.items()):
             named = output, signal, condition
             for name, found in scores.items():
                 table = [
-                    [np.mean(found[key][:, place]) if key in found else _NONE for key in row]
+                    [np.mean(found[key][:, place]) if key in found else np.nan for key in row]
                     for row in keys
                 ]
                 unit = trials.unit if name == "rms" else f"{trials.unit}²"
                 measures.append(measured(name, *named, unit, np.array(table)))
             own = [[curves[key][..., place] for key in row if key in curves] for row in keys]
-            cmc.append(_cmc(*named, own))
-    responses = {key: transfer_function(*cell, rate, band) for key, cell in cells.items()}
+            agreement.append(_cmc(*named, own))
+    responses = {key: transfer_function(u, y, rate, band) for key, (u, y) in cells.items()}
     return Reliability(
-        subjects, visits, conditions, band, tuple(measures), tuple(cmc), responses, tuple(notes)
-    )
+        subjects, visits, conditions, band, tuple(measures), tuple(agreement), responses,
+        tuple(notes),
+    )  # fmt: skip
 
 
 def measured(
     measure: str, output: str, signal: str, condition: str, unit: str, scores: Array
 ) -> MeasureResult:
     """Analyse the scores (subjects, visits); NaN is a missing visit."""
-    none = Icc(_NONE, _NONE, _NONE, 0, 0)
-    found: dict[str, Any] = {"icc": none, "icc_f": none, "error": MeasurementError(_NONE, _NONE)}
-    found |= {"anova": Anova(_NONE, _NONE, _NONE), "trend": Trend(_NONE, _NONE, _NONE, _NONE)}
+    found: dict[str, Any] = {}
     notes: list[str] = []
     try:
-        found |= {
-            "icc": icc(scores, "A,k", method="generalised"),
-            "icc_f": icc(scores, "A,k"),
-            "error": measurement_error(scores),
-        }
+        found["icc"] = icc(scores, "A,k", method="generalised")
+        found["icc_f"], found["error"] = icc(scores, "A,k"), measurement_error(scores)
         if found["icc"].left_out:
             notes.append(f"{found['icc'].left_out} subjects lack a visit and are left out")
-        found["anova"] = visit_anova(scores)
-        found["trend"] = learning_trend(scores)
+        found["anova"], found["trend"] = visit_anova(scores), learning_trend(scores)
     except DataError as error:
         notes.append(str(error))
-    return MeasureResult(
-        measure, output, signal, condition, unit, scores, **found, notes=tuple(notes)
-    )
+    named = measure, output, signal, condition, unit, scores
+    return MeasureResult(*named, **found, notes=tuple(notes))
 
 
 def _cmc(output: str, signal: str, condition: str, subjects: list[list[ComplexArray]]) -> CmcResult:
@@ -212,4 +209,4 @@ def cmc(curves: ComplexArray, over: tuple[int, ...]) -> float:
         for mean in (curves.mean(axis=axes, keepdims=True) for axes in (over, (*over, 2)))
     )
     share = 1 - own / everything if everything else -1.0
-    return float(np.sqrt(share)) if share >= 0 else float("nan")
+    return float(np.sqrt(share)) if share >= 0 else np.nan

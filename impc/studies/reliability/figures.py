@@ -9,21 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
+from impc.reporting import style
 from impc.reporting.rendering import sentence_case
-from impc.reporting.style import (
-    BLUE,
-    FORBIDDEN,
-    GREEN,
-    HALF,
-    INK,
-    MUTED,
-    RULE,
-    VERMILLION,
-    WIDE,
-    new_figure,
-    plain_log,
-    strip,
-)
 from impc.studies.reliability.verdict import BANDS
 
 if TYPE_CHECKING:
@@ -32,7 +19,7 @@ if TYPE_CHECKING:
     from impc.reporting.document import Draw
     from impc.studies.reliability.analysis import Reliability, Trials
 
-_LINES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, ":"), (INK, "-."))
+_LINES = ((style.BLUE, "-"), (style.VERMILLION, "--"), (style.GREEN, ":"), (style.INK, "-."))
 
 
 def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
@@ -54,17 +41,17 @@ def reliability_figures(trials: Trials, result: Reliability) -> dict[str, Draw]:
 def _icc(result: Reliability) -> Figure:
     """All ICCs with their intervals over the bands from poor to excellent."""
     items = result.known
-    figure = new_figure(HALF, 0.9 + 0.29 * len(items))
+    figure = style.new_figure(style.HALF, 0.9 + 0.29 * len(items))
     ax, labels, name = figure.subplots(), [], ""
     least = -0.5 if min(item.icc.low for item in items) < 0 else 0.0
     ends = [least, *(most for most, _ in BANDS[:-1]), 1.0]
     for place, (low, high) in enumerate(pairwise(ends)):
         if place % 2 == 0:
-            ax.axvspan(low, high, color=RULE, alpha=0.55, linewidth=0, zorder=0)
-        ax.text((max(low, 0.0) + high) / 2, -0.9, BANDS[place][1], ha="center", color=MUTED,
+            ax.axvspan(low, high, color=style.RULE, alpha=0.55, linewidth=0, zorder=0)
+        ax.text((max(low, 0.0) + high) / 2, -0.9, BANDS[place][1], ha="center", color=style.MUTED,
                 fontsize=10)  # fmt: skip
     for at, item in enumerate(items):
-        color, marker = (BLUE, "o") if item.measure == "rms" else (MUTED, "s")
+        color, marker = (style.BLUE, "o") if item.measure == "rms" else (style.MUTED, "s")
         value, low, high = np.clip(item.icc[:3], least, 1.0)
         ax.plot([low, high], [at, at], color=color, linewidth=1.8)
         ax.plot(value, at, marker, color=color)
@@ -83,17 +70,17 @@ def _bland_altman(result: Reliability) -> Figure:
     items = [item for item in result.known if item.measure == "rms"]
     columns = max(len(result.conditions), 2)
     rows = -(-len(items) // columns)
-    figure = new_figure(WIDE, 0.5 + 1.7 * rows)
+    figure = style.new_figure(style.WIDE, 0.5 + 1.7 * rows)
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False, sharey="row"))
     for ax in axes[len(items) :]:
         ax.set_visible(False)
     for ax, item in zip(axes, items, strict=False):
         first, last = item.scores[:, 0], item.scores[:, -1]
         mean, reach = float(np.nanmean(last - first)), 1.96 * np.nanstd(last - first, ddof=1)
-        strip(ax, f"{item.name}, {item.condition} ({item.unit})")
-        ax.axhspan(mean - reach, mean + reach, color=RULE, alpha=0.6, linewidth=0, zorder=0)
-        ax.axhline(mean, color=INK, linewidth=1.0)
-        ax.plot((first + last) / 2, last - first, "o", color=BLUE, markersize=4)
+        style.strip(ax, f"{item.name}, {item.condition} ({item.unit})")
+        ax.axhspan(mean - reach, mean + reach, color=style.RULE, alpha=0.6, linewidth=0, zorder=0)
+        ax.axhline(mean, color=style.INK, linewidth=1.0)
+        ax.plot((first + last) / 2, last - first, "o", color=style.BLUE, markersize=4)
         ax.set_xlabel(f"Mean of both visits ({item.unit})")
     return figure
 
@@ -104,18 +91,19 @@ def _trial(trials: Trials, result: Reliability) -> Figure:
     signals = [("perturbation torque", torque, "N m")]
     for name, values in zip(trials.outputs.values(), outputs.T, strict=True):
         signals.append((name, values, trials.unit))
-    figure = new_figure(WIDE, 0.5 + 1.5 * len(signals))
+    figure = style.new_figure(style.WIDE, 0.5 + 1.5 * len(signals))
     axes = figure.subplots(len(signals), 2, squeeze=False, sharex="col")
     time = np.arange(len(torque)) / trials.rate
     for (left, right), (name, values, unit) in zip(axes, signals, strict=True):
-        strip(left, f"{sentence_case(name)} ({unit})")
-        left.plot(time, values, color=BLUE, linewidth=1.0)
+        style.strip(left, f"{sentence_case(name)} ({unit})")
+        left.plot(time, values, color=style.BLUE, linewidth=1.0)
         frequency, power = scipy.signal.periodogram(values, trials.rate, detrend=False)
         inside = result.band.excited[result.band.excited < len(power)]
         right.set_title(f"Power of {name} (({unit})²/Hz)")
-        right.axvspan(result.band.low, result.band.high, color=FORBIDDEN, linewidth=0, zorder=0)
-        right.loglog(frequency[inside], power[inside], ".-", color=BLUE, linewidth=0.6)
-        plain_log(right.xaxis, right.yaxis)
+        band = result.band
+        right.axvspan(band.low, band.high, color=style.FORBIDDEN, linewidth=0, zorder=0)
+        right.loglog(frequency[inside], power[inside], ".-", color=style.BLUE, linewidth=0.6)
+        style.plain_log(right.xaxis, right.yaxis)
     axes[-1, -1].set_xlabel("Frequency (Hz)")
     axes[-1, 0].set_xlabel("Time (s)")
     return figure
@@ -126,23 +114,23 @@ def _responses(
 ) -> Figure:
     """Magnitude and phase of the averaged responses of up to four cells."""
     outputs = list(trials.outputs.values())
-    figure = new_figure(WIDE, 3.4)
+    figure = style.new_figure(style.WIDE, 3.4)
     axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False)
     for (color, line), (label, key) in zip(_LINES, cells.items(), strict=False):
         found = result.responses.get(key)
         if found is None:
             continue
-        style: Any = {"color": color, "linestyle": line, "label": label}
+        look: Any = {"color": color, "linestyle": line, "label": label}
         for index, (above, below) in enumerate(axes.T):
             response, seen = found.response[:, index], found.coherence[:, index]
             # Phase only above the coherence that chance alone reaches in 5 %.
             clear = seen >= 1 - 0.05 ** (1 / max(len(trials.cells[key]) - 1, 1e-9))
             phase = np.full(len(response), np.nan)
             phase[clear] = np.degrees(np.unwrap(np.angle(response[clear])))
-            above.loglog(found.frequency, np.abs(response), **style)
-            below.semilogx(found.frequency, phase, **style)
+            above.loglog(found.frequency, np.abs(response), **look)
+            below.semilogx(found.frequency, phase, **look)
     for (above, below), name in zip(axes.T, outputs, strict=True):
-        plain_log(above.xaxis, above.yaxis)
+        style.plain_log(above.xaxis, above.yaxis)
         above.set_title(f"{sentence_case(name)}, magnitude ({trials.unit}/(N m))")
         below.set_title("Phase (°)")
         below.set_xlabel("Frequency (Hz)")

@@ -1,4 +1,4 @@
-"""Intraclass correlation of agreement (McGraw and Wong 1996), with intervals.
+"""Agreement between visits (McGraw and Wong 1996), with intervals, and change over visits.
 
 n subjects are measured on k occasions. From the two-way analysis of variance
 
@@ -25,11 +25,15 @@ measurements of a subject contains two occasions and two errors, so
 
 where t is Student's quantile with Satterthwaite's degrees of freedom of MSW. SEM equals
 SD sqrt(1 - ICC(A,1)), not with ICC(A,k), which is the reliability of a mean.
+
+A difference between visits is tested by MSC / MSE, uncorrected and with the epsilon of Greenhouse
+and Geisser (1959); the trend (learning) by a t-test of the subjects' slopes, for two visits the
+paired t-test.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -68,19 +72,19 @@ class Icc(NamedTuple):
 
     # NaN if all scores are equal or the denominator is not positive. An estimate of 1 has the
     # interval 1 to 1.
-    value: float
-    low: float
-    high: float
-    subjects: int
-    left_out: int  # Number of subjects without all scores
+    value: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
+    subjects: int = 0
+    left_out: int = 0  # Number of subjects without all scores
 
 
 class MeasurementError(NamedTuple):
     """Error of one measurement of one subject, in the scores' unit."""
 
-    sem: float  # Standard error of measurement
+    sem: float = np.nan  # Standard error of measurement
     # Minimal detectable change: by error alone, 5 % of differences of two measurements exceed it
-    mdc: float
+    mdc: float = np.nan
 
 
 def icc(scores: ArrayLike, form: Form = "A,k", method: Method = "F") -> Icc:
@@ -189,3 +193,54 @@ def _f_limits(squares: MeanSquares) -> tuple[float, float]:
     low = n * (r - lower * e) / (lower * rest + n * r)
     high = n * (upper * r - e) / (rest + n * upper * r)
     return float(low), float(high)
+
+
+class Anova(NamedTuple):
+    """F test of a difference between visits."""
+
+    F: float = np.nan  # Mean square of visits over that of visits by subjects
+    p: float = np.nan  # Uncorrected
+    p_corrected: float = np.nan  # Both degrees of freedom times Greenhouse and Geisser's epsilon
+
+
+class Trend(NamedTuple):
+    """Slope over visits."""
+
+    slope: float = np.nan  # Mean of the subjects' least-squares slopes, in scores per visit
+    low: float = np.nan  # 95 % interval
+    high: float = np.nan
+    p: float = np.nan  # t-test of a mean slope of zero
+
+
+def visit_anova(scores: Array) -> Anova:
+    """Test for differences between visits; scores (subjects, visits), NaN if missing."""
+    kept, _ = complete_rows(scores)
+    squares = mean_squares(kept)
+    if np.ptp(kept - kept.mean(axis=1, keepdims=True)) == 0:
+        raise DataError("scores", "are the same at all visits", "check the recordings")
+    F = squares.occasions / squares.error if squares.error else np.inf
+    freedom = squares.k - 1
+    p, corrected = (
+        float(scipy.stats.f.sf(F, share * freedom, share * freedom * (squares.n - 1)))
+        for share in (1, _greenhouse_geisser(kept))
+    )
+    return Anova(F, p, corrected)
+
+
+def learning_trend(scores: Array) -> Trend:
+    """Trend of the scores over visits; scores (subjects, visits)."""
+    kept, _ = complete_rows(scores)
+    visit = np.arange(kept.shape[1]) - (kept.shape[1] - 1) / 2
+    slopes = kept @ visit / float(visit @ visit)
+    test: Any = scipy.stats.ttest_1samp(slopes, 0.0)
+    low, high = test.confidence_interval(0.95)
+    return Trend(float(slopes.mean()), float(low), float(high), float(test.pvalue))
+
+
+def _greenhouse_geisser(scores: Array) -> float:
+    """tr(S)^2 / ((k - 1) tr(S^2)), where S is the doubly centred covariance of visits."""
+    k = scores.shape[1]
+    centring = np.eye(k) - 1 / k
+    S = centring @ np.cov(scores, rowvar=False) @ centring
+    below = (k - 1) * float(np.sum(S**2))
+    return float(np.clip(np.trace(S) ** 2 / below, 1 / (k - 1), 1.0)) if below > 0 else 1.0

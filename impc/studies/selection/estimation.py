@@ -15,6 +15,7 @@ white, their long-run variance if they are autocorrelated.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -106,7 +107,7 @@ def multi_start(
 ) -> tuple[Estimate, ...]:
     """Fits from the typical values and random points around them, best first."""
     rng = np.random.default_rng(seed)
-    typical = normalised(model, np.asarray(model.typical))
+    typical = model.usual
     found: list[Estimate] = []
     begin = typical
     while len(found) < starts:
@@ -181,18 +182,15 @@ def _evaluation(
     model: ParametricModel, trials: Sequence[Trial], base: Array, chosen: IntArray, pull: Array
 ) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Residual and Jacobian of the chosen parameters; the last point is cached."""
-    last: tuple[bytes, Array, Array] | None = None
-    typical = normalised(model, np.asarray(model.typical))[chosen]
+    typical = model.usual[chosen]
     held = pull > 0
 
-    def evaluated(t: Array) -> tuple[Array, Array]:
-        nonlocal last
-        if last is None or last[0] != t.tobytes():
-            full = base.copy()
-            full[chosen] = t
-            errors, slopes = stacked(model, physical(model, full), trials, chosen)
-            rows = [(pull * (t - typical))[held], *(part.ravel() for part in errors)]
-            last = t.tobytes(), np.concatenate(rows), np.vstack([np.diag(pull)[held], slopes])
-        return last[1], last[2]
+    @functools.lru_cache(maxsize=1)
+    def evaluated(*t: float) -> tuple[Array, Array]:
+        full = base.copy()
+        full[chosen] = t
+        errors, slopes = stacked(model, physical(model, full), trials, chosen)
+        rows = [(pull * (t - typical))[held], *(part.ravel() for part in errors)]
+        return np.concatenate(rows), np.vstack([np.diag(pull)[held], slopes])
 
-    return lambda t: evaluated(t)[0], lambda t: evaluated(t)[1]
+    return lambda t: evaluated(*t.tolist())[0], lambda t: evaluated(*t.tolist())[1]

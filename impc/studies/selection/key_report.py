@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from impc.arrays import Array
     from impc.files.digests import Inputs
-    from impc.studies.selection.key_parameters import KeyParameters
+    from impc.studies.selection.analysis import KeyParameters
     from impc.studies.selection.model import ParametricModel
 
 _OTHER = (

@@ -19,7 +19,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.control.named_solver import require_solver, silent
 from impc.studies.selection.estimation import Estimate, estimate, residuals
-from impc.studies.selection.model import normalised, physical, stacked
+from impc.studies.selection.model import physical, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,7 +41,7 @@ class Lasso(Frozen):
 
 def lasso_of_size(model: ParametricModel, trials: Sequence[Trial], count: int) -> Lasso:
     """Largest selection of at most `count` parameters, by bisection of lambda."""
-    typical = normalised(model, np.asarray(model.typical))
+    typical = model.usual
     low, high = 1e-8, 1e3
     t, chosen = typical, tuple[int, ...]()
     for _ in range(_SOLVES):
@@ -66,7 +66,7 @@ def proximal_lasso(
     model: ParametricModel, trials: Sequence[Trial], weight: float
 ) -> tuple[Array, float]:
     """Solve (C.5): normalised parameters (k,) and the objective."""
-    typical = normalised(model, np.asarray(model.typical))
+    typical = model.usual
     t, current, damping = typical, lasso_objective(model, trials, typical, weight), 1e-6
     for _ in range(_ROUNDS):
         # Local model g'd + d'Hd/2 of the mean square.
@@ -95,7 +95,7 @@ def lasso_objective(
 ) -> float:
     """(C.5) at t (k,); infinite if the outputs are not finite."""
     errors = np.concatenate(residuals(model, physical(model, t), trials))
-    away = np.sum(np.abs(t - normalised(model, np.asarray(model.typical))))
+    away = np.sum(np.abs(t - model.usual))
     found = float(np.mean(errors**2) + weight * away)
     return found if np.isfinite(found) else np.inf
 

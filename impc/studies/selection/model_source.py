@@ -32,8 +32,12 @@ from impc.files.reading import read_recordings, require_whole
 from impc.model.plant import Plant
 from impc.studies.cache import from_json
 from impc.studies.pool import Task, run
-from impc.studies.selection.linear import linear_functions
-from impc.studies.selection.model import ParametricModel, Trial, parametric_model
+from impc.studies.selection.model import (
+    ParametricModel,
+    Trial,
+    linear_functions,
+    parametric_model,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -24,8 +24,7 @@ from impc.studies.reliability.icc import GOOD
 if TYPE_CHECKING:
     import pandas as pd
 
-    from impc.studies.selection.analysis import StudySelection
-    from impc.studies.selection.key_parameters import KeyParameters
+    from impc.studies.selection.analysis import KeyParameters, StudySelection
     from impc.studies.selection.model import ParametricModel
 
 _POOR = 50.0  # VAF of a poor model, %

@@ -12,10 +12,10 @@ import pytest
 import impc
 from impc.files.disk import IN_ITS_PLACE
 from impc.reporting.writer import owned
-from impc.studies.cohort import engine
-from impc.studies.cohort.engine import Failures, Store, open_store, run_study, work_kept
+from impc.studies.cohort import tasks
 from impc.studies.cohort.report import write_report
 from impc.studies.cohort.tables import cohort_tables
+from impc.studies.cohort.tasks import Failures, Store, open_store, run_study, work_kept
 from tests.studies.cohort.made_up import fit_of, made_up_study, replicate_of, tasks_of
 from tests.support import ThisProcess
 
@@ -62,8 +62,8 @@ def refusing(*_: Any) -> dict[str, Any]:
 
 
 def run_and_report(folder: Path, monkeypatch: pytest.MonkeyPatch, fit: Any, draw: Any) -> Failures:
-    monkeypatch.setattr(engine, "fit_unit", fit)
-    monkeypatch.setattr(engine, "replicate_unit", draw)
+    monkeypatch.setattr(tasks, "fit_unit", fit)
+    monkeypatch.setattr(tasks, "replicate_unit", draw)
     store = Store(folder, DIGESTS)
     with owned(folder, "cohort"):
         failures = run_study(STUDY, TASKS, store, ThisProcess())

@@ -11,8 +11,14 @@ from statsmodels.formula.api import ols
 
 import impc
 from impc.arrays import Array
-from impc.studies.reliability.anova import learning_trend, visit_anova
-from impc.studies.reliability.icc import Form, icc, mean_squares, measurement_error
+from impc.studies.reliability.icc import (
+    Form,
+    icc,
+    learning_trend,
+    mean_squares,
+    measurement_error,
+    visit_anova,
+)
 
 FORMS: tuple[Form, ...] = ("A,1", "A,k")
 

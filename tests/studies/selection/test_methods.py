@@ -14,9 +14,8 @@ from experiments.selection_claims import bootstrap_widths, table_c1
 from impc.arrays import Array, percentiles
 from impc.assess.resampling import block_residuals
 from impc.cli.main import main
-from impc.studies.selection.analysis import bootstrap_subset, draw_single
+from impc.studies.selection.analysis import bootstrap_subset, draw_single, key_parameters
 from impc.studies.selection.estimation import estimate
-from impc.studies.selection.key_parameters import key_parameters
 from impc.studies.selection.lasso import _box_lasso, proximal_lasso
 from impc.studies.selection.model import Trial
 from impc.studies.selection.settings import SelectSettings

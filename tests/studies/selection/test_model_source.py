@@ -11,8 +11,8 @@ import impc
 from impc.studies.cache import Cache
 from impc.studies.pool import Result
 from impc.studies.scheduler import Cluster, connected
+from impc.studies.selection.analysis import refit_subsets
 from impc.studies.selection.estimation import Estimate
-from impc.studies.selection.key_parameters import refit_subsets
 from impc.studies.selection.model import Trial
 from impc.studies.selection.model_source import model_source, on_pool
 from tests.studies.selection.dosing import in_turn

@@ -12,8 +12,7 @@ import pytest
 import impc
 from impc.reporting.document import Checks, Copy, Report
 from impc.reporting.rendering import number
-from impc.studies.selection.analysis import select_study
-from impc.studies.selection.key_parameters import key_parameters
+from impc.studies.selection.analysis import key_parameters, select_study
 from impc.studies.selection.key_report import key_report
 from impc.studies.selection.model import Trial
 from impc.studies.selection.report import selection_report
