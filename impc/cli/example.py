@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # impc does not import `plants`: the plant is named by its import path, ``module:function``.
 _EXAMPLE_PLANT = "plants:yalmip_example"
-_SEEDS = 8
+_SEEDS = 7
 
 
 @click.command("example")
@@ -32,8 +32,8 @@ _SEEDS = 8
     "--sweep",
     type=click.Choice(["example", "seat"]),
     help="Instead of the cases: inverse MPC against inverse LQR over 0 to 60 % of samples at the "
-    "limit, exact, with noise, a wrong limit and a wrong plant, on the example's plant (two "
-    "minutes) or the seat (an hour).",
+    "limit, exact, with noise, a wrong limit and a wrong plant, on the example's plant "
+    "(minutes) or the seat (longer).",
 )
 @click.option("--seeds", type=click.IntRange(1, 1000), default=_SEEDS, help="Seeds of --sweep.")
 @out_option("example", "report.html, result.json, tables and the figures")

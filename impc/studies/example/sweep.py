@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from impc.studies.pool import Pool
 
 #: Shares of samples at the limit, %.
-LEVELS = (0, 10, 20, 30, 45, 60)
+LEVELS = (0, 10, 20, 40, 60)
 #: Conditions by name, with the title of their panels.
 CONDITIONS = {
     "exact": "Exact recordings",

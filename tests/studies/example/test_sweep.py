@@ -102,7 +102,7 @@ def made_up(ratios: dict[str, dict[int, float]], seeds: int = 8) -> pd.DataFrame
 
 EVERY = dict.fromkeys(LEVELS, 2.0)
 NEVER = dict.fromkeys(LEVELS, 0.5)
-LATE = {0: 1.0, 10: 3.0, 20: 1.0, 30: 2.0, 45: 4.0, 60: 9.0}
+LATE = {0: 1.0, 10: 3.0, 20: 1.0, 40: 4.0, 60: 9.0}
 FITS = made_up({"exact": EVERY, "noise": LATE, "limit": NEVER, "plant": LATE})
 
 
@@ -110,19 +110,19 @@ def test_biased_is_the_least_level_from_which_all_tests_reject() -> None:
     tests = compared(FITS)
     found = {name: biased_from(tests, name, "inverse_lqr_output") for name in CONDITIONS}
     levels = {name: None if one is None else one["level_percent"] for name, one in found.items()}
-    assert levels == {"exact": 0, "noise": 30, "limit": None, "plant": 30}
+    assert levels == {"exact": 0, "noise": 40, "limit": None, "plant": 40}
     row = found["noise"]
     assert row is not None
     assert row["p"] == pytest.approx(0.5**8)  # eight heads in a row
-    assert row["p_holm"] == pytest.approx(6 * 0.5**8)
-    own = FITS.query("condition == 'noise' and level_percent == 30").pivot_table(
+    assert row["p_holm"] == pytest.approx(5 * 0.5**8)
+    own = FITS.query("condition == 'noise' and level_percent == 40").pivot_table(
         "error_percent", "seed", "method"
     )
     apart = own["inverse_lqr_output"] - own["inverse_mpc"]
     assert row["difference"] == pytest.approx(np.median(apart))
     assert (row["low"], row["high"]) == pytest.approx((apart.min(), apart.max()))
     few = compared(made_up(dict.fromkeys(CONDITIONS, EVERY), seeds=4))
-    assert biased_from(few, "noise", "inverse_lqr_output") is None  # 6 * 0.5^4 > 0.05
+    assert biased_from(few, "noise", "inverse_lqr_output") is None  # 5 * 0.5^4 > 0.05
     assert few["low"].isna().all()
 
 
@@ -130,7 +130,7 @@ def test_a_lost_fit_of_inverse_mpc_counts_against_it() -> None:
     lost = FITS.copy()
     lost.loc[(lost["method"] == SWEPT[0]) & (lost["seed"] == 0), "error_percent"] = np.nan
     row = biased_from(compared(lost), "exact", "inverse_lqr_output")
-    assert row is None  # 7 of 8: 6 * 9 / 2^8 > 0.05
+    assert row is None  # 7 of 8: 5 * 9 / 2^8 > 0.05
     assert compared(lost).query("method == 'inverse_lqr_lmi'")["fits"].max() == 8
 
 
@@ -149,19 +149,19 @@ def test_the_page_says_from_which_level_and_with_what_evidence() -> None:
     report = sweep_report(Sweep(FITS, ("noise-60-9: no limit",)), "cart", Provenance())
     verdict = report.verdict
     assert (verdict.level, verdict.words) == (Level.GREEN, "Shown")
-    assert verdict.headline == "Inverse LQR is biased from 30 % of the samples at the limit."
+    assert verdict.headline == "Inverse LQR is biased from 40 % of the samples at the limit."
     assert "not at 20 %" in verdict.sentence
-    assert "larger in 8 of 8 seeds, p_holm = 0.023" in verdict.sentence
-    assert [key.value for key in report.keys] == ["30", "-", "30"]
+    assert "larger in 8 of 8 seeds, p_holm = 0.02" in verdict.sentence
+    assert [key.value for key in report.keys] == ["40", "-", "40"]
     assert any("any model" in claim.text for claim in verdict.may_not)
     files = report.files()
     assert json.loads(files["result.json"])["biased_from_percent"] == {
-        "exact": 0, "noise": 30, "limit": None, "plant": 30
+        "exact": 0, "noise": 40, "limit": None, "plant": 40
     }  # fmt: skip
     assert len(files["fits.csv"].splitlines()) == len(FITS) + 1
     page = files["report.html"].decode()
     assert "noise-60-9: no limit" in page
-    assert "No limit, inverse LQR (exact): 160 of 192." in page
+    assert "No limit, inverse LQR (exact): 128 of 160." in page
     none = Sweep(made_up(dict.fromkeys(CONDITIONS, NEVER)), ())
     assert sweep_report(none, "cart", Provenance()).verdict.level is Level.AMBER
 
