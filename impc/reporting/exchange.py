@@ -15,6 +15,7 @@ import pandas as pd
 
 from impc.model.plant import UNKNOWN
 from impc.reporting.finding import Finding
+from impc.reporting.rendering import plain
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -59,7 +60,7 @@ def long_rows(
         if isinstance(value, str) or (end in _ENDS and _joined(stem, place) in values):
             continue
         low, high, known = (values.get(_joined(f"{quantity}_{one}", place)) for one in _ENDS)
-        row, _, column = place.partition(".")
+        row, column = [*re.split(r"\.(?=[^\W\d])", place, maxsplit=1), ""][:2]
         found.append({
             **{label: labels.get(label, "") for label in _LABELS},
             "quantity": quantity, "row": row, "column": column, "unit": units.get(name, UNKNOWN),
@@ -129,7 +130,9 @@ def _value(value: Any) -> Any:
         return np.empty((0, 0))
     if isinstance(value, list | tuple | np.ndarray):
         return _array(value)
-    return value if isinstance(value, str | bool | np.bool_) else float(value)
+    if isinstance(value, str):
+        return plain(value)  # file names that are not UTF-8
+    return value if isinstance(value, bool | np.bool_) else float(value)
 
 
 def _array(values: Any) -> Any:

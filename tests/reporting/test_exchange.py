@@ -93,10 +93,12 @@ def test_an_interval_is_in_the_row_of_its_number() -> None:
         "u_low.x": 3.0,
         "headline": "text",
         "none": None,
+        "cost.a - 0.5 b": 1.0,
     }
     rows = long_rows(values, {"K.u.x": "N"}, {"subject": "S01", "group": "a", "trials": "3"})
     assert [(row["quantity"], row["row"], row["column"]) for row in rows] == [
-        ("K", "u", "x"), ("mass", "", ""), ("u_low", "x", ""), ("none", "", "")
+        ("K", "u", "x"), ("mass", "", ""), ("u_low", "x", ""), ("none", "", ""),
+        ("cost", "a - 0.5 b", ""),
     ]  # fmt: skip
     first = rows[0]
     assert (first["subject"], first["group"], first["visit"]) == ("S01", "a", "")
