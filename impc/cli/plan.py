@@ -53,22 +53,19 @@ def command(
     interrupt the command, the same command continues from the last finished step.
     """
     # Imported here: the libraries take seconds to load, and --help needs none.
+    import numpy as np  # noqa: PLC0415
+
     from impc.cli.console import require_consent  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
     from impc.files.digests import gather_inputs  # noqa: PLC0415
     from impc.reporting.provenance import Provenance  # noqa: PLC0415
     from impc.reporting.shown_units import angles_in  # noqa: PLC0415
     from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.cache import Cache, Steps, from_json  # noqa: PLC0415
+    from impc.studies.cache import Cache, Steps  # noqa: PLC0415
     from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
     from impc.studies.plan.report import plan_report  # noqa: PLC0415
     from impc.studies.plan.settings import plan_settings  # noqa: PLC0415
-    from impc.studies.plan.study import (  # noqa: PLC0415
-        OneFit,
-        make_plan,
-        plan_effort,
-        steps_of,
-    )
+    from impc.studies.plan.study import make_plan, plan_effort, steps_of  # noqa: PLC0415
 
     require_writable(out)
     configuration = read_configuration(config)
@@ -84,8 +81,8 @@ def command(
     inputs = gather_inputs(used, config, source.name, source.arguments)
     steps = Steps(Cache(out / "plan-in-progress"), inputs.digest)
 
-    def remember(name: str, compute: Callable[[], OneFit]) -> OneFit:
-        return steps.get(name, compute, lambda kept: from_json(kept, OneFit))
+    def remember(name: str, compute: Callable[[], Array]) -> Array:
+        return steps.get(name, compute, np.array, np.ndarray.tolist)
 
     with progress(steps_of(settings), "step", lambda _: steps.kept()) as done:
         plan = make_plan(person, settings, perturbation, done, remember)
@@ -108,10 +105,9 @@ def _assumed(
 ) -> tuple[Configuration, str]:
     """Configuration completed by the results of a fit (--like), and the name of the plant."""
     from impc.files.plant_sources import consented_name  # noqa: PLC0415
-    from impc.studies.plan.like import filled  # noqa: PLC0415
 
     if like is not None:
-        configuration, named = filled(configuration, like)
+        configuration, named = _filled(configuration, like)
         where = f"--like {like}: plant"
         if named is not None:
             known = tuple(KNOWN)
@@ -119,6 +115,46 @@ def _assumed(
     if plant_name is None:
         raise click.UsageError("Missing option '--plant'; or give '--like' a folder of impc fit.")
     return configuration, plant_name
+
+
+def _filled(configuration: Configuration, folder: Path) -> tuple[Configuration, str | None]:
+    """Complete a configuration by the subject in a `folder`; also return the name of its plant.
+
+    A fit gives plant, settings, gain, and the RMS of its residuals as noise; a simulated subject
+    the gain and its settings.
+    """
+    import msgspec  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
+
+    from impc.errors import InputError  # noqa: PLC0415
+    from impc.files.configuration import read_configuration  # noqa: PLC0415
+    from impc.files.disk import truth_beside  # noqa: PLC0415
+    from impc.files.results import read_result  # noqa: PLC0415
+
+    where, truth = f"--like {folder}", truth_beside(folder)
+    own: dict[str, Any] = {}
+    plant: str | None = None
+    try:
+        if truth:
+            own["gain"], beside = truth["K"], read_configuration(folder / "subject.toml")
+            arguments, settings = beside.plant, beside.fit
+        else:
+            found = read_result(folder).content
+            rms = [np.square(trial["rms_residual"]) for trial in found["trials"]]
+            noise = np.sqrt(np.mean(rms, axis=0)).tolist()
+            own |= {"noise": dict(zip(found["outputs"], noise, strict=True)), "gain": found["K"]}
+            settings = {name: one for name, one in found["settings"].items() if one is not None}
+            plant, arguments = str(found["plant"]["name"]), dict(found["plant"]["arguments"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        remedy = "pass an output folder of impc fit, or of impc simulate seated-balance"
+        raise InputError(where, f"has no subject ({error})", remedy) from None
+    changed = msgspec.structs.replace(
+        configuration,
+        plant=configuration.plant or arguments,
+        fit={**settings, **configuration.fit},
+        plan={**own, **configuration.plan},
+    )
+    return changed, plant
 
 
 def _person(

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from impc.files.results import SCHEMA
 from impc.files.spreadsheet import workbook_bytes
 from impc.levels import Level
+from impc.reporting.exchange import mat_bytes
 from impc.reporting.finding import MOST_CELLS, Chart, Finding, Moving, Picture, csv_bytes
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import plain, render_page
@@ -147,7 +148,7 @@ class Report:
         return {item.name: item.table for item in found if item.table is not None}
 
     def files(self, *, pdf: bool = False) -> dict[str, bytes]:
-        """Files by name: page, result.json, tables and figures; with `pdf` also PDF figures."""
+        """Files by name: page, result.json, tables, .mat, figures; with `pdf` also PDF figures."""
         tables = self._tables()
         # Hidden columns keep their own names, so that no heading is there twice.
         heads = {
@@ -170,6 +171,7 @@ class Report:
             "report.html": self.page().encode(),
             "result.json": json_bytes({**own, **self.data, "findings": found}),
             **{f"{name}.csv": csv_bytes(table) for name, table in tables.items()},
+            **({"results.mat": mat_bytes({**own, **self.data}, tables)} if tables else {}),
             **({"tables.xlsx": workbook_bytes(sheets, self._readme(sheets))} if sheets else {}),
             **figures,
         }

@@ -20,7 +20,7 @@ from impc.studies.fit.first import FitProgress
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings
-from impc.studies.methods_table import method_label
+from impc.studies.methods_table import controller_findings, method_label
 
 if TYPE_CHECKING:
     from impc.assess.assessments import MethodFit
@@ -115,8 +115,7 @@ def _document(fit: MethodFit) -> Report:
         return page
     return replace(
         page,
-        sections=[*page.sections, Section("Gain and cost weights", page.beside[:2])],
-        beside=page.beside[2:],
+        sections=[*page.sections, Section("Gain and cost weights", controller_findings(fit))],
         meta=(label, *page.meta[2:]),
         hero=_PICTURE,
         figures={"trial-1": lambda: movement_figure(fit, 0)},

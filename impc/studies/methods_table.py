@@ -14,9 +14,10 @@ import pandas as pd
 from impc.assess.assessments import ASSESSMENTS, assessed
 from impc.control.named_solver import described
 from impc.inverse.methods import METHODS
-from impc.model.plant import weight_unit
+from impc.model.plant import gain_unit, weight_unit
 from impc.reporting.document import Fold, Section, Terms
 from impc.reporting.estimate_text import gain_table
+from impc.reporting.exchange import entries, long_rows
 from impc.reporting.finding import Finding
 from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
 
@@ -99,6 +100,7 @@ def problem_data(problem: Problem, fits: Sequence[MethodFit]) -> dict[str, Any]:
     return {
         "methods": methods_data(fits),
         **{name: getattr(plant, name) for name in ("states", "controls", "outputs")},
+        "units": dict(plant.units),
         "horizon": problem.horizon,
         "body": plant.moves,
         "solver": problem.solver,
@@ -120,29 +122,55 @@ def _data(fit: MethodFit) -> dict[str, Any]:
     }
 
 
-def controller_findings(fits: Sequence[MethodFit]) -> list[Finding]:
-    """Tables of gain and cost weights of all methods, in units of the plant."""
-    plant = fits[0].estimate.problem.plant
-    hidden = ["number", *(["method"] if len(fits) == 1 else [])]
+def controller_findings(fit: MethodFit) -> list[Finding]:
+    """Tables of gain and cost weights of a method with a gain, in units of the plant."""
+    plant, weights = fit.estimate.problem.plant, fit.estimate.weights
     gains = [
-        (signal_name(plant, state), f"K.{control}.{state}", unit, fit.name, value)
-        for fit in fits
-        if fit.estimate.K is not None
-        for control, state, unit, value in gain_table(plant, fit.estimate.K).to_numpy().tolist()
+        (signal_name(plant, state), f"K.{control}.{state}", unit, value)
+        for control, state, unit, value in gain_table(plant, fit.estimate.gain).to_numpy().tolist()
     ]
-    costs = [
-        (*entry[:-1], fit.name, entry[-1])
-        for fit in fits
-        if fit.estimate.weights is not None
-        for entry in weight_entries(plant, fit.estimate.weights)
+    costs = [] if weights is None else weight_entries(plant, weights)
+    gain = "Gain: opposing command per unit of each state, in units of the plant, no intervals."
+    cost = "Cost weights, scaled to 1 for the first command, without intervals."
+    tables = (
+        pd.DataFrame(gains, columns=["gain_on", "number", "unit", "value"]),
+        pd.DataFrame(costs, columns=["matrix", "first", "second", "unit", "value"]),
+    )
+    return [
+        Finding("gain", tables[0], gain, hidden=["number"]),
+        Finding("weights", tables[1], cost),
     ]
-    last = ["unit", "method", "value"]
-    gain = pd.DataFrame(gains, columns=["gain_on", "number", *last])
-    cost = pd.DataFrame(costs, columns=["matrix", "first", "second", *last])
-    said = "Gain: opposing command per unit of each state, in units of the plant, no intervals."
-    scaled = "Cost weights, scaled to 1 for the first command, without intervals."
-    return [Finding("gain", gain, said, hidden=hidden),
-            Finding("weights", cost, scaled, hidden=hidden)]  # fmt: skip
+
+
+def methods_long(fits: Sequence[MethodFit], **words: str) -> list[dict[str, Any]]:
+    """Rows of the long table: gain, metric, cost weights and measures of every method."""
+    problem, rows = fits[0].estimate.problem, list[dict[str, Any]]()
+    plant, label = problem.plant, problem.recordings[0].label
+    words = {name: getattr(label, name) for name in ("subject", "visit", "condition")} | words
+    for fit in fits:
+        found, values, units = fit.estimate, dict[str, Any](), dict[str, str]()
+        if found.K is not None:
+            values = entries("K", plant.controls, plant.states, found.gain)
+            values |= entries("S", plant.controls, plant.controls, found.metric)
+        for which, one, other, unit, value in (
+            [] if found.weights is None else weight_entries(plant, found.weights)
+        ):
+            values[f"{which}.{one}.{other}"], units[f"{which}.{one}.{other}"] = value, unit
+        for name, measure in assessed(fit).items():
+            own = measure if isinstance(measure, dict) else {"": measure}
+            values |= {f"{name}.{signal}".rstrip("."): value for signal, value in own.items()}
+        units |= {name: "%" for name in values if "vaf." in name} | gain_units(plant)
+        rows += long_rows(values, units, {**words, "method": fit.name})
+    return rows
+
+
+def gain_units(plant: Plant) -> dict[str, str]:
+    """Units of the entries of the gain by name: K.<control>.<state>."""
+    return {
+        f"K.{control}.{state}": gain_unit(plant, control, state)
+        for control in plant.controls
+        for state in plant.states
+    }
 
 
 def weight_entries(plant: Plant, weights: Weights) -> list[tuple[str, str, str, str, float]]:

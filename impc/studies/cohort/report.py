@@ -14,6 +14,7 @@ from impc.checking import replace
 from impc.files.checks import FELL
 from impc.levels import Level
 from impc.reporting.document import Block, Check, Checks, Copy, Lines, Report, Section, Terms
+from impc.reporting.exchange import long_finding, long_rows
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, sentence_case
@@ -92,7 +93,11 @@ def write_report(
     }
     beside = [Finding(name, table, _BESIDE[name]) for name, table in tables.items()]
     report = _page(study, cohort, _checks(study, failures, cohort), command)
-    report = replace(report, data=data, beside=beside)
+    units = {name: one["unit_si"] for name, one in first["shown"].items()}
+    long = [
+        line for row in tables["units"].to_dict("records") for line in long_rows(row, units, row)
+    ]
+    report = replace(report, data=data, beside=[*beside, long_finding(long)])
     write_files(store.folder, report.files(pdf=pdf))
     return report
 

@@ -10,6 +10,7 @@ from impc.checking import replace
 from impc.inverse.estimates import Status
 from impc.levels import Level
 from impc.reporting.document import Block, Check, Checks, Copy, Fold, Report, Section
+from impc.reporting.exchange import long_finding
 from impc.reporting.finding import Chart, Finding, Picture
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key
@@ -17,9 +18,9 @@ from impc.studies.charts import trajectories
 from impc.studies.compare.verdict import RULES, Facts, name_of, needed, share
 from impc.studies.methods_figure import by_score, first_fall, methods_figure, unexplained
 from impc.studies.methods_table import (
-    controller_findings,
     methods_finding,
     methods_fold,
+    methods_long,
     problem_data,
     provenance_section,
     trajectory_table,
@@ -79,7 +80,10 @@ def compare_report(
         keys=_keys(facts),
         figures={"comparison": lambda: methods_figure(compared)},
         copy=verdict.sentence if verdict.level is Level.RED else _copy(facts, count),
-        beside=[*controller_findings(compared), Finding("trajectories", sway, "Row: one sample.")],
+        beside=[
+            long_finding(methods_long(compared)),
+            Finding("trajectories", sway, "Row: one sample."),
+        ],
         data=problem_data(problem, compared),
         provenance=provenance,
     )

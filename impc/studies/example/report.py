@@ -12,18 +12,19 @@ from markupsafe import Markup
 from impc.levels import Level
 from impc.model.weights import condition_number
 from impc.reporting.document import Block, Draw, Fold, Lines, Report, Section
-from impc.reporting.finding import Finding, Picture
+from impc.reporting.exchange import long_finding
+from impc.reporting.finding import Picture
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Key, Verdict
 from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights
 from impc.studies.fit.figures import movement_figure
 from impc.studies.methods_figure import methods_figure
 from impc.studies.methods_table import (
-    controller_findings,
     method_label,
     methods_data,
     methods_finding,
     methods_fold,
+    methods_long,
     provenance_section,
 )
 
@@ -89,7 +90,11 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
         hero=_picture(first),
         keys=_keys(cases),
         figures=figures,
-        beside=[finding for case in cases for finding in _controllers(case)],
+        beside=[
+            long_finding(
+                [row for case in cases for row in methods_long(case.methods, condition=case.name)]
+            )
+        ],
         data=example_data(cases, provenance),
         provenance=provenance,
     )
@@ -187,13 +192,6 @@ def _picture(case: CaseResult) -> Picture:
 
 def _name(case: CaseResult, method: str = "comparison") -> str:
     return f"{method}-case-{case.name}"
-
-
-def _controllers(case: CaseResult) -> list[Finding]:
-    """Tables of gains and cost weights, for the files."""
-    return [
-        replace(one, name=f"{one.name}-{case.name}") for one in controller_findings(case.methods)
-    ]
 
 
 def example_data(cases: Sequence[CaseResult], provenance: Provenance) -> dict[str, Any]:

@@ -136,7 +136,6 @@ def _controller(result: FitResult) -> dict[str, Any]:
         "vaf": dict(zip(plant.outputs, result.inverse_mpc.vaf, strict=True)),
         "held_out_vaf": dict(zip(plant.outputs, left_out, strict=True)),
         "disturbances": plant.disturbances,
-        "units": dict(plant.units),
         "usable": result.usable,
         "K": result.estimate.K,
         "S": fitted.metric * (weights.R[0, 0] / fitted.stage_weights.R[0, 0]),

@@ -10,12 +10,18 @@ import pandas as pd
 from impc.assess.printed_gain import entry_names
 from impc.files.disk import truth_beside
 from impc.inverse.refit import IDENTIFIED
-from impc.model.plant import UNKNOWN, gain_unit
+from impc.model.plant import UNKNOWN
+from impc.reporting.exchange import long_rows
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
 from impc.studies.fit.facts import named_gains, shift_halves, statement_text
 from impc.studies.fit.result import shown_trials, trial_name
-from impc.studies.methods_table import trajectory_table, weight_entries
+from impc.studies.methods_table import (
+    gain_units,
+    methods_long,
+    trajectory_table,
+    weight_entries,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -191,11 +197,23 @@ def number_name(plant: Plant, name: str) -> str:
 
 def number_units(plant: Plant) -> dict[str, str]:
     """Units of the fitted numbers by name: K.<control>.<state>, u_max.<control>."""
-    return {
-        f"K.{control}.{state}": gain_unit(plant, control, state)
-        for control in plant.controls
-        for state in plant.states
-    } | {f"u_max.{control}": plant.unit(control) for control in plant.controls}
+    return gain_units(plant) | {
+        f"u_max.{control}": plant.unit(control) for control in plant.controls
+    }
+
+
+def result_long(result: FitResult) -> list[dict[str, Any]]:
+    """Rows of the long table: numbers with intervals (method "estimate"), and all methods."""
+    plant, label = result.given.plant, result.given.recordings[0].label
+    words = {name: getattr(label, name) for name in ("subject", "visit", "condition")}
+    values: dict[str, Any] = {"saturated": result.saturated}
+    for name, item in result.preferred.items():
+        quantity, dot, place = name.partition(".")
+        own = ("", item.value), ("_low", item.low), ("_high", item.high)
+        for end, value in (*own, ("_identified", item.identified)):
+            values[f"{quantity}{end}{dot}{place}"] = value
+    labels = {**words, "method": "estimate"}
+    return long_rows(values, number_units(plant), labels) + methods_long(result.methods)
 
 
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:

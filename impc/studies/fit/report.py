@@ -25,6 +25,7 @@ from impc.reporting.document import (
     Section,
     Terms,
 )
+from impc.reporting.exchange import long_finding
 from impc.reporting.finding import Chart, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import fixed, number, probability
@@ -104,7 +105,11 @@ def fit_report(
         _keys(result),
         _draws(result, window),
         paper_text(result, verdict, provenance),
-        beside=[findings.trajectory_finding(result), *findings.response_findings(result)],
+        beside=[
+            findings.trajectory_finding(result),
+            *findings.response_findings(result),
+            long_finding(findings.result_long(result)),
+        ],
         data={**fit_data(result, provenance), "truth": None if truth is None else {"K": truth}},
         provenance=provenance,
     )

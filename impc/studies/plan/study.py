@@ -161,15 +161,8 @@ def spread(values: Array) -> Array:
     return np.asarray((high - low) / 2)
 
 
-@dataclass(frozen=True)
-class OneFit(Frozen):
-    """Gain of one simulated fit (m, n); empty if it failed."""
-
-    gain: Array
-
-
-#: (name, compute) -> a fit, stored or computed.
-RememberFit = Callable[[str, Callable[[], OneFit]], OneFit]
+#: (name, compute) -> the gain of a fit (m, n), stored or computed; empty if it failed.
+RememberFit = Callable[[str, Callable[[], Array]], Array]
 
 
 def simulated_fits(
@@ -183,18 +176,18 @@ def simulated_fits(
     """Fit recordings of one experiment `count` times, each with new noise."""
     K, S = np.array(person.controller.K), np.array(person.controller.S)
 
-    def fit(number: int) -> OneFit:
+    def fit(number: int) -> Array:
         try:
             noisy = _measured(person, problem, np.random.default_rng([seed, number]))
-            return OneFit(frozen(refit(noisy, K, S).K))
+            return np.array(refit(noisy, K, S).K)
         except ImpcError:  # counted as failed
-            return OneFit(frozen([]))
+            return np.empty(0)
 
-    found = []
+    gains = []
     for number in range(count):
-        found.append(remember(f"fit {number + 1}", functools.partial(fit, number)))
+        found = remember(f"fit {number + 1}", functools.partial(fit, number))
+        gains += [found] if len(found) else []
         done(f"fit {number + 1}")
-    gains = [one.gain for one in found if len(one.gain)]
     return SimulatedFits(frozen(np.reshape(gains, (-1, *K.shape))), count - len(gains))
 
 

@@ -91,7 +91,7 @@ def test_files_say_what_the_page_says(problem: Problem, compared: tuple[MethodFi
     found = json.loads(files["result.json"])
     assert found["verdict"]["headline"] == report.verdict.headline
     assert list(found["methods"]) == [fit.name for fit in compared]
-    assert {"methods.csv", "gain.csv", "weights.csv", "trajectories.csv"} < set(files)
+    assert {"methods.csv", "long.csv", "trajectories.csv", "results.mat"} < set(files)
     assert "figures/comparison.svg" in files
     (table,) = [one.table for one in report.beside if one.name == "trajectories"]
     assert table is not None
@@ -169,29 +169,27 @@ def test_a_best_model_beyond_the_limit_is_amber(
     assert "best model with the limit explained 90.00 %" in report.copy.results
 
 
-def test_a_limit_without_which_as_much_is_explained_is_not_said_to_matter(
-    problem: Problem, compared: tuple[MethodFit, ...]
-) -> None:
-    poorer = tuple(
-        fit if fit.keeps_bounds else replace(fit, held_out=np.full((2, 2), 96.0))
-        for fit in (replace(fit, held_out=np.full((2, 2), 98.0)) for fit in compared)
-    )
-    headline = compare_report(problem, poorer, PROVENANCE).verdict.headline
-    assert headline.startswith("Without the torque limit of 1 N m, 2 times as much variance")
-    same = np.full((2, 2), 99.0)
-    alike = tuple(replace(fit, held_out=same, vaf=same[0]) for fit in compared)
-    verdict = compare_report(problem, alike, PROVENANCE).verdict
-    assert verdict.headline.startswith("Models without the torque limit explain as much")
-    assert not any("matters" in claim.text for claim in verdict.may)
-
-
-def test_a_limit_that_no_model_reaches_decides_nothing(
-    problem: Problem, compared: tuple[MethodFit, ...]
-) -> None:
-    kept = tuple(replace(fit, exceeded=0.0) for fit in compared)
-    verdict = compare_report(problem, kept, PROVENANCE).verdict
-    assert "does not matter" in verdict.headline
-    assert not any("matters" in claim.text for claim in verdict.may)
+@pytest.mark.parametrize(
+    ("kept", "free", "keep_all", "headline"),
+    [
+        (98.0, 96.0, False, "Without the torque limit of 1 N m, 2 times as much variance"),
+        (99.0, 99.0, False, "Models without the torque limit explain as much"),
+        (98.0, 96.0, True, "No model needs more than 1 N m: the torque limit does not matter"),
+    ],
+)
+def test_a_limit_matters_if_without_it_less_is_explained_and_more_needed(
+    problem: Problem, compared: tuple[MethodFit, ...],
+    kept: float, free: float, keep_all: bool, headline: str,
+) -> None:  # fmt: skip
+    fits = []
+    for fit in compared:
+        score = np.full((2, 2), kept if fit.keeps_bounds else free)
+        exceeded = 0.0 if keep_all else fit.exceeded
+        fits.append(replace(fit, held_out=score, vaf=score[0], exceeded=exceeded))
+    verdict = compare_report(problem, fits, PROVENANCE).verdict
+    assert verdict.headline.startswith(headline)
+    matters = any("matters" in claim.text for claim in verdict.may)
+    assert matters is headline.startswith("Without")
 
 
 def test_without_trials_left_out_nothing_is_said_of_prediction(

@@ -196,8 +196,7 @@ def test_the_command(tmp_path: Path) -> None:
     done = runner.invoke(main, ["compare", *files, *arguments, "--out", str(out)])
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in out.iterdir()}
-    tables = {"gain.csv", "weights.csv", "methods.csv", "trajectories.csv",
-              "tables.xlsx"}  # fmt: skip
+    tables = {"methods.csv", "trajectories.csv", "tables.xlsx", "long.csv", "results.mat"}
     assert names == {"report.html", "result.json", ".impc", "figures", *tables}
     found = json.loads((out / "result.json").read_text())["methods"]
     assert list(found) == list(compared_methods())
@@ -206,16 +205,14 @@ def test_the_command(tmp_path: Path) -> None:
     for row in rows:
         identified = found[row["name"]]["vaf"]["theta1"]
         assert row["vaf_theta1"] == ("" if identified is None else repr(identified))
-    gain, weights, sway = (pd.read_csv(out / f"{name}.csv")
-                           for name in ("gain", "weights", "trajectories"))  # fmt: skip
-    entry = gain.query("number == 'K.command.theta1'").set_index("method")
-    assert entry.loc["inverse_mpc", "unit"] == "N m/rad"
+    long, sway = (pd.read_csv(out / f"{name}.csv") for name in ("long", "trajectories"))
+    first = long[(long["column"] == "theta1") & long["row"].isin(["command", "theta1"])]
+    assert set(first.query("quantity == 'K'")["unit"]) == {"N m/rad"}
     for name, method in found.items():
-        if method["K"] is not None:
-            assert entry.loc[name, "value"] == method["K"][0][0]
-        if method["Q"] is not None:
-            first = weights.query("matrix == 'Q' and method == @name").iloc[0]
-            assert first["value"] == method["Q"][0][0]
+        own = first[first["method"] == name].set_index("quantity")["estimate"]
+        for matrix in ("K", "Q"):
+            if method[matrix] is not None:
+                assert own[matrix] == method[matrix][0][0]
     trial = sway.query("trial == 'trial_2.csv'")
     left = trial.theta1_recorded_deg - trial.theta1_inverse_mpc_deg
     share = 100 * (1 - np.sum(left**2) / np.sum(trial.theta1_recorded_deg**2))
