@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ import tomlkit
 
 from impc.errors import InputError
 from impc.files.configuration import FILL_IN, SignalTable
-from impc.files.draft import guess_of
+from impc.files.draft import guess_of, questions
 from impc.files.plant_sources import UNCERTAINTY
 from impc.files.reading import unit_faults
 from impc.files.units import si_unit
@@ -42,6 +43,16 @@ class Role:
 
 
 @dataclass(frozen=True)
+class Mark:
+    """Whether a column needs a key: a code for missing values, or values that hold."""
+
+    key: str
+    line: str  # What is written if so
+    asked: str
+    answer: str  # "yes", "no", or empty
+
+
+@dataclass(frozen=True)
 class Column:
     """A column of the shown file, with the answers so far."""
 
@@ -51,6 +62,7 @@ class Column:
     entry: Mapping[str, Any]  # The other answers by their keys in subject.toml
     question: str  # To be answered; empty if there is none
     check: str  # A guess to be checked
+    marks: tuple[Mark, ...]
     curve: tuple[list[float], list[float]]  # s (or samples), values
     spoken: str  # The curve for who cannot see it
 
@@ -88,9 +100,20 @@ def columns(text: str, table: Table, plant: Plant) -> list[Column]:
         found.append(Column(
             name, role, "" if unit == FILL_IN else unit, entry,
             asked if role and unit == FILL_IN else "",
-            guessed if "guess" in comment.lower() else "", _curve(time, shown), _spoken(shown),
+            guessed if "guess" in comment.lower() else "",
+            _marks(table, name, entry, known[role]) if role not in ("", CLOCK) else (),
+            _curve(time, shown), _spoken(shown),
         ))  # fmt: skip
     return found
+
+
+def _marks(table: Table, name: str, entry: Mapping[str, Any], role: Role) -> tuple[Mark, ...]:
+    found = []
+    for line, asked in questions(table, name, role.kind == "other"):
+        key = line.partition(" ")[0]
+        no = key in entry and not entry[key]
+        found.append(Mark(key, line, asked, "no" if no else "yes" if key in entry else ""))
+    return tuple(found)
 
 
 def _seconds(table: Table, recording: Mapping[str, Any]) -> Array:
@@ -148,6 +171,11 @@ def signal_changes(form: Mapping[str, str], table: Table, subject: Subject) -> C
             given = SignalTable(column=names[index], unit=unit)
             for error in unit_faults(role, given, plant.unit(role), names[index]) if unit else ():
                 raise error
+            for line, _ in questions(table, names[index], known[role].kind == "other"):
+                ((key, value),) = tomllib.loads(line).items()
+                no = [] if key == "missing" else False
+                answer = form.get(f"{key}.{index}", "")
+                entry[key] = {"yes": value, "no": no}.get(answer)
             entry |= {"unit": unit or FILL_IN, "command": role == plant.controls[0] or None}
             keys = {("signals", role, key): value for key, value in entry.items()}
         found |= keys

@@ -48,7 +48,7 @@ def show_fit(request: Request) -> Response:
     last = next(iter(subject.outs), None)
     return page(
         request, "fit", run=run, before=fits.before(run) if run else 0, problem=problem,
-        answer=answer, takes=takes, words=words, resumes=subject.out.exists(), waits=waits,
+        where=answer, takes=takes, words=words, resumes=subject.out.exists(), waits=waits,
         polled=target == "progress", since=_since(subject, last) if last else "",
     )  # fmt: skip
 

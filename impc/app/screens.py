@@ -119,6 +119,7 @@ def show_signals(request: Request, problem: str = "", file: str = "") -> Respons
     columns, known = answers.columns(subject.text, shown, plant), answers.roles(plant)
     taken = {column.role for column in columns}
     asked = {("signals", one.role, "unit") for one in columns if one.question}
+    asked |= {("signals", one.role, mark.key) for one in columns for mark in one.marks}
     start = drafted(shown, subject.source).start
     sheets = [name.removeprefix("sheet ") for name, why in shown.skipped.items()
               if why == OTHER_SHEET]  # fmt: skip

@@ -31,6 +31,8 @@ _SAME, _EXACT, _GAP = 1e-2, 1e-3, 1.5
 _LONGEST, _EVEN = 1e30, 0.9
 _LOST, _TURN = 3.0, 10.0  # longest step of a counter that wraps, and least number between wraps
 _COMMON, _COVERED = 0.1, 0.5  # least part of the longest clock: common, and of a clock that counts
+# Noise beside the pulse relative to its height, and longest pulse relative to the recording.
+_FLAT, _PULSE = 0.1, 0.5
 
 
 def named_clock(name: str, unit: str = "") -> bool:
@@ -156,3 +158,18 @@ def _at(values: Array, time: Array, instants: Array) -> Array:
 
 def _step(time: Array) -> float:
     return float(np.median(np.diff(time)))
+
+
+def pulse(values: Array) -> tuple[int, float] | None:
+    """First sample and height of the only pulse of a column; None if it is no such column."""
+    if len(values) < 3 or not np.all(np.isfinite(values)):  # before, in, after
+        return None
+    away = values - np.median(values)
+    height = float(away[np.argmax(np.abs(away))])
+    high = away / height > 0.5 if height else np.zeros(len(values), dtype=bool)
+    edges = np.flatnonzero(np.diff(high.astype(np.int8)))
+    low = np.abs(away[~high])
+    # The samples next to an edge may be between both levels.
+    flat = np.count_nonzero(low > _FLAT * abs(height)) <= len(edges)
+    single = len(edges) == 2 and not high[0] and np.mean(high) < _PULSE
+    return (int(edges[0]) + 1, height) if single and flat else None

@@ -13,12 +13,11 @@ import numpy as np
 
 from impc.checking import replace
 from impc.errors import InputError
-from impc.files.alignment import named_clock, rising
+from impc.files.alignment import named_clock, pulse, rising
 from impc.files.checks import changes_only, missing_code
 from impc.files.clock import clock_fault, counts_days
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN, make_plant
-from impc.files.pulse import pulse
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:

@@ -105,6 +105,19 @@ def test_what_cannot_be_is_told_and_not_kept(client: Client, study: Path) -> Non
     assert "u_max" not in written(study)["fit"]
 
 
+def test_a_code_for_missing_values_is_asked_for(client: Client, study: Path) -> None:
+    path = study / NAME / "Versuch 1.csv"
+    lines = path.read_bytes().decode("cp1252").split("\r\n")
+    for row in range(40, 340, 20):
+        cells = lines[row].split(";")
+        lines[row] = ";".join([cells[0], "-9999", *cells[2:]])
+    path.write_bytes("\r\n".join(lines).encode("cp1252"))
+    assert "does it mark missing values?" in client.get("signals", f=NAME).text
+    for answer, kept in (("yes", -9999.0), ("no", []), ("", None)):
+        client.post("signals", ANSWERED | {"missing.1": answer}, f=NAME)
+        assert written(study)["signals"]["theta1"].get("missing") == kept
+
+
 def test_a_sheet_is_chosen(client: Client, study: Path) -> None:
     table = impc.read_table(study / NAME / "Versuch 1.csv")
     first = impc.make_table("", {f"{name}_raw": one for name, one in table.columns.items()})

@@ -7,9 +7,9 @@ import pytest
 
 import impc
 from impc.arrays import Array
+from impc.files.alignment import pulse
 from impc.files.draft import drafted
 from impc.files.plant_sources import plant_source
-from impc.files.pulse import pulse
 
 TIME = np.arange(500) / 100
 
