@@ -111,17 +111,17 @@ class Fit:
         given = {"IMPC_PROGRESS": "json", "IMPC_STOP_WITH_INPUT": "1", "IMPC_QUIET": "",
                  "PYTHONIOENCODING": "utf-8:backslashreplace"}  # fmt: skip
         # -P: the working folder may hold files called impc.py or numpy.py.
-        self._process = subprocess.Popen(
+        with subprocess.Popen(
             [sys.executable, "-P", "-m", "impc", *self.words[1:], "--yes"],
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
             encoding="utf-8", errors="replace", env=os.environ | given,
-        )  # fmt: skip
-        if self._stop.is_set():  # meanwhile
-            self._close()
-        assert self._process.stderr is not None  # a pipe
-        for line in self._process.stderr:
-            self._hear(line.strip())
-        return self._process.wait()
+        ) as self._process:  # fmt: skip
+            if self._stop.is_set():  # meanwhile
+                self._close()
+            assert self._process.stderr is not None  # a pipe
+            for line in self._process.stderr:
+                self._hear(line.strip())
+            return self._process.wait()
 
     def _hear(self, line: str) -> None:
         try:

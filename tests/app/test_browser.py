@@ -172,7 +172,7 @@ def test_every_screen_from_dropped_files_to_the_report(
         typed(page, place, value)
     followed(page, "Next: fit")
     accessible(page)
-    assert page.locator("button:has-text('Fit')").is_enabled()
+    page.locator("button:enabled:has-text('Fit')").wait_for(timeout=120_000)  # it is checked first
 
 
 @pytest.mark.full

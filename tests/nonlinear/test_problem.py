@@ -157,7 +157,7 @@ def test_arguments_are_checked() -> None:
         (lambda: problem.recorded_plan(X, U + np.inf), "inputs: has infinite entries"),
         (lambda: problem.recorded_plan(X * np.nan, U), "x0: 2 of 2 entries are NaN"),
         (lambda: problem.recorded_loop(X[:1]), "states: has 1 samples; give at least 2"),
-        (lambda: problem.recorded_plan("x"), "states: expected real numbers"),
+        (lambda: problem.recorded_plan("x"), "x: expected real numbers"),
         (lambda: problem.recorded_plan(X * np.nan, x0=[0, 0]), "recording: has missing"),
     ]  # fmt: skip
     for make, words in refused:
