@@ -92,7 +92,7 @@ def columns(text: str, table: Table, plant: Plant) -> list[Column]:
         entry = recording if role == CLOCK else signals.get(role, {})
         key, named = ("time_unit", "time") if role == CLOCK else ("unit", "column")
         unit = str(entry.get(key, table.units.get(name, "")))
-        origin = guess_of(table, name, "").origin.rstrip(".")
+        origin = guess_of(table, name, "").origin.rstrip(" ,.")
         comment = entry.item(named).trivia.comment.lstrip("# ") if named in entry else ""
         asked = f"Which unit is it in? {origin[0].upper()}{origin[1:]}."
         guessed = f"This is {comment[:1].lower()}{comment[1:].replace('GUESS', 'guess')}"

@@ -17,7 +17,7 @@ from impc.app.page import back, page, subject_of
 from impc.app.subject import RESULTS, Subject, may_be_recording, table
 from impc.errors import ImpcError
 from impc.files.disk import LARGEST, write_whole
-from impc.files.draft import drafted
+from impc.files.draft import drafted, rejected_clocks
 from impc.files.formats import FORMATS
 from impc.files.table import OTHER_SHEET
 from impc.reporting.shown_units import signal_name
@@ -118,15 +118,21 @@ def show_signals(request: Request, problem: str = "", file: str = "") -> Respons
     shown, plant = table(path, subject.sheet), subject.plant()
     columns, known = answers.columns(subject.text, shown, plant), answers.roles(plant)
     taken = {column.role for column in columns}
+    absent = [name for name in known if name not in {answers.CLOCK, *taken}]
     asked = {("signals", one.role, "unit") for one in columns if one.question}
     asked |= {("signals", one.role, mark.key) for one in columns for mark in one.marks}
+    asked |= {("signals", name, *key) for name in absent for key in ((), ("column",), ("unit",))}
+    clocks = {} if answers.CLOCK in taken else rejected_clocks(shown)
+    asked |= {("recording", "time")} if clocks else set()
     start = drafted(shown, subject.source).start
     sheets = [name.removeprefix("sheet ") for name, why in shown.skipped.items()
               if why == OTHER_SHEET]  # fmt: skip
     return page(
         request, "signals", files=list(files), path=path, columns=columns, roles=known,
         notices=[one for one in subject.notices() if one.place not in asked], rate=shown.rate,
-        lacking=[known[name].words for name in plant.outputs if name not in taken],
+        lacking=[known[name].words for name in absent if known[name].kind == "output"],
+        pushes=[known[name].words for name in absent if name in plant.controls[1:]],
+        clocks=[f"{name} {fault}; {remedy}" for name, (fault, remedy) in clocks.items()],
         recording=subject.content.get("recording", {}), problem=problem,
         pulse=start[1] if start else "", sheets=sheets,
     )  # fmt: skip

@@ -118,6 +118,15 @@ def test_a_code_for_missing_values_is_asked_for(client: Client, study: Path) -> 
         assert written(study)["signals"]["theta1"].get("missing") == kept
 
 
+def test_two_trials_in_a_file_are_named(client: Client, study: Path) -> None:
+    for path in (study / NAME).glob("*.csv"):
+        head, *rows = path.read_bytes().split(b"\r\n")
+        path.write_bytes(b"\r\n".join([head, *rows, *rows]))
+    page = client.get("signals", f=NAME).text
+    assert "Zeit begins again in sample 601" in page
+    assert "save each trial as a file of its own" in page
+
+
 def test_a_sheet_is_chosen(client: Client, study: Path) -> None:
     table = impc.read_table(study / NAME / "Versuch 1.csv")
     first = impc.make_table("", {f"{name}_raw": one for name, one in table.columns.items()})
