@@ -110,15 +110,11 @@ def subject_arguments(config: str) -> Callable[[F], F]:
 
 
 def scheduler_options(command: F) -> F:
-    """Add --scheduler, --tls-ca, --tls-cert, --tls-key and --workers to a `command`."""
-    path = click.Path(path_type=Path)
+    """Add --scheduler and --workers to a `command`."""
     options = (
         click.option(
             "--scheduler", help="Address of a running Dask scheduler, such as tls://host:8786."
         ),
-        click.option("--tls-ca", type=path, help="CA certificate that signed the scheduler's."),
-        click.option("--tls-cert", type=path, help="Client certificate for the scheduler."),
-        click.option("--tls-key", type=path, help="Private key of the client certificate."),
         click.option(
             "--workers",
             type=click.IntRange(1, 1024),
@@ -127,19 +123,10 @@ def scheduler_options(command: F) -> F:
     )
 
     @functools.wraps(command)
-    def connecting(
-        *given: Any,
-        scheduler: str | None,
-        tls_ca: Path | None,
-        tls_cert: Path | None,
-        tls_key: Path | None,
-        workers: int | None,
-        **named: Any,
-    ) -> Any:
+    def connecting(*given: Any, scheduler: str | None, workers: int | None, **named: Any) -> Any:
         from impc.studies.scheduler import Cluster  # noqa: PLC0415
 
-        cluster = Cluster(scheduler, workers, tls_ca, tls_cert, tls_key)
-        return command(*given, cluster=cluster, **named)
+        return command(*given, cluster=Cluster(scheduler, workers), **named)
 
     return functools.reduce(lambda found, one: one(found), options[::-1], cast("F", connecting))
 

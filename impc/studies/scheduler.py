@@ -17,7 +17,6 @@ from impc.studies.pool import answered, processes
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from concurrent.futures import Future
-    from pathlib import Path
 
     from distributed import Client
 
@@ -34,10 +33,6 @@ class Cluster:
 
     scheduler: str | None = None  # Address of a running Dask scheduler; None: this machine
     workers: int | None = None  # Number of workers on this machine; None: one per processor
-    # For an address tls://: CA certificate, client certificate and its private key
-    tls_ca: Path | None = None
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
 
 
 @contextmanager
@@ -45,19 +40,16 @@ def connected(cluster: Cluster) -> Iterator[Pool]:
     """Connect to the workers of a `cluster` during the block."""
     address = cluster.scheduler
     if address is None:
-        if any((cluster.tls_ca, cluster.tls_cert, cluster.tls_key)):
-            raise InputError("--tls-ca", "is given without --scheduler", "remove the --tls options")
         with processes(cluster.workers) as pool:
             yield pool
         return
     distributed = optional("distributed", f"scheduler {address}")
     import dask  # noqa: PLC0415  # a dependency of distributed
 
-    security = _security(cluster, address)
     patience = {"distributed.comm.timeouts.connect": _PATIENCE}
     logging.disable(logging.CRITICAL)  # Dask logs 112 lines for a lost scheduler
     try:
-        with dask.config.set(patience), _client(address, security) as client:
+        with dask.config.set(patience), _client(address) as client:
             yield _Scheduler(client)
     except (CancelledError, distributed.client.ClosedClientError):
         raise OutputError(
@@ -68,38 +60,19 @@ def connected(cluster: Cluster) -> Iterator[Pool]:
         logging.disable(logging.NOTSET)
 
 
-def _client(address: str, security: Any) -> Client:
+def _client(address: str) -> Client:
+    """A client of the scheduler; certificates for tls:// are those of Dask's configuration."""
     distributed = optional("distributed", f"scheduler {address}")
     try:
-        client: Client = distributed.Client(address, timeout=_PATIENCE, security=security)
+        client: Client = distributed.Client(address, timeout=_PATIENCE)
     except (OSError, ValueError, TypeError, TimeoutError) as error:
         raise InputError(
             f"scheduler {address}",
             f"does not answer ({type(error).__name__})",
-            "start one with `dask scheduler`, and pass its address and certificates",
+            "start one with `dask scheduler`; for tls://, name the certificates in Dask's "
+            "configuration",
         ) from None
     return client
-
-
-def _security(cluster: Cluster, address: str) -> Any:
-    """Certificates of the connection, from the options of the command; None without."""
-    options = ("--tls-ca", "--tls-cert", "--tls-key")
-    files = dict(zip(options, (cluster.tls_ca, cluster.tls_cert, cluster.tls_key), strict=True))
-    where, given = f"scheduler {address}", {name: path for name, path in files.items() if path}
-    if not address.startswith("tls://"):
-        if given:
-            raise InputError(where, "takes no certificates", "use an address tls://...")
-        return None
-    for name, path in given.items():
-        if not path.is_file():
-            raise InputError(f"{name} {path}", "is not a file", "check the path")
-    if len(given) < len(files):
-        missing = ", ".join(name for name in files if name not in given)
-        raise InputError(where, f"needs {missing}", "pass all three files")
-    ca, cert, key = map(str, given.values())
-    return optional("distributed", where).Security(
-        tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key, require_encryption=True
-    )
 
 
 class _Scheduler:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
 import pytest
 from distributed.security import Security
@@ -36,6 +38,13 @@ def certificates(folder: Path) -> tuple[Path, Path, Path]:
     for line in OPENSSL.splitlines():
         subprocess.run(line, shell=True, cwd=folder, check=True, capture_output=True)
     return folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+
+
+def configured(files: tuple[Path, Path, Path]) -> Any:
+    """Dask's configuration with the certificates of a client."""
+    names = ("ca-file", "client.cert", "client.key")
+    return dask.config.set({f"distributed.comm.tls.{name}": str(path)
+                            for name, path in zip(names, files, strict=True)})  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +79,7 @@ def test_a_scheduler_with_certificates(
     assert address.startswith("tls://")
     queue = deque([Task("one", "", abs, (-2,)), Task("two", "", int, ("x\ny",))])
     queue.extend(Task(f"many {number}", "", abs, (number,)) for number in range(50))
-    with connected(Cluster(address, None, *files)) as pool:
+    with configured(files), connected(Cluster(address)) as pool:
         assert pool.threads == 1
         found = {result.task.name: result for result in run(pool, queue, Cache(tmp_path))}
     assert found["one"].content == 2
@@ -79,36 +88,21 @@ def test_a_scheduler_with_certificates(
     assert [found[f"many {number}"].content for number in range(50)] == list(range(50))
 
 
-def require_refused(says: str, address: str | None, *given: Path | None) -> None:
-    """The cluster is refused before anything is done, in one line."""
-    with (
-        pytest.raises(impc.InputError, match=says) as caught,
-        connected(Cluster(address, None, *given)),
-    ):
-        pytest.fail("entered")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("missing", [0, 1, 2])
-def test_certificates_that_are_missing(
-    missing: int, files: tuple[Path, Path, Path], tmp_path: Path
-) -> None:
-    given: list[Path | None] = list(files)
-    for other, says in ((None, "needs --tls-"), (tmp_path / "none.pem", "is not a file")):
-        given[missing] = other
-        require_refused(says, "tls://127.0.0.1:9", *given)
-    require_refused("takes no certificates", "tcp://127.0.0.1:9", *files)
-    require_refused("without --scheduler", None, *files)
-
-
-def test_certificates_of_somebody_else(
+def test_missing_certificates_and_those_of_somebody_else_are_refused(
     scheduler: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_PATIENCE", "1s")
     others, broken = certificates(tmp_path), tmp_path / "broken.pem"
     broken.write_text("no certificate")
-    for given in (others, (broken, *others[1:])):
-        require_refused("does not answer", scheduler.scheduler_address, *given)
+    none = contextlib.nullcontext()
+    for given in (none, configured(others), configured((broken, *others[1:]))):
+        with (
+            given,
+            pytest.raises(impc.InputError, match="does not answer") as caught,
+            connected(Cluster(scheduler.scheduler_address)),
+        ):
+            pytest.fail("entered")
+        assert "\n" not in str(caught.value)
 
 
 def test_a_scheduler_that_is_lost(
@@ -117,7 +111,7 @@ def test_a_scheduler_that_is_lost(
     monkeypatch.setattr(module, "_PATIENCE", "1s")
 
     def lose() -> None:
-        with connected(Cluster(scheduler.scheduler_address, None, *files)) as pool:
+        with configured(files), connected(Cluster(scheduler.scheduler_address)) as pool:
             future = pool.submit(Task("long", "", time.sleep, (0.5,)))
             scheduler.close()
             future.result()
