@@ -28,7 +28,7 @@ from plants.seated_parameters import SeatedBalanceParameters
 _ARGUMENTS = {
     "mass": ("body mass", "kg"),
     "height": ("body height", "m"),
-    "sex": ("sex of the sample of body segments", "", *DE_LEVA),
+    "sex": ("sex (for the shares of body segments)", "", *DE_LEVA),
     "sample_time": ("sample time", "s"),
     "delay_order": ("order of the approximation of the delay", ""),
     **{
