@@ -45,7 +45,7 @@ _KINDS = {
 }
 # Words of mistakes in the meaning of a signal, and what to do.
 _MISTAKES = {
-    SIGN: ("a reversed sign of the {}", "Reverse its direction (in impc app), or sign in [signals.{}]."),
+    SIGN: ("a reversed sign of the {}", "Reverse its direction (sign in [signals.{}])."),
     EXCHANGED: ("an exchange of the {} with another signal", "Exchange the columns."),
     SUM: ("a {} recorded as its sum with another signal", "Subtract that signal."),
     DIFFERENCE: ("a {} recorded as its difference to another signal", "Add that signal."),
