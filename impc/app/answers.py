@@ -173,7 +173,7 @@ def signal_changes(form: Mapping[str, str], table: Table, subject: Subject) -> C
                 raise error
             for line, _ in questions(table, names[index], known[role].kind == "other"):
                 ((key, value),) = tomllib.loads(line).items()
-                no = [] if key == "missing" else False
+                no: Any = [] if key == "missing" else False
                 answer = form.get(f"{key}.{index}", "")
                 entry[key] = {"yes": value, "no": no}.get(answer)
             entry |= {"unit": unit or FILL_IN, "command": role == plant.controls[0] or None}

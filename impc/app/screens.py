@@ -119,7 +119,8 @@ def show_signals(request: Request, problem: str = "", file: str = "") -> Respons
     columns, known = answers.columns(subject.text, shown, plant), answers.roles(plant)
     taken = {column.role for column in columns}
     absent = [name for name in known if name not in {answers.CLOCK, *taken}]
-    asked = {("signals", one.role, "unit") for one in columns if one.question}
+    asked: set[tuple[str, ...]] = set()
+    asked |= {("signals", one.role, "unit") for one in columns if one.question}
     asked |= {("signals", one.role, mark.key) for one in columns for mark in one.marks}
     asked |= {("signals", name, *key) for name in absent for key in ((), ("column",), ("unit",))}
     clocks = {} if answers.CLOCK in taken else rejected_clocks(shown)
