@@ -121,7 +121,12 @@ def _filtered(prepared: PreparedFilter, trial: Recording, counted: int) -> Likel
     while first < N and status[first] not in _FAILED:
         belief = Belief(z, dz, P, dP)
         work = workspace(parts.rows, parts.drows, len(parts.unit))
-        first = run_filter(parts, outputs, disturbance, aim, belief, result, first, work)
+        try:
+            first = run_filter(parts, outputs, disturbance, aim, belief, result, first, work)
+        except np.linalg.LinAlgError:  # a factorisation of numbers that are not finite
+            raise SolverError(
+                "filter", "its covariance is not finite", "use another starting point"
+            ) from None
         dz, dP = np.ascontiguousarray(dz[:, : parts.lasting]), dP[: parts.lasting]
     failed = np.flatnonzero(np.isin(status, _FAILED))
     if len(failed):

@@ -346,3 +346,14 @@ def test_a_target_of_a_cart_only_moves_the_origin(limit: float) -> None:
     assert np.any(rest.status > 0) == np.isfinite(limit)
     np.testing.assert_allclose(aimed.identified, rest.identified, atol=1e-8)
     np.testing.assert_allclose(aimed.score, rest.score, atol=1e-6)
+
+
+def test_a_covariance_that_is_not_finite_is_an_error_of_the_search() -> None:
+    """As where a step makes a noise SD overflow: the search takes another step."""
+    who = Someone(sensory=(0.02, 0.05))
+    prepared = filter_of(who)
+    joint = prepared.parts.joint
+    broken = joint._replace(P0=np.full_like(joint.P0, np.inf))
+    parts = prepared.parts._replace(joint=broken)
+    with pytest.raises(impc.SolverError, match="is not finite"):
+        joint_likelihoods(impc.replace(prepared, parts=parts), [trial_of(who, np.zeros((40, 1)))])
