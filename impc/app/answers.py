@@ -169,13 +169,14 @@ def signal_changes(form: Mapping[str, str], table: Table, subject: Subject) -> C
         else:
             entry = _signal(form, index, names[index], known[role])
             given = SignalTable(column=names[index], unit=unit)
-            for error in unit_faults(role, given, plant.unit(role), names[index]) if unit else ():
-                raise error
-            for line, _ in questions(table, names[index], known[role].kind == "other"):
-                ((key, value),) = tomllib.loads(line).items()
-                no: Any = [] if key == "missing" else False
-                answer = form.get(f"{key}.{index}", "")
-                entry[key] = {"yes": value, "no": no}.get(answer)
+            fault = next(unit_faults(role, given, plant.unit(role), names[index]), None)
+            if unit and fault is not None:
+                raise fault
+            for mark in _marks(table, names[index], {}, known[role]):
+                value = tomllib.loads(mark.line)[mark.key]
+                no: Any = [] if mark.key == "missing" else False
+                answer = form.get(f"{mark.key}.{index}", "")
+                entry[mark.key] = {"yes": value, "no": no}.get(answer)
             entry |= {"unit": unit or FILL_IN, "command": role == plant.controls[0] or None}
             keys = {("signals", role, key): value for key, value in entry.items()}
         found |= keys

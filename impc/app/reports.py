@@ -45,11 +45,12 @@ def show_fit(request: Request) -> Response:
     problem, answer, takes = "There is nothing to fit yet: add recordings.", "recordings", ""
     if subject.trials:
         problem, answer, takes = _ready(subject) if target == "fit" else ("", "", "")
-    last = next(iter(subject.outs), None)
+    last = next(iter(subject.outs), None) if target == "fit" else None
+    since = _changes(_used(subject.config), _used(last / CONFIGURATION)) if last else ""
     return page(
         request, "fit", run=run, before=fits.before(run) if run else 0, problem=problem,
         where=answer, takes=takes, words=words, resumes=subject.out.exists(), waits=waits,
-        polled=target == "progress", since=_since(subject, last) if last else "",
+        polled=target == "progress", since=since,
     )  # fmt: skip
 
 
@@ -98,18 +99,13 @@ def results(request: Request) -> Response:
     rows = _table(folder).to_dict("records") if subject.outs else []
     used = [_used(folder / row["folder"] / CONFIGURATION) for row in rows]
     changes = [*(_changes(*pair) for pair in pairwise(used)), ""][: len(rows)]
-    since = _since(subject, folder / rows[0]["folder"]) if rows else ""
+    since = _changes(_used(subject.config), used[0]) if rows else ""
     names = [row["folder"] for row in rows]
     asked = request.query_params.get("r", "")
     chosen = asked if asked in names else next(iter(names), "")
     return page(
         request, "results", rows=rows, changes=changes, since=since, folder=folder, chosen=chosen
     )
-
-
-def _since(subject: Subject, out: Path) -> str:
-    """What changed since the fit in a folder of results."""
-    return _changes(_used(subject.config), _used(out / CONFIGURATION))
 
 
 def _used(file: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from impc.app.page import back, page, subject_of
 from impc.app.subject import RESULTS, Subject, may_be_recording, table
 from impc.errors import ImpcError
 from impc.files.disk import LARGEST, write_whole
-from impc.files.draft import drafted, rejected_clocks
+from impc.files.draft import draft, rejected_clocks
 from impc.files.formats import FORMATS
 from impc.files.table import OTHER_SHEET
 from impc.reporting.shown_units import signal_name
@@ -125,7 +125,7 @@ def show_signals(request: Request, problem: str = "", file: str = "") -> Respons
     asked |= {("signals", name, *key) for name in absent for key in ((), ("column",), ("unit",))}
     clocks = {} if answers.CLOCK in taken else rejected_clocks(shown)
     asked |= {("recording", "time")} if clocks else set()
-    start = drafted(shown, subject.source).start
+    start = draft(shown, plant).start
     sheets = [name.removeprefix("sheet ") for name, why in shown.skipped.items()
               if why == OTHER_SHEET]  # fmt: skip
     return page(

@@ -14,6 +14,8 @@ from urllib.parse import urlencode
 
 import numpy as np
 
+from impc.files.table import Table
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -106,3 +108,11 @@ def german(path: Path, seed: int = 1) -> None:
     rows = zip(np.arange(600) / 100, angle, 0.5 * np.roll(angle, 7), push, strict=True)
     lines += [";".join(f"{value:.5f}".replace(".", ",") for value in row) for row in rows]
     path.write_bytes("\r\n".join(lines).encode("cp1252"))
+
+
+def sheet(table: Table) -> list[tuple[object, ...]]:
+    """Headings with their units and rows of a table, as in a sheet."""
+    heads = (f"{name} [{table.units[name]}]" if name in table.units else name
+             for name in table.columns)  # fmt: skip
+    values = (column.tolist() for column in table.columns.values())
+    return [tuple(heads), *zip(*values, strict=True)]

@@ -15,12 +15,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 import pytest
 
 import impc
-from impc.files.table import Table
-from tests.app.serving import ROOT, german, serving
+from tests.app.serving import ROOT, german, serving, sheet
+from tests.files.samples import workbook
 
 if TYPE_CHECKING:
     from playwright.sync_api import ConsoleMessage, Page
@@ -90,13 +89,6 @@ def accessible(page: Page) -> None:
     page.set_viewport_size({"width": 1500, "height": 900})
 
 
-def workbook(table: Table, path: Path) -> None:
-    """The columns of a table as numbers in a sheet, with the units in the headings."""
-    heads = {name: f"{name} [{table.units[name]}]" if name in table.units else name
-             for name in table.columns}  # fmt: skip
-    pd.DataFrame(dict(table.columns)).rename(columns=heads).to_excel(path, index=False)
-
-
 def reached(page: Page, wanted: str) -> None:
     """Press Tab until an element has the focus; its id or its text is `wanted`."""
     for _ in range(100):
@@ -144,7 +136,8 @@ def test_every_screen_from_dropped_files_to_the_report(
     page.get_by_role("link", name="VP07").click()
     for seed in (1, 2):
         german(tmp_path / f"Versuch {seed}.csv", seed)
-    workbook(impc.read_table(tmp_path / "Versuch 2.csv"), tmp_path / "Versuch 2.xlsx")
+    table = impc.read_table(tmp_path / "Versuch 2.csv")
+    workbook(tmp_path / "Versuch 2.xlsx", Versuch=sheet(table))
     (tmp_path / "Versuch 2.csv").unlink()
     (tmp_path / "notes.docx").write_text("no recording")
     files = [{"name": one.name, "text": base64.b64encode(one.read_bytes()).decode()}

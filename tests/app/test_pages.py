@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import impc
-from tests.app.serving import ROOT, Client, german, serving
+from tests.app.serving import ROOT, Client, german, serving, sheet
+from tests.files.samples import workbook
 
 NAME = "VP 07"
 BODY = {"plant": "seated-balance", "plant.mass": "82,5", "plant.height": "1.80", "u_max": "6,5",
@@ -130,21 +131,12 @@ def test_two_trials_in_a_file_are_named(client: Client, study: Path) -> None:
 def test_a_sheet_is_chosen(client: Client, study: Path) -> None:
     table = impc.read_table(study / NAME / "Versuch 1.csv")
     first = impc.make_table("", {f"{name}_raw": one for name, one in table.columns.items()})
-    sheets = {"Rohdaten": first, "Gefiltert": table}
-    book(study / NAME / "Versuch 0.xlsx", sheets)
+    workbook(study / NAME / "Versuch 0.xlsx", Rohdaten=sheet(first), Gefiltert=sheet(table))
     form = ANSWERED | {"file": "Versuch 0.xlsx", "sheet": "Gefiltert"}
     assert ">Sitzwinkel_raw</legend>" in client.get("signals", f=NAME).text
     assert client.post("signals", form, f=NAME).headers["hx-refresh"] == "true"
     assert ">Sitzwinkel_raw</legend>" not in client.get("signals", f=NAME).text
     assert written(study)["recording"]["sheet"] == "Gefiltert"
-
-
-def book(path: Path, sheets: dict[str, Any]) -> None:
-    import pandas as pd  # noqa: PLC0415  # takes a third of a second
-
-    with pd.ExcelWriter(path) as writer:
-        for name, table in sheets.items():
-            pd.DataFrame(dict(table.columns)).to_excel(writer, sheet_name=name, index=False)
 
 
 def test_recordings_are_dropped_chosen_and_never_replaced(client: Client, study: Path) -> None:
