@@ -184,7 +184,8 @@ def may_be_recording(name: str) -> bool:
 
 def table(path: Path, sheet: str = "") -> Table:
     """The columns of a recording; kept until the file changes."""
-    return _table(path, sheet, path.stat().st_mtime_ns)
+    changed = path.stat().st_mtime_ns if path.exists() else 0  # reading says what is wrong
+    return _table(path, sheet, changed)
 
 
 @functools.lru_cache(maxsize=16)
