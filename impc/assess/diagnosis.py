@@ -85,8 +85,8 @@ def diagnosed(
     named: ModelError = first
     if ends:
         best, last = min(ends, key=lambda pair: pair[1].objective)
-        test, promised = lack_of_fit(last), 2 * seen_at(at).colour * first.evidence
-        if test is None or not test.alarm or at.objective - last.objective > promised:
+        promised = 2 * seen_at(at).colour * first.evidence
+        if _passes(last) or at.objective - last.objective > promised:
             named = best
     others = tuple(one for one in found.errors if one is not named)
     further = mistakes.get(named.name) or _freed(problem, named.name)
@@ -113,11 +113,21 @@ def _refits(problem: Problem, at: Fitted, found: LackOfFit) -> list[tuple[ModelE
             errors = np.array(end.problem.errors)
             again[one] = there.at(np.array(there.starts), body, errors)
     limit = next((one for one in likely if one.name == LIMIT), None)
-    # A limit that no sample reaches has no test.
-    if limit is not None or not any(one.name == LIMIT for one in found.errors):
-        again |= {limit or _like(first, LIMIT): there for there in _lower_limit(problem)}
+    lower = _lower_limit(problem)
+    if limit is not None and lower is not None:
+        again[limit] = lower
     displaced = {_like(first, name): other for name, other in _displaced(problem)}
-    return [*ends, *_tried(again | displaced)]
+    ends += _tried(again | displaced)
+    if lower is None or any(one.name == LIMIT for one in found.errors):
+        return ends
+    # A limit that no sample reaches has no test of its own: its fit must pass all others.
+    untested = _tried({_like(first, LIMIT): lower})
+    return ends + [pair for pair in untested if _passes(pair[1])]
+
+
+def _passes(end: Fitted) -> bool:
+    test = lack_of_fit(end)
+    return test is None or not test.alarm
 
 
 def _tried(problems: Mapping[ModelError, Problem]) -> list[tuple[ModelError, Fitted]]:
@@ -151,18 +161,16 @@ def _refitted(at: Fitted, name: str) -> Fitted | None:
         return None
 
 
-def _lower_limit(problem: Problem) -> Iterator[Problem]:
-    """The problem with its limit as a further unknown, from a lower one; none without a limit."""
+def _lower_limit(problem: Problem) -> Problem | None:
+    """The problem with its limit as a further unknown, from a lower one; None without a limit."""
     fitted = {name.split(".")[0] for name in problem.parameter_names}
     there = with_limit_unknown(problem)
-    if (
-        there is not None
-        and PARAMETERS[LIMIT] not in fitted
-        and np.all(problem.bounds.u_max < np.inf)
-    ):
-        lower = np.array(there.logarithms)
-        lower[len(problem.logarithms) :] = _LOWER
-        yield there.at(np.array(there.starts), lower, np.array(there.errors))
+    known = PARAMETERS[LIMIT] in fitted or not np.all(problem.bounds.u_max < np.inf)
+    if there is None or known:
+        return None
+    lower = np.array(there.logarithms)
+    lower[len(problem.logarithms) :] = _LOWER
+    return there.at(np.array(there.starts), lower, np.array(there.errors))
 
 
 def _displaced(problem: Problem) -> Iterator[tuple[str, Problem]]:

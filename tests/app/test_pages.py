@@ -243,8 +243,8 @@ def test_a_file_that_is_deleted_elsewhere_stops_no_page(client: Client, study: P
     both = {"use.Versuch 1.csv": "on", "use.Versuch 2.csv": "on"}
     assert client.post("use", both, f=NAME).status == 204
     (study / NAME / "Versuch 2.csv").unlink()
-    page = client.post("signals", ANSWERED | {"file": "Versuch 2.csv"}, f=NAME)
-    assert (page.status, "does not exist" in page.text) == (200, True)
+    answer = client.post("signals", ANSWERED | {"file": "Versuch 2.csv"}, f=NAME)
+    assert (answer.status, "does not exist" in answer.text) == (200, True)
     for step in ("signals", "body", "fit", "results"):
         assert client.get(step, f=NAME).status == 200
     page = client.get("recordings", f=NAME).text

@@ -8,12 +8,14 @@ import pytest
 import impc
 from experiments.benchmarks.workloads import seat
 from experiments.simulated_subjects import noisy_recordings
+from experiments.verdicts import KINDS
 from impc.arrays import Array, frozen
 from impc.assess.diagnosis import Diagnosis, diagnosed
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.inverse.refit import refit
 from impc.studies.fit.first import FitProgress, first_fits
+from impc.studies.fit.verdict import fit_verdict
 from tests.assess.cart_fits import uncertain_cart
 from tests.inverse.test_signal_errors import controller, recorded
 from tests.support import present
@@ -118,3 +120,10 @@ def test_a_wrong_scale_far_from_a_minimum_is_named() -> None:
     assert posed.signal_errors == (("scale", "perturbation"),)
     assert present(first).errors[0].name == "scale.perturbation"
     assert not present(last).alarm
+
+
+@pytest.mark.full
+def test_a_wrong_body_is_not_named_a_limit_that_no_sample_reaches() -> None:
+    """A lower limit makes up for most of another stiffness, and its fit passes no test."""
+    made, _, words = KINDS["body"]
+    assert words in fit_verdict(made(0).result).headline
