@@ -20,7 +20,6 @@ import scipy.special
 from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import InputError, SolverError, WeightsError
-from impc.inverse.ends import several_ends
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.estimates import Estimate, SearchEnd, simulated_estimate
 from impc.inverse.explaining_weights import weights_behind
@@ -43,7 +42,7 @@ from impc.inverse.problem import (
     with_or_without_set,
 )
 from impc.inverse.proximal_search import weights_near
-from impc.inverse.refit import refit
+from impc.inverse.refit import refit, several_ends
 from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
 from impc.inverse.search import (
     FEW,

@@ -23,13 +23,17 @@ import numpy as np
 from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import ImpcError, SolverError
-from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.laws import FixedLaw, GainLaw
 from impc.inverse.minimiser import PROMISE, Stop
 from impc.inverse.prediction import correction
 from impc.inverse.problem import EXPLAINED, recorded_size, require_riccati
 from impc.inverse.residuals import misfit_or_reason
-from impc.inverse.starts import balanced_regulator, drawn_starts, regulators
+from impc.inverse.starts import (
+    balanced_regulator,
+    drawn_starts,
+    pair_of_inactive_samples,
+    regulators,
+)
 from impc.inverse.unknowns import Unknowns
 from impc.model.riccati import solve_lqr, stabilises
 

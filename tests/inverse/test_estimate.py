@@ -22,10 +22,9 @@ from experiments.coverage import cart
 from impc.arrays import frozen
 from impc.assess.printed_gain import GainEstimate, covariance_intervals, gain_estimate
 from impc.attached_methods import METHODS, PROPERTIES
-from impc.inverse.ends import relative_error, several_ends
 from impc.inverse.estimates import SearchEnd
 from impc.inverse.minimiser import Ended
-from impc.inverse.refit import refit
+from impc.inverse.refit import refit, relative_error, several_ends
 from impc.nonlinear.fit import OptimalControlEstimate
 from tests.assess.cart_fits import cart_fit, uncertain_fit
 from tests.inverse.test_targets_and_gaps import gapped

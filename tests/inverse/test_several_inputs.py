@@ -12,12 +12,12 @@ from experiments.printed_intervals import carts, fit, noisy_recording, random_re
 from experiments.printed_intervals import regulator as cart_regulator
 from impc.control.closed_loop import simulate
 from impc.inverse.explaining_weights import weights_behind
-from impc.inverse.inactive_samples import pair_of_inactive_samples
 from impc.inverse.laws import GainLaw
 from impc.inverse.metric_family import metric_family
 from impc.inverse.noisy_fit import fit_controller
 from impc.inverse.residuals import residual_only
 from impc.inverse.search import fit_gain, refine_gain
+from impc.inverse.starts import pair_of_inactive_samples
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.inverse.unknowns import Unknowns
 from impc.model.weights import condition_number
