@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import DataError
-from impc.files.cells import WORD, Column, certain, kind_of
+from impc.files.cells import NUMBER, WORD, Column, certain, kind_of
 from impc.files.disk import LARGEST
 from impc.files.layout import HEAD, Row, extent, first_block, table_of, written_heading
 
@@ -175,12 +175,12 @@ def _divided(text: _Text, suffix: str) -> tuple[_Text, Block]:
 
 def _block(text: _Text) -> tuple[Block | None, float]:
     """Block of numbers, and the share of certain numbers among its fields that are not empty."""
-    if text.decimal == text.delimiter:
-        return None, 0.0
     lines = [line for _, line in _from(text, 0, _SAMPLE)]
     block = first_block([text.kinds(line) for line in lines], text.delimiter == "\n")
     fields = [item for line in lines[block.first :] for item in text.fields(line)] if block else []
     known = sum(certain(item, text.decimal) for item in fields)
+    if text.decimal == text.delimiter:  # quoted numbers, which may have thousands instead
+        known -= sum("," in item and kind_of(item, ".") == NUMBER for item in fields)
     return block, known / max(sum(map(bool, fields)), 1)
 
 

@@ -13,12 +13,12 @@ import numpy as np
 
 from impc.checking import replace
 from impc.errors import InputError
-from impc.files.alignment import named_clock, pulse, rising
+from impc.files.alignment import named_clock, pulse, rising, usual_step
 from impc.files.checks import changes_only, missing_code
-from impc.files.clock import clock_fault, counts_days
+from impc.files.clock import counts_days, rejected_clocks
 from impc.files.configuration import FILL_IN
 from impc.files.plant_sources import OWN, make_plant
-from impc.files.units import si_unit
+from impc.files.units import is_unit, si_unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 # than `_SLOWEST` s, the longest of any movement recording.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
-_RISES = 0.9  # least part of the steps of a clock that are upward
 _HORIZON = 20
 _INPUT = "a recorded perturbation; delete this table if it was not recorded"
 # Units at the end of names, as in alpha_deg.
@@ -150,8 +149,9 @@ def draft(
     """
     clock = clock_guess(table)
     clocks = {*rejected_clocks(table), *([clock.column] if clock else [])}
-    rest = [name for name in table.columns if name not in clocks]
-    rest = rest or list(table.columns)
+    rest = [name for name, values in table.columns.items() if name not in clocks]
+    if plant is None:
+        rest = [name for name in rest if not counts(table, name)]
     chosen, names = {column: (column, "") for column in rest}, tuple(rest)
     if plant is not None:
         names = (*plant.outputs, *plant.controls[1:])
@@ -175,9 +175,9 @@ def questions(table: Table, column: str, held: bool = True) -> tuple[tuple[str, 
     values = table.columns.get(column, np.empty(0))
     found = []
     if (code := missing_code(values)) is not None:
-        many = f"{code[0]:.7g} in {code[1]} of {len(values)} samples"
+        many = f"{code[0]} in {code[1]} of {len(values)} samples"
         asked = f"{many}, far from all others: does it mark missing values?"
-        found.append((f"missing = {code[0]:.7g}", asked))
+        found.append((f"missing = {code[0]}", asked))
     if held and (written := changes_only(values)):
         asked = f"a value in {written} of {len(values)} samples: is it written only where it "
         found.append(("held = true", f"{asked}changes, and holds until then?"))
@@ -253,10 +253,16 @@ def guess_of(table: Table, column: str, why: str) -> Guess:
     return Guess(column, why, FILL_IN, "fill in: deg, rad, N*m, ...")
 
 
+def counts(table: Table, name: str) -> bool:
+    """Whether a column counts samples, or is another clock that rises evenly."""
+    values = table.columns[name]
+    whole = len(values) > 2 and bool((np.diff(values) == 1).all())
+    return whole or (rate_of(values) is not None and named_clock(name, table.units.get(name, "")))
+
+
 def rate_of(values: Array) -> float | None:
     """Samples per unit of a column that rises evenly; None for the others."""
-    whole = len(rising(values)) == len(values)
-    return 1 / float(np.median(np.diff(values))) if whole else None
+    return 1 / usual_step(values) if len(rising(values)) == len(values) else None
 
 
 def _line(setting: str, comment: str) -> str:
@@ -290,26 +296,15 @@ def _clock_lines(table: Table, clock: Guess | None) -> list[str]:
             _line("# rate = 1000.0", "or give the samples per second"),
         ]
     values = table.columns[clock.column]
-    step = float(np.median(np.diff(values)))
+    step = usual_step(values)
+    if not named_clock(clock.column, table.units.get(clock.column, "")) and counts(
+        table, clock.column
+    ):
+        asked = f"samples per second, which {clock.column!r} counts"
+        return [_line("# rate = 1000.0", asked)]
     span = f"from {values[0]:.6g} to {values[-1]:.6g}, in steps of {step:.6g}"
     unit = _line(f"time_unit = {_quoted(clock.unit)}", clock.origin)
     return [_line(f"time = {_quoted(clock.column)}", span), unit]
-
-
-def rejected_clocks(table: Table) -> dict[str, tuple[str, str]]:
-    """Columns that are clocks but rise unevenly: what is wrong with each, and what to do."""
-    found = {}
-    for name, values in table.columns.items():
-        fault = clock_fault(values)
-        steps = np.diff(values[np.isfinite(values)])
-        rises = np.sum(steps > 0) >= _RISES * np.sum(steps != 0)
-        named = rises and named_clock(name, table.units.get(name, ""))
-        if fault is None and named and rate_of(values) is None:
-            said = f"rises unevenly, in steps from {steps.min():.4g} to {steps.max():.4g}"
-            fault = said, "export with a constant sampling rate, or give recording.rate instead"
-        if fault is not None and (named or "trials" in fault[0]):
-            found[name] = fault
-    return found
 
 
 def clock_guess(table: Table) -> Guess | None:
@@ -322,9 +317,11 @@ def clock_guess(table: Table) -> Guess | None:
     values, guess = table.columns[name], guess_of(table, name, "")
     if guess.unit != "day" and counts_days(values) and not table.units.get(name):
         return Guess(name, "", "day", "a guess: day numbers of a spreadsheet")
+    if guess.unit == FILL_IN and is_unit(name) and si_unit(name).base == "second":
+        guess = replace(guess, unit=name, origin="a guess from its name")
     if guess.unit != FILL_IN and si_unit(guess.unit).base == "second":
         return guess
-    step = float(np.median(np.diff(values)))
+    step = usual_step(values)
     unit, second = next(pair for pair in _GUESSES if step < pair[1] * _SLOWEST or pair[1] == 1e9)
     origin = f"a guess: {second / step:.4g} samples per second; a counter needs rate"
     return Guess(name, "", unit, origin)

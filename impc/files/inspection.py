@@ -8,9 +8,9 @@ import numpy as np
 
 from impc.errors import InputError
 from impc.files.checks import straight_lines
-from impc.files.clock import read_clock
+from impc.files.clock import read_clock, rejected_clocks
 from impc.files.configuration import RecordingTable
-from impc.files.draft import clock_guess, questions, rate_of, rejected_clocks
+from impc.files.draft import clock_guess, questions, rate_of
 from impc.files.table import in_columns
 from impc.files.units import si_unit
 
@@ -26,10 +26,12 @@ def summary(table: Table, dt: float | None = None) -> str:
     if table.rate is not None:
         lines.append(f"The file states a rate of {table.rate:g} samples per second.")
     lines += _clock_findings(table, dt)
+    rejected = rejected_clocks(table)
     for name, values in table.columns.items():
+        if rate_of(values) is not None or name in rejected:
+            continue
         lines += [f"Column {name!r}: {asked} ({line})" for line, asked in questions(table, name)]
-        clock = rate_of(values) is not None or name in rejected_clocks(table)
-        if not clock and (found := straight_lines(values)) is not None:
+        if (found := straight_lines(values)) is not None:
             said = f"is a straight line from sample {found[0] + 1} to {found[1] + 1}"
             lines.append(f"Column {name!r} {said}: a gap that was filled by interpolation?")
     lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]

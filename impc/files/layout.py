@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from impc.errors import DataError
 from impc.files.cells import EMPTY, NUMBER, WORD, require_no_thousands
 from impc.files.table import make_table
@@ -200,7 +202,8 @@ def table_of(
     `texts` are the places and texts of a column, to tell decimals from thousands.
     """
     empty = [column.empty for column in columns]
-    heads = find_headings(source, above, empty, named_rows)
+    heads = find_headings(source, above, [not one.numeric for one in columns], named_rows)
+    first = _counts(columns)
     kept, units, said = {}, dict(heads.units), [*heads.notes]
     for place, (name, column) in enumerate(zip(heads.names, columns, strict=True)):
         known = name or f"column_{place + 1}"
@@ -218,26 +221,34 @@ def table_of(
             continue
         if column.grouped:
             require_no_thousands(source, known, texts(place), column.decimal)
-        found.flags.writeable = False  # used without a copy
-        kept[known] = found
+        kept[known] = found[first:]
+        kept[known].flags.writeable = False  # used without a copy
         units |= {known: "s"} if column.timed else {}
     return make_table(source, kept, units, None, skipped, (*said, *filter(None, notes)))
 
 
+def _counts(columns: Sequence[Column]) -> int:
+    """1 if the first row holds the number of rows below it (AcqKnowledge), otherwise 0."""
+    first = [one.values[0] for one in columns if one.numeric and not np.isnan(one.values[0])]
+    rows = len(columns[0].values)
+    return int(rows > _NAMED and {*first} == {rows - 1.0})
+
+
 # Lines that may end the settings of a file without headings (LabVIEW, OpenSim).
 _NO_HEAD = ("endofheader", "endheader")
+_TITLES, _UNITS = "ChannelTitle=", "UnitName="
 # Columns that rows may omit where they are empty.
 _REMARKS = ("comment", "comments", "kommentar", "event", "events", "note", "notes", "remarks")
 
-_HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
+# A unit in brackets, or behind a comma or slash: "tilt (deg)", "tilt, deg", "tilt / deg".
+_HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]|(.*\S)(?:, ?| / )([^,]+)")
 
 
 def split_heading(heading: str) -> tuple[str, str]:
     """Name and unit of a heading such as ``angle (deg)``; the unit may be empty."""
     found = _HEADING.fullmatch(heading.strip())
-    if found and is_unit(found[2]):
-        return found[1], found[2].strip()
-    return heading.strip(), ""
+    name, unit = [part for part in found.groups() if part is not None] if found else ("", "")
+    return (name, unit.strip()) if is_unit(unit) else (heading.strip(), "")
 
 
 def written_heading(name: str, unit: str | None) -> str:
@@ -273,6 +284,9 @@ def find_headings(
     if rows and rows[-1][0].strip("*_ ").lower().replace("_", "") in _NO_HEAD:
         rows = []
     units: Sequence[str] = ()
+    if titles := [row for row in rows if row[0] == _TITLES]:  # of LabChart, above their units
+        units = next((["", *row[1:]] for row in rows if row[0] == _UNITS), ())
+        rows = [["time", *titles[0][1:]]]
     if len(rows) > 1 and len(rows[-1]) <= width and are_units(rows[-1]) and not are_units(rows[-2]):
         units = rows.pop()
     if not rows:
@@ -288,7 +302,7 @@ def find_headings(
             f"the header names {len(heads)} columns, but the rows below have {width} values",
             "export with a point as decimal sign, or with semicolons between columns",
         )
-    level = rows[-2] if len(rows) > 1 and len(rows[-2]) <= width else ()
+    level = rows[-2] if len(rows) > 1 and 1 < len(rows[-2]) <= width else ()
     return named_columns(_padded(heads, width), _padded(units, width), _padded(level, width))
 
 

@@ -148,7 +148,9 @@ def _collect(
         skipped[name] = reason
     elif value.dtype.names:
         if value.size != 1 or depth >= _DEPTH:
-            skipped[name] = f"is an array of {value.size} structs; save each as a separate file"
+            skipped[name] = (
+                f"is an array of {value.size} structs; save one of them, such as s = {name}(1)"
+            )
             return
         for part in value.dtype.names:
             _collect(f"{name}.{part}", value.flat[0][part], columns, skipped, depth + 1)

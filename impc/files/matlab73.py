@@ -111,7 +111,8 @@ def _unreadable(dataset: Any, kind: str) -> str:
     if dataset.dtype.names is not None:
         return "is complex"
     if dataset.dtype.kind not in "fiub":
-        return "is not numeric"
+        structs = "ref" in (dataset.dtype.metadata or {})
+        return "is an array of structs; save one of them" if structs else "is not numeric"
     return "" if dataset.id.get_storage_size() else "has no stored values, only a fill value"
 
 
