@@ -247,14 +247,14 @@ def rejected_clocks(table: Table) -> dict[str, tuple[str, str]]:
     """Columns that are clocks but rise unevenly: what is wrong with each, and what to do."""
     found = {}
     for name, values in table.columns.items():
-        fault = clock_fault(values)
         steps = np.diff(values[np.isfinite(values)])
         rises = np.sum(steps > 0) >= _RISES * np.sum(steps != 0)
         named = rises and named_clock(name, table.units.get(name, ""))
+        fault = clock_fault(values) if named or _starts(values) else None
         if fault is None and named and len(rising(values)) < len(values):
             said = f"rises unevenly, in steps from {steps.min():.4g} to {steps.max():.4g}"
             fault = said, "export with a constant sampling rate, or give recording.rate instead"
-        if fault is not None and (named or "trials" in fault[0]):
+        if fault is not None:
             found[name] = fault
     return found
 
@@ -275,24 +275,22 @@ def _starts(values: Array) -> list[int]:
 
 
 def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
+    """Rows between recording.start and stop, which must lie within the recording."""
     slack = 1e-9 * max(abs(time[0]), abs(time[-1]), 1.0)
-    start = -np.inf if recording.start is None else recording.start - slack
-    stop = np.inf if recording.stop is None else recording.stop + slack
-    kept = np.flatnonzero((time >= start) & (time <= stop))
+    start, stop = (-np.inf if recording.start is None else recording.start,
+                   np.inf if recording.stop is None else recording.stop)  # fmt: skip
+    kept = np.flatnonzero((time >= start - slack) & (time <= stop + slack))
     if len(kept) < 2:
         raise DataError(
             source,
             f"has {len(kept)} samples between recording.start and stop",
             f"choose them within the recording ({time[0]:g} to {time[-1]:g} s)",
         ).at("", "recording", "start")
-    for key, wanted, reached in (
-        ("start", recording.start, float(time[0])),
-        ("stop", recording.stop, float(time[-1])),
+    spare = float(np.median(np.diff(time[kept])))
+    for key, wanted, beyond in (
+        ("start", start, -np.inf < start < time[0] - spare),
+        ("stop", stop, time[-1] + spare < stop < np.inf),
     ):
-        spare = float(np.median(np.diff(time[kept])))
-        beyond = wanted is not None and (
-            wanted < reached - spare if key == "start" else wanted > reached + spare
-        )
         if beyond:
             raise DataError(
                 source,

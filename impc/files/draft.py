@@ -1,4 +1,4 @@
-"""Draft of a configuration from the names and units of a file's columns."""
+"""What a file holds: summary of its columns, and draft of a configuration from their names."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ import numpy as np
 from impc.checking import replace
 from impc.errors import InputError
 from impc.files.alignment import named_clock, pulse, rising, usual_step
-from impc.files.checks import changes_only, missing_code
-from impc.files.clock import counts_days, rejected_clocks
-from impc.files.configuration import FILL_IN
+from impc.files.checks import changes_only, missing_code, straight_lines
+from impc.files.clock import counts_days, read_clock, rejected_clocks
+from impc.files.configuration import FILL_IN, RecordingTable
 from impc.files.plant_sources import OWN, make_plant
+from impc.files.table import in_columns
 from impc.files.units import is_unit, si_unit
 
 if TYPE_CHECKING:
@@ -128,7 +129,8 @@ class Draft:
             kind = _INPUT if acts else _span(table, guess.column)
             lines += ["", *_signal_lines(signal, guess, kind, plant)]
         if self.unused:
-            named = ", ".join(_stated(table, name) for name in self.unused)
+            idle = _idle(table)
+            named = ", ".join(_stated(table, name, idle.get(name, "")) for name in self.unused)
             lines += ["", f"# Columns that are not used: {named}"]
         if plant is None:
             lines += ["", "[plant]", "# arguments of the plant's function", ""]
@@ -216,8 +218,8 @@ def _fit_lines(plant: Plant) -> list[str]:
     ]
 
 
-def _stated(table: Table, column: str) -> str:
-    about = ", ".join(filter(None, (table.units.get(column), _idle(table, column))))
+def _stated(table: Table, column: str, idle: str) -> str:
+    about = ", ".join(filter(None, (table.units.get(column), idle)))
     return f"{_quoted(column)} ({about})" if about else _quoted(column)
 
 
@@ -342,7 +344,7 @@ def _guessed(
         if fit
     }
     chosen: dict[str, tuple[str, str]] = {}
-    free = list(columns)
+    free, idle = list(columns), _idle(table)
     for signal, column in sorted(likeness, key=lambda pair: -likeness[pair]):
         alike = likeness[signal, column] >= _ALIKE
         if alike and signal not in chosen and column in free:
@@ -350,7 +352,7 @@ def _guessed(
             chosen[signal] = column, "" if same else "a guess from its name"
             free.remove(column)
     for signal in signals:
-        left = [column for column in free if fits[signal, column] and not _idle(table, column)]
+        left = [column for column in free if fits[signal, column] and column not in idle]
         if signal not in chosen and left:
             # The first of those that fit equally well.
             best = max(left, key=lambda column: fits[signal, column])
@@ -360,15 +362,18 @@ def _guessed(
     return chosen
 
 
-def _idle(table: Table, column: str) -> str:
-    """Reason why a column is hardly a signal; empty if it may be one."""
-    values = table.columns[column]
-    values = values[np.isfinite(values)]
-    if len(values) == 0 or np.ptp(values) == 0:
-        return "constant"
-    if (fault := rejected_clocks(table).get(column)) is not None:
-        return f"a clock that {fault[0]}"
-    return "" if rate_of(values) is None else "a clock or counter"
+def _idle(table: Table) -> dict[str, str]:
+    """Columns that are hardly signals, and why."""
+    rejected, found = rejected_clocks(table), {}
+    for column, values in table.columns.items():
+        finite = values[np.isfinite(values)]
+        if len(finite) == 0 or np.ptp(finite) == 0:
+            found[column] = "constant"
+        elif column in rejected:
+            found[column] = f"a clock that {rejected[column][0]}"
+        elif rate_of(finite) is not None:
+            found[column] = "a clock or counter"
+    return found
 
 
 def _signal_lines(signal: str, guess: Guess, kind: str, plant: Plant | None) -> list[str]:
@@ -392,3 +397,61 @@ def _signal_lines(signal: str, guess: Guess, kind: str, plant: Plant | None) -> 
 
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML forbids it
+
+
+@np.errstate(all="ignore")  # the mean of values of 1e308 overflows
+def summary(table: Table, dt: float | None = None) -> str:
+    """Table of the columns with the findings of their clock; `dt` of the plant in s, if known."""
+    heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
+    lines = [in_columns([heads, *(_row(table, name) for name in table.columns)], left=2)]
+    if table.rate is not None:
+        lines.append(f"The file states a rate of {table.rate:g} samples per second.")
+    lines += _clock_findings(table, dt)
+    rejected = rejected_clocks(table)
+    for name, values in table.columns.items():
+        if rate_of(values) is not None or name in rejected:
+            continue
+        lines += [f"Column {name!r}: {asked} ({line})" for line, asked in questions(table, name)]
+        if (found := straight_lines(values)) is not None:
+            said = f"is a straight line from sample {found[0] + 1} to {found[1] + 1}"
+            lines.append(f"Column {name!r} {said}: a gap that was filled by interpolation?")
+    lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
+    lines += [f"Note: {note}" for note in table.notes]
+    return "\n".join(lines)
+
+
+def _row(table: Table, name: str) -> tuple[str, ...]:
+    values = table.columns[name]
+    finite = values[np.isfinite(values)]
+    numbers = (
+        tuple(f"{value:.6g}" for value in (finite.min(), finite.max(), finite.mean()))
+        if len(finite)
+        else ("-", "-", "-")
+    )
+    rate = rate_of(values)
+    return (
+        name,
+        table.units.get(name, ""),
+        str(len(values)),
+        *numbers,
+        str(len(values) - len(finite)),
+        "" if rate is None else f"{rate:.6g}",
+    )
+
+
+def _clock_findings(table: Table, dt: float | None) -> list[str]:
+    """Findings of the clock that the draft names, or of the rate of the file."""
+    recording = RecordingTable()
+    if (clock := clock_guess(table)) is not None:
+        longest = float(np.diff(table.columns[clock.column]).max()) * si_unit(clock.unit).factor
+        fill_gaps = longest if dt is None else None
+        recording = RecordingTable(time=clock.column, time_unit=clock.unit, fill_gaps=fill_gaps)
+    elif table.rate is None:
+        faults = rejected_clocks(table).items()
+        return [f"{table.source}: clock {name!r} {'; '.join(fault)}" for name, fault in faults]
+    try:
+        used = read_clock(table, recording, dt or 0.0)
+    except InputError as error:
+        return [str(error)]
+    found = [*used.findings, *used.notes]
+    return found if dt else [one.removesuffix(": interpolated") for one in found]

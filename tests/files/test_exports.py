@@ -230,6 +230,8 @@ READ: dict[str, tuple[str, Content, str]] = {
     "a signed counter": (".csv", text(((WRAP % 65536) - 32768).tolist(), head="ms"), "ms"),
     "seconds that wrap": (".csv", text(((WRAP % 65536) / 1000).tolist(), head="clock"), "clock"),
     "a counter of 8 bits": (".csv", text((np.arange(SAMPLES) % 256.0).tolist(), head="n"), "n"),
+    "bars": (".csv", text((), "|"), "time"),
+    "commas between": (".tsv", text(), "time"),
     "a counter of 12 bits": (".csv", text((WRAP % 4096).tolist(), head="ms"), "ms"),
     "of LabChart": (
         ".txt", "\n".join([LABCHART, "UnitName=\tdeg\tN", *COMMENTED]), "time"),
