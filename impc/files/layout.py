@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from itertools import accumulate, chain, count
+from itertools import chain, count
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -315,10 +315,11 @@ def _named(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> 
     short = [name for name, _ in split]
     kept = heads if _repeated(short) and not _repeated(heads) else short  # with their units
     names = [name or above for name, above in zip(kept, level, strict=True)]
-    groups, again = accumulate(level, lambda group, above: above or group), _repeated(names)
+    again, group = _repeated(names), ""
     made: list[str] = []
     known = set[str]()
-    for name, group in zip(names, groups, strict=True):
+    for name, above in zip(names, level, strict=True):
+        group = above or group
         whole = f"{group} {name}" if name in again and group else name
         numbered = (f"{whole}_{number}" for number in count(2))
         made.append(next(one for one in chain([whole], numbered) if not one or one not in known))
