@@ -16,8 +16,9 @@ from impc.app import answers
 from impc.app.page import back, page, subject_of
 from impc.app.subject import RESULTS, Subject, may_be_recording, table
 from impc.errors import ImpcError
+from impc.files.clock import rejected_clocks
 from impc.files.disk import LARGEST, write_whole
-from impc.files.draft import draft, rejected_clocks
+from impc.files.draft import draft
 from impc.files.formats import FORMATS
 from impc.files.table import OTHER_SHEET
 from impc.reporting.shown_units import signal_name

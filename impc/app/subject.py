@@ -17,9 +17,9 @@ from impc.files.configuration import FILL_IN, SubjectTable, configuration, conve
 from impc.files.disk import write_whole
 from impc.files.draft import drafted
 from impc.files.edited import edited
-from impc.files.examination import examine
 from impc.files.formats import FORMATS, read_table
 from impc.files.plant_sources import make_plant
+from impc.files.reading import examine
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -37,9 +37,8 @@ def command(
 ) -> None:
     """Show what a recording holds and write a commented configuration for it."""
     from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
-    from impc.files.draft import drafted  # noqa: PLC0415
+    from impc.files.draft import drafted, summary  # noqa: PLC0415
     from impc.files.formats import read_table, write_file  # noqa: PLC0415
-    from impc.files.inspection import summary  # noqa: PLC0415
 
     if config is not None:
         _check(file, config, plant_name)
@@ -77,10 +76,9 @@ def _check(file: Path, config: Path, plant_name: str | None) -> None:
     from impc.errors import InputError  # noqa: PLC0415
     from impc.files.checks import fault  # noqa: PLC0415
     from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.examination import examine  # noqa: PLC0415
     from impc.files.formats import read_table  # noqa: PLC0415
     from impc.files.plant_sources import make_plant  # noqa: PLC0415
-    from impc.files.reading import recording_of  # noqa: PLC0415
+    from impc.files.reading import examine, recording_of  # noqa: PLC0415
 
     if plant_name is None:
         raise InputError("--config", "is given without --plant", "add --plant NAME")

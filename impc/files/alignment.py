@@ -17,7 +17,7 @@ from impc.errors import DataError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from impc.arrays import Array
+    from impc.arrays import Array, BoolArray
 
 _WORDS = {
     *("time", "t", "zeit", "temps", "tiempo", "tempo", "tijd", "tid", "uhrzeit", "timestamp"),
@@ -26,7 +26,7 @@ _WORDS = {
 _SECONDS = ("s", "sec", "ms", "us")
 # Clocks are equal if they differ by less than this part of a step; a value is taken without
 # interpolation below the second; an interval of more than the third many steps is a gap.
-_SAME, _EXACT, _GAP = 1e-2, 1e-3, 1.5
+_SAME, _EXACT, GAP = 1e-2, 1e-3, 1.5
 # Longest clock in any unit; least part of its steps that are within half of the usual one.
 _LONGEST, _EVEN = 1e30, 0.9
 _LOST, _TURN = 3.0, 10.0  # longest step of a counter that wraps, and least number between wraps
@@ -47,8 +47,13 @@ def named_clock(name: str, unit: str = "") -> bool:
 
 
 def rising(values: Array) -> Array:
-    """`values` (samples,) to the last finite one, if they rise evenly to it; otherwise empty."""
+    """`values` (samples,) without the empty or equal ones at the end, if they rise evenly.
+
+    Otherwise empty. Shorter columns of a file are padded with nothing, zeros or their last value.
+    """
     time = values[: int(np.isfinite(values).sum())]
+    if len(time) > 2 and time[-1] == time[-2]:
+        time = time[: 1 + np.max(np.flatnonzero(time != time[-1]), initial=-1)]
     with np.errstate(all="ignore"):  # steps of numbers beyond any clock
         steps = np.diff(time)
         if len(time) < 2 or not (steps > 0).all() or not 1 / _LONGEST < np.ptp(time) < _LONGEST:
@@ -67,13 +72,20 @@ def unwrapped(values: Array, moduli: Sequence[float]) -> tuple[Array, float]:
         steps = np.diff(values[known])
         fell = steps < 0
         usual = float(np.median(steps[~fell])) if fell.any() and not fell.all() else 0.0
+        low, high = (steps[fell].min(), steps[fell].max()) if usual > 0 else (0.0, 0.0)
         for modulus in moduli if usual > 0 else ():
-            on = steps[fell] + modulus
-            if modulus >= _TURN * usual and (on > 0).all() and (on <= _LOST * usual).all():
+            close = low + modulus > 0 and high + modulus <= _LOST * usual
+            if modulus >= _TURN * usual and close and not _repeats(values[known], fell):
                 made = values.copy()
                 made[known[1:]] += modulus * np.cumsum(fell)
                 return made, modulus
     return values, 0.0
+
+
+def _repeats(values: Array, fell: BoolArray) -> bool:
+    """Whether `values` run through the same numbers after each fall, as the clocks of trials do."""
+    first, last = values[1:][fell], values[:-1][fell]
+    return bool((first == values[0]).all() and (last == values[-1]).all())
 
 
 def own_clocks(
@@ -114,14 +126,15 @@ def aligned(
         for name, time in times.items()
         if len(time) == len(most) or np.ptp(time) > _COVERED * np.ptp(most)
     }
-    close = _SAME * _step(most)
+    close = _SAME * usual_step(most)
     if all(len(t) == len(most) and np.abs(t - most).max() <= close for t in times.values()):
         return dict(columns), ()
-    fastest = min(times, key=lambda name: _step(times[name]))
+    fastest = min(times, key=lambda name: usual_step(times[name]))
     first = max(float(time[0]) for time in times.values())
     last = min(float(time[-1]) for time in times.values())
     spans = ", ".join(
-        f"{name} ({time[0]:g} to {time[-1]:g} by {_step(time):.4g})" for name, time in times.items()
+        f"{name} ({time[0]:g} to {time[-1]:g} by {usual_step(time):.4g})"
+        for name, time in times.items()
     )
     if not last - first >= _COMMON * np.ptp(most):
         raise DataError(
@@ -129,7 +142,7 @@ def aligned(
             f"has clocks without a common span: {spans}",
             "save the columns of each in a file of their own, or remove a clock that is not used",
         )
-    instants, slack = times[fastest], _EXACT * _step(times[fastest])
+    instants, slack = times[fastest], _EXACT * usual_step(times[fastest])
     instants = instants[(instants >= first - slack) & (instants <= last + slack)]
     made = dict(columns)
     for name, (clock, time) in clocks.items():
@@ -147,17 +160,19 @@ def _at(values: Array, time: Array, instants: Array) -> Array:
     if finite.sum() < 2:
         return np.full(len(instants), np.nan)
     after = np.clip(np.searchsorted(time, instants), 1, len(time) - 1)
-    before, step = after - 1, _step(time)
+    before, step = after - 1, usual_step(time)
     near = np.where(instants - time[before] < time[after] - instants, before, after)
-    known = finite[before] & finite[after] & (time[after] - time[before] <= _GAP * step)
+    known = finite[before] & finite[after] & (time[after] - time[before] <= GAP * step)
     spline = scipy.interpolate.Akima1DInterpolator(time[finite], values[finite], method="makima")
     between = np.where(known, spline(instants), np.nan)
     exact = np.abs(time[near] - instants) <= _EXACT * step
     return np.asarray(np.where(exact, values[near], between), dtype=np.float64)
 
 
-def _step(time: Array) -> float:
-    return float(np.median(np.diff(time)))
+def usual_step(time: Array) -> float:
+    """Mean of the steps of a rising clock that are not gaps."""
+    steps = np.diff(time)
+    return float(np.mean(steps[steps < GAP * np.median(steps)]))
 
 
 def pulse(values: Array) -> tuple[int, float] | None:

@@ -30,7 +30,7 @@ from impc.files.table import Table
 READERS = {
     "matlab": ("impc.files.matlab", "read_matlab", "scipy.io"),
     "matrices": ("impc.files.matlab", "read_matrices", "scipy.io"),
-    "matlab73": ("impc.files.matlab73", "read_matlab73", "h5py"),
+    "matlab73": ("impc.files.matlab", "read_matlab73", "h5py"),
     "tdms": ("impc.files.recorders", "read_tdms", "nptdms"),
     "c3d": ("impc.files.recorders", "read_c3d", "c3d"),
     "spreadsheet": ("impc.files.spreadsheet", "read_spreadsheet", "python_calamine"),

@@ -44,25 +44,19 @@ _MISSING = re.compile(
     re.IGNORECASE,
 )
 _MARK = re.compile(r"[^\w\s\"'#%]{1,4}")
-_DATES, _DATED, _TIMES = "dates", "dates with a time", "times of the day"
-
-_DATE = (
-    r"(?P<y>\d{4})[-/.](?P<m>\d\d?)[-/.](?P<d>\d\d?)|(?P<a>\d\d?)[-/.](?P<b>\d\d?)[-/.](?P<c>\d{4}|\d\d)"
-    r"|(?P<day>\d\d?)[- .]+(?P<month>[a-z]{3})[a-z]*[- .]+(?P<year>\d{4})|(?P<days>\d{1,5}) days?"
-)
-_TIME = (
-    r"(?:(?P<hour>\d{1,4}):)?(?P<minute>\d{1,3}):(?P<second>\d\d?)"
-    r"(?:[.,](?P<part>\d{0,12})|:(?P<milli>\d{3}))?(?:\s*(?P<half>[ap])\.?m\.?)?"
-)
+# Kinds of a column. The day of a clock, AM and PM and the zone need no reading: a recording is
+# shorter than its clock's turn, so each fall by one is the next turn.
+_DATES, _CLOCKS, _PLAIN = "dates", "clocks", "numbers"
+_DATE = re.compile(r"\d{1,4}[-/.]\d\d?[-/.](\d{4}|\d\d)")
 _CLOCK = re.compile(
-    rf"(?:(?P<date>{_DATE})(?:[t_]|,?\s+|$))?(?:(?P<time>{_TIME})(?:\s*(?:z|utc|[+-]\d\d:?\d\d))?)?",
+    r"(?:(?P<date>(?=[^:]*\d)[\w,./ -]{5,30}?)(?:[t_]|,?\s)\s*)?"
+    r"(?:(?P<hour>\d{1,4}):)?(?P<minute>\d{1,3}):(?P<second>\d\d?)"
+    r"(?:[.,](?P<part>\d{0,12})|:(?P<milli>\d{3}))?\s*(?P<half>[ap]\.?\s?m\.?)?"
+    r"\s*(?:z|utc|[a-z]{2,3}t|[+-]\d\d(?::?\d\d)?)?",
     re.IGNORECASE,
 )
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_DAY = 86_400.0
-_MIDNIGHT = datetime.datetime(1970, 1, 1)  # clocks of a file have no zone
 # Where the text of a clock may begin anew: at an hour, at noon and at midnight, s.
-_TURNS = (3600.0, _DAY / 2, _DAY)
+_TURNS = (3600.0, 43_200.0, 86_400.0)
 
 
 def number(text: str, decimal: str) -> float | None:
@@ -97,44 +91,17 @@ def kind_of(cell: Any, *decimals: str) -> int:
 
 
 @functools.lru_cache(maxsize=2)  # a cell is asked for its kind, and then for its number
-def clock(text: str) -> tuple[str, int, float] | None:
-    """Kind of a clock, its day (0 without a date) and seconds; None if a text is no clock."""
-    if not text[:1].isdigit() or len(text) > 40 or not (found := _CLOCK.fullmatch(text)):
-        return None
-    if not found["time"]:
-        day = _date(found)
-        return None if day is None else (_DATES, day, 0.0)
-    day = _date(found) if found["date"] else 0
+def clock(text: str) -> tuple[str, float] | None:
+    """Kind of a clock or date, and its seconds; None if a text is neither."""
+    if len(text) > 40 or not (found := _CLOCK.fullmatch(text)):
+        return (_DATES, 0.0) if _DATE.fullmatch(text) else None
     hour, minute, second = (int(found[key] or 0) for key in ("hour", "minute", "second"))
     if found["hour"] is None and (found["date"] or found["half"]):
         hour, minute, second = minute, second, 0  # hours and minutes
-    if second > 59 or (minute > 59 and found["hour"]) or day is None:
+    if second > 59 or (minute > 59 and found["hour"]):
         return None
-    if found["half"]:
-        hour = hour % 12 + 12 * (found["half"].lower() == "p")
     part = float(f"0.{found['part'] or found['milli'] or 0}")
-    return _DATED if found["date"] else _TIMES, day, 3600.0 * hour + 60.0 * minute + second + part
-
-
-def _date(found: re.Match[str]) -> int | None:
-    """Day of a date since 1970; None if there is no such day."""
-    if found["days"]:
-        return int(found["days"])
-    if found["y"]:
-        year, month, day = (int(found[key]) for key in "ymd")
-    elif found["month"]:
-        name = found["month"].lower()
-        month = _MONTHS.index(name) + 1 if name in _MONTHS else 0
-        year, day = int(found["year"]), int(found["day"])
-    else:
-        day, month, year = (int(found[key]) for key in "abc")
-        year += 2000 if len(found["c"]) == 2 else 0
-        if month > 12 or (day < 13 and found["half"]):  # with AM and PM the month comes first
-            day, month = month, day
-    try:
-        return (datetime.datetime(year, month, day) - _MIDNIGHT).days
-    except ValueError:
-        return None
+    return _CLOCKS, 3600.0 * hour + 60.0 * minute + second + part
 
 
 class Column:
@@ -146,7 +113,6 @@ class Column:
         self.signs = False  # whether some of its numbers may have a decimal sign
         self._filled = 0
         self._kinds: set[str] = set()
-        self._day = 0  # of the first clock
         self._words = Counter[str]()
         self._first = (0, "")  # row and text of the first word
         self._last = 0  # row of the last word
@@ -155,6 +121,11 @@ class Column:
     def empty(self) -> bool:
         """Whether it has no value and no word."""
         return not self._kinds and not self._words
+
+    @property
+    def numeric(self) -> bool:
+        """Whether it has numbers or clocks."""
+        return bool(self._kinds)
 
     @property
     def words(self) -> bool:
@@ -167,7 +138,7 @@ class Column:
         if isinstance(cells, np.ndarray) and cells.dtype.kind in "fiu":
             self.values[start : self._filled] = cells
             self.signs |= cells.dtype.kind == "f"
-            self._kinds |= set() if np.isnan(cells).all() else {"numbers"}
+            self._kinds |= set() if np.isnan(cells).all() else {_PLAIN}
             return
         for row, cell in enumerate(cells, start):
             if cell is None or (isinstance(cell, float) and np.isnan(cell)):
@@ -189,7 +160,7 @@ class Column:
         if not isinstance(cell, str):
             timed = _timed(cell)
             if timed is None:
-                self._kinds.add("numbers")
+                self._kinds.add(_PLAIN)
                 self.signs |= not float(cell).is_integer()
                 return float(cell)
         else:
@@ -198,16 +169,13 @@ class Column:
             value = number(text, self.decimal)
             if value is not None:
                 if text:
-                    self._kinds.add("numbers")
+                    self._kinds.add(_PLAIN)
                 return value
             timed = clock(text)
             if timed is None:
                 return None
-        kind, day, seconds = timed
-        if not self._kinds:
-            self._day = day
-        self._kinds.add(kind)
-        return _DAY * (day - self._day) + seconds
+        self._kinds.add(timed[0])
+        return timed[1]
 
     def numbers(
         self, source: str, name: str, where: Callable[[int], str]
@@ -230,10 +198,10 @@ class Column:
                 raise DataError(source, f"column {name!r} has text in {among}", remedy)
             note = f"column {name!r} has {word!r} in {among[: among.index(', the')]}, from "
             note += f"{where(row)}: read as missing values"
-        if len(self._kinds) > 1:
+        if _PLAIN in self._kinds and len(self._kinds) > 1:
             problem = f"column {name!r} has {' and '.join(sorted(self._kinds))}"
             raise DataError(source, problem, "save the column as numbers, all of one kind")
-        if self._kinds == {"numbers"}:
+        if _PLAIN in self._kinds:
             return self.values, note
         turned, turn = unwrapped(self.values, _TURNS)
         finite = turned[np.isfinite(turned)]
@@ -252,22 +220,18 @@ class Column:
     @property
     def timed(self) -> bool:
         """Whether it holds clocks, which are read in seconds."""
-        return bool(self._kinds) and self._kinds <= {_DATED, _TIMES}
+        return _CLOCKS in self._kinds
 
 
-def _timed(cell: Any) -> tuple[str, int, float] | None:
-    """Kind, day and seconds of a date or time of a workbook; None for a number."""
+def _timed(cell: Any) -> tuple[str, float] | None:
+    """Kind and seconds of a date or time of a workbook; None for a number."""
     if isinstance(cell, datetime.timedelta):
-        return _TIMES, 0, cell.total_seconds()
-    if isinstance(cell, datetime.time):
+        return _CLOCKS, cell.total_seconds()
+    if isinstance(cell, datetime.time | datetime.datetime):
         seconds = cell.hour * 3600 + cell.minute * 60 + cell.second + cell.microsecond / 1e6
-        return _TIMES, 0, seconds
-    if isinstance(cell, datetime.datetime):
-        since = cell.replace(tzinfo=None) - _MIDNIGHT
-        return _DATED, since.days, since.seconds + since.microseconds / 1e6
-    if isinstance(cell, datetime.date):
-        return _DATES, cell.toordinal() - _MIDNIGHT.toordinal(), 0.0
-    return None
+        return _CLOCKS, seconds
+    # A time that is exactly midnight is a date there.
+    return (_DATES, 0.0) if isinstance(cell, datetime.date) else None
 
 
 def require_no_thousands(

@@ -33,14 +33,13 @@ _NEXT = 3.0
 # A sensor failed where it keeps a value this many times longer than elsewhere, for at least this
 # many samples, in at most this many stretches.
 _LONGER, _STILL, _EPISODES = 4, 10, 20
-# A code of missing values is at least twice in a signal, in at most half of it, and this many
-# ranges of the others away, which have so many levels. Fewer if all its digits are nine, or it is
-# a power of ten or an end of 16 or 32 bits, as written to seven digits.
-_TWICE, _LEVELS, _AWAY, _AWAY_CODE = 2, 10, 10.0, 1.0
-_CODE = re.compile(r"-?(9{2,}|9{2,}\.9+|1e\+\d+|10{3,}|32767|32768|65535|2\.147484e\+09)")
-# Share of samples below which a signal may be written only where it changes, and least share of
-# values in it that are a change.
-_SPARSE, _CHANGES = 0.5, 0.9
+# A code of missing values is at least twice in a signal, in at most half of it, and ten ranges of
+# the others away, which have at least ten levels. If all its digits are nine, or it is a power of
+# ten or an end of 16 or 32 bits, as written to seven digits, it may be one range away from two
+# levels, and of nines also once or in most of it; 0 and -1 may be one range away.
+_LEVELS, _AWAY = 10, 10.0
+_CODE = re.compile(r"9{2,}|9{2,}\.(9+|25)|1e\+\d+|10{3,}|32767|32768|65535|2\.147484e\+09")
+_SPARSE = 0.5  # share of samples below which a signal may be written only where it changes
 # A jump is this many times the usual step; reported if it leads to one value this often.
 _JUMP, _AGAIN = 6, 3
 _BALANCED = 0.05  # share of a trial before a fall
@@ -141,39 +140,47 @@ def held(values: Array) -> Array:
     return np.asarray(values[last])
 
 
-def missing_code(values: Array) -> tuple[float, int] | None:
-    """Value of a column that may mark missing samples, and how often it occurs.
+def missing_code(values: Array) -> tuple[str, int] | None:
+    """Values of a column that may mark missing samples, as TOML, and how often they occur.
 
-    It is repeated and far from all others.
+    They are repeated and far from all others.
     """
     finite = values[np.isfinite(values)]
-    for code in (finite.min(), finite.max()) if len(finite) else ():
-        rest, times = finite[finite != code], int(np.sum(finite == code))
-        usual = bool(_CODE.fullmatch(f"{code:.7g}"))
-        levels = _TWICE if usual else _LEVELS
-        if times < _TWICE or 2 * times >= len(finite) or len(np.unique(rest)) < levels:
-            continue
-        with np.errstate(over="ignore"):
-            away, span = np.abs(rest - code).min(), np.ptp(rest)
-        if away > (_AWAY_CODE if usual else _AWAY) * span:
-            return float(code), times
+    ends = [finite.min(), finite.max()] if len(finite) else []
+    for codes in (ends[:1], ends[1:], ends) if ends else ():
+        marked = np.isin(finite, codes)
+        if all(_may_mark(finite[~marked], code, int(np.sum(finite == code))) for code in codes):
+            said = [f"{code:.7g}" for code in codes]
+            return said[0] if len(said) == 1 else f"[{', '.join(said)}]", int(marked.sum())
     return None
+
+
+@np.errstate(over="ignore")
+def _may_mark(rest: Array, code: float, times: int) -> bool:
+    """Whether a value that occurs so many `times` may mark missing samples among the `rest`."""
+    said = f"{code:.7g}".lstrip("-")
+    usual = bool(_CODE.fullmatch(said))
+    if not said.startswith("99") and not 1 < times < len(rest):
+        return False
+    if len(np.unique(rest)) < (2 if usual else _LEVELS):
+        return False
+    away, span = np.abs(rest - code).min(), np.ptp(rest)
+    near = times > 1 and (usual or code in (0, -1))
+    return bool(away > (1 if near else _AWAY) * span)
 
 
 def changes_only(values: Array) -> int:
     """Number of samples of a column that is written only where it changes; 0 for the others."""
     finite = np.isfinite(values)
     written = values[finite]
-    if not len(written) or not finite[0] or len(written) > _SPARSE * len(values):
-        return 0
-    return len(written) if np.mean(np.diff(written) != 0) >= _CHANGES else 0
+    return len(written) if len(written) <= _SPARSE * len(values) else 0
 
 
 def coded(channel: Channel, raw: Array) -> None:
     """Reject a signal with a value that may mark missing samples; `raw` are those of the file."""
     if (found := missing_code(raw)) is None:
         return
-    code = f"{found[0]:.7g}"
+    code = found[0]
     raise DataError(
         channel.name,
         f"is {code} in {found[1]} of {len(raw)} samples, far from all others",
@@ -187,7 +194,7 @@ def written_at_changes(channel: Channel, raw: Array) -> None:
     if written := changes_only(raw):
         raise DataError(
             channel.name,
-            f"has a value in {written} of {len(raw)} samples, each another one",
+            f"has a value in {written} of {len(raw)} samples",
             f"if it is written only where it changes, write held = true in "
             f"[signals.{channel.signal}], otherwise held = false",
         ).at(*channel.key("held"))

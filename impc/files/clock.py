@@ -10,7 +10,8 @@ import scipy
 
 from impc.checking import replace
 from impc.errors import DataError, InputError, blamed
-from impc.files.alignment import named_clock, rising
+from impc.files.alignment import GAP, named_clock, rising, usual_step
+from impc.files.checks import missing_code
 from impc.files.units import si_unit
 
 if TYPE_CHECKING:
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from impc.files.configuration import RecordingTable
     from impc.files.table import Table
 
-# An interval of at least this many periods contains a lost sample.
-_GAP = 1.5
 # Deviation from a uniform clock, in periods, that is reported and makes values be interpolated.
 _JITTER = 0.01
 # Largest relative difference of two clocks that is that of two devices and not of two units.
@@ -29,7 +28,8 @@ _UNITS = np.array([1, 60, 3600, 86400])  # of a clock, in s, times any power of 
 _UNEVEN = 0.05
 # A file holds at most this many trials of at least so many samples, with a clock of which this
 # share of steps is the usual one.
-_TRIALS, _TRIAL, _EVEN = 50, 10, 0.9
+_TRIALS, _TRIAL, _EVEN = 50, 50, 0.9
+_RISES = 0.9  # least part of the steps of a clock that are upward
 # Relative difference above which two statements of the rate contradict each other.
 _RATE = 1e-3
 _TIME_UNIT = ("recording", "time_unit")
@@ -99,7 +99,11 @@ def _read(table: Table, recording: RecordingTable, fill_gaps: float) -> Clock:
     if table.rate is not None and abs(table.rate * clock.period - 1) > _RATE:
         stated = f"the file states {table.rate:g} samples per second"
         notes = (*notes, f"{subject} has {1 / clock.period:.4g} and {stated}")
-    return replace(clock, notes=(*notes, *_rows_lost(table, clock, name)))
+    bad = rejected_clocks(table).items()
+    others = (
+        f"{table.source}: clock {other!r} {fault[0]}" for other, fault in bad if other != name
+    )
+    return replace(clock, notes=(*notes, *_rows_lost(table, clock, name), *others))
 
 
 def counts_days(values: Array) -> bool:
@@ -215,6 +219,9 @@ def clock_fault(values: Array) -> tuple[str, str] | None:
     if (missing := ~np.isfinite(values)).any():
         problem = f"has {missing.sum()} missing times, the first in sample {np.argmax(missing) + 1}"
         return problem, "repair the clock, or give recording.rate instead"
+    if code := missing_code(values):
+        problem = f"has {code[0]} in {code[1]} samples, which no clock has"
+        return problem, "repair the clock, or give recording.rate instead"
     if starts := _starts(values):
         listed = ", ".join(f"{place + 1} ({values[place]:g} after {values[place - 1]:g})"
                          for place in starts[:3])  # fmt: skip
@@ -235,6 +242,23 @@ def clock_fault(values: Array) -> tuple[str, str] | None:
     return None
 
 
+@np.errstate(all="ignore")
+def rejected_clocks(table: Table) -> dict[str, tuple[str, str]]:
+    """Columns that are clocks but rise unevenly: what is wrong with each, and what to do."""
+    found = {}
+    for name, values in table.columns.items():
+        steps = np.diff(values[np.isfinite(values)])
+        rises = np.sum(steps > 0) >= _RISES * np.sum(steps != 0)
+        named = rises and named_clock(name, table.units.get(name, ""))
+        fault = clock_fault(values) if named or _starts(values) else None
+        if fault is None and named and len(rising(values)) < len(values):
+            said = f"rises unevenly, in steps from {steps.min():.4g} to {steps.max():.4g}"
+            fault = said, "export with a constant sampling rate, or give recording.rate instead"
+        if fault is not None:
+            found[name] = fault
+    return found
+
+
 def _starts(values: Array) -> list[int]:
     """Samples in which a clock begins again; empty if it does not, or is no clock."""
     with np.errstate(all="ignore"):
@@ -251,24 +275,22 @@ def _starts(values: Array) -> list[int]:
 
 
 def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
+    """Rows between recording.start and stop, which must lie within the recording."""
     slack = 1e-9 * max(abs(time[0]), abs(time[-1]), 1.0)
-    start = -np.inf if recording.start is None else recording.start - slack
-    stop = np.inf if recording.stop is None else recording.stop + slack
-    kept = np.flatnonzero((time >= start) & (time <= stop))
+    start, stop = (-np.inf if recording.start is None else recording.start,
+                   np.inf if recording.stop is None else recording.stop)  # fmt: skip
+    kept = np.flatnonzero((time >= start - slack) & (time <= stop + slack))
     if len(kept) < 2:
         raise DataError(
             source,
             f"has {len(kept)} samples between recording.start and stop",
             f"choose them within the recording ({time[0]:g} to {time[-1]:g} s)",
         ).at("", "recording", "start")
-    for key, wanted, reached in (
-        ("start", recording.start, float(time[0])),
-        ("stop", recording.stop, float(time[-1])),
+    spare = float(np.median(np.diff(time[kept])))
+    for key, wanted, beyond in (
+        ("start", start, -np.inf < start < time[0] - spare),
+        ("stop", stop, time[-1] + spare < stop < np.inf),
     ):
-        spare = float(np.median(np.diff(time[kept])))
-        beyond = wanted is not None and (
-            wanted < reached - spare if key == "start" else wanted > reached + spare
-        )
         if beyond:
             raise DataError(
                 source,
@@ -281,8 +303,7 @@ def _cut(source: str, time: Array, recording: RecordingTable) -> slice:
 def _measured(subject: str, time: Array, rows: slice, fill_gaps: float, longest: str) -> Clock:
     """Period by least squares over the samples; gaps count as whole periods."""
     intervals = np.diff(time)
-    usual = intervals[intervals < _GAP * np.median(intervals)]
-    rough = float(np.mean(usual))
+    rough = usual_step(time)
     _require_period(subject, rough, "time_unit")
     if (instants := (time[-1] - time[0]) / rough) > _GAPS * len(time):
         problem = f"has {len(time)} samples at {instants:.3g} uniform instants: the rest are gaps"
@@ -298,7 +319,7 @@ def _measured(subject: str, time: Array, rows: slice, fill_gaps: float, longest:
             "export with a constant sampling rate",
         )
     steps = np.concatenate([[0], np.cumsum(counts)])
-    findings, lost = list[str](), intervals > _GAP * rough
+    findings, lost = list[str](), intervals > GAP * rough
     if lost.any():
         worst = int(np.argmax(intervals))
         if intervals[worst] > fill_gaps * (1 + 1e-9):

@@ -14,8 +14,9 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from impc.checking import replace
 from impc.errors import DataError
-from impc.files.cells import WORD, Column, certain, kind_of
+from impc.files.cells import NUMBER, WORD, Column, certain, kind_of
 from impc.files.disk import LARGEST
 from impc.files.layout import HEAD, Row, extent, first_block, table_of, written_heading
 
@@ -26,9 +27,7 @@ if TYPE_CHECKING:
     from impc.files.layout import Block, Extent
     from impc.files.table import Table
 
-_DELIMITERS = {".csv": ",;\t", ".lvm": "\t,;", ".txt": "\t;, "}
-_TABS = "\t", "\t "  # .tsv; OpenSim files, whose columns may also be separated by blanks
-_NAMES = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars", ":": "colons"}
+_DELIMITERS = "\t;,| \n"  # the last: a single column
 # Texts for a missing number that pandas takes for one; others are recognised cell by cell.
 _MISSING = ["", "NaN", "nan", "NA", "N/A", "null", "#N/A", "#NV"]
 _BEGINS = tuple("0123456789+-. ")  # first characters of a row of numbers
@@ -79,10 +78,10 @@ class _Text:
 
 
 def read_delimited(path: Path, largest: int = LARGEST) -> Table:
-    """Read the text file at `path`; its ending determines the possible delimiters."""
+    """Read the text file at `path`."""
     source = str(path)
     content, encoding = _decoded(source, path.read_bytes())
-    text, block = _divided(_Text(source, content, encoding), path.suffix.lower())
+    text, block = _divided(_Text(source, content, encoding))
     above = [line for _, (_, line) in zip(range(block.first), text.lines(), strict=False)]
     body = extent(source, block, _rows(text, block), not content.endswith(b"\n"))
     if 8 * body.rows * body.width > largest:
@@ -149,38 +148,28 @@ def _decoded(source: str, content: bytes) -> tuple[bytes, str]:
     return content, "utf-8"
 
 
-def _divided(text: _Text, suffix: str) -> tuple[_Text, Block]:
+def _divided(text: _Text) -> tuple[_Text, Block]:
     """Choose the delimiter and decimal sign with most numbers; locate the block of numbers."""
-    allowed = _DELIMITERS.get(suffix, _TABS[suffix != ".tsv"])
     best, most = None, 0.5
-    for delimiter in (*allowed, "\n"):
-        for decimal in (".", ","):
-            found = _Text(text.source, text.content, text.encoding, delimiter, decimal)
-            block, share = _block(found)
-            if block is not None and share > most:
-                best, most = (found, block), share
-    if best is not None:
-        return best
-    others = {mark: _Text(text.source, text.content, text.encoding, mark, ".") for mark in _NAMES}
-    between = next(
-        (mark for mark in _NAMES if mark not in allowed and _block(others[mark])[1] > 0.9), None
-    )
-    expected = " or ".join(_NAMES[mark] for mark in allowed)
-    if between is None:
-        problem = f"has no rows of numbers separated by {expected} in the first {HEAD} of its lines"
-    else:
-        problem = f"is separated by {_NAMES[between]}; a {suffix} file needs {expected}"
-    raise DataError(text.source, problem, "export it again, one signal per column")
+    for delimiter, decimal in itertools.product(_DELIMITERS, ".,"):
+        found = replace(text, delimiter=delimiter, decimal=decimal)
+        block, share = _block(found)
+        if block is not None and share > most:
+            best, most = (found, block), share
+    if best is None:
+        problem = f"has no rows of numbers in the first {HEAD} of its lines"
+        raise DataError(text.source, problem, "export it again, one signal per column")
+    return best
 
 
 def _block(text: _Text) -> tuple[Block | None, float]:
     """Block of numbers, and the share of certain numbers among its fields that are not empty."""
-    if text.decimal == text.delimiter:
-        return None, 0.0
     lines = [line for _, line in _from(text, 0, _SAMPLE)]
     block = first_block([text.kinds(line) for line in lines], text.delimiter == "\n")
     fields = [item for line in lines[block.first :] for item in text.fields(line)] if block else []
     known = sum(certain(item, text.decimal) for item in fields)
+    if text.decimal == text.delimiter:  # quoted numbers, which may have thousands instead
+        known -= sum("," in item and kind_of(item, ".") == NUMBER for item in fields)
     return block, known / max(sum(map(bool, fields)), 1)
 
 

@@ -25,6 +25,7 @@ import msgspec
 import numpy as np
 
 from impc.errors import DataError
+from impc.files.disk import require_ordinary
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -61,8 +62,7 @@ def _written(value: Any) -> Any:
 def content_digest(path: Path) -> str:
     """SHA-256 of the file at `path`, hexadecimal."""
     try:
-        if path.exists() and not path.is_file():
-            raise DataError(f"file {path.name}", "is not a regular file", "name a file")
+        require_ordinary(path)
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Draft of a configuration from the names and units of a file's columns."""
+"""What a file holds: summary of its columns, and draft of a configuration from their names."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ import numpy as np
 
 from impc.checking import replace
 from impc.errors import InputError
-from impc.files.alignment import named_clock, pulse, rising
-from impc.files.checks import changes_only, missing_code
-from impc.files.clock import clock_fault, counts_days
-from impc.files.configuration import FILL_IN
+from impc.files.alignment import named_clock, pulse, rising, usual_step
+from impc.files.checks import changes_only, missing_code, straight_lines
+from impc.files.clock import counts_days, read_clock, rejected_clocks
+from impc.files.configuration import FILL_IN, RecordingTable
 from impc.files.plant_sources import OWN, make_plant
-from impc.files.units import si_unit
+from impc.files.table import in_columns
+from impc.files.units import is_unit, si_unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 # than `_SLOWEST` s, the longest of any movement recording.
 _GUESSES = (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9))
 _SLOWEST = 0.2
-_RISES = 0.9  # least part of the steps of a clock that are upward
 _HORIZON = 20
 _INPUT = "a recorded perturbation; delete this table if it was not recorded"
 # Units at the end of names, as in alpha_deg.
@@ -129,7 +129,8 @@ class Draft:
             kind = _INPUT if acts else _span(table, guess.column)
             lines += ["", *_signal_lines(signal, guess, kind, plant)]
         if self.unused:
-            named = ", ".join(_stated(table, name) for name in self.unused)
+            idle = _idle(table)
+            named = ", ".join(_stated(table, name, idle.get(name, "")) for name in self.unused)
             lines += ["", f"# Columns that are not used: {named}"]
         if plant is None:
             lines += ["", "[plant]", "# arguments of the plant's function", ""]
@@ -150,8 +151,9 @@ def draft(
     """
     clock = clock_guess(table)
     clocks = {*rejected_clocks(table), *([clock.column] if clock else [])}
-    rest = [name for name in table.columns if name not in clocks]
-    rest = rest or list(table.columns)
+    rest = [name for name, values in table.columns.items() if name not in clocks]
+    if plant is None:
+        rest = [name for name in rest if not counts(table, name)]
     chosen, names = {column: (column, "") for column in rest}, tuple(rest)
     if plant is not None:
         names = (*plant.outputs, *plant.controls[1:])
@@ -175,9 +177,9 @@ def questions(table: Table, column: str, held: bool = True) -> tuple[tuple[str, 
     values = table.columns.get(column, np.empty(0))
     found = []
     if (code := missing_code(values)) is not None:
-        many = f"{code[0]:.7g} in {code[1]} of {len(values)} samples"
+        many = f"{code[0]} in {code[1]} of {len(values)} samples"
         asked = f"{many}, far from all others: does it mark missing values?"
-        found.append((f"missing = {code[0]:.7g}", asked))
+        found.append((f"missing = {code[0]}", asked))
     if held and (written := changes_only(values)):
         asked = f"a value in {written} of {len(values)} samples: is it written only where it "
         found.append(("held = true", f"{asked}changes, and holds until then?"))
@@ -216,8 +218,8 @@ def _fit_lines(plant: Plant) -> list[str]:
     ]
 
 
-def _stated(table: Table, column: str) -> str:
-    about = ", ".join(filter(None, (table.units.get(column), _idle(table, column))))
+def _stated(table: Table, column: str, idle: str) -> str:
+    about = ", ".join(filter(None, (table.units.get(column), idle)))
     return f"{_quoted(column)} ({about})" if about else _quoted(column)
 
 
@@ -253,10 +255,16 @@ def guess_of(table: Table, column: str, why: str) -> Guess:
     return Guess(column, why, FILL_IN, "fill in: deg, rad, N*m, ...")
 
 
+def counts(table: Table, name: str) -> bool:
+    """Whether a column counts samples, or is another clock that rises evenly."""
+    values = table.columns[name]
+    whole = len(values) > 2 and bool((np.diff(values) == 1).all())
+    return whole or (rate_of(values) is not None and named_clock(name, table.units.get(name, "")))
+
+
 def rate_of(values: Array) -> float | None:
     """Samples per unit of a column that rises evenly; None for the others."""
-    whole = len(rising(values)) == len(values)
-    return 1 / float(np.median(np.diff(values))) if whole else None
+    return 1 / usual_step(values) if len(rising(values)) == len(values) else None
 
 
 def _line(setting: str, comment: str) -> str:
@@ -290,26 +298,15 @@ def _clock_lines(table: Table, clock: Guess | None) -> list[str]:
             _line("# rate = 1000.0", "or give the samples per second"),
         ]
     values = table.columns[clock.column]
-    step = float(np.median(np.diff(values)))
+    step = usual_step(values)
+    if not named_clock(clock.column, table.units.get(clock.column, "")) and counts(
+        table, clock.column
+    ):
+        asked = f"samples per second, which {clock.column!r} counts"
+        return [_line("# rate = 1000.0", asked)]
     span = f"from {values[0]:.6g} to {values[-1]:.6g}, in steps of {step:.6g}"
     unit = _line(f"time_unit = {_quoted(clock.unit)}", clock.origin)
     return [_line(f"time = {_quoted(clock.column)}", span), unit]
-
-
-def rejected_clocks(table: Table) -> dict[str, tuple[str, str]]:
-    """Columns that are clocks but rise unevenly: what is wrong with each, and what to do."""
-    found = {}
-    for name, values in table.columns.items():
-        fault = clock_fault(values)
-        steps = np.diff(values[np.isfinite(values)])
-        rises = np.sum(steps > 0) >= _RISES * np.sum(steps != 0)
-        named = rises and named_clock(name, table.units.get(name, ""))
-        if fault is None and named and rate_of(values) is None:
-            said = f"rises unevenly, in steps from {steps.min():.4g} to {steps.max():.4g}"
-            fault = said, "export with a constant sampling rate, or give recording.rate instead"
-        if fault is not None and (named or "trials" in fault[0]):
-            found[name] = fault
-    return found
 
 
 def clock_guess(table: Table) -> Guess | None:
@@ -322,9 +319,11 @@ def clock_guess(table: Table) -> Guess | None:
     values, guess = table.columns[name], guess_of(table, name, "")
     if guess.unit != "day" and counts_days(values) and not table.units.get(name):
         return Guess(name, "", "day", "a guess: day numbers of a spreadsheet")
+    if guess.unit == FILL_IN and is_unit(name) and si_unit(name).base == "second":
+        guess = replace(guess, unit=name, origin="a guess from its name")
     if guess.unit != FILL_IN and si_unit(guess.unit).base == "second":
         return guess
-    step = float(np.median(np.diff(values)))
+    step = usual_step(values)
     unit, second = next(pair for pair in _GUESSES if step < pair[1] * _SLOWEST or pair[1] == 1e9)
     origin = f"a guess: {second / step:.4g} samples per second; a counter needs rate"
     return Guess(name, "", unit, origin)
@@ -345,7 +344,7 @@ def _guessed(
         if fit
     }
     chosen: dict[str, tuple[str, str]] = {}
-    free = list(columns)
+    free, idle = list(columns), _idle(table)
     for signal, column in sorted(likeness, key=lambda pair: -likeness[pair]):
         alike = likeness[signal, column] >= _ALIKE
         if alike and signal not in chosen and column in free:
@@ -353,7 +352,7 @@ def _guessed(
             chosen[signal] = column, "" if same else "a guess from its name"
             free.remove(column)
     for signal in signals:
-        left = [column for column in free if fits[signal, column] and not _idle(table, column)]
+        left = [column for column in free if fits[signal, column] and column not in idle]
         if signal not in chosen and left:
             # The first of those that fit equally well.
             best = max(left, key=lambda column: fits[signal, column])
@@ -363,15 +362,18 @@ def _guessed(
     return chosen
 
 
-def _idle(table: Table, column: str) -> str:
-    """Reason why a column is hardly a signal; empty if it may be one."""
-    values = table.columns[column]
-    values = values[np.isfinite(values)]
-    if len(values) == 0 or np.ptp(values) == 0:
-        return "constant"
-    if (fault := rejected_clocks(table).get(column)) is not None:
-        return f"a clock that {fault[0]}"
-    return "" if rate_of(values) is None else "a clock or counter"
+def _idle(table: Table) -> dict[str, str]:
+    """Columns that are hardly signals, and why."""
+    rejected, found = rejected_clocks(table), {}
+    for column, values in table.columns.items():
+        finite = values[np.isfinite(values)]
+        if len(finite) == 0 or np.ptp(finite) == 0:
+            found[column] = "constant"
+        elif column in rejected:
+            found[column] = f"a clock that {rejected[column][0]}"
+        elif rate_of(finite) is not None:
+            found[column] = "a clock or counter"
+    return found
 
 
 def _signal_lines(signal: str, guess: Guess, kind: str, plant: Plant | None) -> list[str]:
@@ -395,3 +397,61 @@ def _signal_lines(signal: str, guess: Guess, kind: str, plant: Plant | None) -> 
 
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML forbids it
+
+
+@np.errstate(all="ignore")  # the mean of values of 1e308 overflows
+def summary(table: Table, dt: float | None = None) -> str:
+    """Table of the columns with the findings of their clock; `dt` of the plant in s, if known."""
+    heads = ("column", "unit", "samples", "min", "max", "mean", "not finite", "rate")
+    lines = [in_columns([heads, *(_row(table, name) for name in table.columns)], left=2)]
+    if table.rate is not None:
+        lines.append(f"The file states a rate of {table.rate:g} samples per second.")
+    lines += _clock_findings(table, dt)
+    rejected = rejected_clocks(table)
+    for name, values in table.columns.items():
+        if rate_of(values) is not None or name in rejected:
+            continue
+        lines += [f"Column {name!r}: {asked} ({line})" for line, asked in questions(table, name)]
+        if (found := straight_lines(values)) is not None:
+            said = f"is a straight line from sample {found[0] + 1} to {found[1] + 1}"
+            lines.append(f"Column {name!r} {said}: a gap that was filled by interpolation?")
+    lines += [f"Not read: {name} {reason}" for name, reason in table.skipped.items()]
+    lines += [f"Note: {note}" for note in table.notes]
+    return "\n".join(lines)
+
+
+def _row(table: Table, name: str) -> tuple[str, ...]:
+    values = table.columns[name]
+    finite = values[np.isfinite(values)]
+    numbers = (
+        tuple(f"{value:.6g}" for value in (finite.min(), finite.max(), finite.mean()))
+        if len(finite)
+        else ("-", "-", "-")
+    )
+    rate = rate_of(values)
+    return (
+        name,
+        table.units.get(name, ""),
+        str(len(values)),
+        *numbers,
+        str(len(values) - len(finite)),
+        "" if rate is None else f"{rate:.6g}",
+    )
+
+
+def _clock_findings(table: Table, dt: float | None) -> list[str]:
+    """Findings of the clock that the draft names, or of the rate of the file."""
+    recording = RecordingTable()
+    if (clock := clock_guess(table)) is not None:
+        longest = float(np.diff(table.columns[clock.column]).max()) * si_unit(clock.unit).factor
+        fill_gaps = longest if dt is None else None
+        recording = RecordingTable(time=clock.column, time_unit=clock.unit, fill_gaps=fill_gaps)
+    elif table.rate is None:
+        faults = rejected_clocks(table).items()
+        return [f"{table.source}: clock {name!r} {'; '.join(fault)}" for name, fault in faults]
+    try:
+        used = read_clock(table, recording, dt or 0.0)
+    except InputError as error:
+        return [str(error)]
+    found = [*used.findings, *used.notes]
+    return found if dt else [one.removesuffix(": interpolated") for one in found]

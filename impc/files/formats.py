@@ -14,8 +14,7 @@ from impc.errors import DataError, ImpcError, InputError, OutputError
 from impc.files.apart import read_apart
 from impc.files.delimited import encode_delimited, read_delimited
 from impc.files.disk import LARGEST, damaged, require_readable, unwritable
-from impc.files.matlab import encode_matlab
-from impc.files.matlab73 import HDF5_SIGNATURE
+from impc.files.matlab import HDF5_SIGNATURE, encode_matlab
 from impc.files.recorders import encode_c3d, encode_tdms
 from impc.files.spreadsheet import encode_workbook
 
@@ -182,20 +181,11 @@ def _require(source: str, agrees: bool, suffix: str, head: bytes) -> None:
 
 
 def _read_matlab(path: Path, largest: int) -> Table:
-    """Read v5 or v7.3; the version in the header must agree with the HDF5 signature."""
-    source, head = str(path), _head(path, largest)
+    """Read v5 or v7.3, which is HDF5, perhaps behind a header."""
+    head = _head(path, largest)
     hdf5 = HDF5_SIGNATURE in (head[:8], head[512:520])
-    version = int.from_bytes(head[124:126], "big" if head[126:128] == b"MI" else "little") >> 8
-    if hdf5 and (version == 2 or head.startswith(HDF5_SIGNATURE)):
-        return read_apart("matlab73", path, largest)
-    _require(source, head.startswith(b"MATLAB "), ".mat", head)
-    if version == 1 and not hdf5:
-        return read_apart("matlab", path, largest)
-    inside, said = ("7.3", "5") if hdf5 else ("5", "7.3")
-    if hdf5 or version == 2:
-        problem = f"states version {said}, but contains version {inside} or damaged data"
-        raise DataError(source, problem, "save it again in MATLAB: save(..., '-v7')")
-    raise DataError(source, "has an unknown MATLAB version", "save it again with '-v7'")
+    _require(str(path), hdf5 or head.startswith(b"MATLAB "), ".mat", head)
+    return read_apart("matlab73" if hdf5 else "matlab", path, largest)
 
 
 def _delimited(ending: str) -> Format:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, count
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from impc.errors import DataError
 from impc.files.cells import EMPTY, NUMBER, WORD, require_no_thousands
@@ -141,11 +143,11 @@ class Extent(NamedTuple):
 def extent(source: str, block: Block, rows: Iterable[Row], cut_short: bool) -> Extent:
     """Extent of a `block` in its rows and those below; `cut_short`: the last line has no end."""
     left: Iterator[Row] = iter(rows)
-    count, kept, width, blank = 0, 0, len(block.kinds), False
+    seen, kept, width, blank = 0, 0, len(block.kinds), False
     for row in left:
         blank |= row.after_blank
         if row.kinds is not None and not any(row.kinds):  # counts if rows of numbers follow it
-            count, blank = count + 1, True
+            seen, blank = seen + 1, True
             continue
         if row.kinds is not None and not block.fits(row.kinds, blank):
             following = next(left, None)
@@ -162,8 +164,8 @@ def extent(source: str, block: Block, rows: Iterable[Row], cut_short: bool) -> E
                 said += f"{len(block.kinds)}{': the file ends in the middle of a row' * cut}"
                 raise DataError(source, said, "copy or export the file again")
             left = chain([following] if following else [], left)
-        count, width, blank = count + 1, max(width, row.width), False
-        kept = count
+        seen, width, blank = seen + 1, max(width, row.width), False
+        kept = seen
     return Extent(kept, width)
 
 
@@ -200,7 +202,8 @@ def table_of(
     `texts` are the places and texts of a column, to tell decimals from thousands.
     """
     empty = [column.empty for column in columns]
-    heads = find_headings(source, above, empty, named_rows)
+    heads = find_headings(source, above, [not one.numeric for one in columns], named_rows)
+    first = _counts(columns)
     kept, units, said = {}, dict(heads.units), [*heads.notes]
     for place, (name, column) in enumerate(zip(heads.names, columns, strict=True)):
         known = name or f"column_{place + 1}"
@@ -218,26 +221,34 @@ def table_of(
             continue
         if column.grouped:
             require_no_thousands(source, known, texts(place), column.decimal)
-        found.flags.writeable = False  # used without a copy
-        kept[known] = found
+        kept[known] = found[first:]
+        kept[known].flags.writeable = False  # used without a copy
         units |= {known: "s"} if column.timed else {}
     return make_table(source, kept, units, None, skipped, (*said, *filter(None, notes)))
 
 
+def _counts(columns: Sequence[Column]) -> int:
+    """1 if the first row holds the number of rows below it (AcqKnowledge), otherwise 0."""
+    first = [one.values[0] for one in columns if one.numeric and not np.isnan(one.values[0])]
+    rows = len(columns[0].values)
+    return int(rows > _NAMED and {*first} == {rows - 1.0})
+
+
 # Lines that may end the settings of a file without headings (LabVIEW, OpenSim).
 _NO_HEAD = ("endofheader", "endheader")
+_TITLES, _UNITS = "ChannelTitle=", "UnitName="
 # Columns that rows may omit where they are empty.
 _REMARKS = ("comment", "comments", "kommentar", "event", "events", "note", "notes", "remarks")
 
-_HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]")
+# A unit in brackets, or behind a comma or slash: "tilt (deg)", "tilt, deg", "tilt / deg".
+_HEADING = re.compile(r"(.*\S)\s*[(\[]([^()\[\]]*)[)\]]|(.*\S)(?:, ?| / )([^,]+)")
 
 
 def split_heading(heading: str) -> tuple[str, str]:
     """Name and unit of a heading such as ``angle (deg)``; the unit may be empty."""
     found = _HEADING.fullmatch(heading.strip())
-    if found and is_unit(found[2]):
-        return found[1], found[2].strip()
-    return heading.strip(), ""
+    name, unit = [part for part in found.groups() if part is not None] if found else ("", "")
+    return (name, unit.strip()) if is_unit(unit) else (heading.strip(), "")
 
 
 def written_heading(name: str, unit: str | None) -> str:
@@ -251,11 +262,10 @@ def are_units(row: Sequence[str]) -> bool:
     return any(plain) and all(not item or is_unit(item) for item in plain)
 
 
-@dataclass(frozen=True)
-class Headings:
+class Headings(NamedTuple):
     """Headings above the numbers."""
 
-    names: tuple[str, ...]  # of all columns; empty for a column without a name
+    names: list[str]  # of all columns; empty for a column without a name
     units: dict[str, str]  # of the columns that have one
     notes: tuple[str, ...] = ()  # names that differ from those of the file
 
@@ -273,10 +283,13 @@ def find_headings(
     if rows and rows[-1][0].strip("*_ ").lower().replace("_", "") in _NO_HEAD:
         rows = []
     units: Sequence[str] = ()
+    if titles := [row for row in rows if row[0] == _TITLES]:  # of LabChart, above their units
+        units = next((["", *row[1:]] for row in rows if row[0] == _UNITS), ())
+        rows = [["time", *titles[0][1:]]]
     if len(rows) > 1 and len(rows[-1]) <= width and are_units(rows[-1]) and not are_units(rows[-2]):
         units = rows.pop()
     if not rows:
-        return Headings(tuple(f"column_{place + 1}" for place in range(width)), {})
+        return Headings([f"column_{place + 1}" for place in range(width)], {})
     heads = rows[-1]
     if len(heads) == width - 1 and not empty[-1] and named_rows:
         heads, rows = ["", *heads], [["", *row] for row in rows]
@@ -288,53 +301,36 @@ def find_headings(
             f"the header names {len(heads)} columns, but the rows below have {width} values",
             "export with a point as decimal sign, or with semicolons between columns",
         )
-    level = rows[-2] if len(rows) > 1 and len(rows[-2]) <= width else ()
-    return named_columns(_padded(heads, width), _padded(units, width), _padded(level, width))
+    level = rows[-2] if len(rows) > 1 and 1 < len(rows[-2]) <= width else ()
+    return _named(*([*row, *[""] * (width - len(row))] for row in (heads, units, level)))
 
 
-def named_columns(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> Headings:
+def _named(heads: Sequence[str], units: Sequence[str], level: Sequence[str]) -> Headings:
     """Distinct names from the `heads` of all columns, and units of those that have one.
 
     `units` is a separate row of units (or empty); `level` the row above the heads, which names
     columns without a name and distinguishes equal names.
     """
     split = [split_heading(item) for item in heads]
-    names = [name or above for (name, _), above in zip(split, level, strict=True)]
-    if _repeated([name for name, _ in split]) and not _repeated(heads):
-        names = [head or above for head, above in zip(heads, level, strict=True)]  # keep the unit
-    found = _distinct(names, level)
-    changed = [f"{new!r}" for old, new in zip(names, found, strict=True) if old != new]
+    short = [name for name, _ in split]
+    kept = heads if _repeated(short) and not _repeated(heads) else short  # with their units
+    names = [name or above for name, above in zip(kept, level, strict=True)]
+    again, group = _repeated(names), ""
+    made: list[str] = []
+    known = set[str]()
+    for name, above in zip(names, level, strict=True):
+        group = above or group
+        whole = f"{group} {name}" if name in again and group else name
+        numbered = (f"{whole}_{number}" for number in count(2))
+        made.append(next(one for one in chain([whole], numbered) if not one or one not in known))
+        known.add(made[-1])
+    changed = [f"{new!r}" for old, new in zip(names, made, strict=True) if old != new]
     note = f"columns with the same name were renamed: {', '.join(changed[:12])}"
     stated = {
-        name: _bare(below) or own
-        for name, (_, own), below in zip(found, split, units, strict=True)
-        if name and (_bare(below) or own)
+        name: _bare(below) or own for name, (_, own), below in zip(made, split, units, strict=True)
     }
-    return Headings(tuple(found), stated, (note,) if changed else ())
-
-
-def _distinct(names: Sequence[str], level: Sequence[str]) -> list[str]:
-    """Make names distinct with the row above them, else with a number."""
-    groups, group = [], ""
-    for above in level:
-        group = above or group
-        groups.append(group)
-    repeated = _repeated(names)
-    found = [
-        f"{group} {name}" if name in repeated and group else name
-        for name, group in zip(names, groups, strict=True)
-    ]
-    made: list[str] = []
-    seen: set[str] = set()
-    numbers = Counter[str]()
-    for name in found:
-        other = name
-        while other and other in seen:
-            numbers[name] += 1
-            other = f"{name}_{numbers[name] + 1}"
-        seen.add(other)
-        made.append(other)
-    return made
+    stated = {name: unit for name, unit in stated.items() if name and unit}
+    return Headings(made, stated, (note,) if changed else ())
 
 
 def _repeated(names: Sequence[str]) -> set[str]:
@@ -346,10 +342,6 @@ def _trimmed(row: Sequence[str]) -> list[str]:
     """Row without empty fields at the end."""
     filled = [place for place, item in enumerate(row) if item]
     return list(row[: filled[-1] + 1]) if filled else []
-
-
-def _padded(row: Sequence[str], width: int) -> list[str]:
-    return [*row, *[""] * (width - len(row))]
 
 
 def _bare(item: str) -> str:

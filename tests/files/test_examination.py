@@ -14,8 +14,7 @@ from impc.cli.main import main
 from impc.errors import InputError
 from impc.files.checks import Notice
 from impc.files.configuration import Configuration, configuration
-from impc.files.examination import examine
-from impc.files.reading import recording_of
+from impc.files.reading import examine, recording_of
 from impc.files.table import Table, make_table
 from impc.levels import Level
 from impc.model.plant import Plant

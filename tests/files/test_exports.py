@@ -14,6 +14,7 @@ from typing import Any
 
 import control
 import numpy as np
+import openpyxl
 import pytest
 from click.testing import CliRunner
 
@@ -83,7 +84,7 @@ def grouped(values: Array, mark: str, decimal: str) -> list[str]:
             for value in values]  # fmt: skip
 
 
-def spoiled(values: Array, code: Any, *places: int) -> list[Any]:
+def spoiled(values: Array | list[Any], code: Any, *places: int) -> list[Any]:
     made: list[Any] = list(values)
     for place in places:
         made[place] = code
@@ -103,6 +104,14 @@ def filtered(path: Path) -> None:
     ods_file(path, {"Info": [["by", "hand"]], "Data": sheet_of(TIME.tolist())})
     row, hides = b"<table:table-row", b'<table:table-row table:visibility="filter"'
     repacked(path, content=lambda text: hides.join(text.rsplit(row, 1)))
+
+
+def narrowed(path: Path) -> None:
+    """A workbook of which a column is hidden."""
+    rows(sheet_of(TIME.tolist()))(path)
+    book = openpyxl.load_workbook(path)
+    book["Data"].column_dimensions["B"].hidden = True
+    book.save(path)
 
 
 def sheet_of(clock: Sequence[Any], tilt: Sequence[Any] = TILT.tolist()) -> list[list[Any]]:
@@ -139,6 +148,14 @@ CLOCKS = {
     "a comma behind the date": at("%m/%d/%Y, %I:%M:%S.%f %p"),
     "German": at("%d.%m.%Y %H:%M:%S,%f"),
     "of MATLAB": at("%d-%b-%Y %H:%M:%S.%f"),
+    "the month first, over midnight": at("%m/%d/%Y %H:%M:%S.%f", NIGHT),
+    "over the end of a month": at("%m/%d/%Y %H:%M:%S.%f", NIGHT.replace(day=31)),
+    "a zone by name": at("%Y-%m-%d %H:%M:%S.%f CET"),
+    "a zone of hours": at("%Y-%m-%d %H:%M:%S.%f+02"),
+    "a weekday": at("%a %b %d %Y %H:%M:%S.%f"),
+    "a name of a month": at("%B %d, %Y %I:%M:%S.%f %p"),
+    "a month of Spain": at("%d-abr-%y %I:%M:%S.%f a. m."),
+    "Chinese": at("%Y年%m月%d日 %H:%M:%S.%f"),
     "of pandas": [f"0 days 00:00:{t:09.6f}" for t in TIME],
 }
 
@@ -150,6 +167,7 @@ def require_signals(path: Path, clock: str = "time") -> None:
     np.testing.assert_allclose(found / found[-1], TIME / TIME[-1], atol=1e-6)
     for name, values in SIGNALS.items():
         np.testing.assert_allclose(table.columns[name], values, atol=1e-9)
+    assert list(draft(table).signals) == ["tilt", "tap"]
     guess = draft(table).clock
     assert guess is not None
     assert guess.column == clock
@@ -190,6 +208,14 @@ def test_a_workbook_has_the_same_clocks(name: str, tmp_path: Path) -> None:
 
 # Files that are read ----------------------------------------------------------------------------
 
+LABCHART = (
+    "Interval=\t0.02 s\nTimeFormat=\tStartOfBlock\nChannelTitle=\ttilt\ttap\nRange=\t9 V\t9 V"
+)
+SAMPLED = (
+    f"a.acq\n20 msec/sample\n2 channels\nAngle\ndeg\nForce\nN\nmin,tilt,tap\n,{SAMPLES},{SAMPLES}"
+)
+COMMENTED = [f"{line}\t#* start" if k == 9 else line
+             for k, line in enumerate(text((), "\t").splitlines()[1:])]  # fmt: skip
 WRAP = np.round(20 * np.arange(SAMPLES) + 62_000)
 READ: dict[str, tuple[str, Content, str]] = {
     "thousands point": (
@@ -204,6 +230,20 @@ READ: dict[str, tuple[str, Content, str]] = {
     "a signed counter": (".csv", text(((WRAP % 65536) - 32768).tolist(), head="ms"), "ms"),
     "seconds that wrap": (".csv", text(((WRAP % 65536) / 1000).tolist(), head="clock"), "clock"),
     "a counter of 8 bits": (".csv", text((np.arange(SAMPLES) % 256.0).tolist(), head="n"), "n"),
+    "bars": (".csv", text((), "|"), "time"),
+    "commas between": (".tsv", text(), "time"),
+    "a counter of 12 bits": (".csv", text((WRAP % 4096).tolist(), head="ms"), "ms"),
+    "of LabChart": (
+        ".txt", "\n".join([LABCHART, "UnitName=\tdeg\tN", *COMMENTED]), "time"),
+    "of AcqKnowledge": (
+        ".csv", "\n".join([SAMPLED, *text(TIME / 60).splitlines()[1:]]), "min"),
+    "units behind a slash": (
+        ".csv", text((), ";", ",").replace("time;tilt;tap", "time / s;tilt / Grad;tap, N"), "time"),
+    "quoted decimal commas": (
+        ".csv", text().replace(",", '","').replace("\n", '"\n"').replace(".", ",")[:-1].join('""'),
+        "time"),
+    "a line above the names": (
+        ".csv", f"Label: tilt Sampling frequency: 50 Number of points: 300\n{text()}", "time"),
 }  # fmt: skip
 
 
@@ -220,6 +260,20 @@ def written(folder: Path, ending: str, content: Content) -> Path:
 def test_what_is_read(name: str, tmp_path: Path) -> None:
     ending, content, clock = READ[name]
     require_signals(written(tmp_path, ending, content), clock)
+
+
+@pytest.mark.parametrize("pad", ["", "0"])
+def test_a_slower_signal_with_a_clock_of_its_own(pad: str, tmp_path: Path) -> None:
+    """As Delsys exports it, below which nothing or zeros stand."""
+    faster = np.arange(2 * SAMPLES) / (2 * RATE)
+    signal = np.interp(faster, TIME, TAP).round(6)
+    slower = [f"{t},{tilt}" for t, tilt in zip(TIME, TILT, strict=True)]
+    slower += [f"{pad},{pad}"] * SAMPLES
+    lines = [f"{t},{tap},{one}" for t, tap, one in zip(faster, signal, slower, strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["X [s],tap,X [s],tilt", *lines]))
+    table = read_table(tmp_path / "a.csv")
+    np.testing.assert_allclose(table.columns["tilt"][::2], TILT, atol=1e-9)
+    assert list(draft(table).signals) == ["tap", "tilt"]
 
 
 @pytest.mark.parametrize("version", ["5", "7.3"])
@@ -256,6 +310,10 @@ def coded(code: object) -> tuple[str, Content]:
     return csv(tilt=spoiled(TILT, code, *SOME))
 
 
+def coded_at(code: object, *places: int) -> tuple[str, Content]:
+    return csv(tilt=spoiled(TILT, code, *places))
+
+
 def book(tilt: Sequence[Any] = TILT.tolist(), hidden: Sequence[int] = ()) -> tuple[str, Content]:
     return ".xlsx", rows(sheet_of(TIME.tolist(), tilt), hidden)
 
@@ -266,6 +324,8 @@ def thing(kind: str) -> tuple[str, Content]:
     return ".mat", lambda path: path.write_bytes(content)
 
 
+FRAMED = text(np.arange(SAMPLES), head="Frame")
+OFTEN = tuple(range(60, 260))
 TRIALS = "the file holds 2 trials; save each trial as a file of its own"
 ENDS = "ends the recording, but more rows of numbers follow"
 # File, and what `impc inspect` says.
@@ -273,6 +333,7 @@ SAID: dict[str, tuple[tuple[str, Content], str]] = {
     "two trials": (csv(TWICE), f"begins again in sample 151 (0 after 2.98): {TRIALS}"),
     "two trials without a name": (csv(1000 * TWICE, head="a"), TRIALS),
     "two trials by the day": (csv([f"0:{t:05.2f}" for t in TWICE]), TRIALS),
+    "two trials as long as a counter": (csv(TWICE * 16.384 / 3, head="t"), TRIALS),
     "three trials": (csv((TIME % 2).round(2)), "the file holds 3 trials"),
     "a repeated row": (
         csv([*TIME[:99], *TIME[98:-1]]), "is repeated 1 times, the first from sample 99 to 100"
@@ -291,6 +352,13 @@ SAID: dict[str, tuple[tuple[str, Content], str]] = {
     "of a push": (csv(tap=spoiled(TAP, -9999, *SOME)), "Column 'tap': -9999 in 15 of 300 samples"),
     "single precision": (coded(float(np.float32(1e30))), "(missing = 1e+30)"),
     "1e30": (coded(1e30), "(missing = 1e+30)"),
+    "two codes": (csv(tilt=spoiled(spoiled(TILT, -9999, *SOME), 9999, 20, 40)),
+                  "(missing = [-9999, 9999])"),
+    "once": (coded_at(-9999, 9), "-9999 in 1 of 300 samples"),
+    "mostly": (coded_at(-9999, *OFTEN), "-9999 in 200 of 300 samples"),
+    "zeros of a lost marker": (
+        csv(tilt=spoiled(TILT + 40, 0, *OFTEN[:30])), "(missing = 0)"),
+    "in a clock": (csv(spoiled(TIME, -9999, *SOME)), "has -9999 in 15 samples, which no clock has"),
     "16 bits": (book(spoiled(TILT, 32767, *SOME)), "(missing = 32767)"),
     "-1e6": (
         (".mat", mat("5", time=TIME, tilt=np.array(spoiled(TILT, -1e6, *SOME)))),
@@ -307,11 +375,20 @@ SAID: dict[str, tuple[tuple[str, Content], str]] = {
         csv(tap=np.where(np.arange(SAMPLES) % 10, np.nan, SPARSE)),
         "is it written only where it changes",
     ),
+    "at a tenth of the rate": (
+        csv(tap=np.where(np.arange(SAMPLES) % 10, np.nan, TAP)), "a value in 30 of 300 samples"
+    ),
+    "another clock": (
+        csv(clock=spoiled(TIME, 0.0, 150, 151, 152), head="t", tap=TAP, ms=20 * np.arange(SAMPLES)),
+        "clock 't' runs backward",
+    ),
+    "frames": ((".csv", FRAMED), "samples per second, which 'Frame' counts"),
     "a straight line": (csv(tilt=LINE), "is a straight line from sample 101 to 161"),
     "hidden rows": (
         book(hidden=range(50, 60)),
         "sheet 'Data' has 10 hidden rows, the first 50, which are read like the others",
     ),
+    "hidden columns": ((".xlsx", narrowed), "sheet 'Data' has 1 hidden columns, which are read"),
     "filtered": ((".ods", filtered), "sheet 'Data' has 1 hidden rows, which are read like"),
     "two blocks": ((".csv", "\n".join(VICON)), f"line 307 ('Trajectories') {ENDS}"),
     "a trial below": (

@@ -13,9 +13,8 @@ import pytest
 from impc.errors import DataError
 from impc.files import apart
 from impc.files.configuration import read_configuration
-from impc.files.draft import draft
+from impc.files.draft import draft, summary
 from impc.files.formats import read_table, write_table
-from impc.files.inspection import summary
 from impc.files.table import make_table
 from tests.files.hostile_files import HOSTILE
 from tests.files.samples import hdf5_mat

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impc.files.resampling import held_means
-from impc.files.steps import steps_of
+from impc.files.resampling import held_means, steps_of
 from plants.ternary import ternary_torque
 
 DT, DWELL, DURATION = 0.01, 0.125, 15.0

@@ -15,9 +15,8 @@ import numpy as np
 
 from impc.errors import ImpcError
 from impc.files.configuration import read_configuration
-from impc.files.draft import draft
+from impc.files.draft import draft, summary
 from impc.files.formats import FORMATS, read_table, write_table
-from impc.files.inspection import summary
 from impc.files.plant_sources import make_plant, plant_source
 from impc.files.reading import recording_of
 from impc.files.table import make_table
