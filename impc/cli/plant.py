@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Short name -> import path of a plant; the package `impc` itself contains no plants.
 KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor_plant"}
+#: Copy of the configuration among the results of `impc fit`.
+CONFIGURATION = "configuration.toml"
 
 
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
@@ -119,7 +121,7 @@ def subject_plant(config: Path, named: str, given: str | None, allowed: bool) ->
 def asked_subject(
     command: str,
     files: Sequence[Path],
-    plant_name: str | None,
+    given: str | None,
     config: Path,
     solver: str | None = None,
     allowed: bool = False,
@@ -129,14 +131,14 @@ def asked_subject(
 
     configuration = read_configuration(config)
     named, where = configuration.subject, f"{config}: subject"
-    plant = subject_plant(config, named.plant, plant_name, allowed)
+    plant = subject_plant(config, named.plant, given, allowed)
     found = tuple(files) or tuple(config.parent / name for name in named.files)
     if not found:
         raise InputError(f"{where}.files", "names no recording", "name them, or pass FILES")
-    options = {"--plant": plant_name, "--config": config.name, "--solver": solver}
-    given = [word for pair in options.items() if pair[1] is not None for word in pair]
-    given += ["--allow-plant"] if allowed else []
-    line = shlex.join(["impc", command, *(path.name for path in files), *map(str, given)])
+    options = {"--plant": given, "--config": config.name, "--solver": solver}
+    words = [word for pair in options.items() if pair[1] is not None for word in pair]
+    words += ["--allow-plant"] if allowed else []
+    line = shlex.join(["impc", command, *(path.name for path in files), *map(str, words)])
     return Asked(found, plant, config, configuration, solver, line)
 
 
