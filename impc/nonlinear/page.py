@@ -121,7 +121,6 @@ _EXPLAINS = Kind[OptimalFit](
 )  # fmt: skip
 RULES = Rules[OptimalFit](
     {
-        "explained": lambda it: it.explained,
         "poor": lambda it: ", ".join(_words(name) for name in it.poor),
         "open": lambda it: ", ".join(it.open),
         "names": lambda it: ", ".join(one.name for one in it.estimate.combinations.identified),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -106,8 +105,7 @@ _EXPLAINS = Kind[Facts](
     Level.GREEN, always, "“{best}” explains {share} of the variance.", "{sentence}."
 )
 RULES = Rules[Facts](
-    {name: attrgetter(name) for name in ("limit", "word", "where", "sentence", "factor")}
-    | {
+    {
         "best": lambda it: name_of(it.best),
         "share": lambda it: share(it.best),
         "needs": lambda it: needed(it.unbounded),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
@@ -100,7 +99,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     )
 
 
-class _Facts:
+class Facts:
     """Methods that stay within the limit in every case, and those that find the true weights."""
 
     def __init__(self, cases: Sequence[CaseResult]) -> None:
@@ -121,18 +120,17 @@ class _Facts:
             self.others += f"{BOUND:g}."
 
 
-_SHOWN = Kind[_Facts](
+_SHOWN = Kind[Facts](
     Level.GREEN, always,
     "{all} methods were tried on the same movement; {few} {need} no more than the limit.",
     "{finds} the true cost weights.{others}", badge="As expected",
 )  # fmt: skip
-RULES = Rules[_Facts](
+RULES = Rules[Facts](
     {
         "all": lambda _: _COUNTS[len(EXAMPLE)],
         "few": lambda it: _COUNTS[len(it.within)].lower(),
         "need": lambda it: "needs" if len(it.within) == 1 else "need",
-    }
-    | {name: attrgetter(name) for name in ("finds", "others")},
+    },
     kinds=(
         replace(
             _SHOWN, level=Level.AMBER, when=lambda it: not it.found, badge="Not as expected",
@@ -155,11 +153,11 @@ RULES = Rules[_Facts](
 
 def example_verdict(cases: Sequence[CaseResult]) -> Verdict:
     """Verdict: methods that stay within the limit and methods that find the true weights."""
-    return RULES.verdict(_Facts(cases))
+    return RULES.verdict(Facts(cases))
 
 
 def _keys(cases: Sequence[CaseResult]) -> list[Key]:
-    within, found = len(_Facts(cases).within), cases[0].identifiability
+    within, found = len(Facts(cases).within), cases[0].identifiability
     fixed = "numbers of the cost determined by the movement"
     return [
         Key(str(len(EXAMPLE)), "methods", "tried", "on the same recordings"),

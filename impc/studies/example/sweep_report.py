@@ -51,7 +51,7 @@ _TEST = (
 )
 
 
-class _Facts:
+class Facts:
     """Sentences on each condition."""
 
     def __init__(self, sweep: Sweep) -> None:
@@ -82,13 +82,12 @@ class _Facts:
         )
 
 
-_BIASED = Kind[_Facts](
+_BIASED = Kind[Facts](
     Level.GREEN, always,
     "Inverse LQR is biased from {level} of the samples at the limit.", "{said}", badge="Shown",
 )  # fmt: skip
-RULES = Rules[_Facts](
-    {"level": lambda it: it.level, "said": lambda it: it.said, "seeds": lambda it: it.seeds,
-     "lost": lambda it: it.lost},
+RULES = Rules[Facts](
+    {},
     kinds=(
         Kind(
             Level.AMBER, lambda it: not it.level,
@@ -116,7 +115,7 @@ RULES = Rules[_Facts](
 
 def sweep_report(sweep: Sweep, title: str, provenance: Provenance) -> Report:
     """Report of `impc example --sweep`."""
-    facts = _Facts(sweep)
+    facts = Facts(sweep)
     verdict, count = RULES.verdict(facts), len(sweep.fits) // len(SWEPT)
     without = sweep.fits[sweep.fits["error_percent"].isna()].groupby("method").size()
     lost = [f"{method_label(str(name))}: {times} of {count}." for name, times in without.items()]
@@ -154,7 +153,7 @@ def sweep_report(sweep: Sweep, title: str, provenance: Provenance) -> Report:
     )  # fmt: skip
 
 
-def _keys(facts: _Facts) -> list[Key]:
+def _keys(facts: Facts) -> list[Key]:
     said = {"noise": "right model, noise", "limit": "limit 20 % too low",
             "plant": "plant 10 % wrong"}  # fmt: skip
     return [
@@ -164,7 +163,7 @@ def _keys(facts: _Facts) -> list[Key]:
     ]  # fmt: skip
 
 
-def _levels(facts: _Facts) -> Finding:
+def _levels(facts: Facts) -> Finding:
     """Table: level from which each inverse LQR method is biased, per condition."""
     import pandas as pd  # noqa: PLC0415  # a third of a second
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -119,7 +118,7 @@ def stated_as(half: float) -> str:
     return f"±{number(100 * half, 2)} %" if half < _WIDEST else "not determined"
 
 
-class _Facts:
+class Facts:
     """Numbers and phrases of the verdict."""
 
     def __init__(self, plan: Plan) -> None:
@@ -149,9 +148,7 @@ class _Facts:
             self.measure += "parameters."
 
 
-_WORDS = ("count", "good", "missed", "gains", "every", "aim", "close", "verb", "chosen", "more",
-          "record", "measure", "share")  # fmt: skip
-_WIDE = Kind[_Facts](
+_WIDE = Kind[Facts](
     Level.AMBER, lambda it: it.good < it.count,
     "{verb} {good} of {count} {gains} to within {aim}.", "{more} {chosen}",
     "Some intervals are too wide", "95 % intervals, relative to the gain: {missed}.",
@@ -161,8 +158,8 @@ _WIDE = Kind[_Facts](
      "Or accept a larger difference."),
     badge="Depends",
 )  # fmt: skip
-RULES = Rules[_Facts](
-    {name: attrgetter(name) for name in _WORDS},
+RULES = Rules[Facts](
+    {},
     kinds=(
         replace(
             _WIDE, level=Level.RED, when=lambda it: not it.good, title="All intervals are too wide",
@@ -184,7 +181,7 @@ RULES = Rules[_Facts](
 
 def plan_verdict(plan: Plan) -> Verdict:
     """Verdict: whether the intervals of the experiment are narrow enough."""
-    return RULES.verdict(_Facts(plan))
+    return RULES.verdict(Facts(plan))
 
 
 def _experiment(plan: Plan) -> str:

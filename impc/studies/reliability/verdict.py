@@ -7,7 +7,6 @@ after Cicchetti (1994), whatever the estimate (docs/howto/reliability_selection.
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,8 +81,7 @@ _PART = replace(
           "Average over more trials or visits before you compare people."),
 )  # fmt: skip
 RULES = Rules[Facts](
-    {name: attrgetter(name) for name in ("lowest", "bad", "cases", "people", "visits")}
-    | {"each": lambda it: _headline(it.sways)},
+    {"each": lambda it: _headline(it.sways)},
     kinds=(
         Kind(
             Level.AMBER, lambda it: not it.sways,
