@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import click
 
 from impc.checking import replace
 from impc.cli.console import progress, publish, require_consent
 from impc.cli.ending import ExitStatus
+from impc.cli.options import Page
 from impc.cli.plant import named_plant
+from impc.files.configuration import Configuration
 from impc.files.digests import gather_inputs
-from impc.files.plant_sources import make_plant
+from impc.files.plant_sources import PlantSource, make_plant
 from impc.files.reading import read_recordings, require_whole
 from impc.reporting.shown_units import angles_in, shown_angle, signal_name
 from impc.studies.cohort import tasks as work
 from impc.studies.cohort.report import write_report
-from impc.studies.cohort.study import read_study
+from impc.studies.cohort.study import Study, Unit, read_study
 from impc.studies.fit.settings import fit_settings, require_used
 from impc.studies.reliability.analysis import Trials, analyse
 from impc.studies.reliability.report import reliability_report
-from impc.studies.scheduler import connected
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from impc.cli.options import Page
-    from impc.files.configuration import Configuration
-    from impc.files.plant_sources import PlantSource
-    from impc.studies.cohort.study import Study, Unit
-    from impc.studies.scheduler import Cluster
+from impc.studies.scheduler import Cluster, connected
 
 # Settings with extra computations that a worker supports.
 _USED = ("replicates", "structure")

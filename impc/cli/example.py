@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import click
 import numpy as np
 
 from impc.cli.commands import SEEDS
 from impc.cli.console import progress, publish
+from impc.cli.options import Page
 from impc.cli.plant import load_plant
 from impc.cli.seat import HORIZON, PLANT, seat_weights
 from impc.control.named_solver import COMPILED, require_solver
 from impc.files.plant_sources import make_plant, plant_source
 from impc.model.weights import Weights
+from impc.reporting.document import Report
 from impc.reporting.provenance import Provenance
 from impc.studies.cache import Cache
 from impc.studies.example.cases import CASES, EXAMPLE, LOST, run_case
@@ -21,12 +23,6 @@ from impc.studies.example.report import example_report
 from impc.studies.example.sweep import CONDITIONS, LEVELS, Setup, pushed, run_sweep
 from impc.studies.example.sweep_report import sweep_report
 from impc.studies.pool import processes
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.cli.options import Page
-    from impc.reporting.document import Report
 
 # impc does not import `plants`: the plant is named by its import path, ``module:function``.
 _EXAMPLE_PLANT = "plants:yalmip_example"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import click
 
+from impc.arrays import Array
 from impc.checking import replace
 from impc.cli.console import progress, publish, require_consent
-from impc.cli.plant import CONFIGURATION, KNOWN, AllFellError, find_plant, read_subject
+from impc.cli.options import Page
+from impc.cli.plant import CONFIGURATION, KNOWN, AllFellError, Asked, find_plant, read_subject
 from impc.extras import installed
 from impc.files.plant_sources import made_by
 from impc.reporting.shown_units import angles_in
@@ -20,19 +23,11 @@ from impc.studies.effort import fit_effort
 from impc.studies.fit.findings import per_unit_finding, read_truth, truth_found
 from impc.studies.fit.memory import open_memory
 from impc.studies.fit.report import fallen_report, fit_report
+from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import missing, require_used
 from impc.studies.fit.subject import fit_recordings, stages
 from impc.studies.fit.verdict import GAIN, forbidden
 from impc.studies.methods_table import methods_finding
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.cli.options import Page
-    from impc.cli.plant import Asked
-    from impc.studies.fit.result import FitResult
 
 # Title of the last stage.
 _PAGE = "report and figures"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -13,15 +12,12 @@ from impc.cli.plant import find_plant
 from impc.errors import InputError, OutputError
 from impc.files.checks import fault
 from impc.files.configuration import read_configuration
-from impc.files.draft import drafted
+from impc.files.draft import Draft, drafted
 from impc.files.examination import examine
 from impc.files.formats import read_table, write_file
 from impc.files.inspection import summary
 from impc.files.plant_sources import make_plant
 from impc.files.reading import recording_of
-
-if TYPE_CHECKING:
-    from impc.files.draft import Draft
 
 
 def run_inspect(

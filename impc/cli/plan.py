@@ -2,46 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import msgspec
 import numpy as np
 
+from impc.arrays import Array
 from impc.cli.console import progress, publish, require_consent
+from impc.cli.options import Page
 from impc.cli.plant import KNOWN, find_plant
 from impc.cli.seat import TORQUE
 from impc.control.controller import Controller
 from impc.errors import InputError
-from impc.files.configuration import read_configuration
+from impc.files.configuration import Configuration, read_configuration
 from impc.files.digests import gather_inputs
 from impc.files.disk import truth_beside
 from impc.files.formats import read_table
-from impc.files.plant_sources import consented_name, import_function
+from impc.files.plant_sources import PlantSource, consented_name, import_function
 from impc.files.reading import disturbances_of
 from impc.files.results import read_result
+from impc.model.plant import Plant
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import angles_in
 from impc.studies.cache import Cache, Steps
 from impc.studies.fit.asked import asked_plant, fit_bounds
-from impc.studies.fit.settings import fit_settings
+from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.plan import settings as assumed
-from impc.studies.plan.designs import Person
+from impc.studies.plan.designs import Person, Perturbation
 from impc.studies.plan.report import plan_report
+from impc.studies.plan.settings import PlanSettings
 from impc.studies.plan.study import make_plan, plan_effort, steps_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.arrays import Array
-    from impc.cli.options import Page
-    from impc.files.configuration import Configuration
-    from impc.files.plant_sources import PlantSource
-    from impc.model.plant import Plant
-    from impc.studies.fit.settings import FitSettings
-    from impc.studies.plan.designs import Perturbation
-    from impc.studies.plan.settings import PlanSettings
 
 _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 
@@ -94,11 +87,7 @@ def _assumed(
 
 
 def _filled(configuration: Configuration, folder: Path) -> tuple[Configuration, str | None]:
-    """Complete a configuration by the subject in a `folder`; also return the name of its plant.
-
-    A fit gives plant, settings, gain, and the RMS of its residuals as noise; a simulated subject
-    the gain and its settings.
-    """
+    """Configuration completed by the fit or simulated subject in `folder`, and its plant."""
     where, truth = f"--like {folder}", truth_beside(folder)
     own: dict[str, Any] = {}
     plant: str | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import click
 
@@ -11,9 +11,6 @@ from impc.files.formats import write_file
 from impc.files.results import results_and_origins
 from impc.files.spreadsheet import as_data, workbook_bytes
 from impc.reporting.finding import Finding, csv_bytes
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def run_results(folder: Path, out: Path | None) -> None:

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
+from impc.arrays import Array
 from impc.cli.console import print_next, progress
 from impc.control.controller import Controller
 from impc.files.plant_sources import make_plant, plant_source
-from impc.files.table import make_table
+from impc.files.table import Table, make_table
 from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from impc.model.weights import Weights
 from impc.reporting.writer import write_files
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.files.table import Table
-    from impc.model.plant import Plant
 
 #: Import paths of the linear plant, and of the time step of the nonlinear one.
 PLANT, STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"

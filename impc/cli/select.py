@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from impc.checking import replace
 from impc.cli.console import FEWER_STARTS, progress, publish, require_consent
-from impc.files.digests import gather_inputs
+from impc.cli.options import Page
+from impc.files.digests import Inputs, gather_inputs
 from impc.files.plant_sources import consented_name
+from impc.reporting.document import Report
 from impc.studies.cache import Cache
-from impc.studies.cohort.study import read_study
+from impc.studies.cohort.study import Study, read_study
 from impc.studies.effort import key_evaluations, select_evaluations, selection_effort
+from impc.studies.pool import Result
 from impc.studies.reliability.icc import GOOD
-from impc.studies.scheduler import connected
+from impc.studies.scheduler import Cluster, connected
 from impc.studies.selection.analysis import key_parameters, select_study
 from impc.studies.selection.key_report import key_report
-from impc.studies.selection.model_source import model_source, on_pool, read_trials
+from impc.studies.selection.model import Trial
+from impc.studies.selection.model_source import (
+    ModelSource,
+    Runner,
+    model_source,
+    on_pool,
+    read_trials,
+)
 from impc.studies.selection.report import read_truths, selection_report
 from impc.studies.selection.settings import select_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from impc.cli.options import Page
-    from impc.files.digests import Inputs
-    from impc.reporting.document import Report
-    from impc.studies.cohort.study import Study
-    from impc.studies.pool import Result
-    from impc.studies.scheduler import Cluster
-    from impc.studies.selection.model import Trial
-    from impc.studies.selection.model_source import ModelSource, Runner
 
 
 def run_select(

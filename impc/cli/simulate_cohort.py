@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -13,9 +14,6 @@ from impc.files.plant_sources import import_function, plant_source
 from impc.reporting.writer import write_files
 from impc.studies.fit.settings import fit_settings
 from impc.studies.simulated_people import simulate_subject
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _RATE = 100.0
 # Integration steps between two samples: one step of 10 ms is inaccurate in the delay states.

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.signal
 
+from impc.arrays import Array
 from impc.cli import seat
 from impc.files.formats import encode_table
 from impc.files.plant_sources import import_function, make_plant, plant_source
 from impc.files.table import make_table
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
 from impc.reporting.writer import write_files
 from impc.studies.selection.model_source import model_source
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.model.plant import Plant
 
 _RATE = 100.0
 # 242 steps of 0.12 s are one period of the ternary sequence: a line spectrum without leakage.

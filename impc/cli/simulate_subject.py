@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,19 +15,15 @@ from impc.arrays import frozen
 from impc.checking import replace
 from impc.cli import seat
 from impc.cli.console import print_files, print_next
+from impc.control.controller import Controller
 from impc.extras import installed
 from impc.files.formats import encode_table
 from impc.files.plant_sources import import_function, plant_source
 from impc.reporting.writer import write_files
-from impc.studies.simulated_people import simulate_subject
+from impc.studies.simulated_people import SubjectTrial, simulate_subject
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from impc.control.controller import Controller
     from impc.output_feedback.observer import Observer
-    from impc.studies.simulated_people import SubjectTrial
 
 _FORMATS = ("csv", "tsv", "xlsx", "mat", "tdms", "c3d")
 # Formats that need an optional library.

@@ -6,8 +6,6 @@ trajectory of a nonlinear body, and with sensory noise.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import casadi as ca
 import click
 import numpy as np
@@ -17,14 +15,11 @@ from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.compiled_body import states_from
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
-from impc.control.simulation import scenario
+from impc.control.simulation import Scenario, scenario
 from impc.jit import say_when_compiling
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
-
-if TYPE_CHECKING:
-    from impc.control.simulation import Scenario
 
 _LIMIT, _STEPS = 0.8, 40
 

@@ -11,6 +11,7 @@ changes of the active rows; 1e-10 is the problem itself (docs/howto/nonlinear.md
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,26 +21,22 @@ from impc.arrays import Array, Frozen, IntArray
 from impc.attached_methods import attach
 from impc.checking import checked
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
+from impc.nonlinear.closed_loop import OptimalRecording
 from impc.nonlinear.combinations import Combinations, combinations, interval
 from impc.nonlinear.plan import require_solver
+from impc.nonlinear.problem import OptimalControlProblem
 from impc.nonlinear.search import (
     EXPLAINED,
     Budget,
+    Evaluation,
     Residuals,
     along_mu,
     begin,
     guided,
     scales_of,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from impc.nonlinear.closed_loop import OptimalRecording
-    from impc.nonlinear.problem import OptimalControlProblem
-    from impc.nonlinear.search import Evaluation
-    from impc.reporting.document import Report
-    from impc.reporting.provenance import Provenance
+from impc.reporting.document import Report
+from impc.reporting.provenance import Provenance
 
 #: Decreasing mu, relative to the mean cost of a recorded stage if that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
@@ -203,10 +200,7 @@ def _places(
     evaluations: int,
     budget: Budget,
 ) -> Iterator[tuple[Array, Sequence[float]]]:
-    """Yield the start and others about it, preceded by their guided versions, with their mu.
-
-    The sequence is reproducible.
-    """
+    """Yield the start and others about it, each after its guided version, with their mu."""
     for index in range(starts):
         budget.left, here = evaluations, theta
         if index:

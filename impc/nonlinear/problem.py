@@ -9,6 +9,7 @@ A row of h that no input affects is dropped at k = 0 (docs/howto/nonlinear.md).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +36,6 @@ from impc.nonlinear.expressions import (
 from impc.nonlinear.plan import Plan, solve_plan
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from numpy.typing import ArrayLike
 
 _LONGEST = 10_000  # stages; the size of the program is proportional

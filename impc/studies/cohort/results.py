@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.levels import Level
 from impc.model.plant import UNKNOWN
 from impc.reporting.rendering import number, p_value, sentence_case
 from impc.studies.cohort.comparison import (
+    Comparison,
     compare_cohort,
     difference_of,
     interval_of,
@@ -22,12 +25,7 @@ from impc.studies.fit.facts import between, with_unit
 from impc.studies.fit.verdict import UNDETERMINED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import pandas as pd
-
-    from impc.arrays import Array
-    from impc.studies.cohort.comparison import Comparison
 
 _LEADING = ("K.", LOGARITHM)
 # Questions about means, in the order of preference.

@@ -19,9 +19,10 @@ from __future__ import annotations
 import glob
 import re
 from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -35,9 +36,6 @@ from impc.studies.cohort.participants import (
     read_participants,
     read_sheet,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 

@@ -12,20 +12,16 @@ the log, so that the same results give identical files.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from impc.arrays import percentiles
 from impc.model.plant import UNKNOWN
-from impc.studies.cohort.study import LABELS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from impc.studies.cohort.study import Study
-    from impc.studies.cohort.tasks import Store
+from impc.studies.cohort.study import LABELS, Study
+from impc.studies.cohort.tasks import Store
 
 
 def cohort_tables(study: Study, store: Store) -> dict[str, pd.DataFrame]:

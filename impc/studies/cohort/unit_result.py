@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from impc.assess.assessments import assessed
+from impc.assess.assessments import MethodFit, assessed
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names, follows_command
-from impc.model.plant import UNKNOWN, gain_unit, weight_unit
+from impc.model.plant import UNKNOWN, Plant, gain_unit, weight_unit
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
 from impc.studies.fit.facts import one_of
+from impc.studies.fit.result import FitResult
 from impc.studies.fit.verdict import fit_verdict
-
-if TYPE_CHECKING:
-    from impc.assess.assessments import MethodFit
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult
 
 #: Prefix of columns of logarithms, which are compared as ratios.
 LOGARITHM = "log_cost_weight."

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from impc.levels import Level
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim, Verdict
 from impc.studies.cohort.results import SIGNIFICANT, Cohort
 from impc.studies.cohort.unit_result import LOGARITHM
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # Share of fits with a warning, or of missing fits, above which the report is amber.
 _MANY = 0.1

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
 
@@ -13,9 +14,10 @@ from impc.model.weights import condition_number
 from impc.reporting.document import Block, Draw, Fold, Lines, Report, Section
 from impc.reporting.exchange import long_finding
 from impc.reporting.finding import Picture
+from impc.reporting.provenance import Provenance
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Key, Verdict
-from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights
+from impc.studies.example.cases import BOUND, EXAMPLE, LOST, CaseResult, distance, true_weights
 from impc.studies.fit.figures import movement_figure
 from impc.studies.methods_figure import methods_figure
 from impc.studies.methods_table import (
@@ -26,12 +28,6 @@ from impc.studies.methods_table import (
     methods_long,
     provenance_section,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.reporting.provenance import Provenance
-    from impc.studies.example.cases import CaseResult
 
 # Largest distance to the true weights that counts as found; typical 1e-14.
 _FOUND = 1e-6

@@ -10,6 +10,7 @@ import numpy as np
 from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.style import BLUE, GREEN, HALF, MUTED, VERMILLION, new_figure, plain_log
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from impc.reporting.provenance import Provenance
 
 # The inverse LQR method of the headline: the one with the smallest errors.
 _BEST = "inverse_lqr_output"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +11,7 @@ from impc.model.signal_errors import KINDS
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, signal_name
 from impc.studies.fit.asked import OBSERVER
-
-if TYPE_CHECKING:
-    from impc.studies.fit.result import FitResult
+from impc.studies.fit.result import FitResult
 
 
 def aim_data(result: FitResult) -> dict[str, Any]:

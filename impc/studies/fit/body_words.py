@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from markupsafe import Markup
 
 from impc.assess import lack_of_fit
 from impc.assess.diagnosis import DIFFERENCE, EXCHANGED, SIGN, SUM
+from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.levels import Level
+from impc.model.plant import Plant
 from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, signal_name
 from impc.studies.fit.facts import shifted
-
-if TYPE_CHECKING:
-    from impc.assess.lack_of_fit import LackOfFit, ModelError
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult, FittedParameter
+from impc.studies.fit.result import FitResult, FittedParameter
 
 # Standard deviation after the fit over the stated one above which nothing was learned.
 _AS_BEFORE = 0.9

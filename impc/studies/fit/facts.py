@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.printed_gain import entry_names, follows_command
+from impc.assess.printed_gain import Interval, entry_names, follows_command
+from impc.assess.weights_ranges import Statement
+from impc.model.plant import Plant
 from impc.reporting.rendering import fixed, number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
-from impc.studies.fit.result import LITTLE
+from impc.studies.fit.result import LITTLE, FitResult, LimitFound
 from impc.studies.methods_figure import explained
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.assess.printed_gain import Interval
-    from impc.assess.weights_ranges import Statement
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult, LimitFound
 
 #: Ratio of unexplained variances from which a limit is said to matter.
 MATTERS = 2.0
@@ -248,10 +244,7 @@ def left_out_text(result: FitResult) -> str:
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:
-    """VAF (p,) that counts, and where it was taken; of the gain if no weights have it.
-
-    Left-out trials count if there are any and the fitted ones are explained.
-    """
+    """VAF (p,) that counts: of left-out trials if there are any and the fitted are explained."""
     own, held = result.inverse_mpc.vaf, held_out(result)
     if result.weights_test.rejected:
         own = result.gain_shares
@@ -276,10 +269,7 @@ def explained_words(result: FitResult) -> str:
 
 
 def unlimited_ratio(result: FitResult) -> tuple[float, str]:
-    """Unexplained variance of the best method without a limit over that of the model, in words.
-
-    Of the output for which the ratio is largest; NaN without such a method.
-    """
+    """Largest ratio of unexplained variances, best method without limit over model, in words."""
     others = [
         item.vaf
         for item in result.methods[:-1]

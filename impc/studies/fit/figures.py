@@ -6,19 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.assessments import MethodFit
+from impc.assess.frequency_response import FrequencyResponse
 from impc.assess.variance_accounted_for import at_limit
+from impc.model.bounds import Bounds
 from impc.reporting import style
 from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
+from impc.studies.fit.result import FitResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from impc.assess.assessments import MethodFit
-    from impc.assess.frequency_response import FrequencyResponse
-    from impc.model.bounds import Bounds
-    from impc.studies.fit.result import FitResult
 
 _WINDOW = 10.0  # s
 _LAGS = 1.0  # Largest lag of the autocorrelation, s

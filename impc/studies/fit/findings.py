@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from impc.arrays import Array
 from impc.assess.printed_gain import entry_names
 from impc.files.disk import truth_beside
 from impc.inverse.refit import IDENTIFIED
-from impc.model.plant import UNKNOWN
+from impc.model.plant import UNKNOWN, Plant
 from impc.reporting.exchange import long_rows
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
-from impc.studies.fit.facts import named_gains, shift_halves, statement_text
-from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.fit.facts import GainRow, named_gains, shift_halves, statement_text
+from impc.studies.fit.result import FitResult, shown_trials, trial_name
+from impc.studies.fit.uncertainty import Alternative
 from impc.studies.methods_table import (
     gain_units,
     methods_long,
     trajectory_table,
     weight_entries,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.model.plant import Plant
-    from impc.studies.fit.facts import GainRow
-    from impc.studies.fit.result import FitResult
-    from impc.studies.fit.uncertainty import Alternative
 
 # Smallest component of a direction that is printed.
 _NAMED = 0.15

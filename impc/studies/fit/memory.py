@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.saved_estimates import decode_estimate, encode_estimate
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, Method
+from impc.inverse.problem import Problem
 from impc.studies.cache import Cache, Steps
 from impc.studies.fit.first import FitProgress
+from impc.studies.fit.settings import FitSettings
 from impc.studies.methods_table import method_label
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.studies.fit.settings import FitSettings
 
 # What follows the method in the title of an estimate without one trial.
 _LEFT_OUT = re.compile(r", trial (\d+) left out$")

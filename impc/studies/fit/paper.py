@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from impc.levels import Level
 from impc.model.foresight import physical_disturbances
 from impc.reporting.document import Copy
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
+from impc.reporting.verdict import Verdict
 from impc.studies.fit import facts
 from impc.studies.fit.aim import aim_sentences
+from impc.studies.fit.result import FitResult
 from impc.studies.fit.structures import structure_sentences
 from impc.studies.fit.verdict import GAIN, SHARE, WEIGHTS, forbidden, reason
-
-if TYPE_CHECKING:
-    from impc.reporting.provenance import Provenance
-    from impc.reporting.verdict import Verdict
-    from impc.studies.fit.result import FitResult
 
 
 def paper_text(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy | str:

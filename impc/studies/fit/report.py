@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
+from impc.arrays import Array
 from impc.assess.lack_of_fit import LIMIT
 from impc.assess.printed_gain import LastingResponse, lasting_responses
 from impc.checking import replace
@@ -44,15 +44,11 @@ from impc.studies.fit.body_words import (
 from impc.studies.fit.data import fit_data
 from impc.studies.fit.movement import movement_section
 from impc.studies.fit.paper import paper_text
-from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.fit.result import FitResult, shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_section
 from impc.studies.methods_figure import explained, methods_figure
 from impc.studies.methods_table import methods_finding, provenance_section
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.studies.fit.result import FitResult
 
 _HIDDEN = "Not shown as a result, because of the warning above."
 

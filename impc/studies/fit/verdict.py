@@ -6,7 +6,7 @@ results that they forbid are hidden.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from impc.checking import replace
 from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
+from impc.reporting.verdict import Verdict
 from impc.studies.fit import facts
 from impc.studies.fit.body_words import (
     alternative_reason,
@@ -23,13 +24,7 @@ from impc.studies.fit.body_words import (
     probability_words,
     remedy_words,
 )
-from impc.studies.fit.result import LITTLE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.reporting.verdict import Verdict
-    from impc.studies.fit.result import FitResult
+from impc.studies.fit.result import LITTLE, FitResult
 
 # VAF (%) below which the residual is large; p of the whiteness test that rules out white noise.
 _MUCH, _COLOURED = 90.0, 1e-3

@@ -8,9 +8,8 @@ length of the trial, or if an output exceeds its mechanical stop.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,18 +18,13 @@ from impc.assess.expected import Expectation, expected_intervals
 from impc.assess.printed_gain import follows_command
 from impc.assess.variance_accounted_for import saturated_share
 from impc.control.closed_loop import simulate
+from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import SolverError
 from impc.inverse.problem import Problem
+from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.control.controller import Controller
-    from impc.model.plant import Plant
-    from impc.model.plant_family import PlantFamily
-
 
 #: (amplitude, hold time, number of the draw) -> disturbance (samples, d).
 Perturbation = Callable[[float, float, int], Array]

@@ -13,18 +13,16 @@ import pandas as pd
 from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import Block, Checks, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, RULE, new_figure, plain_log
 from impc.studies.fit.facts import one_of
 from impc.studies.plan import sentences
 from impc.studies.plan.designs import gain_places, relative_errors
-from impc.studies.plan.study import spread
+from impc.studies.plan.study import Plan, spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from impc.reporting.provenance import Provenance
-    from impc.studies.plan.study import Plan
 
 _TRIALS = Picture(
     "trials",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.expected import MULTIPLES
+from impc.assess.expected import MULTIPLES, Expectation
 from impc.levels import Level
 from impc.reporting.document import Check, Copy
 from impc.reporting.rendering import number, sentence_case
@@ -18,13 +19,8 @@ from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.verdict import Key, Verdict
 from impc.studies.fit.facts import with_unit
 from impc.studies.fit.findings import number_name
-from impc.studies.plan.designs import gain_places, relative_errors
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.assess.expected import Expectation
-    from impc.studies.plan.designs import Design
-    from impc.studies.plan.study import Plan
+from impc.studies.plan.designs import Design, gain_places, relative_errors
+from impc.studies.plan.study import Plan
 
 # Widest interval that is printed as a percentage of the gain.
 _WIDEST = 3.0

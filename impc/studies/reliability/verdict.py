@@ -6,8 +6,8 @@ after Cicchetti (1994), whatever the estimate (docs/howto/reliability_selection.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,12 +15,8 @@ from impc.levels import Level
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim
+from impc.studies.reliability.analysis import MeasureResult, Reliability
 from impc.studies.reliability.icc import GOOD
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.studies.reliability.analysis import MeasureResult, Reliability
 
 #: Upper ends and names of the bands of an ICC (Cicchetti 1994).
 BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))

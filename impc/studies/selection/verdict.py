@@ -19,12 +19,11 @@ from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.studies.reliability.icc import GOOD
+from impc.studies.selection.analysis import KeyParameters, StudySelection
+from impc.studies.selection.model import ParametricModel
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from impc.studies.selection.analysis import KeyParameters, StudySelection
-    from impc.studies.selection.model import ParametricModel
 
 _POOR = 50.0  # VAF of a poor model, %
 #: Column of the bias by fixing parameters, and end of a note on an estimate.
