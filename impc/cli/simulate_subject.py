@@ -101,6 +101,8 @@ def _trials(
 
 def _observer(controller: Controller, given: dict[str, Any]) -> Observer | None:
     """The subject's observer, if --observer is given."""
+    from impc.output_feedback.observer import Observer  # noqa: PLC0415  # optional
+
     if not given["observer"]:
         return None
     look = np.radians(given["sensory_noise"])

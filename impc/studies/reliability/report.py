@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from impc.arrays import Array
 from impc.assess.several_tests import holm
+from impc.files.digests import Inputs
 from impc.levels import Level
-from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
+from impc.reporting.document import Block, Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, probability, sentence_case
 from impc.reporting.verdict import Key
 from impc.studies.reliability import verdict as rules
-from impc.studies.reliability.analysis import MEASURES
+from impc.studies.reliability.analysis import (
+    MEASURES,
+    CmcResult,
+    MeasureResult,
+    Reliability,
+    Trials,
+)
 from impc.studies.reliability.figures import reliability_figures
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.arrays import Array
-    from impc.files.digests import Inputs
-    from impc.reporting.document import Block
-    from impc.studies.reliability.analysis import CmcResult, MeasureResult, Reliability, Trials
 
 _HERO = Picture(
     "icc", "ICC of every measure with its interval, over bands from poor to excellent",
