@@ -17,18 +17,13 @@ _PACKAGES = ("impc", "casadi", "clarabel", "control", "cvxpy", "numba", "numpy",
 
 
 def _versions() -> dict[str, str]:
-    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"  # for example impc itself, run from a source tree
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"  # for example impc itself, run from a source tree
+    return found
 
 
 @dataclass(frozen=True)
@@ -43,7 +38,8 @@ class Provenance:
     inputs: Inputs | None = None  # Digests of all input files; None if there are none
     # Versions of Python and of the numerical packages
     versions: Mapping[str, str] = field(default_factory=_versions)
-    made: str = field(default_factory=_now)  # Date and time of creation, UTC, ISO 8601
+    # Date and time of creation, UTC, ISO 8601
+    made: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     def data(self) -> dict[str, Any]:
         """Entries in result.json."""

@@ -19,7 +19,7 @@ from __future__ import annotations
 import glob
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -141,7 +141,11 @@ def read_study(path: Path) -> Study:
         raise InputError(f"{path}: subject {', '.join(missing)}", f"is not in {named}", "add a row")
     require_distinct([file for unit in units for file in unit.files])
     _require_folders(path, units)
-    _require_reference(path, table.reference, units)
+    names = {name for one in units for name in (one.group, one.visit, one.condition) if name}
+    if table.reference is not None and table.reference not in names:
+        problem = f"{table.reference!a} is no group, visit or condition"
+        remedy = f"use one of {', '.join(sorted(names)) or 'none: there are none'}"
+        raise InputError(f"{path}: study.reference", problem, remedy)
     return Study(
         table.plant or "", configuration, tuple(units), table.model or "", table.reference or ""
     )
@@ -201,15 +205,6 @@ def _require_folders(path: Path, units: Sequence[Unit]) -> None:
             raise InputError(
                 f"{path}: {unit.name}", "is the folder of two units", "use letters, digits, - and +"
             )
-
-
-def _require_reference(path: Path, reference: str | None, units: Iterable[Unit]) -> None:
-    """Raise InputError if no group, visit or condition has the name `reference`."""
-    names = {name for one in units for name in (one.group, one.visit, one.condition) if name}
-    if reference is not None and reference not in names:
-        problem = f"{reference!a} is no group, visit or condition"
-        remedy = f"use one of {', '.join(sorted(names)) or 'none: there are none'}"
-        raise InputError(f"{path}: study.reference", problem, remedy)
 
 
 #: Labels of a trial, and their short names in BIDS.

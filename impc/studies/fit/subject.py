@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -22,7 +22,7 @@ from impc.assess.frequency_response import frequency_response
 from impc.assess.intent import Intent, intent
 from impc.assess.printed_gain import GainEstimate, gain_estimate
 from impc.assess.structures import StructureFit, assess_structure, no_structure
-from impc.assess.variance_accounted_for import TrialAgreement, agreement, left_out
+from impc.assess.variance_accounted_for import agreement, left_out
 from impc.assess.weights_ranges import WeightsSummary, estimate_draws, weights_summary_or_reason
 from impc.assess.weights_test import WeightsTest, identifiability, weights_test
 from impc.checking import replace
@@ -33,7 +33,6 @@ from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
 from impc.inverse.problem import Problem
 from impc.inverse.structured import fit_structured
-from impc.model.bounds import Bounds
 from impc.studies.fit.asked import fit_structures, output_feedback
 from impc.studies.fit.first import FitProgress, first_fits
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
@@ -109,6 +108,7 @@ def fit_recordings(
     known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
     pair = np.array(fitted.gain), np.array(fitted.metrics)
     intended = intent(known.plant, *pair, state_sizes(own.runs), weights)
+    sides = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     doubted = lack[-1] is not None and lack[-1].alarm
     test = weights_test(fitted, estimate, contradicted=doubted)
     usable = bool(np.all(own.vaf >= LITTLE))
@@ -129,7 +129,10 @@ def fit_recordings(
         intent=intended,
         identifiability=identifiability(known, weights),
         uncertainty=uncertainty if usable or alone else replace(uncertainty, intervals=()),
-        trials=_agreements(known, own.runs, problem.bounds),
+        trials=tuple(
+            agreement(known.plant, trial, run, *sides)
+            for trial, run in zip(known.recordings, own.runs, strict=True)
+        ),
         methods=(*others, own),
         lack=lack,
         weights_test=test,
@@ -263,15 +266,6 @@ def _structures(
             )
         progress.done(stage)
     return tuple(found)
-
-
-def _agreements(
-    known: Problem, runs: Sequence[Simulation], bounds: Bounds
-) -> tuple[TrialAgreement, ...]:
-    return tuple(
-        agreement(known.plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
-        for trial, run in zip(known.recordings, runs, strict=True)
-    )
 
 
 def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:

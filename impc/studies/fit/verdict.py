@@ -97,10 +97,6 @@ def _weak(result: FitResult) -> bool:
     return not any(row.determined for _, row in facts.named_gains(result))
 
 
-def _refused(result: FitResult) -> bool:
-    return bool(result.structures) and result.structures[0].refused
-
-
 def _of_limit(result: FitResult) -> str:
     refitted = result.added is not None and result.added.name == LIMIT
     if refitted and result.culprit is None:
@@ -388,7 +384,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
     ),
     Kind(
         Level.AMBER,
-        _refused,
+        lambda it: it.structures and it.structures[0].refused,
         "The gain is identified, but the structure “{structure}” does not explain it.",
         "Do not report cost weights within this structure.",
         "The recordings reject the structure “{structure}”",

@@ -155,11 +155,11 @@ def best_of(person: Person, outcomes: Sequence[Outcome], falls: float) -> Outcom
     Variances are relative to the gain and, for a mean that exists if nothing is known of a gain,
     those after a prior with an SD of the gain's size.
     """
-    held = [
-        (_score(relative_errors(person, np.array(item.expected.gain.entries))), item)
-        for item in outcomes
-        if item.expected is not None and item.falls <= falls
-    ]
+    held = []
+    for item in outcomes:
+        if item.expected is not None and item.falls <= falls:
+            errors = relative_errors(person, np.array(item.expected.gain.entries))
+            held.append((float(np.mean(1 / (1 + np.maximum(errors, 1e-100) ** -2))), item))
     if not held:
         least = min(item.falls for item in outcomes)
         raise SolverError(
@@ -169,7 +169,3 @@ def best_of(person: Person, outcomes: Sequence[Outcome], falls: float) -> Outcom
             "reduce amplitude, or increase u_max or the allowed share falls",
         )
     return min(held, key=lambda pair: pair[0])[1]
-
-
-def _score(errors: Array) -> float:
-    return float(np.mean(1 / (1 + np.maximum(errors, 1e-100) ** -2)))
