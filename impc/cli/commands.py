@@ -106,10 +106,7 @@ def results() -> None:
 @study_options("plant", "reliability", "report.html, result.json, tables and figures")
 @page_options
 @click.option(
-    "--last",
-    type=click.IntRange(min=1),
-    default=3,
-    help="Use the last N trials of each visit.",
+    "--last", type=click.IntRange(min=1), default=3, help="Use the last N trials of each visit."
 )
 @runs("cohort:run_reliability")
 def reliability() -> None:

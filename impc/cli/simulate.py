@@ -6,6 +6,8 @@ import click
 
 from impc.cli.options import Number, out_option, runs, seed_option
 
+_POSITIVE, _SIZE = Number(min=0, max=1e6, min_open=True), Number(min=0, max=1e6)
+
 
 @click.group("simulate")
 def command() -> None:
@@ -15,29 +17,23 @@ def command() -> None:
 @command.command("seated-balance")
 @out_option("subject", "the recordings, subject.toml and truth.json")
 @click.option(
-    "--torque-limit",
-    type=Number(min=0, max=1e6, min_open=True),
-    default=6.0,
-    help="Largest torque of the subject, N m.",
+    "--torque-limit", type=_POSITIVE, default=6.0, help="Largest torque of the subject, N m."
 )
 @click.option("--trials", type=click.IntRange(1, 99), default=3, help="Number of trials.")
 @click.option("--duration", type=Number(min=2, max=600), default=30.0, help="Of each trial, s.")
 @click.option(
-    "--amplitude",
-    type=Number(min=0, max=1e6, min_open=True),
-    default=5.0,
-    help="Of the ternary torque on the seat, N m.",
+    "--amplitude", type=_POSITIVE, default=5.0, help="Of the ternary torque on the seat, N m."
 )
 @click.option(
     "--motor-noise",
-    type=Number(min=0, max=1e6),
+    type=_SIZE,
     show_default="0, with --observer 0.3",
     help="Standard deviation of the noise on the torque, N m; a fit without [fit.observer] treats "
     "it as recording noise.",
 )
 @click.option(
     "--sensor-noise",
-    type=Number(min=0, max=1e6),
+    type=_SIZE,
     default=0.1,
     help="Standard deviation of the recording noise on the angles, degrees.",
 )
@@ -48,7 +44,7 @@ def command() -> None:
 )
 @click.option(
     "--sensory-noise",
-    type=Number(min=0, max=1e6, min_open=True),
+    type=_POSITIVE,
     default=0.1,
     help="With --observer: standard deviation of one sensed sample (0.01 s) of an angle, degrees; "
     "of a rate, ten times that per second.",
@@ -98,7 +94,7 @@ def seated_balance() -> None:
 )
 @click.option(
     "--motor-noise",
-    type=Number(min=0, max=1e6),
+    type=_SIZE,
     default=0.0,
     help="Standard deviation of the noise on the torque, N m; a fit treats it as recording noise.",
 )

@@ -22,9 +22,8 @@ from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key, Verdict
 from impc.reporting.writer import write_files
 from impc.studies.cohort.figures import forest, subject_figure
-from impc.studies.cohort.results import Cohort
+from impc.studies.cohort.results import Cohort, cohort_tables, row_of
 from impc.studies.cohort.study import Study, Unit, safe_name
-from impc.studies.cohort.tables import cohort_tables, row_of
 from impc.studies.cohort.tasks import Failures, Store
 from impc.studies.cohort.unit_result import LOGARITHM
 from impc.studies.cohort.verdict import cohort_verdict

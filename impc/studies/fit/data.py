@@ -55,8 +55,7 @@ from impc.assess.printed_gain import lasting_responses
 from impc.model.riccati import solve_lqr
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import shown_unit
-from impc.studies.fit.aim import aim_data
-from impc.studies.fit.facts import named_gains
+from impc.studies.fit.facts import aim_data, named_gains
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data

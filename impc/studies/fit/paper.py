@@ -12,7 +12,6 @@ from impc.reporting.rendering import number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.verdict import Verdict
 from impc.studies.fit import facts
-from impc.studies.fit.aim import aim_sentences
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.structures import structure_sentences
 from impc.studies.fit.verdict import GAIN, SHARE, WEIGHTS, forbidden, reason
@@ -40,7 +39,7 @@ def _methods(result: FitResult, provenance: Provenance) -> list[str]:
         "second with a zero-phase low-pass filter.",
         f"The body model was {_model_name(provenance)}{provenance.arguments}. The controller "
         f"predicted {problem.horizon * dt:.3g} s ahead at {rate} samples per second, {bounded}.",
-        *aim_sentences(result),
+        *facts.aim_sentences(result),
         "The feedback gain was estimated by minimising the difference between recorded and "
         "modelled outputs in all trials together; 95 % confidence intervals allow for "
         "autocorrelated residuals.",

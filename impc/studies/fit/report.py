@@ -34,7 +34,6 @@ from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
 from impc.studies.fit import facts, figures, findings
 from impc.studies.fit import verdict as rules
-from impc.studies.fit.aim import aim_sentences
 from impc.studies.fit.body_words import (
     added_sentence,
     body_sentence_of,
@@ -203,7 +202,7 @@ def _gain(result: FitResult, hidden: bool) -> list[Block]:
     ]
     if hidden:
         return [
-            *aim_sentences(result),
+            *facts.aim_sentences(result),
             Quiet(f"{_HIDDEN} The numbers below are for troubleshooting only."),
             Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
             *findings.error_findings(result),
@@ -213,7 +212,7 @@ def _gain(result: FitResult, hidden: bool) -> list[Block]:
         "A gain is the opposing command per unit of a deviation, as long as the limit is not "
         f"reached. {body_sentence_of(result)}",
         *filter(None, lasting),
-        *aim_sentences(result),
+        *facts.aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
         *facts.shift_words(result),
         findings.per_unit_finding(result),
