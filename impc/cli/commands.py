@@ -6,17 +6,7 @@ from pathlib import Path
 
 import click
 
-from impc.cli.options import (
-    Number,
-    out_option,
-    page_options,
-    runs,
-    scheduler_options,
-    solver_option,
-    study_options,
-    subject_arguments,
-    yes_option,
-)
+from impc.cli import options
 from impc.cli.plant import KNOWN
 
 _PATH = click.Path(path_type=Path)
@@ -25,10 +15,12 @@ SEEDS = 7
 
 
 @click.command("fit")
-@subject_arguments("Meaning of the columns, and settings; `impc inspect FILE` drafts this file.")
-@out_option("fit", "report.html, result.json, tables and the figures")
-@page_options
-@runs("fit:run_fit")
+@options.subject_arguments(
+    "Meaning of the columns, and settings; `impc inspect FILE` drafts this file."
+)
+@options.out_option("fit", "report.html, result.json, tables and the figures")
+@options.page_options
+@options.runs("fit:run_fit")
 def fit() -> None:
     """Fit the controller behind the trials of one subject, one file a trial.
 
@@ -38,10 +30,10 @@ def fit() -> None:
 
 
 @click.command("compare")
-@subject_arguments("Meaning of the columns, and settings, as for `impc fit`.")
-@out_option("compare", "report.html, result.json, tables and the figure")
-@page_options
-@runs("fit:run_compare")
+@options.subject_arguments("Meaning of the columns, and settings, as for `impc fit`.")
+@options.out_option("compare", "report.html, result.json, tables and the figure")
+@options.page_options
+@options.runs("fit:run_compare")
 def compare() -> None:
     """Compare feedback gain, inverse LQR and inverse MPC, one file a trial.
 
@@ -66,18 +58,19 @@ def compare() -> None:
     "--config", type=_PATH, help="Check the file against this configuration; needs --plant."
 )
 @click.option("--open", "open_page", is_flag=True, help="Draw every signal on a page, and open it.")
-@runs("inspect:run_inspect")
+@options.runs("inspect:run_inspect")
 def inspect() -> None:
     """Show what a recording holds and write a commented configuration for it."""
 
 
 @click.command("cohort")
-@study_options("plant", "cohort", "results, tables and report; give the same folder again to "
-               "continue")  # fmt: skip
-@page_options
-@scheduler_options
-@yes_option
-@runs("cohort:run_cohort")
+@options.study_options(
+    "plant", "cohort", "results, tables and report; give the same folder again to continue"
+)
+@options.page_options
+@options.scheduler_options
+@options.yes_option
+@options.runs("cohort:run_cohort")
 def cohort() -> None:
     """Fit every subject, visit and condition of a study, with bootstrap replicates.
 
@@ -94,7 +87,7 @@ def cohort() -> None:
     help="Write all columns to this .xlsx file, with command, versions and SHA-256 of the inputs "
     "in a second sheet, or to this .csv file; never overwrites a file.",
 )
-@runs("results:run_results")
+@options.runs("results:run_results")
 def results() -> None:
     """Show the fits in a folder and below, one row each, newest first.
 
@@ -103,12 +96,12 @@ def results() -> None:
 
 
 @click.command("reliability")
-@study_options("plant", "reliability", "report.html, result.json, tables and figures")
-@page_options
+@options.study_options("plant", "reliability", "report.html, result.json, tables and figures")
+@options.page_options
 @click.option(
     "--last", type=click.IntRange(min=1), default=3, help="Use the last N trials of each visit."
 )
-@runs("cohort:run_reliability")
+@options.runs("cohort:run_reliability")
 def reliability() -> None:
     """Analyse test-retest reliability over subjects, visits, conditions and trials.
 
@@ -125,10 +118,10 @@ def reliability() -> None:
     help="Folder of `impc fit`: plant, settings, gain and noise of the assumed subject; or of "
     "`impc simulate seated-balance`: its gain. Keys in CONFIG take precedence.",
 )
-@out_option("plan", "report.html, result.json, tables and the figures")
-@page_options
-@yes_option
-@runs("plan:run_plan")
+@options.out_option("plan", "report.html, result.json, tables and the figures")
+@options.page_options
+@options.yes_option
+@options.runs("plan:run_plan")
 def plan() -> None:
     """Plan an experiment for an assumed subject, from the [plan] table of CONFIG.
 
@@ -138,11 +131,11 @@ def plan() -> None:
 
 
 @click.command("select")
-@study_options("model", "select", "report.html, result.json, tables and figure")
-@page_options
-@scheduler_options
-@yes_option
-@runs("select:run_select")
+@options.study_options("model", "select", "report.html, result.json, tables and figure")
+@options.page_options
+@options.scheduler_options
+@options.yes_option
+@options.runs("select:run_select")
 def select() -> None:
     """Select sensitive parameters of a simulation model (chapter 4), per subject and pooled.
 
@@ -152,23 +145,23 @@ def select() -> None:
 
 
 @click.command("key-parameters")
-@study_options("model", "key-parameters", "report.html, result.json, table and figure")
+@options.study_options("model", "key-parameters", "report.html, result.json, table and figure")
 @click.option(
     "--bound",
-    type=Number(min=0, max=1e6, min_open=True),
+    type=options.Number(min=0, max=1e6, min_open=True),
     default=0.35,
     help="Largest allowed variance of a parameter, in squared halves of its range.",
 )
-@click.option("--vaf", type=Number(), default=69.0, help="Smallest allowed mean VAF, %.")
+@click.option("--vaf", type=options.Number(), default=69.0, help="Smallest allowed mean VAF, %.")
 @click.option(
     "--icc",
-    type=Number(),
+    type=options.Number(),
     help="Smallest allowed lower end of the 95 % interval of ICC(A,k). Default: 0.6, good.",
 )
-@page_options
-@scheduler_options
-@yes_option
-@runs("select:run_key_parameters")
+@options.page_options
+@options.scheduler_options
+@options.yes_option
+@options.runs("select:run_key_parameters")
 def key_parameters() -> None:
     """Find key parameters (chapter 5) in a study of several subjects and visits.
 
@@ -192,10 +185,10 @@ def key_parameters() -> None:
     "(minutes) or the seat (longer).",
 )
 @click.option("--seeds", type=click.IntRange(1, 1000), default=SEEDS, help="Seeds of --sweep.")
-@out_option("example", "report.html, result.json, tables and the figures")
-@page_options
-@solver_option
-@runs("example:run_example")
+@options.out_option("example", "report.html, result.json, tables and the figures")
+@options.page_options
+@options.solver_option
+@options.runs("example:run_example")
 def example() -> None:
     """Run the simulation example of the dissertation with all methods.
 
@@ -206,7 +199,7 @@ def example() -> None:
 
 @click.command("warm")
 @click.option("--sensory-noise", is_flag=True, help="Also compile the filter of sensory noise.")
-@runs("warm:run_warm")
+@options.runs("warm:run_warm")
 def warm() -> None:
     """Compile the inner loops of all commands once; takes about half a minute.
 
