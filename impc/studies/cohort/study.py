@@ -1,17 +1,7 @@
-"""Study file (TOML): which recordings belong together, and how they are fitted.
+"""Study file (docs/howto/cohort.md): which recordings belong together, and how they are fitted.
 
-    [study]
-    plant = "seated-balance"
-    recordings = "data/sub-{subject}/ses-{visit}/sub-{subject}_task-{condition}_run-{trial}.csv"
-    participants = "data/participants.tsv"
-
-    [recording] ... [signals.NAME] ... [plant] ... [fit] ...     as for `impc fit`
-
-All trials with the same subject, visit and condition form a unit, which gets one fit.
-
-Names of subjects, visits, conditions, trials and groups become names of files and folders, table
-cells and terminal output. Only names that are safe in all of them are accepted: letters, digits,
-spaces and . + - _, beginning with a letter or digit.
+All trials with the same subject, visit and condition form a unit, which gets one fit. Names become
+names of files, cells and lines on a terminal: only names that are safe in all are accepted.
 """
 
 from __future__ import annotations
