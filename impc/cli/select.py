@@ -16,6 +16,7 @@ from impc.reporting.document import Report
 from impc.studies.cache import Cache
 from impc.studies.cohort.study import Study, read_study
 from impc.studies.effort import key_evaluations, select_evaluations, selection_effort
+from impc.studies.fit.settings import read_settings
 from impc.studies.pool import Result
 from impc.studies.reliability.icc import GOOD
 from impc.studies.scheduler import Cluster, connected
@@ -30,7 +31,7 @@ from impc.studies.selection.model_source import (
     read_trials,
 )
 from impc.studies.selection.report import read_truths, selection_report
-from impc.studies.selection.settings import select_settings
+from impc.studies.selection.settings import SelectSettings
 
 
 def run_select(
@@ -44,7 +45,7 @@ def run_select(
 ) -> None:
     """Select the parameters that can be estimated."""
     study, source, recorded, inputs = read_model_study(study_file, given, allowed)
-    settings = select_settings(study.configuration.select)
+    settings = read_settings("select", SelectSettings, study.configuration.select)
     named = {" visit ".join(part for part in key if part): item for key, item in recorded.items()}
     effort = selection_effort(source.model, named.values(), select_evaluations(settings))
     with study_runner(source, out, cluster, 2 * len(named)) as (run, threads):
@@ -73,7 +74,7 @@ def run_key_parameters(
     """Find the parameters that are repeatable between visits."""
     icc = GOOD if icc is None else icc
     study, source, recorded, inputs = read_model_study(study_file, given, allowed)
-    settings = select_settings(study.configuration.select)
+    settings = read_settings("select", SelectSettings, study.configuration.select)
     effort = selection_effort(source.model, recorded.values(), key_evaluations(settings))
     with study_runner(source, out, cluster, 2 * len(recorded)) as (run, threads):
         require_consent(effort.shared(len(recorded), threads), yes, FEWER_STARTS)

@@ -26,7 +26,7 @@ from impc.studies.cohort.results import Cohort, cohort_tables, row_of
 from impc.studies.cohort.study import Study, Unit, safe_name
 from impc.studies.cohort.tasks import Failures, Store
 from impc.studies.cohort.unit_result import LOGARITHM
-from impc.studies.cohort.verdict import cohort_verdict
+from impc.studies.cohort.verdict import RULES
 from impc.studies.fit.facts import between
 
 _BESIDE = {
@@ -99,7 +99,7 @@ def write_report(
 
 def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -> Report:
     """Report of a cohort."""
-    verdict, name = cohort_verdict(cohort), cohort.of(cohort.measure)["name"]
+    verdict, name = RULES.verdict(cohort), cohort.of(cohort.measure)["name"]
     people = len({unit.subject for unit in study.units})
     provenance = Provenance(command=command)
     recordings = f"{sum(len(unit.files) for unit in study.units)} files of {people} people"

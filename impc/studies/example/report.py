@@ -16,7 +16,7 @@ from impc.reporting.exchange import long_finding
 from impc.reporting.finding import Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.verdict import Key, Verdict
+from impc.reporting.verdict import Key
 from impc.studies.example.cases import BOUND, EXAMPLE, LOST, CaseResult, distance, true_weights
 from impc.studies.fit.figures import movement_figure
 from impc.studies.methods_figure import methods_figure
@@ -70,7 +70,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     return Report(
         "impc example",
         "example",
-        example_verdict(cases),
+        RULES.verdict(Facts(cases)),
         [
             *(_case_section(case, hero=case is first) for case in cases),
             Section("What the example shows", [_SETTING, _GAIN, LOST, methods_fold(EXAMPLE)]),
@@ -145,11 +145,6 @@ RULES = Rules[Facts](
              "Others lead to the same movement; here a rule happens to choose the true ones."),
     ),
 )  # fmt: skip
-
-
-def example_verdict(cases: Sequence[CaseResult]) -> Verdict:
-    """Verdict: methods that stay within the limit and methods that find the true weights."""
-    return RULES.verdict(Facts(cases))
 
 
 def _keys(cases: Sequence[CaseResult]) -> list[Key]:

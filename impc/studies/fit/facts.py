@@ -73,11 +73,6 @@ def with_unit(value: str, unit: str) -> str:
     return f"{value}{unit}" if unit[:1] == "°" else value if unit == "-" else f"{value} {unit}"
 
 
-def one_of(unit: str) -> str:
-    """The number 1 with this unit."""
-    return with_unit("1", unit)
-
-
 def gain_rows(result: FitResult) -> list[GainRow]:
     """All entries of the gain, row by row, in shown units."""
     plant, found = result.given.plant, result.preferred
@@ -90,7 +85,7 @@ def gain_rows(result: FitResult) -> list[GainRow]:
                 continue
             factor, of = shown_unit(plant, state)
             ratio, words = scale / factor, signal_name(plant, state)
-            per = f"{one_of(of)} of {words}"
+            per = f"{with_unit('1', of)} of {words}"
             value = np.nan if item.value is None else ratio * item.value
             ends = ratio * item.low, ratio * item.high
             name = signal_name(plant, control)

@@ -56,7 +56,7 @@ def fit_report(
     result: FitResult, provenance: Provenance, truth: Array | None = None, missing: str = ""
 ) -> Report:
     """Report of a fit; `truth` (m, n) is the gain of a simulated subject."""
-    verdict, subject = rules.fit_verdict(result), str(result.given.recordings[0].label.subject)
+    verdict, subject = rules.RULES.verdict(result), str(result.given.recordings[0].label.subject)
     trials, dt = result.given.recordings, result.given.plant.dt
     seconds = sum(trial.samples for trial in trials) * dt
     count = "1 trial" if len(trials) == 1 else f"{len(trials)} trials"
@@ -85,7 +85,7 @@ def fit_report(
 
 def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
     """Report for a subject who fell in every trial."""
-    verdict = rules.fallen_verdict(falls)
+    verdict = rules.FALLEN.verdict(falls)
     made = Section("Provenance", [Terms(provenance.terms)])
     sections = [Section("Falls", [Lines(falls)]), made]
     words = dict.fromkeys(("headline", "reason"), verdict.headline)
@@ -240,7 +240,7 @@ def _lasting(result: FitResult, found: LastingResponse) -> str:
     gravity = dict(plant.gravity).get(found.state)
     times = f", {number(found.value / gravity, 2)} times m g h" if gravity else ""
     return (
-        f"A quick {words} of {facts.one_of(unit)} is answered with {fixed(at_once)} {of}. "
+        f"A quick {words} of {facts.with_unit('1', unit)} is answered with {fixed(at_once)} {of}. "
         f"If it lasts, {change} {fixed(value)} {of} remain "
         f"(95 % CI {facts.between(low, high)}){times}."
     )

@@ -15,7 +15,6 @@ from impc.checking import replace
 from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.verdict import Verdict
 from impc.studies.fit import facts
 from impc.studies.fit.body_words import (
     alternative_reason,
@@ -38,24 +37,14 @@ _NO_GAIN = frozenset([GAIN, WEIGHTS])
 _NOTHING = frozenset([GAIN, WEIGHTS, SHARE])
 
 
-def fit_verdict(result: FitResult) -> Verdict:
-    """The verdict of a fit."""
-    return _RULES.verdict(result)
-
-
 def forbidden(result: FitResult) -> frozenset[str]:
     """Results that the page must not show."""
-    return _RULES.forbidden(result)
+    return RULES.forbidden(result)
 
 
 def reason(result: FitResult, what: str) -> str:
     """Title of the first warning that forbids a result; empty if none does."""
-    return _RULES.reason(result, what)
-
-
-def fallen_verdict(falls: tuple[str, ...]) -> Verdict:
-    """Verdict if every trial ended in a fall, so that nothing was fitted."""
-    return _FALLEN.verdict(falls)
+    return RULES.reason(result, what)
 
 
 def little(result: FitResult) -> bool:
@@ -510,9 +499,10 @@ _MAY_NOT: tuple[Line[FitResult], ...] = (
          "{trials} of one person in one condition."),
 )  # fmt: skip
 
-_RULES = Rules(_WORDS, _KINDS, _MAY, _MAY_NOT)
+RULES = Rules(_WORDS, _KINDS, _MAY, _MAY_NOT)
 
-_FALLEN = Rules[tuple[str, ...]](
+#: Rules if every trial ended in a fall, so that nothing was fitted.
+FALLEN = Rules[tuple[str, ...]](
     {"falls": "; ".join},
     (
         Kind(

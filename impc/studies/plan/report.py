@@ -16,7 +16,7 @@ from impc.reporting.finding import Finding, Picture, table_of
 from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, RULE, new_figure, plain_log
-from impc.studies.fit.facts import one_of
+from impc.studies.fit.facts import with_unit
 from impc.studies.plan import sentences
 from impc.studies.plan.designs import gain_places, relative_errors
 from impc.studies.plan.study import Plan, spread
@@ -41,7 +41,7 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
     return Report(
         "impc plan",
         "plan of an experiment",
-        sentences.plan_verdict(plan),
+        sentences.RULES.verdict(sentences.Facts(plan)),
         [
             Section("Gains", [_gains(plan), *_body(plan)]),
             Section("Experiments", [_experiments(plan)]),
@@ -149,7 +149,7 @@ def _gains(plan: Plan) -> Finding:
     table = pd.DataFrame(
         {
             "gain": sentences.gain_names(plan),
-            "for_every": [one_of(unit) for _, unit in states],
+            "for_every": [with_unit("1", unit) for _, unit in states],
             "assumed": K[gain_places(plant)] * scales,
             "unit": [unit for _, unit in commands],
             "interval": list(map(sentences.stated_as, sentences.halves(plan).tolist())),

@@ -16,7 +16,7 @@ from impc.reporting.document import Check, Copy
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Rules, always
 from impc.reporting.shown_units import shown_unit, signal_name
-from impc.reporting.verdict import Key, Verdict
+from impc.reporting.verdict import Key
 from impc.studies.fit.facts import with_unit
 from impc.studies.fit.findings import number_name
 from impc.studies.plan.designs import Design, gain_places, relative_errors
@@ -173,11 +173,6 @@ RULES = Rules[Facts](
              badge="Enough"),
     ),
 )  # fmt: skip
-
-
-def plan_verdict(plan: Plan) -> Verdict:
-    """Verdict: whether the intervals of the experiment are narrow enough."""
-    return RULES.verdict(Facts(plan))
 
 
 def _experiment(plan: Plan) -> str:
