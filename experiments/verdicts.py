@@ -29,7 +29,7 @@ from impc.model.riccati import solve_lqr
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.facts import decided, named_gains
 from impc.studies.fit.subject import fit_recordings
-from impc.studies.fit.verdict import FALLEN, GAIN, RULES, WEIGHTS, forbidden
+from impc.studies.fit.verdict import FALLEN, GAIN, RULES, WEIGHTS
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -142,7 +142,7 @@ def _judged(task: tuple[str, int]) -> tuple[str, list[bool], list[bool]]:
     name, seed = task
     make, level, words = KINDS[name]
     result, gain = make(seed)
-    verdict, no = RULES.verdict(result), forbidden(result)
+    verdict, no = RULES.verdict(result), RULES.forbidden(result)
     held: list[bool] = []
     if GAIN not in no:
         rows = zip(gain.ravel(), named_gains(result), strict=False)

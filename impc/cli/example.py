@@ -10,7 +10,6 @@ import numpy as np
 from impc.cli.commands import SEEDS
 from impc.cli.console import progress, publish
 from impc.cli.options import Page
-from impc.cli.plant import load_plant
 from impc.cli.seat import HORIZON, PLANT, seat_weights
 from impc.control.named_solver import COMPILED, require_solver
 from impc.files.plant_sources import make_plant, plant_source
@@ -45,7 +44,7 @@ def run_example(
 
 def _cases(case: str, solver: str | None) -> Report:
     chosen = require_solver(COMPILED if solver is None else solver)
-    plant = load_plant(_EXAMPLE_PLANT)
+    plant = make_plant(plant_source(_EXAMPLE_PLANT, {}), ())
     names = tuple(CASES) if case == "all" else (case,)
     with progress(len(names) * len(EXAMPLE), "method") as step:
         cases = [run_case(plant, name, solver=chosen, progress=step) for name in names]
@@ -66,7 +65,7 @@ def _swept(name: str, seeds: int, out: Path) -> Report:
 def _setup(name: str) -> Setup:
     """The simulated loop: trials of 60 s at 1 Hz, or of 10 s at 100 Hz on the seat."""
     if name == "example":
-        plant = pushed(load_plant(_EXAMPLE_PLANT))
+        plant = pushed(make_plant(plant_source(_EXAMPLE_PLANT, {}), ()))
         return Setup(plant, Weights(np.eye(plant.n), np.eye(plant.m)), 5, 60, 1, 1.0)
     plant = make_plant(plant_source(PLANT, {}), ("perturbation",))
     return Setup(plant, seat_weights(plant), HORIZON, 1000, 12, 5.0)

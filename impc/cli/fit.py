@@ -26,7 +26,7 @@ from impc.studies.fit.report import fallen_report, fit_report
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import missing, require_used
 from impc.studies.fit.subject import fit_recordings, stages
-from impc.studies.fit.verdict import GAIN, forbidden
+from impc.studies.fit.verdict import GAIN, RULES
 from impc.studies.methods_table import methods_finding
 
 # Title of the last stage.
@@ -86,7 +86,7 @@ def _own_problem(asked: Asked, out: Path, page: Page) -> bool:
 
 def _texts(result: FitResult, truth: Array | None) -> Iterator[str]:
     """Gain, methods and, for simulated recordings, the true gain, for the terminal."""
-    if GAIN not in forbidden(result):
+    if GAIN not in RULES.forbidden(result):
         yield f"\n{per_unit_finding(result).text()}"
     yield f"\n{methods_finding(result.methods[::-1]).text()}\n"
     if truth is not None:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from impc.files.digests import Inputs
     from impc.files.plant_sources import PlantSource
     from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
     from impc.reporting.provenance import Provenance
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
@@ -53,13 +52,6 @@ def _kept(value: object) -> bool:
     if isinstance(value, int):
         return value.bit_length() < 64
     return isinstance(value, (float, str))
-
-
-def load_plant(path: str) -> Plant:
-    """Call the function of an import path ``module:function`` without arguments."""
-    from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
-
-    return make_plant(plant_source(path, {}), ())
 
 
 def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:

@@ -58,7 +58,8 @@ class Provenance:
         found = [("Recordings", ", ".join(self.files))]
         found += [("Command", self.command and code.format(self.command))]
         found += [("Plant", self.plant_name and code.format(self.plant_name + self.arguments))]
-        found += [("Created", self.made), ("Software", self.all_versions)]
+        versions = ", ".join(f"{name} {version}" for name, version in self.versions.items())
+        found += [("Created", self.made), ("Software", versions)]
         if self.inputs is not None:
             seal = f"{self.inputs.digest[:16]} (SHA-256 of all input files; full in result.json)"
             found.append(("Fingerprint", seal))
@@ -69,8 +70,3 @@ class Provenance:
         """Arguments of the plant in brackets."""
         given = ", ".join(f"{name} {value}" for name, value in self.plant_arguments.items())
         return f" ({given})" if given else ""
-
-    @property
-    def all_versions(self) -> str:
-        """All versions in one line."""
-        return ", ".join(f"{name} {version}" for name, version in self.versions.items())

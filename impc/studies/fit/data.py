@@ -59,7 +59,7 @@ from impc.studies.fit.facts import aim_data, named_gains
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
-from impc.studies.fit.verdict import GAIN, RULES, reason
+from impc.studies.fit.verdict import GAIN, RULES
 from impc.studies.methods_table import problem_data
 
 
@@ -101,7 +101,7 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
 def _summary(result: FitResult) -> dict[str, Any]:
     """Row of the fit in a table of fits, in shown units; gains that the page forbids are None."""
     plant, verdict = result.given.plant, RULES.verdict(result)
-    label, why = result.given.recordings[0].label, reason(result, GAIN)
+    label, why = result.given.recordings[0].label, RULES.reason(result, GAIN)
     vaf = map(float, result.inverse_mpc.vaf)
     row: dict[str, Any] = {
         **{name: str(getattr(label, name)) for name in ("subject", "visit", "condition")},

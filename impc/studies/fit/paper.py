@@ -14,7 +14,7 @@ from impc.reporting.verdict import Verdict
 from impc.studies.fit import facts
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.structures import structure_sentences
-from impc.studies.fit.verdict import GAIN, SHARE, WEIGHTS, forbidden, reason
+from impc.studies.fit.verdict import GAIN, RULES, SHARE, WEIGHTS
 
 
 def paper_text(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy | str:
@@ -66,7 +66,7 @@ def _pushed(result: FitResult) -> str:
 
 
 def _results(result: FitResult) -> list[str]:
-    no, held = forbidden(result), facts.held_out(result)
+    no, held = RULES.forbidden(result), facts.held_out(result)
     left_out = (
         f", and for {facts.shares(result, held)} in left-out trials" if held is not None else ""
     )
@@ -80,7 +80,7 @@ def _results(result: FitResult) -> list[str]:
         share, (_, without) = 100 * result.saturated, facts.unlimited_ratio(result)
         said.append(f"The command was at its limit for {share:.1f} % of the time.{without}")
     if GAIN in no:
-        why = reason(result, GAIN)
+        why = RULES.reason(result, GAIN)
         return [*said, f"Gains are not reported: {why[:1].lower()}{why[1:]}."]
     gains = [row.text for _, row in facts.named_gains(result) if row.determined]
     said.append(f"Gains were {'; '.join(gains)}.")

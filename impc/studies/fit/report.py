@@ -33,7 +33,6 @@ from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
 from impc.studies.fit import facts, figures, findings
-from impc.studies.fit import verdict as rules
 from impc.studies.fit.body_words import (
     added_sentence,
     body_sentence_of,
@@ -46,6 +45,7 @@ from impc.studies.fit.paper import paper_text
 from impc.studies.fit.result import FitResult, shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_section
+from impc.studies.fit.verdict import FALLEN, GAIN, RULES, SHARE, WEIGHTS, little
 from impc.studies.methods_figure import explained, methods_figure
 from impc.studies.methods_table import methods_finding, provenance_section
 
@@ -56,7 +56,7 @@ def fit_report(
     result: FitResult, provenance: Provenance, truth: Array | None = None, missing: str = ""
 ) -> Report:
     """Report of a fit; `truth` (m, n) is the gain of a simulated subject."""
-    verdict, subject = rules.RULES.verdict(result), str(result.given.recordings[0].label.subject)
+    verdict, subject = RULES.verdict(result), str(result.given.recordings[0].label.subject)
     trials, dt = result.given.recordings, result.given.plant.dt
     seconds = sum(trial.samples for trial in trials) * dt
     count = "1 trial" if len(trials) == 1 else f"{len(trials)} trials"
@@ -85,7 +85,7 @@ def fit_report(
 
 def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
     """Report for a subject who fell in every trial."""
-    verdict = rules.FALLEN.verdict(falls)
+    verdict = FALLEN.verdict(falls)
     made = Section("Provenance", [Terms(provenance.terms)])
     sections = [Section("Falls", [Lines(falls)]), made]
     words = dict.fromkeys(("headline", "reason"), verdict.headline)
@@ -122,7 +122,7 @@ def _keys(result: FitResult) -> list[Key]:
         Key(f"{vaf[0]:.2f}", "%", "of the variance explained",
             f"{names[0]}, {where}{'; ' + others if others else ''}")
     ]  # fmt: skip
-    if rules.SHARE in rules.forbidden(result) and result.limit_found is not None:
+    if SHARE in RULES.forbidden(result) and result.limit_found is not None:
         found = result.limit_found
         keys.append(
             Key(number(found.value), f"{found.unit}, not {number(found.given)}",
@@ -143,10 +143,8 @@ def _keys(result: FitResult) -> list[Key]:
                 f"with a limit of {limit}" if limit else "no limit was given")
         )  # fmt: skip
     row, gains = facts.first_gain(result), facts.named_gains(result)
-    if row is None or rules.GAIN in rules.forbidden(result):
-        known = (
-            0 if rules.GAIN in rules.forbidden(result) else sum(row.determined for _, row in gains)
-        )
+    if row is None or GAIN in RULES.forbidden(result):
+        known = 0 if GAIN in RULES.forbidden(result) else sum(row.determined for _, row in gains)
         keys.append(Key(str(known), f"of {len(gains)}", "gains to report", "see the warning"))
     else:
         unit = row.unit if row.unit == "-" else f"{row.unit} per {row.per[1:].partition(' of ')[0]}"
@@ -167,7 +165,7 @@ def _draws(result: FitResult, window: int) -> dict[str, Draw]:
     if result.response is not None:
         response = functools.partial(figures.frequency_figure, result, result.response)
         found["frequency-response"] = response
-    if result.compared and rules.WEIGHTS not in rules.forbidden(result):
+    if result.compared and WEIGHTS not in RULES.forbidden(result):
         found["statements"] = functools.partial(figures.statements_figure, result)
     return found
 
@@ -176,16 +174,14 @@ def _sections(
     result: FitResult, provenance: Provenance, truth: Array | None, missing: str
 ) -> list[Section]:
     """Sections of the page; add a line here for a new section."""
-    no = rules.forbidden(result)
+    no = RULES.forbidden(result)
     return [
-        Section("Feedback gain", _gain(result, rules.GAIN in no)),
+        Section("Feedback gain", _gain(result, GAIN in no)),
         *([] if result.person is None else [result.person.section()]),
-        Section("Does the limit matter?", _limit(result, rules.SHARE in no), "Limit"),
+        Section("Does the limit matter?", _limit(result, SHARE in no), "Limit"),
         *movement_section(result),
         *([structure_section(result)] if result.structures else []),
-        Section(
-            "Intent: what the cost weights say", _intent(result, rules.WEIGHTS in no), "Intent"
-        ),
+        Section("Intent: what the cost weights say", _intent(result, WEIGHTS in no), "Intent"),
         *([Section("Frequency response", _response(result))] if result.response else []),
         Section("Checks", _checks(result, truth)),
         _made(result, provenance, missing),
@@ -323,7 +319,7 @@ def _response(result: FitResult) -> list[Block]:
 def _checks(result: FitResult, truth: Array | None) -> list[Block]:
     checks = [
         _recordings(result),
-        Check(Level.RED if rules.little(result) else Level.GREEN, "Explained variance",
+        Check(Level.RED if little(result) else Level.GREEN, "Explained variance",
               facts.left_out_text(result)),
         _limit_check(result),
         _model(result),

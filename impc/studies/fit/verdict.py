@@ -37,16 +37,6 @@ _NO_GAIN = frozenset([GAIN, WEIGHTS])
 _NOTHING = frozenset([GAIN, WEIGHTS, SHARE])
 
 
-def forbidden(result: FitResult) -> frozenset[str]:
-    """Results that the page must not show."""
-    return RULES.forbidden(result)
-
-
-def reason(result: FitResult, what: str) -> str:
-    """Title of the first warning that forbids a result; empty if none does."""
-    return RULES.reason(result, what)
-
-
 def little(result: FitResult) -> bool:
     """Whether the model does not describe the recordings."""
     found, where = facts.reported_shares(result)
@@ -453,7 +443,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
 
 def _allows(result: FitResult, what: str = "") -> bool:
     """Whether the model describes the recordings, and this result is not forbidden."""
-    return not little(result) and what not in forbidden(result)
+    return not little(result) and what not in RULES.forbidden(result)
 
 
 def _limit_matters(result: FitResult) -> bool:
@@ -482,16 +472,16 @@ _MAY: tuple[Line[FitResult], ...] = (
 
 
 _MAY_NOT: tuple[Line[FitResult], ...] = (
-    Line(lambda it: GAIN in forbidden(it), "Any gain.", "See the warning above."),
-    Line(lambda it: GAIN not in forbidden(it) and _names(it, known=False),
+    Line(lambda it: GAIN in RULES.forbidden(it), "Any gain.", "See the warning above."),
+    Line(lambda it: GAIN not in RULES.forbidden(it) and _names(it, known=False),
          "The gain on {unknown}, by itself.", "It is not known to within half of its value."),
-    Line(lambda it: WEIGHTS in forbidden(it), "Any cost weight, or comparison of costs.",
+    Line(lambda it: WEIGHTS in RULES.forbidden(it), "Any cost weight, or comparison of costs.",
          "See the warning above."),
-    Line(lambda it: WEIGHTS not in forbidden(it),
+    Line(lambda it: WEIGHTS not in RULES.forbidden(it),
          "The matrix of cost weights, or one of its entries, as a property of the person.",
          "{free} numbers describe the cost. These recordings fix {rank}; a convention chooses the "
          "other {chosen}."),
-    Line(lambda it: SHARE in forbidden(it) or facts.given_limit(it) is None or not it.met,
+    Line(lambda it: SHARE in RULES.forbidden(it) or facts.given_limit(it) is None or not it.met,
          "The time at the limit, or that the limit matters.", "{no_limit}"),
     Line(always, "That the person computes an optimal plan.",
          "Another rule that gives the same command would look the same."),
@@ -499,7 +489,7 @@ _MAY_NOT: tuple[Line[FitResult], ...] = (
          "{trials} of one person in one condition."),
 )  # fmt: skip
 
-RULES = Rules(_WORDS, _KINDS, _MAY, _MAY_NOT)
+RULES: Rules[FitResult] = Rules(_WORDS, _KINDS, _MAY, _MAY_NOT)
 
 #: Rules if every trial ended in a fall, so that nothing was fitted.
 FALLEN = Rules[tuple[str, ...]](

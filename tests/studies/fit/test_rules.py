@@ -22,7 +22,7 @@ from impc.studies.fit.findings import read_truth, truth_found
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.subject import fit_recordings
-from impc.studies.fit.verdict import RULES, UNDETERMINED, WEIGHTS, forbidden
+from impc.studies.fit.verdict import RULES, UNDETERMINED, WEIGHTS
 from tests.studies.fit.test_verdict import explained, model_error
 from tests.support import present
 
@@ -225,7 +225,7 @@ def test_no_weights_is_said_before_any_weights() -> None:
     assert result.weights_test.rejected
     verdict = RULES.verdict(result)
     assert "no cost weights explain it" in verdict.headline
-    assert WEIGHTS in forbidden(result)
+    assert WEIGHTS in RULES.forbidden(result)
     assert np.min(result.gain_shares) > 99
     assert f"{result.gain_shares[0]:.0f} %" in verdict.may[0].why
     assert "statements" not in data(result)["findings"]

@@ -29,7 +29,7 @@ from impc.studies.fit.report import fallen_report, fit_report
 from impc.studies.fit.result import FittedParameter
 from impc.studies.fit.settings import missing
 from impc.studies.fit.subject import fit_recordings, stages
-from impc.studies.fit.verdict import GAIN, RULES, WEIGHTS, forbidden
+from impc.studies.fit.verdict import GAIN, RULES, WEIGHTS
 from tests.support import regulator
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def test_an_error_of_the_model_forbids_gains() -> None:
     verdict = RULES.verdict(result)
     assert verdict.level is Level.AMBER
     assert "a delay of the command of 100 ± 10 ms (p < 0.0001)" in verdict.alerts[0].found
-    assert forbidden(result) == {GAIN, WEIGHTS}
+    assert RULES.forbidden(result) == {GAIN, WEIGHTS}
     assert not any("gain on" in claim.text for claim in verdict.may)
     report = fit_report(result, Provenance())
     assert isinstance(report.copy, Copy)
@@ -275,8 +275,8 @@ def test_weights_that_fit_as_well_forbid_a_gain_that_excludes_them() -> None:
     assert found.level is Level.AMBER
     assert "less certain than its interval" in found.headline
     assert "(chi-squared 24.7)" in found.alerts[0].found
-    assert {GAIN, WEIGHTS} <= forbidden(impc.replace(result, weights_test=ours))
+    assert {GAIN, WEIGHTS} <= RULES.forbidden(impc.replace(result, weights_test=ours))
     both = impc.replace(ours, likelihood_ratio=200.0, p_value=1e-9)
     rejected = impc.replace(result, weights_test=both)
     assert "no cost weights explain it" in RULES.verdict(rejected).headline
-    assert GAIN not in forbidden(rejected)
+    assert GAIN not in RULES.forbidden(rejected)
