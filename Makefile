@@ -84,7 +84,7 @@ app: $(COMPILED)
 # Each test file runs in one process, longest folders first. The shared closed loop is compiled on one
 # core while the checks run on the other; no test here uses the filter of sensory noise.
 test: $(PROJECT) $(LOCKED) $(POLYTOPE)
-	@$(PY) -c 'from impc.studies.warm import compile_loop; compile_loop()' & compiled=$$!; \
+	@$(PY) -c 'from impc.cli.warm import compile_loop; compile_loop()' & compiled=$$!; \
 	$(MAKE) --no-print-directory check; checked=$$?; wait $$compiled && exit $$checked
 	$(PYTEST) -m "not full and not slow"
 

@@ -29,7 +29,7 @@ from impc.model.riccati import solve_lqr
 from impc.studies.fit.asked import fit_problem
 from impc.studies.fit.facts import decided, named_gains
 from impc.studies.fit.subject import fit_recordings
-from impc.studies.fit.verdict import GAIN, WEIGHTS, fallen_verdict, fit_verdict, forbidden
+from impc.studies.fit.verdict import FALLEN, GAIN, RULES, WEIGHTS
 
 if TYPE_CHECKING:
     from impc.arrays import Array
@@ -142,7 +142,7 @@ def _judged(task: tuple[str, int]) -> tuple[str, list[bool], list[bool]]:
     name, seed = task
     make, level, words = KINDS[name]
     result, gain = make(seed)
-    verdict, no = fit_verdict(result), forbidden(result)
+    verdict, no = RULES.verdict(result), RULES.forbidden(result)
     held: list[bool] = []
     if GAIN not in no:
         rows = zip(gain.ravel(), named_gains(result), strict=False)
@@ -170,7 +170,7 @@ def main() -> None:
         said = Counter(one[0] for task, one in zip(tasks, found, strict=True) if task[0] == name)
         others = "; ".join(f"{count} {text}" for text, count in said.items() if text != "right")
         print(f"{name:<20}{said['right']} of {given.seeds}  {others}")
-    fallen = fallen_verdict(("trial 1: fell at 3.2 s",))
+    fallen = FALLEN.verdict(("trial 1: fell at 3.2 s",))
     print(f"{'fell in all':<20}{fallen.level.value}: {fallen.headline}")
     print(f"intervals of reportable gains that cover: {_count(one[1] for one in found)}")
     print(f"reportable comparisons of cost that are true: {_count(one[2] for one in found)}")

@@ -12,7 +12,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from impc.app.page import back, page, subject_of
 from impc.app.subject import RESULTS
-from impc.cli.fit import CONFIGURATION
+from impc.cli.plant import CONFIGURATION
 from impc.errors import ImpcError
 from impc.files.configuration import toml_content
 from impc.reporting.rendering import report_script_hashes

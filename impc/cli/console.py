@@ -21,9 +21,12 @@ from tqdm import tqdm
 from impc.errors import one_line
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from impc.cli.options import Page
+    from impc.reporting.document import Report
+    from impc.studies.cache import Cache
     from impc.studies.effort import Effort
 
 # Seconds and GB above which a command asks first: two hours, half of a machine with 8 GB.
@@ -137,6 +140,25 @@ def _ticking(bar: tqdm[Any]) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+
+
+def publish(
+    report: Report,
+    out: Path,
+    page: Page,
+    *texts: str,
+    kept: Cache | None = None,
+    files: Mapping[str, bytes] | None = None,
+) -> None:
+    """Write a report or its `files`, drop what was kept, print verdict, `texts` and files."""
+    from impc.reporting.writer import write_files  # noqa: PLC0415
+
+    written = write_files(out, report.files(pdf=page.pdf) if files is None else files)
+    if kept is not None:
+        kept.forget()
+    for text in (report.verdict.text(), *texts):
+        click.echo(text)
+    print_files(out, written, page.open)
 
 
 def print_files(out: Path, written: Sequence[Path], open_page: bool = False) -> None:

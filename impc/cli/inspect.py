@@ -4,42 +4,24 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from impc.cli.plant import KNOWN, find_plant
+from impc.cli.console import print_files
+from impc.cli.plant import find_plant
+from impc.errors import InputError, OutputError
+from impc.files.checks import fault
+from impc.files.configuration import read_configuration
+from impc.files.draft import Draft, drafted, summary
+from impc.files.formats import read_table, write_file
+from impc.files.plant_sources import make_plant
+from impc.files.reading import examine, recording_of
 
-if TYPE_CHECKING:
-    from impc.files.draft import Draft
 
-
-@click.command("inspect")
-@click.argument("file", type=click.Path(path_type=Path))
-@click.option(
-    "--plant",
-    "plant_name",
-    help=f"Plant whose signals are looked for: {', '.join(KNOWN)}, module:function, or a file.",
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    help="Write the configuration to this file instead of the screen; never overwrites a file.",
-)
-@click.option(
-    "--config",
-    type=click.Path(path_type=Path),
-    help="Check the file against this configuration; needs --plant.",
-)
-@click.option("--open", "open_page", is_flag=True, help="Draw every signal on a page, and open it.")
-def command(
+def run_inspect(
     file: Path, plant_name: str | None, out: Path | None, config: Path | None, open_page: bool
 ) -> None:
-    """Show what a recording holds and write a commented configuration for it."""
-    from impc.errors import OutputError  # noqa: PLC0415  # not needed for --help
-    from impc.files.draft import drafted, summary  # noqa: PLC0415
-    from impc.files.formats import read_table, write_file  # noqa: PLC0415
-
+    """Describe a recording, and draft or check its configuration."""
     if config is not None:
         _check(file, config, plant_name)
         return
@@ -60,8 +42,7 @@ def command(
 
 def _open(file: Path, plant_name: str | None, draft: Draft) -> None:
     """Write the page of a draft to results/inspect and open it."""
-    from impc.cli.console import print_files  # noqa: PLC0415
-    from impc.reporting.writer import owned, write_files  # noqa: PLC0415
+    from impc.reporting.writer import owned, write_files  # noqa: PLC0415  # for a page only
     from impc.studies.inspection import inspection_report  # noqa: PLC0415
 
     out, plant = Path("results", "inspect"), () if plant_name is None else ("--plant", plant_name)
@@ -73,13 +54,6 @@ def _open(file: Path, plant_name: str | None, draft: Draft) -> None:
 
 def _check(file: Path, config: Path, plant_name: str | None) -> None:
     """Read the file as `impc fit` does, and print what the checks found."""
-    from impc.errors import InputError  # noqa: PLC0415
-    from impc.files.checks import fault  # noqa: PLC0415
-    from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.formats import read_table  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant  # noqa: PLC0415
-    from impc.files.reading import examine, recording_of  # noqa: PLC0415
-
     if plant_name is None:
         raise InputError("--config", "is given without --plant", "add --plant NAME")
     configuration = read_configuration(config)

@@ -9,39 +9,26 @@ from typing import Any
 
 import click
 
+from impc.cli import commands
 from impc.cli.ending import ExitStatus, ended, interruptions, own_process
+from impc.cli.simulate import command as simulate
 from impc.jit import keep_caches, say_when_compiling
 from impc.settings_files import ignore_settings_files
 
-# Command -> module and function; imported only when the command is used.
-_COMMANDS = {
-    "app": ("impc.app.command", "command"),
-    "cohort": ("impc.cli.cohort", "command"),
-    "compare": ("impc.cli.fit", "compare_command"),
-    "example": ("impc.cli.example", "command"),
-    "fit": ("impc.cli.fit", "command"),
-    "inspect": ("impc.cli.inspect", "command"),
-    "key-parameters": ("impc.cli.select", "key_command"),
-    "plan": ("impc.cli.plan", "command"),
-    "reliability": ("impc.cli.cohort", "reliability_command"),
-    "results": ("impc.cli.cohort", "results_command"),
-    "select": ("impc.cli.select", "command"),
-    "simulate": ("impc.cli.simulate", "command"),
-    "warm": (__name__, "warm"),
-}
+# Of a higher layer; imported only when it is used.
+_APP = "app"
 
 
 class _Program(click.Group):
     """Group of commands that ends every expected failure with one line on stderr."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
+        return sorted([_APP, *super().list_commands(ctx)])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in _COMMANDS:
-            return None
-        module, function = _COMMANDS[cmd_name]
-        found: click.Command = getattr(importlib.import_module(module), function)
+        if cmd_name != _APP:
+            return super().get_command(ctx, cmd_name)
+        found: click.Command = importlib.import_module("impc.app.command").command
         return found
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
@@ -83,22 +70,7 @@ def main(context: click.Context) -> None:
         click.echo(context.get_help())
 
 
-@click.command("warm")
-@click.option("--sensory-noise", is_flag=True, help="Also compile the filter of sensory noise.")
-def warm(sensory_noise: bool) -> None:
-    """Compile the inner loops of all commands once; takes about half a minute.
-
-    `make demo` calls it; after an installation by pip, call it yourself. Without it, the first
-    command that needs compiled code compiles it and says so. So does the first fit with sensory
-    noise: its filter is compiled here only with --sensory-noise.
-    """
-    say_when_compiling(lambda _: None)  # this command prints its own lines
-    from impc.studies.warm import compile_bodies, compile_filter, compile_loop  # noqa: PLC0415
-
-    compile_loop()
-    click.echo("compiled: the constrained controller and its closed loop")
-    compile_bodies()
-    click.echo("compiled: nonlinear bodies")
-    if sensory_noise:
-        compile_filter()
-        click.echo("compiled: the filter of sensory noise")
+for _command in vars(commands).values():
+    if isinstance(_command, click.Command):
+        main.add_command(_command)
+main.add_command(simulate)

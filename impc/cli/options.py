@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import click
 
@@ -43,11 +44,37 @@ yes_option = click.option(
 )
 
 
+def runs(place: str) -> Callable[[F], F]:
+    """Call ``module:function`` of impc.cli as the command; --help does not load its libraries."""
+
+    def added(command: F) -> F:
+        @functools.wraps(command)
+        def running(**given: Any) -> Any:
+            module, _, name = place.partition(":")
+            return getattr(importlib.import_module(f"impc.cli.{module}"), name)(**given)
+
+        return cast("F", running)
+
+    return added
+
+
+class Page(NamedTuple):
+    """Options of a command that writes a report."""
+
+    pdf: bool
+    open: bool
+
+
 def page_options(command: F) -> F:
-    """Add --pdf and --open to a `command` that writes a report."""
+    """Add --pdf and --open to a `command` that writes a report; passed on as `page`."""
     pdf = click.option("--pdf", is_flag=True, help="Also write the figures as PDF.")
     shown = click.option("--open", "open_page", is_flag=True, help="Open the report in a browser.")
-    return pdf(shown(command))
+
+    @functools.wraps(command)
+    def paged(*given: Any, pdf: bool, open_page: bool, **named: Any) -> Any:
+        return command(*given, page=Page(pdf, open_page), **named)
+
+    return pdf(shown(cast("F", paged)))
 
 
 def out_option(folder: str, holds: str) -> Callable[[F], F]:
@@ -83,7 +110,7 @@ def _command_name(context: click.Context) -> str:
 
 def subject_arguments(config: str) -> Callable[[F], F]:
     """Add FILES and options of a fit, --config with the help `config`; passed on as `asked`."""
-    path, words = click.Path(path_type=Path), ("files", "plant_name", "allowed", "config", "solver")
+    path, words = click.Path(path_type=Path), ("files", "given", "allowed", "config", "solver")
     options = (
         click.argument("files", nargs=-1, type=path),
         code_options("plant", "configuration", f": {', '.join(KNOWN)}; your own module:function; "
@@ -134,7 +161,7 @@ def scheduler_options(command: F) -> F:
 def code_options(kind: str, file: str = "study", names: str = "") -> Callable[[F], F]:
     """Add --plant and --allow-plant (or --model ...): consent to run code that a `file` names."""
     name = click.option(
-        f"--{kind}", f"{kind}_name", help=f"Replaces the {kind} that the {file} names{names}."
+        f"--{kind}", "given", help=f"Replaces the {kind} that the {file} names{names}."
     )
     allow = click.option(
         f"--allow-{kind}",
@@ -143,6 +170,13 @@ def code_options(kind: str, file: str = "study", names: str = "") -> Callable[[F
         help=f"Allow running the code that the {file} names as its {kind}.",
     )
     return lambda command: name(allow(command))
+
+
+def study_options(kind: str, folder: str, holds: str) -> Callable[[F], F]:
+    """Add STUDY, the options of the code that it names as its `kind`, and --out."""
+    study = click.argument("study_file", metavar="STUDY", type=click.Path(path_type=Path))
+    code, out = code_options(kind), out_option(folder, holds)
+    return lambda command: study(code(out(command)))
 
 
 class Number(click.FloatRange):

@@ -2,75 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import msgspec
+import numpy as np
 
-from impc.cli.console import print_files, progress
-from impc.cli.options import out_option, page_options, yes_option
+from impc.arrays import Array
+from impc.cli.console import progress, publish, require_consent
+from impc.cli.options import Page
 from impc.cli.plant import KNOWN, find_plant
 from impc.cli.seat import TORQUE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.arrays import Array
-    from impc.files.configuration import Configuration
-    from impc.files.plant_sources import PlantSource
-    from impc.model.plant import Plant
-    from impc.studies.fit.settings import FitSettings
-    from impc.studies.plan.designs import Person, Perturbation
-    from impc.studies.plan.settings import PlanSettings
+from impc.control.controller import Controller
+from impc.errors import InputError
+from impc.files.configuration import Configuration, read_configuration
+from impc.files.digests import gather_inputs
+from impc.files.disk import truth_beside
+from impc.files.formats import read_table
+from impc.files.plant_sources import PlantSource, consented_name, import_function
+from impc.files.reading import disturbances_of
+from impc.files.results import read_result
+from impc.model.plant import Plant
+from impc.reporting.provenance import Provenance
+from impc.reporting.shown_units import angles_in
+from impc.studies.cache import Cache, Steps
+from impc.studies.fit.asked import asked_plant, fit_bounds
+from impc.studies.fit.settings import FitSettings, fit_settings
+from impc.studies.plan import settings as assumed
+from impc.studies.plan.designs import Person, Perturbation
+from impc.studies.plan.report import plan_report
+from impc.studies.plan.settings import PlanSettings
+from impc.studies.plan.study import make_plan, plan_effort, steps_of
 
 _FEWER = "lower fits, draws, amplitude or dwell in [plan]"
 
 
-@click.command("plan")
-@click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
-@click.option("--plant", "plant_name", help=f"{', '.join(KNOWN)}; or as for `impc fit`.")
-@click.option(
-    "--like",
-    type=click.Path(path_type=Path),
-    help="Folder of `impc fit`: plant, settings, gain and noise of the assumed subject; or of "
-    "`impc simulate seated-balance`: its gain. Keys in CONFIG take precedence.",
-)
-@out_option("plan", "report.html, result.json, tables and the figures")
-@page_options
-@yes_option
-def command(
-    config: Path,
-    plant_name: str | None,
-    like: Path | None,
-    out: Path,
-    yes: bool,
-    pdf: bool,
-    open_page: bool,
+def run_plan(
+    config: Path, plant_name: str | None, like: Path | None, out: Path, yes: bool, page: Page
 ) -> None:
-    """Plan an experiment for an assumed subject, from the [plan] table of CONFIG.
-
-    CONFIG may be the file that `impc fit` reads later: [plant] and [fit] mean the same. If you
-    interrupt the command, the same command continues from the last finished step.
-    """
-    # Imported here: the libraries take seconds to load, and --help needs none.
-    import numpy as np  # noqa: PLC0415
-
-    from impc.cli.console import require_consent  # noqa: PLC0415
-    from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.digests import gather_inputs  # noqa: PLC0415
-    from impc.reporting.provenance import Provenance  # noqa: PLC0415
-    from impc.reporting.shown_units import angles_in  # noqa: PLC0415
-    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.cache import Cache, Steps  # noqa: PLC0415
-    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
-    from impc.studies.plan.report import plan_report  # noqa: PLC0415
-    from impc.studies.plan.settings import plan_settings  # noqa: PLC0415
-    from impc.studies.plan.study import make_plan, plan_effort, steps_of  # noqa: PLC0415
-
-    require_writable(out)
-    configuration = read_configuration(config)
-    configuration, name = _assumed(configuration, plant_name, like)
-    settings = plan_settings(configuration.plan)
+    """Plan an experiment."""
+    configuration, name = _assumed(read_configuration(config), plant_name, like)
+    settings = assumed.plan_settings(configuration.plan)
     source = find_plant(name, configuration.plant)
     person = _person(configuration, settings, fit_settings(configuration.fit), source)
     recorded = [config.parent / name for name in settings.files]
@@ -93,19 +67,14 @@ def command(
     made = Provenance(source.name, line, dict(source.arguments), names, inputs)
     with angles_in(configuration.report.angles):
         report = plan_report(plan, made)
-        written = write_files(out, report.files(pdf=pdf))
-    steps.cache.forget()
-    click.echo(report.verdict.text())
-    click.echo("\n".join(f"{key.label}: {key.value} {key.unit}" for key in report.keys))
-    print_files(out, written, open_page)
+        keys = (f"{key.label}: {key.value} {key.unit}" for key in report.keys)
+        publish(report, out, page, *keys, kept=steps.cache)
 
 
 def _assumed(
     configuration: Configuration, plant_name: str | None, like: Path | None
 ) -> tuple[Configuration, str]:
     """Configuration completed by the results of a fit (--like), and the name of the plant."""
-    from impc.files.plant_sources import consented_name  # noqa: PLC0415
-
     if like is not None:
         configuration, named = _filled(configuration, like)
         where = f"--like {like}: plant"
@@ -118,19 +87,7 @@ def _assumed(
 
 
 def _filled(configuration: Configuration, folder: Path) -> tuple[Configuration, str | None]:
-    """Complete a configuration by the subject in a `folder`; also return the name of its plant.
-
-    A fit gives plant, settings, gain, and the RMS of its residuals as noise; a simulated subject
-    the gain and its settings.
-    """
-    import msgspec  # noqa: PLC0415
-    import numpy as np  # noqa: PLC0415
-
-    from impc.errors import InputError  # noqa: PLC0415
-    from impc.files.configuration import read_configuration  # noqa: PLC0415
-    from impc.files.disk import truth_beside  # noqa: PLC0415
-    from impc.files.results import read_result  # noqa: PLC0415
-
+    """Configuration completed by the fit or simulated subject in `folder`, and its plant."""
     where, truth = f"--like {folder}", truth_beside(folder)
     own: dict[str, Any] = {}
     plant: str | None = None
@@ -160,18 +117,6 @@ def _filled(configuration: Configuration, folder: Path) -> tuple[Configuration, 
 def _person(
     configuration: Configuration, settings: PlanSettings, fit: FitSettings, source: PlantSource
 ) -> Person:
-    import numpy as np  # noqa: PLC0415
-
-    from impc.control.controller import Controller  # noqa: PLC0415
-    from impc.errors import InputError  # noqa: PLC0415
-    from impc.studies.fit.asked import asked_plant, fit_bounds  # noqa: PLC0415
-    from impc.studies.plan.designs import Person  # noqa: PLC0415
-    from impc.studies.plan.settings import (  # noqa: PLC0415
-        assumed_gain,
-        mechanical_stops,
-        noise_deviations,
-    )
-
     recorded = tuple(settings.perturbed or configuration.recorded)
     plant, family = asked_plant(source, recorded, fit)
     if not plant.disturbances:
@@ -181,7 +126,7 @@ def _person(
         raise InputError("[fit] bounded_states", 'is "data"', "give numbers: a plan has no data")
     controller = Controller.from_gain(
         plant,
-        assumed_gain(plant, settings),
+        assumed.assumed_gain(plant, settings),
         fit_bounds(plant, fit, ()),
         fit.horizon,
         terminal_set=fit.terminal_set is True,
@@ -189,9 +134,9 @@ def _person(
     tau = settings.correlation
     return Person(
         controller,
-        noise_deviations(plant, settings),
+        assumed.noise_deviations(plant, settings),
         float(np.exp(-plant.dt / tau)) if tau > 0 else 0.0,
-        mechanical_stops(plant, settings, configuration.signals),
+        assumed.mechanical_stops(plant, settings, configuration.signals),
         family,
     )
 
@@ -200,12 +145,6 @@ def _perturbation(
     plant: Plant, configuration: Configuration, settings: PlanSettings, files: list[Path]
 ) -> Perturbation:
     """Ternary sequences, one for each disturbance, or the recorded `files` in turn."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.formats import read_table  # noqa: PLC0415
-    from impc.files.plant_sources import import_function  # noqa: PLC0415
-    from impc.files.reading import disturbances_of  # noqa: PLC0415
-
     if files:
         found = [
             disturbances_of(

@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from impc.files.digests import Inputs
     from impc.files.plant_sources import PlantSource
     from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
     from impc.reporting.provenance import Provenance
     from impc.studies.cohort.study import Study
     from impc.studies.fit.settings import FitSettings
 
 #: Short name -> import path of a plant; the package `impc` itself contains no plants.
 KNOWN = {"seated-balance": "plants:seated_balance_for", "cursor": "plants:cursor_plant"}
+#: Copy of the configuration among the results of `impc fit`.
+CONFIGURATION = "configuration.toml"
 
 
 def find_plant(name: str, arguments: Mapping[str, Any]) -> PlantSource:
@@ -51,13 +52,6 @@ def _kept(value: object) -> bool:
     if isinstance(value, int):
         return value.bit_length() < 64
     return isinstance(value, (float, str))
-
-
-def load_plant(path: str) -> Plant:
-    """Call the function of an import path ``module:function`` without arguments."""
-    from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
-
-    return make_plant(plant_source(path, {}), ())
 
 
 def named_plant(study_file: Path, study: Study, given: str | None, allowed: bool) -> PlantSource:
@@ -119,7 +113,7 @@ def subject_plant(config: Path, named: str, given: str | None, allowed: bool) ->
 def asked_subject(
     command: str,
     files: Sequence[Path],
-    plant_name: str | None,
+    given: str | None,
     config: Path,
     solver: str | None = None,
     allowed: bool = False,
@@ -129,14 +123,14 @@ def asked_subject(
 
     configuration = read_configuration(config)
     named, where = configuration.subject, f"{config}: subject"
-    plant = subject_plant(config, named.plant, plant_name, allowed)
+    plant = subject_plant(config, named.plant, given, allowed)
     found = tuple(files) or tuple(config.parent / name for name in named.files)
     if not found:
         raise InputError(f"{where}.files", "names no recording", "name them, or pass FILES")
-    options = {"--plant": plant_name, "--config": config.name, "--solver": solver}
-    given = [word for pair in options.items() if pair[1] is not None for word in pair]
-    given += ["--allow-plant"] if allowed else []
-    line = shlex.join(["impc", command, *(path.name for path in files), *map(str, given)])
+    options = {"--plant": given, "--config": config.name, "--solver": solver}
+    words = [word for pair in options.items() if pair[1] is not None for word in pair]
+    words += ["--allow-plant"] if allowed else []
+    line = shlex.join(["impc", command, *(path.name for path in files), *map(str, words)])
     return Asked(found, plant, config, configuration, solver, line)
 
 

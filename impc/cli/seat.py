@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import click
+import numpy as np
 
+from impc.arrays import Array
 from impc.cli.console import print_next, progress
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    import numpy as np
-
-    from impc.arrays import Array
-    from impc.control.controller import Controller
-    from impc.files.table import Table
-    from impc.model.plant import Plant
-    from impc.model.weights import Weights
+from impc.control.controller import Controller
+from impc.files.plant_sources import make_plant, plant_source
+from impc.files.table import Table, make_table
+from impc.model.bounds import Bounds
+from impc.model.plant import Plant
+from impc.model.weights import Weights
+from impc.reporting.writer import write_files
 
 #: Import paths of the linear plant, and of the time step of the nonlinear one.
 PLANT, STEP = "plants:seated_balance_for", "plants:seated_balance_step_for"
@@ -62,10 +61,6 @@ def numbered(subjects: int) -> Iterator[str]:
 
 def seat_weights(plant: Plant, cost_weight: float = 1.0) -> Weights:
     """True weights: Q is almost one direction of angles and rates, scaled by `cost_weight`."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.model.weights import Weights  # noqa: PLC0415
-
     v = np.array([0.70, 0.65, 0.22, 0.20])
     v /= np.linalg.norm(v)
     Q = 1e-2 * np.eye(plant.n)
@@ -75,10 +70,6 @@ def seat_weights(plant: Plant, cost_weight: float = 1.0) -> Weights:
 
 def seat_controller(person: dict[str, Any], limit: float, cost_weight: float = 1.0) -> Controller:
     """Controller of a `person`: torque `limit` (N m), `cost_weight` of angles and rates."""
-    from impc.control.controller import Controller  # noqa: PLC0415
-    from impc.files.plant_sources import make_plant, plant_source  # noqa: PLC0415
-    from impc.model.bounds import Bounds  # noqa: PLC0415
-
     plant = make_plant(plant_source(PLANT, person), ("perturbation",))
     bounds = Bounds(plant, u_min=-limit, u_max=limit)
     return Controller(plant, seat_weights(plant, cost_weight), bounds, HORIZON, terminal_set=False)
@@ -90,17 +81,11 @@ def between_samples(torque: Array) -> Array:
     Recordings are read with the same interpolation (docs/howto/recordings.md). A torque held over
     each sample would act half a sample late and bias the fitted gain.
     """
-    import numpy as np  # noqa: PLC0415
-
     return np.asarray((torque + np.append(torque[1:], torque[-1])) / 2)
 
 
 def seat_table(name: str, degrees: Array, torque: Array, rate: float) -> Table:
     """Table of a trial: angles in `degrees` (samples, 2), `torque` in N m, `rate` in Hz."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.table import make_table  # noqa: PLC0415
-
     columns = {
         "time": np.arange(len(torque)) / rate,
         "seat_angle": degrees[:, 0],
@@ -113,8 +98,6 @@ def seat_table(name: str, degrees: Array, torque: Array, rate: float) -> Table:
 
 def write_study(out: Path, command: str, study: str, truth: dict[str, Any], **more: str) -> None:
     """Write study.toml, truth.json and `more` files (`stem_ending`); print the next command."""
-    from impc.reporting.writer import write_files  # noqa: PLC0415
-
     texts = {"study.toml": study, "truth.json": json.dumps(truth, indent=1) + "\n"}
     texts |= {name.replace("_", "."): text for name, text in more.items()}
     write_files(out, {name: text.encode() for name, text in texts.items()})

@@ -1,43 +1,12 @@
-"""`impc simulate`: recordings of simulated subjects whose controller is known."""
+"""`impc simulate`: arguments and help of the commands that simulate recordings."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
 import click
 
-from impc.cli.console import print_files, print_next
-from impc.cli.options import Number, out_option, seed_option
-from impc.cli.seat import (
-    HORIZON,
-    SIGNALS,
-    STEP,
-    TORQUE,
-    between_samples,
-    seat_controller,
-    seat_table,
-    seat_weights,
-)
-from impc.cli.simulate_cohort import cohort
-from impc.cli.simulate_studies import head_tracking, reliability_study
-from impc.extras import installed
+from impc.cli.options import Number, out_option, runs, seed_option
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.control.controller import Controller
-    from impc.output_feedback.observer import Observer
-    from impc.studies.simulated_people import SubjectTrial
-
-_FORMATS = ("csv", "tsv", "xlsx", "mat", "tdms", "c3d")
-# Formats that need an optional library.
-_LIBRARIES = {"tdms": "nptdms", "c3d": "c3d"}
-_RATE = 1000.0
-#: Signals that the simulated subject senses.
-_SENSED = ("theta1", "theta2", "theta1_rate", "theta2_rate")
-_STOP = "limit = 12.0                 # mechanical stop, in this unit\n"
+_POSITIVE, _SIZE = Number(min=0, max=1e6, min_open=True), Number(min=0, max=1e6)
 
 
 @click.group("simulate")
@@ -48,29 +17,23 @@ def command() -> None:
 @command.command("seated-balance")
 @out_option("subject", "the recordings, subject.toml and truth.json")
 @click.option(
-    "--torque-limit",
-    type=Number(min=0, max=1e6, min_open=True),
-    default=6.0,
-    help="Largest torque of the subject, N m.",
+    "--torque-limit", type=_POSITIVE, default=6.0, help="Largest torque of the subject, N m."
 )
 @click.option("--trials", type=click.IntRange(1, 99), default=3, help="Number of trials.")
 @click.option("--duration", type=Number(min=2, max=600), default=30.0, help="Of each trial, s.")
 @click.option(
-    "--amplitude",
-    type=Number(min=0, max=1e6, min_open=True),
-    default=5.0,
-    help="Of the ternary torque on the seat, N m.",
+    "--amplitude", type=_POSITIVE, default=5.0, help="Of the ternary torque on the seat, N m."
 )
 @click.option(
     "--motor-noise",
-    type=Number(min=0, max=1e6),
+    type=_SIZE,
     show_default="0, with --observer 0.3",
     help="Standard deviation of the noise on the torque, N m; a fit without [fit.observer] treats "
     "it as recording noise.",
 )
 @click.option(
     "--sensor-noise",
-    type=Number(min=0, max=1e6),
+    type=_SIZE,
     default=0.1,
     help="Standard deviation of the recording noise on the angles, degrees.",
 )
@@ -81,7 +44,7 @@ def command() -> None:
 )
 @click.option(
     "--sensory-noise",
-    type=Number(min=0, max=1e6, min_open=True),
+    type=_POSITIVE,
     default=0.1,
     help="With --observer: standard deviation of one sensed sample (0.01 s) of an angle, degrees; "
     "of a rate, ten times that per second.",
@@ -100,171 +63,88 @@ def command() -> None:
     show_default="all that are installed",
     help="Comma-separated list of csv, tsv, xlsx, mat, tdms and c3d.",
 )
-def seated_balance(out: Path, formats: str | None, **given: Any) -> None:
+@runs("simulate_subject:run_seated_balance")
+def seated_balance() -> None:
     """Simulate a subject who balances on a tilting seat with a bounded controller.
 
     1000 samples a second; the nonlinear plant of the dissertation with parameters from body mass
     and height. truth.json holds the true gain and weights.
     """
-    # Imported here: the libraries take seconds to load, and --help needs none.
-    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-
-    wanted = _wanted(formats)
-    require_writable(out)
-    if given["motor_noise"] is None:
-        given["motor_noise"] = 0.3 if given["observer"] else 0.0
-    person = {key: given[key] for key in ("mass", "height", "sex")}
-    controller = seat_controller(person, given["torque_limit"])
-    trials = _trials(controller, person, given)
-    # One format: the trials are the same in all.
-    names = [f"trial_{number}.{wanted[0]}" for number in range(1, len(trials) + 1)]
-    files: dict[str, bytes] = {"subject.toml": _configuration(person, given, names).encode()}
-    files["truth.json"] = (json.dumps(_truth(controller, given), indent=1) + "\n").encode()
-    for number, trial in enumerate(trials, 1):
-        files |= _encoded(f"trial_{number}", trial, wanted)
-    written = write_files(out, files)
-    for number, trial in enumerate(trials, 1):
-        fell = "" if trial.fell is None else f", falls at {trial.fell:.2f} s"
-        share = 100 * trial.saturated
-        click.echo(f"trial {number}: at the torque limit for {share:.1f} % of the time{fell}")
-    print_files(out, written)
-    print_next("impc fit --config {}", out, "subject.toml")
 
 
-def _wanted(formats: str | None) -> tuple[str, ...]:
-    if formats is None:
-        absent = {name for name, library in _LIBRARIES.items() if not installed(library)}
-        if absent:
-            remedy = "to write them too: pip install 'impc[formats]'"
-            click.echo(f"without {', '.join(sorted(absent))}; {remedy}")
-        return tuple(name for name in _FORMATS if name not in absent)
-    wanted = tuple(part.strip() for part in formats.split(",") if part.strip())
-    for name in wanted or ("",):
-        if name not in _FORMATS:
-            raise click.BadParameter(f"{name!r} is not one of {', '.join(_FORMATS)}")
-    return wanted
+@command.command("cohort")
+@out_option("cohort-data", "the recordings, study.toml, participants.tsv and truth.json")
+@click.option(
+    "--subjects", type=click.IntRange(2, 9999), default=30, help="Number in both groups together."
+)
+@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Per subject.")
+@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Per visit.")
+@click.option("--duration", type=Number(5, 600), default=30.0, help="Of each trial, s.")
+@click.option(
+    "--difference",
+    type=Number(min=0.05, max=20),
+    default=0.4,
+    help="Ratio of the cost weights of angles and rates, second group to first; 1: no difference.",
+)
+@click.option(
+    "--torque-limit",
+    type=Number(min=1, max=1e6),
+    default=6.0,
+    help="Largest lumbar torque of a subject, N m.",
+)
+@click.option(
+    "--motor-noise",
+    type=_SIZE,
+    default=0.0,
+    help="Standard deviation of the noise on the torque, N m; a fit treats it as recording noise.",
+)
+@click.option(
+    "--replicates",
+    type=click.IntRange(0, 1_000_000),
+    default=20,
+    help="Bootstrap replicates, written to study.toml.",
+)
+@seed_option
+@runs("simulate_cohort:run_cohort")
+def cohort() -> None:
+    """Simulate two groups of seated subjects, in folders with BIDS names.
+
+    The groups differ only in the cost weights of angles and rates relative to torque. Body mass and
+    height differ between subjects, cost weights between subjects and visits. 100 samples a second.
+    """
 
 
-def _trials(
-    controller: Controller, person: dict[str, Any], given: dict[str, Any]
-) -> list[SubjectTrial]:
-    import numpy as np  # noqa: PLC0415
+@command.command("reliability-study")
+@out_option("reliability-data", "the recordings, study.toml and truth.json")
+@click.option("--subjects", type=click.IntRange(2, 999), default=30, help="Number of subjects.")
+@click.option("--visits", type=click.IntRange(2, 9), default=3, help="Per subject.")
+@click.option("--trials", type=click.IntRange(2, 9), default=3, help="Per visit and condition.")
+@seed_option
+@runs("simulate_studies:run_reliability_study")
+def reliability_study() -> None:
+    """Simulate a reliability study of seated subjects under three conditions.
 
-    from impc.arrays import frozen  # noqa: PLC0415
-    from impc.checking import replace  # noqa: PLC0415
-    from impc.files.plant_sources import import_function, plant_source  # noqa: PLC0415
-    from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
-
-    torque, step = import_function(TORQUE), plant_source(STEP, person).make(**person)
-    seeds = np.random.SeedSequence(given["seed"]).spawn(given["trials"])
-    length = {"amplitude": given["amplitude"], "duration": given["duration"], "rate": _RATE}
-    recorded = [
-        torque(**length, seed=given["seed"] * 100 + number) for number in range(1, 1 + len(seeds))
-    ]
-    trials = [
-        simulate_subject(
-            controller,
-            step,
-            between_samples(pushed),
-            rate=_RATE,
-            motor=given["motor_noise"],
-            sensor=np.radians(given["sensor_noise"]),
-            person=_observer(controller, given),
-            seed=seed,
-        )
-        for pushed, seed in zip(recorded, seeds, strict=True)
-    ]
-    return [
-        replace(trial, disturbance=frozen(pushed[:, None]))
-        for trial, pushed in zip(trials, recorded, strict=True)
-    ]
+    Bodies differ between subjects; cost weights of angles and rates between subjects and visits;
+    sway between subjects, visits and trials; mean lean between visits. Closed eyes and vibration
+    change cost weights, sway and noise. A trial lasts 29.04 s, one period of the ternary torque, at
+    100 samples a second.
+    """
 
 
-def _observer(controller: Controller, given: dict[str, Any]) -> Observer | None:
-    """The subject's observer, if --observer is given."""
-    import numpy as np  # noqa: PLC0415
+@command.command("head-tracking")
+@out_option("head-data", "the recordings, study.toml and truth.json")
+@click.option(
+    "--axis", type=click.Choice(["yaw", "pitch"]), default="yaw", help="Of the head's rotation."
+)
+@click.option("--subjects", type=click.IntRange(1, 999), default=10, help="Number of subjects.")
+@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Per subject.")
+@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Per visit.")
+@click.option("--duration", type=Number(5, 300), default=30.0, help="Of each trial, s.")
+@seed_option
+@runs("simulate_studies:run_head_tracking")
+def head_tracking() -> None:
+    """Simulate head tracking as in chapter 4; --subjects 40 --visits 2 for chapter 5.
 
-    from impc.output_feedback.observer import Observer  # noqa: PLC0415
-
-    if not given["observer"]:
-        return None
-    look = np.radians(given["sensory_noise"])
-    walk = given["amplitude"] if given["unknown_perturbation"] else None
-    return Observer(
-        controller.plant,
-        _SENSED,
-        motor=given["motor_noise"],
-        sensory=look * np.array([1.0, 1.0, 10.0, 10.0]),
-        walk=walk,
-    )
-
-
-def _encoded(name: str, trial: SubjectTrial, wanted: Sequence[str]) -> dict[str, bytes]:
-    """Encode one trial in every wanted format, in degrees and newton metres."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.formats import encode_table  # noqa: PLC0415
-
-    table = seat_table(name, np.degrees(trial.outputs), trial.disturbance[:, 0], _RATE)
-    return {f"{name}.{ending}": encode_table(f".{ending}", table) for ending in wanted}
-
-
-def _truth(controller: Controller, given: dict[str, Any]) -> dict[str, Any]:
-    """True values, for truth.json."""
-    import importlib.metadata  # noqa: PLC0415
-
-    weights = seat_weights(controller.plant)
-    return {
-        "impc": importlib.metadata.version("impc"),
-        "states": list(controller.plant.states),
-        "K": controller.K.tolist(),
-        "Q": weights.Q.tolist(),
-        "R": weights.R.tolist(),
-        "horizon": controller.horizon,
-        "settings": given,
-    }
-
-
-def _configuration(person: dict[str, Any], given: dict[str, Any], files: list[str]) -> str:
-    """Text of subject.toml, which `impc fit` reads."""
-    return f"""\
-# A simulated subject: meaning of the columns of its recordings. truth.json holds the true values.
-[subject]
-plant = "seated-balance"
-files = {json.dumps(files)}
-
-[recording]
-time = "time"
-subject = "simulated"
-pattern = "trial_(?P<trial>[0-9]+)"
-
-{SIGNALS.replace("LIMIT", _STOP)}
-[plant]
-mass = {person["mass"]}
-height = {person["height"]}
-sex = "{person["sex"]}"
-
-[fit]
-horizon = {HORIZON}                 # samples of 0.01 s
-u_max = {given["torque_limit"]}                  # N m
-{_observer_table(given)}"""
-
-
-def _observer_table(given: dict[str, Any]) -> str:
-    if not given["observer"]:
-        return ""
-    return f"""
-[fit.observer]
-sensed = {json.dumps(_SENSED)}
-known = {json.dumps(not given["unknown_perturbation"])}
-
-[fit.structure]              # no cost weights for the states of delay and muscle
-Q = "full"
-over = {json.dumps(_SENSED)}
-name = "posture"
-"""
-
-
-command.add_command(cohort)
-command.add_command(reliability_study)
-command.add_command(head_tracking)
+    Subjects differ in all twelve parameters, drawn around the nominal values of table 4.3 such that
+    the loop is stable, and in the noise.
+    """

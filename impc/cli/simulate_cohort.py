@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import numpy as np
 
-from impc.cli.options import Number, out_option, seed_option
-from impc.cli.seat import (
-    HORIZON,
-    SIGNALS,
-    STEP,
-    TORQUE,
-    numbered,
-    random_person,
-    seat_controller,
-    seat_table,
-    write_study,
-)
-
-if TYPE_CHECKING:
-    import numpy as np
+from impc.cli import seat
+from impc.files.formats import encode_table
+from impc.files.plant_sources import import_function, plant_source
+from impc.reporting.writer import write_files
+from impc.studies.fit.settings import fit_settings
+from impc.studies.simulated_people import simulate_subject
 
 _RATE = 100.0
 # Integration steps between two samples: one step of 10 ms is inaccurate in the delay states.
@@ -34,58 +26,15 @@ _LIMIT = f"limit = {_STOP}\n"
 _BETWEEN, _AGAIN = 0.2, 0.05
 
 
-@click.command("cohort")
-@out_option("cohort-data", "the recordings, study.toml, participants.tsv and truth.json")
-@click.option(
-    "--subjects", type=click.IntRange(2, 9999), default=30, help="Number in both groups together."
-)
-@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Per subject.")
-@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Per visit.")
-@click.option("--duration", type=Number(5, 600), default=30.0, help="Of each trial, s.")
-@click.option(
-    "--difference",
-    type=Number(min=0.05, max=20),
-    default=0.4,
-    help="Ratio of the cost weights of angles and rates, second group to first; 1: no difference.",
-)
-@click.option(
-    "--torque-limit",
-    type=Number(min=1, max=1e6),
-    default=6.0,
-    help="Largest lumbar torque of a subject, N m.",
-)
-@click.option(
-    "--motor-noise",
-    type=Number(min=0, max=1e6),
-    default=0.0,
-    help="Standard deviation of the noise on the torque, N m; a fit treats it as recording noise.",
-)
-@click.option(
-    "--replicates",
-    type=click.IntRange(0, 1_000_000),
-    default=20,
-    help="Bootstrap replicates, written to study.toml.",
-)
-@seed_option
-def cohort(out: Path, **given: Any) -> None:
-    """Simulate two groups of seated subjects, in folders with BIDS names.
-
-    The groups differ only in the cost weights of angles and rates relative to torque. Body mass and
-    height differ between subjects, cost weights between subjects and visits. 100 samples a second.
-    """
-    import numpy as np  # noqa: PLC0415
-
-    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.fit.settings import fit_settings  # noqa: PLC0415
-
+def run_cohort(out: Path, **given: Any) -> None:
+    """Simulate a cohort and write all files."""
     fit_settings({"replicates": given["replicates"]})  # fail here if `impc cohort` would
-    require_writable(out)
     rng = np.random.default_rng(given["seed"])
     rows = ["participant_id\tgroup\tmass\theight\tsex"]
     truth: dict[str, Any] = {}
-    for number, name in enumerate(numbered(given["subjects"])):
+    for number, name in enumerate(seat.numbered(given["subjects"])):
         group = "first" if number < (given["subjects"] + 1) // 2 else "second"
-        person = random_person(rng)
+        person = seat.random_person(rng)
         row = (group, person["mass"], person["height"], person["sex"])
         rows.append("\t".join([f"sub-{name}", *map(str, row)]))
         factor = given["difference"] if group == "second" else 1.0
@@ -101,7 +50,7 @@ def cohort(out: Path, **given: Any) -> None:
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
     everything = {"settings": given, "subjects": truth}
     people = "\n".join(rows) + "\n"
-    write_study(out, "cohort", _study(given), everything, participants_tsv=people)
+    seat.write_study(out, "cohort", _study(given), everything, participants_tsv=people)
 
 
 def _visit(
@@ -113,15 +62,9 @@ def _visit(
     rng: np.random.Generator,
 ) -> tuple[dict[str, bytes], list[list[float]], dict[str, float]]:
     """All trials of a visit as files, the true gain, and the times of falls by file."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.formats import encode_table  # noqa: PLC0415
-    from impc.files.plant_sources import import_function, plant_source  # noqa: PLC0415
-    from impc.studies.simulated_people import simulate_subject  # noqa: PLC0415
-
-    controller = seat_controller(person, given["torque_limit"], cost_weight)
-    step = plant_source(STEP, person | {"sample_time": 1 / (_WITHIN * _RATE)})
-    make, torque = step.make(**step.arguments), import_function(TORQUE)
+    controller = seat.seat_controller(person, given["torque_limit"], cost_weight)
+    step = plant_source(seat.STEP, person | {"sample_time": 1 / (_WITHIN * _RATE)})
+    make, torque = step.make(**step.arguments), import_function(seat.TORQUE)
     files, falls = {}, {}
     for run in range(1, given["trials"] + 1):
         pushed = torque(duration=given["duration"], rate=_RATE, seed=int(rng.integers(2**31)))
@@ -136,7 +79,7 @@ def _visit(
             seed=int(rng.integers(2**31)),
         )
         file = f"sub-{name}_ses-{visit}_task-seat_run-{run}_motion"
-        table = seat_table(file, np.degrees(trial.outputs[::_WITHIN]), pushed, _RATE)
+        table = seat.seat_table(file, np.degrees(trial.outputs[::_WITHIN]), pushed, _RATE)
         files[f"{file}.csv"] = encode_table(".csv", table)
         beyond = np.abs(trial.outputs[:, 0]) > np.radians(_STOP)
         if beyond.any():  # beyond the mechanical stop that study.toml names
@@ -155,9 +98,9 @@ participants = "participants.tsv"
 [recording]
 time = "time"
 
-{SIGNALS.replace("LIMIT", _LIMIT)}
+{seat.SIGNALS.replace("LIMIT", _LIMIT)}
 [fit]
-horizon = {HORIZON}                     # samples of 0.01 s
+horizon = {seat.HORIZON}                     # samples of 0.01 s
 u_max = {given["torque_limit"]}                      # N m
 held_out = false
 replicates = {given["replicates"]}

@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
+import numpy as np
+import scipy.signal
 
-from impc.cli.options import Number, out_option, seed_option
-from impc.cli.seat import (
-    PLANT,
-    SIGNALS,
-    TORQUE,
-    numbered,
-    random_person,
-    seat_table,
-    seat_weights,
-    write_study,
-)
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from impc.arrays import Array
-    from impc.model.plant import Plant
+from impc.arrays import Array
+from impc.cli import seat
+from impc.files.formats import encode_table
+from impc.files.plant_sources import import_function, make_plant, plant_source
+from impc.files.table import make_table
+from impc.model.plant import Plant
+from impc.model.riccati import solve_lqr
+from impc.reporting.writer import write_files
+from impc.studies.selection.model_source import model_source
 
 _RATE = 100.0
 # 242 steps of 0.12 s are one period of the ternary sequence: a line spectrum without leakage.
@@ -42,33 +35,15 @@ _COST_WEIGHT, _SWAY, _AT_A_VISIT, _TRIAL, _LEARNING = 0.8, 0.4, 0.25, 0.10, -0.0
 _LEAN = (0.1, 0.8)
 
 
-@click.command("reliability-study")
-@out_option("reliability-data", "the recordings, study.toml and truth.json")
-@click.option("--subjects", type=click.IntRange(2, 999), default=30, help="Number of subjects.")
-@click.option("--visits", type=click.IntRange(2, 9), default=3, help="Per subject.")
-@click.option("--trials", type=click.IntRange(2, 9), default=3, help="Per visit and condition.")
-@seed_option
-def reliability_study(out: Path, **given: Any) -> None:
-    """Simulate a reliability study of seated subjects under three conditions.
-
-    Bodies differ between subjects; cost weights of angles and rates between subjects and visits;
-    sway between subjects, visits and trials; mean lean between visits. Closed eyes and vibration
-    change cost weights, sway and noise. A trial lasts 29.04 s, one period of the ternary torque, at
-    100 samples a second.
-    """
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.plant_sources import import_function, make_plant, plant_source  # noqa: PLC0415
-    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-
-    require_writable(out)
+def run_reliability_study(out: Path, **given: Any) -> None:
+    """Simulate a reliability study and write all files."""
     rng = np.random.default_rng(given["seed"])
     torque = np.asarray(
-        import_function(TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
+        import_function(seat.TORQUE)(dwell=_DWELL, duration=_DURATION, rate=_RATE), dtype=np.float64
     )
     truth: dict[str, Any] = {}
-    for name in numbered(given["subjects"]):
-        plant = make_plant(plant_source(PLANT, random_person(rng)), ("perturbation",))
+    for name in seat.numbered(given["subjects"]):
+        plant = make_plant(plant_source(seat.PLANT, seat.random_person(rng)), ("perturbation",))
         cost_weight, sway = np.exp(np.array([_COST_WEIGHT, _SWAY]) * rng.standard_normal(2))
         truth[name] = {"cost_weight": float(cost_weight), "sway": float(sway)}
         for visit in range(given["visits"]):
@@ -86,8 +61,8 @@ def reliability_study(out: Path, **given: Any) -> None:
         "cost_weight": _COST_WEIGHT, "sway": _SWAY, "visit": _AT_A_VISIT, "trial": _TRIAL,
         "learning": _LEARNING, "lean": _LEAN, "conditions": _CONDITIONS, **given,
     }  # fmt: skip
-    study = _SEAT_STUDY + SIGNALS.replace("LIMIT", "")
-    write_study(out, "reliability", study, {"settings": settings, "subjects": truth})
+    study = _SEAT_STUDY + seat.SIGNALS.replace("LIMIT", "")
+    seat.write_study(out, "reliability", study, {"settings": settings, "subjects": truth})
 
 
 def _cell(
@@ -100,19 +75,14 @@ def _cell(
     rng: np.random.Generator,
 ) -> list[bytes]:
     """Files of all trials of one subject, visit and condition."""
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.formats import encode_table  # noqa: PLC0415
-    from impc.model.riccati import solve_lqr  # noqa: PLC0415
-
     (cost_weight, sway), (factor, own, noise) = size, _CONDITIONS[condition]
-    K = solve_lqr(plant, seat_weights(plant, factor * cost_weight)).K
+    K = solve_lqr(plant, seat.seat_weights(plant, factor * cost_weight)).K
     files = []
     for _ in range(given["trials"]):
         here = own * sway * float(np.exp(_TRIAL * rng.standard_normal()))
         outputs = lean + np.degrees(_simulated(plant, K, torque, here, rng))
         outputs += np.array(noise) * rng.standard_normal(outputs.shape)
-        table = seat_table("trial", outputs, torque, _RATE)
+        table = seat.seat_table("trial", outputs, torque, _RATE)
         files.append(encode_table(".csv", table))
     return files
 
@@ -121,9 +91,6 @@ def _simulated(
     plant: Plant, K: Array, torque: Array, sway: float, rng: np.random.Generator
 ) -> Array:
     """Outputs of x+ = (A - BK) x + E d + B w in the second period of the torque."""
-    import numpy as np  # noqa: PLC0415
-    import scipy.signal  # noqa: PLC0415
-
     driven = np.concatenate([torque, torque])
     # Sway: noise on the torque with a time constant of 0.5 s.
     white = rng.standard_normal((len(driven), plant.m))
@@ -156,31 +123,8 @@ _HEAD_RATE = 60.0
 _SPREAD, _VISIT, _VAF = 0.25, 0.05, (82.3, 7.7)
 
 
-@click.command("head-tracking")
-@out_option("head-data", "the recordings, study.toml and truth.json")
-@click.option(
-    "--axis", type=click.Choice(["yaw", "pitch"]), default="yaw", help="Of the head's rotation."
-)
-@click.option("--subjects", type=click.IntRange(1, 999), default=10, help="Number of subjects.")
-@click.option("--visits", type=click.IntRange(1, 9), default=1, help="Per subject.")
-@click.option("--trials", type=click.IntRange(1, 9), default=3, help="Per visit.")
-@click.option("--duration", type=Number(5, 300), default=30.0, help="Of each trial, s.")
-@seed_option
-def head_tracking(out: Path, **given: Any) -> None:
-    """Simulate head tracking as in chapter 4; --subjects 40 --visits 2 for chapter 5.
-
-    Subjects differ in all twelve parameters, drawn around the nominal values of table 4.3 such that
-    the loop is stable, and in the noise.
-    """
-    import numpy as np  # noqa: PLC0415
-
-    from impc.files.formats import encode_table  # noqa: PLC0415
-    from impc.files.plant_sources import import_function  # noqa: PLC0415
-    from impc.files.table import make_table  # noqa: PLC0415
-    from impc.reporting.writer import require_writable, write_files  # noqa: PLC0415
-    from impc.studies.selection.model_source import model_source  # noqa: PLC0415
-
-    require_writable(out)
+def run_head_tracking(out: Path, **given: Any) -> None:
+    """Simulate head tracking and write all files."""
     rng = np.random.default_rng(given["seed"])
     source = model_source(_MODEL, {"axis": given["axis"]})
     model, steps = source.model, import_function(_STEPS)
@@ -197,7 +141,7 @@ def head_tracking(out: Path, **given: Any) -> None:
 
     truth: dict[str, Any] = {}
     recordings: dict[str, Any] = {}
-    for name in numbered(given["subjects"]):
+    for name in seat.numbered(given["subjects"]):
         own = drawn(typical, _SPREAD)
         truth[name] = dict(zip(model.names, own.tolist(), strict=True))
         for visit in range(1, given["visits"] + 1):
@@ -222,7 +166,7 @@ def head_tracking(out: Path, **given: Any) -> None:
             write_files(out / f"sub-{name}" / f"ses-{visit}", files)
     study = _HEAD_STUDY.replace("AXIS", given["axis"])
     found = {"settings": given, "subjects": truth, "recordings": recordings}
-    write_study(out, "select", study, found)
+    seat.write_study(out, "select", study, found)
 
 
 _HEAD_STUDY = """\

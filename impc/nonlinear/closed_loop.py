@@ -13,17 +13,15 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen, with_shape
 from impc.errors import DataError, SolverError
+from impc.nonlinear.expressions import Stages
 from impc.nonlinear.plan import Plan, nearby_plan, solved_plan
-
-if TYPE_CHECKING:
-    from impc.nonlinear.expressions import Stages
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +43,7 @@ def closed_loop_from(
     mu: float,
     before: ClosedLoop | None = None,
 ) -> ClosedLoop:
-    """Simulate, starting each plan near the previous one, or near those of an earlier simulation.
-
-    `theta` (p,); `x0` (n,); `d` (steps, d). Raises SolverError at a sample without a plan.
-    """
+    """Simulate, each plan from the last one or those `before`; SolverError without a plan."""
     problem, steps, p = first.problem, len(d), len(theta)
     x, u = np.zeros((steps + 1, problem.n)), np.zeros((steps, problem.m))
     dx = np.zeros((steps + 1, problem.n, p + problem.n))
@@ -111,10 +106,7 @@ def optimal_recording(
     *,
     closed_loop: bool,
 ) -> OptimalRecording:
-    """Make a checked recording.
-
-    `x` (steps + 1, n); `u` (steps, m); `d` (steps, d); `x0` (n,).
-    """
+    """Checked recording of x (steps + 1, n), u (steps, m), d (steps, d), and x0 (n,)."""
     states = _table("states", x, None, problem.n)
     T = len(states) - 1
     if T < 1 or (not closed_loop and problem.horizon != T):

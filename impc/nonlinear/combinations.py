@@ -10,18 +10,14 @@ curve and holds only near the estimate. Identified are the products that no scal
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from impc.arrays import Array, BoolArray, Frozen, IntArray
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.nonlinear.problem import OptimalControlProblem
+from impc.nonlinear.problem import OptimalControlProblem
 
 # Singular values below this share of the largest count as zero. On four systems the weakest
 # identified direction has 3e-4 and the strongest unidentified one, of a bound that is never
@@ -119,10 +115,7 @@ def combinations(
     signals: IntArray,
     holds: Callable[[Array], bool],
 ) -> Combinations:
-    """Split the parameters into identified and unidentified combinations.
-
-    `theta` (p,); `jacobian` (r, k); `residual` (r,); `signals` (r,); `holds` (p,).
-    """
+    """Split parameters (p,) by `jacobian` (r, k); `holds` (p,) simulates a scaling."""
     p, positive = len(theta), problem.positive
     own, rest = jacobian[:, :p], jacobian[:, p:]
     if rest.shape[1]:

@@ -5,8 +5,9 @@ Every function has the arguments (x, u, d, theta) and is expanded to SX, which e
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -14,9 +15,6 @@ import numpy as np
 from impc.arrays import BoolArray, Frozen
 from impc.checking import asked
 from impc.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 
 @dataclass(frozen=True, init=False, eq=False)

@@ -7,9 +7,10 @@ are NaN (not measured). The last row of an input is not used.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -19,8 +20,8 @@ from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import InputError, brief
 from impc.files import checks
-from impc.files.clock import on_even_instants, read_clock
-from impc.files.configuration import converted, require_known
+from impc.files.clock import Clock, on_even_instants, read_clock
+from impc.files.configuration import Configuration, converted, require_known
 from impc.files.formats import read_table
 from impc.files.reading import (
     channel_of,
@@ -30,21 +31,15 @@ from impc.files.reading import (
     unit_faults,
 )
 from impc.files.resampling import held_means, instants, same_rate
+from impc.files.table import Table
 from impc.files.units import si_unit
 from impc.model.plant import UNKNOWN
+from impc.nonlinear.closed_loop import OptimalRecording
 from impc.nonlinear.fit import fit_optimal_control
 from impc.nonlinear.page import OptimalFit
 from impc.nonlinear.plan import require_solver
+from impc.nonlinear.problem import OptimalControlProblem
 from impc.studies.fit.settings import read_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from impc.files.clock import Clock
-    from impc.files.configuration import Configuration
-    from impc.files.table import Table
-    from impc.nonlinear.closed_loop import OptimalRecording
-    from impc.nonlinear.problem import OptimalControlProblem
 
 
 class ParameterSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -11,6 +11,7 @@ changes of the active rows; 1e-10 is the problem itself (docs/howto/nonlinear.md
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,26 +21,13 @@ from impc.arrays import Array, Frozen, IntArray
 from impc.attached_methods import attach
 from impc.checking import checked
 from impc.errors import DataError, InfeasibleError, InputError, SolverError
+from impc.nonlinear import search
+from impc.nonlinear.closed_loop import OptimalRecording
 from impc.nonlinear.combinations import Combinations, combinations, interval
 from impc.nonlinear.plan import require_solver
-from impc.nonlinear.search import (
-    EXPLAINED,
-    Budget,
-    Residuals,
-    along_mu,
-    begin,
-    guided,
-    scales_of,
-)
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from impc.nonlinear.closed_loop import OptimalRecording
-    from impc.nonlinear.problem import OptimalControlProblem
-    from impc.nonlinear.search import Evaluation
-    from impc.reporting.document import Report
-    from impc.reporting.provenance import Provenance
+from impc.nonlinear.problem import OptimalControlProblem
+from impc.reporting.document import Report
+from impc.reporting.provenance import Provenance
 
 #: Decreasing mu, relative to the mean cost of a recorded stage if that is below one.
 MU_STEPS = (1e-1, 1e-2, 1e-4, 1e-10)
@@ -164,25 +152,25 @@ def fit_optimal_control(
     if any(one.problem is not problem for one in recordings):
         raise InputError("recordings", "belong to another problem", "record them with this one")
     began = time.perf_counter()
-    theta, budget = problem.values(start), Budget()
-    given = Residuals(problem, tuple(recordings), solver, scales_of(recordings))
-    mu_steps, explained = _scaled(recordings, theta), EXPLAINED * given.size
-    best: tuple[Evaluation, bool] | None = None
+    theta, budget = problem.values(start), search.Budget()
+    given = search.Residuals(problem, tuple(recordings), solver, search.scales_of(recordings))
+    mu_steps, explained = _scaled(recordings, theta), search.EXPLAINED * given.size
+    best: tuple[search.Evaluation, bool] | None = None
     refused: Exception = SolverError("start", "no search could leave it", "start nearer")
     for place, steps in _places(given, theta, mu_steps, starts, evaluations, budget):
         budget.take()
         try:
-            first = begin(given, given.unknowns(place), steps[0])
+            first = search.begin(given, given.unknowns(place), steps[0])
         except (InfeasibleError, SolverError) as error:  # raised if no start has a plan
             refused = error if best is None and place is theta else refused
             continue
         # Initial states stay at their samples until the rest has converged: from a distant start
         # they would converge elsewhere.
         held, free = given.free(sampled=False), given.free()
-        found = along_mu(given, first, steps, held, budget)
+        found = search.along_mu(given, first, steps, held, budget)
         if found[1] and not np.array_equal(held, free):
             again = mu_steps[-1:] if found[0].loss < explained else mu_steps
-            found = min(found, along_mu(given, found[0], again, free, budget), key=_loss)
+            found = min(found, search.along_mu(given, found[0], again, free, budget), key=_loss)
         best = found if best is None else min(best, found, key=_loss)
         if best[0].loss < explained:
             break
@@ -191,28 +179,25 @@ def fit_optimal_control(
     return _estimate(given, theta, *best, budget.done, time.perf_counter() - began)
 
 
-def _loss(found: tuple[Evaluation, bool]) -> float:
+def _loss(found: tuple[search.Evaluation, bool]) -> float:
     return found[0].loss
 
 
 def _places(
-    given: Residuals,
+    given: search.Residuals,
     theta: Array,
     mu_steps: Sequence[float],
     starts: int,
     evaluations: int,
-    budget: Budget,
+    budget: search.Budget,
 ) -> Iterator[tuple[Array, Sequence[float]]]:
-    """Yield the start and others about it, preceded by their guided versions, with their mu.
-
-    The sequence is reproducible.
-    """
+    """Yield the start and others about it, each after its guided version, with their mu."""
     for index in range(starts):
         budget.left, here = evaluations, theta
         if index:
             noise = _SPREAD * np.random.default_rng(index).normal(size=len(theta))
             here = np.where(given.problem.positive, theta * np.exp(noise), theta * (1 + noise))
-        near = guided(given, here, mu_steps, budget)
+        near = search.guided(given, here, mu_steps, budget)
         if near is not None:
             yield near, mu_steps[-2:]
         yield here, mu_steps
@@ -232,9 +217,9 @@ def _scaled(recordings: Sequence[OptimalRecording], theta: Array) -> Sequence[fl
 
 
 def _estimate(
-    given: Residuals,
+    given: search.Residuals,
     start: Array,
-    found: Evaluation,
+    found: search.Evaluation,
     settled: bool,
     evaluations: int,
     seconds: float,
@@ -246,7 +231,7 @@ def _estimate(
     def holds(theta: Array) -> bool:
         unknowns = np.append(given.unknowns(theta)[:p], found.unknowns[p:])
         try:
-            there = begin(given, unknowns, found.mu)
+            there = search.begin(given, unknowns, found.mu)
         except (InputError, InfeasibleError, SolverError):
             return False
         moved = float(np.linalg.norm(there.residual - found.residual))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +14,11 @@ from impc.arrays import Frozen
 from impc.inverse.estimates import Status
 from impc.levels import Level
 from impc.nonlinear.combinations import interval
+from impc.nonlinear.fit import OptimalControlEstimate
 from impc.nonlinear.search import Residuals
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.shown_units import shown_as
@@ -23,12 +26,7 @@ from impc.reporting.style import panels
 from impc.reporting.verdict import Key
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from matplotlib.figure import Figure
-
-    from impc.nonlinear.fit import OptimalControlEstimate
-    from impc.reporting.provenance import Provenance
 
 #: Number of recordings of which every sample is written.
 MOST_TRIALS = 6
@@ -121,7 +119,6 @@ _EXPLAINS = Kind[OptimalFit](
 )  # fmt: skip
 RULES = Rules[OptimalFit](
     {
-        "explained": lambda it: it.explained,
         "poor": lambda it: ", ".join(_words(name) for name in it.poor),
         "open": lambda it: ", ".join(it.open),
         "names": lambda it: ", ".join(one.name for one in it.estimate.combinations.identified),

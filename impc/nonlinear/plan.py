@@ -16,8 +16,9 @@ is their sparse system, factorised once per plan for the derivatives by all para
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,12 +27,8 @@ from scipy.sparse.linalg import splu
 
 from impc.arrays import Array, Frozen
 from impc.errors import InfeasibleError, InputError, SolverError
+from impc.nonlinear.expressions import Stages
 from impc.settings_files import IPOPT_ALONE
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from impc.nonlinear.expressions import Stages
 
 # Tolerance of the gradient relative to the largest multiplier, and of c and h + s.
 _TOLERANCE = 1e-10
@@ -72,10 +69,7 @@ def require_solver(name: str) -> str:
 
 
 class Program:
-    """Nonlinear program of a problem with p = (x_0, d, theta), and its derivatives.
-
-    x_0 is an unknown fixed by an equation, and stages are consecutive, as fatrop requires.
-    """
+    """Nonlinear program with p = (x_0, d, theta); x_0 is an unknown, as fatrop requires."""
 
     def __init__(self, problem: Stages) -> None:
         f, cost, e, h, h_end = problem.functions
@@ -228,10 +222,7 @@ def solved_plan(
     solver: str,
     mu: float,
 ) -> Plan | None:
-    """Solve from a guess x (N + 1, n), u (N, m), at theta (p,) and d (N, d); None if it fails.
-
-    A large mu is tried too: far from all bounds the program is easier.
-    """
+    """Plan from x (N + 1, n), u (N, m), also by way of a large mu; None if it fails."""
     p, w = _parameters(x[0], d, theta), _stages(x, u)
     paths = ([(solver, first), ("ipopt", mu)] for first in dict.fromkeys([mu, max(mu, 1e-1)]))
     return _first(problem, p, w, None, paths)

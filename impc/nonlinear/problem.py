@@ -9,6 +9,7 @@ A row of h that no input affects is dropped at k = 0 (docs/howto/nonlinear.md).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,32 +19,23 @@ import numpy as np
 from impc.arrays import Array, BoolArray, Expression, finite_array
 from impc.checking import asked, checked
 from impc.errors import InputError
+from impc.nonlinear import expressions
 from impc.nonlinear.closed_loop import (
     ClosedLoop,
     OptimalRecording,
     closed_loop_from,
     optimal_recording,
 )
-from impc.nonlinear.expressions import (
-    Stages,
-    function_of,
-    names_of,
-    require_influence,
-    stacked,
-    symbols_of,
-)
 from impc.nonlinear.plan import Plan, solve_plan
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from numpy.typing import ArrayLike
 
 _LONGEST = 10_000  # stages; the size of the program is proportional
 
 
 @dataclass(frozen=True, init=False, eq=False)
-class OptimalControlProblem(Stages):
+class OptimalControlProblem(expressions.Stages):
     """An optimal control problem with unknown parameters.
 
     Parameters
@@ -142,28 +134,30 @@ class OptimalControlProblem(Stages):
         if asked("next_state", hasattr, next_state, "updfcn"):
             raise InputError("next_state", "is a system of python-control", "call its function"
                              " with the symbols: docs/howto/nonlinear.md")  # fmt: skip
-        x, u = symbols_of("states", states), symbols_of("inputs", inputs)
-        d = [] if disturbances is None else symbols_of("disturbances", disturbances)
+        x, u = expressions.symbols_of("states", states), expressions.symbols_of("inputs", inputs)
+        d = [] if disturbances is None else expressions.symbols_of("disturbances", disturbances)
         theta = []
         for name, symbol in parameters.items():
-            theta += symbols_of(f"parameter {name}", symbol)
-            if len(names_of(theta)) != len(theta) or symbol.numel() != 1:
+            theta += expressions.symbols_of(f"parameter {name}", symbol)
+            if len(expressions.names_of(theta)) != len(theta) or symbol.numel() != 1:
                 raise InputError(f"parameter {name}", "is not a scalar symbol", "give each a name")
         for subject, symbols in {"states": x, "inputs": u, "parameters": theta}.items():
             if not symbols:
                 raise InputError(subject, "is empty", "give at least one")
-        path, rows = stacked(constraints or {})
-        last, terminal_rows = stacked(terminal_constraints or {})
-        groups, signals = (x, u, d, theta), [names_of(item) for item in (x, u, d)]
+        path, rows = expressions.stacked(constraints or {})
+        last, terminal_rows = expressions.stacked(terminal_constraints or {})
+        groups, signals = (x, u, d, theta), [expressions.names_of(item) for item in (x, u, d)]
         functions = (
-            function_of("next_state", next_state, groups, len(signals[0])),
-            function_of("stage_cost", stage_cost, groups, 1),
-            function_of("terminal_cost", terminal_cost, groups, 1, alone=True),
-            function_of("constraints", path, groups, len(rows)),
-            function_of("terminal_constraints", last, groups, len(terminal_rows), alone=True),
+            expressions.function_of("next_state", next_state, groups, len(signals[0])),
+            expressions.function_of("stage_cost", stage_cost, groups, 1),
+            expressions.function_of("terminal_cost", terminal_cost, groups, 1, alone=True),
+            expressions.function_of("constraints", path, groups, len(rows)),
+            expressions.function_of(
+                "terminal_constraints", last, groups, len(terminal_rows), alone=True
+            ),
         )
         names, given = tuple(parameters), dict(units or {})
-        require_influence(names, functions)
+        expressions.require_influence(names, functions)
         for name in (*signed, *(set(given).difference(*signals))):
             if name not in names:
                 problem = "is not among the parameters"

@@ -11,22 +11,17 @@ plans stay near the recording even if theta is wrong.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, BoolArray, IntArray, frozen
 from impc.checking import replace
 from impc.errors import SolverError
-from impc.nonlinear.closed_loop import ClosedLoop, closed_loop_from
+from impc.nonlinear.closed_loop import ClosedLoop, OptimalRecording, closed_loop_from
 from impc.nonlinear.plan import Plan, nearby_plan, solve_plan, solved_plan
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.nonlinear.closed_loop import OptimalRecording
-    from impc.nonlinear.problem import OptimalControlProblem
+from impc.nonlinear.problem import OptimalControlProblem
 
 #: Unexplained share of squares above which the plans may be of another kind: a cart-pole that does
 #: not swing up leaves 0.8, noise of 16 dB leaves 0.025.
@@ -186,10 +181,7 @@ def along_mu(
     free: BoolArray,
     budget: Budget,
 ) -> tuple[Evaluation, bool]:
-    """Search the `free` unknowns (k,) at each of the decreasing `mu_steps`.
-
-    The second value is whether the last search converged.
-    """
+    """Search the `free` unknowns (k,) along falling mu; whether the last search converged."""
     settled = True
     for mu in mu_steps:
         if mu != current.mu:
@@ -241,10 +233,7 @@ def _levenberg(
 def guided(
     given: Residuals, theta: Array, mu_steps: Sequence[float], budget: Budget
 ) -> Array | None:
-    """Parameters (p,) by a separate plan from each recorded state, along decreasing `mu_steps`.
-
-    States without a plan are left out; None if none is left, or no input of a loop was measured.
-    """
+    """Parameters (p,) by a plan from each recorded state; None if no plan or input is there."""
     if not any(one.closed_loop and np.any(np.isfinite(one.u)) for one in given.recordings):
         return None
     problem, parts, runs = given.problem, [], []

@@ -143,17 +143,14 @@ class Report:
     def _blocks(self) -> list[Block]:
         return _flat([item for section in self.sections for item in section.blocks])
 
-    def _tables(self) -> dict[str, pd.DataFrame]:
-        found = [*self.findings(), *self.beside]
-        return {item.name: item.table for item in found if item.table is not None}
-
     def files(self, *, pdf: bool = False) -> dict[str, bytes]:
         """Files by name: page, result.json, tables, .mat, figures; with `pdf` also PDF figures."""
-        tables = self._tables()
+        every = [*self.findings(), *self.beside]
+        tables = {one.name: one.table for one in every if one.table is not None}
         # Hidden columns keep their own names, so that no heading is there twice.
         heads = {
             one.name: {name: head for name, head in one.labels.items() if name not in one.hidden}
-            for one in [*self.findings(), *self.beside]
+            for one in every
         }
         sheets = {
             name: one.rename(columns=heads[name])

@@ -7,20 +7,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import escape
 
+from impc.arrays import Array
 from impc.checking import asked, checked
 from impc.errors import InputError
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
-from impc.model.plant import gain_unit
+from impc.model.plant import Plant, gain_unit
 from impc.model.signal_errors import KINDS
 from impc.reporting.shown_units import axis_label, error_unit, shown_unit
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-
-    from impc.arrays import Array
-    from impc.inverse.estimates import Estimate
-    from impc.model.plant import Plant
 
 _WIDTH = 78
 # Largest number of rows of a matrix that is printed in full.

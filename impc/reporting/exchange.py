@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import io
 import re
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from impc.arrays import Array
 from impc.model.plant import UNKNOWN
 from impc.reporting.finding import Finding
 from impc.reporting.rendering import plain
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.arrays import Array
 
 #: Columns of the long table; those of a label are empty where a study has none.
 LONG = (

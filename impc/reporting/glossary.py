@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from markupsafe import Markup, escape
 
+_VAF = "100 % if model and recording coincide, 0 % if the model is no better than a constant zero."
 #: Term -> explanation. Matches in any case of its first letter, and in the plural.
 TERMS: dict[str, str] = {
     "AIC": "Akaike's information criterion: misfit plus a penalty for each fitted number. Lower is "
@@ -42,10 +43,8 @@ TERMS: dict[str, str] = {
     "RMS": "Root mean square: the size of a signal.",
     "SEM": "Standard error of measurement: standard deviation of repeated results of one person.",
     "typical": "Root mean square in these recordings.",
-    "variance accounted for": "100 % if model and recording coincide, 0 % if the model is no "
-    "better than a constant zero.",
-    "VAF": "Variance accounted for: 100 % if model and recording coincide, 0 % if the model is no "
-    "better than a constant zero.",
+    "variance accounted for": _VAF,
+    "VAF": f"Variance accounted for: {_VAF}",
 }
 
 

@@ -7,29 +7,23 @@ import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
 
-if TYPE_CHECKING:
-    from impc.files.digests import Inputs
+from impc.files.digests import Inputs
 
 _PACKAGES = ("impc", "casadi", "clarabel", "control", "cvxpy", "numba", "numpy", "scipy")
 
 
 def _versions() -> dict[str, str]:
-    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"  # for example impc itself, run from a source tree
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"  # for example impc itself, run from a source tree
+    return found
 
 
 @dataclass(frozen=True)
@@ -44,7 +38,8 @@ class Provenance:
     inputs: Inputs | None = None  # Digests of all input files; None if there are none
     # Versions of Python and of the numerical packages
     versions: Mapping[str, str] = field(default_factory=_versions)
-    made: str = field(default_factory=_now)  # Date and time of creation, UTC, ISO 8601
+    # Date and time of creation, UTC, ISO 8601
+    made: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     def data(self) -> dict[str, Any]:
         """Entries in result.json."""
@@ -63,7 +58,8 @@ class Provenance:
         found = [("Recordings", ", ".join(self.files))]
         found += [("Command", self.command and code.format(self.command))]
         found += [("Plant", self.plant_name and code.format(self.plant_name + self.arguments))]
-        found += [("Created", self.made), ("Software", self.all_versions)]
+        versions = ", ".join(f"{name} {version}" for name, version in self.versions.items())
+        found += [("Created", self.made), ("Software", versions)]
         if self.inputs is not None:
             seal = f"{self.inputs.digest[:16]} (SHA-256 of all input files; full in result.json)"
             found.append(("Fingerprint", seal))
@@ -74,8 +70,3 @@ class Provenance:
         """Arguments of the plant in brackets."""
         given = ", ".join(f"{name} {value}" for name, value in self.plant_arguments.items())
         return f" ({given})" if given else ""
-
-    @property
-    def all_versions(self) -> str:
-        """All versions in one line."""
-        return ", ".join(f"{name} {version}" for name, version in self.versions.items())

@@ -137,10 +137,7 @@ def fixed(value: float, digits: int = 3) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Convert arrays and NumPy numbers to lists and numbers for JSON, at every depth.
-
-    NaN and infinity become None (JSON null); bytes of file names that are not UTF-8 are escaped.
-    """
+    """Values for JSON at every depth; not finite: None, bytes that are not UTF-8: escaped."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,6 +1,7 @@
 """Rules of a verdict as data: one row for each kind of finding, one builder for all studies.
 
-A text is a template whose words in braces are functions of the facts: "It was given as {limit}."
+A text is a template whose words in braces are functions of the facts, or their attributes: "It was
+given as {limit}."
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ Lines = Callable[[F], Sequence[Claim]]
 class Rules(Generic[F]):
     """The rules of a study: `kinds` worst first, the last applies always."""
 
-    words: Mapping[str, Callable[[F], object]]
+    words: Mapping[str, Callable[[F], object]]  # In addition to the attributes of the facts
     kinds: Sequence[Kind[F]]
     may: Sequence[Line[F] | Lines[F]] = ()
     may_not: Sequence[Line[F] | Lines[F]] = ()
@@ -96,7 +97,8 @@ class _Words(dict[str, Any]):
         self._words, self._facts = words, facts
 
     def __missing__(self, name: str) -> object:
-        self[name] = self._words[name](self._facts)
+        word = self._words.get(name)
+        self[name] = getattr(self._facts, name) if word is None else word(self._facts)
         return self[name]
 
     def fill(self, text: str) -> str:

@@ -7,18 +7,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING
 
-from impc.model.plant import UNKNOWN
+from impc.model.plant import UNKNOWN, Plant
 from impc.model.signal_errors import KINDS
 from impc.reporting.rendering import sentence_case
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.model.plant import Plant
 
 _DEGREES = {"rad": "°", "rad/s": "°/s", "rad/s^2": "°/s²"}
 # If the plant states no unit, angles are recognised by these prefixes of their names.

@@ -12,11 +12,12 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 import msgspec
 
@@ -28,8 +29,6 @@ try:
 except ImportError:  # Windows
     import msvcrt
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
 
 _REMEDY = "choose another folder"
 # List of files, lock, and folder in which files are written before they are moved.
@@ -182,11 +181,7 @@ def require_writable(folder: Path) -> None:
 
 
 def write_files(folder: Path, files: Mapping[str, bytes]) -> tuple[Path, ...]:
-    """Write files by name into a folder, which is created if it does not exist.
-
-    Files are first written to a staging folder and then moved one by one. If anything fails,
-    existing files are restored and new ones removed.
-    """
+    """Write files by way of a staging folder; if anything fails, restore what was there."""
     require_writable(folder)
     run = _RUN.get()
     if run is not None and not folder.is_relative_to(run.folder):

@@ -9,20 +9,17 @@ Long trials are thinned.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from impc.arrays import Array
+from impc.assess.assessments import MethodFit
 from impc.inverse.methods import METHODS
+from impc.inverse.problem import Problem
 from impc.reporting.shown_units import axis_label, shown_unit
 from impc.studies.methods_table import until_its_end
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.arrays import Array
-    from impc.assess.assessments import MethodFit
-    from impc.inverse.problem import Problem
 
 # Largest number of values on a page: 25,000 are 0.15 MB.
 _MOST = 25_000

@@ -9,21 +9,16 @@ experiments/benchmarks/results.md.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.control.closed_loop import first_stages
-from impc.studies.selection.model import sensitivity
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from impc.inverse.problem import Problem
-    from impc.studies.fit.settings import FitSettings
-    from impc.studies.selection.model import ParametricModel, Trial
-    from impc.studies.selection.settings import SelectSettings
+from impc.inverse.problem import Problem
+from impc.studies.fit.settings import FitSettings
+from impc.studies.selection.model import ParametricModel, Trial, sensitivity
+from impc.studies.selection.settings import SelectSettings
 
 #: Seconds per sample, state and sample of the horizon: 5.4 ms for 3000 samples, n = 10, N = 20.
 SECONDS_A_SAMPLE = 5.4e-3 / (3000 * 10 * 20)

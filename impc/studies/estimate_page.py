@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from impc.assess.assessments import evaluate_method
+from impc.assess.assessments import MethodFit, evaluate_method
 from impc.checking import checked, replace
 from impc.errors import InputError
 from impc.inverse.estimates import Estimate
@@ -21,9 +21,6 @@ from impc.studies.fit.report import fit_report
 from impc.studies.fit.settings import FitSettings
 from impc.studies.fit.subject import fit_recordings
 from impc.studies.methods_table import controller_findings, method_label
-
-if TYPE_CHECKING:
-    from impc.assess.assessments import MethodFit
 
 _OURS = "inverse_mpc"
 _CALLER = "given by the program that called impc.report"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pandas as pd
 
 from impc.files.configuration import FILL_IN
+from impc.files.draft import Draft, Guess
 from impc.files.units import si_unit
 from impc.levels import Level
 from impc.reporting.document import Report, Section
@@ -15,9 +14,6 @@ from impc.reporting.finding import Chart, Finding
 from impc.reporting.provenance import Provenance
 from impc.reporting.verdict import Verdict
 from impc.studies.charts import short
-
-if TYPE_CHECKING:
-    from impc.files.draft import Draft, Guess
 
 # Largest number of values of a curve.
 _MOST = 3000

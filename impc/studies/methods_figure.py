@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from impc.assess.assessments import ASSESSMENTS
+from impc.arrays import Array
+from impc.assess.assessments import ASSESSMENTS, MethodFit
 from impc.reporting import style
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.studies.methods_table import method_label
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from impc.arrays import Array
-    from impc.assess.assessments import MethodFit
 
 # Smallest unexplained variance that is drawn, %.
 _ROUNDING = 1e-6

@@ -6,31 +6,26 @@ The columns are the `ASSESSMENTS` of `impc.assess.assessments` in all commands.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from impc.assess.assessments import ASSESSMENTS, assessed
+from impc.arrays import Array
+from impc.assess.assessments import ASSESSMENTS, MethodFit, assessed
 from impc.control.named_solver import described
+from impc.control.simulation import Simulation
 from impc.inverse.methods import METHODS
-from impc.model.plant import gain_unit, weight_unit
+from impc.inverse.problem import Problem
+from impc.model.plant import Plant, gain_unit, weight_unit
+from impc.model.weights import Weights
 from impc.reporting.document import Fold, Section, Terms
 from impc.reporting.estimate_text import gain_table
 from impc.reporting.exchange import entries, long_rows
 from impc.reporting.finding import Finding
+from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import body_sentence, shown_unit, signal_name
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    from impc.arrays import Array
-    from impc.assess.assessments import MethodFit
-    from impc.control.simulation import Simulation
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
-    from impc.model.weights import Weights
-    from impc.reporting.provenance import Provenance
 
 # Column headings by assessment; default: the name with spaces.
 _HEADS = {
@@ -191,10 +186,7 @@ def trajectory_table(
     trials: Mapping[int, str],
     runs: Mapping[str, Sequence[Simulation]],
 ) -> pd.DataFrame:
-    """Recorded outputs, disturbances and simulated `runs` of `trials`, one row per sample.
-
-    Angles are in the shown unit, which is appended to the column name.
-    """
+    """Recorded signals and `runs` of `trials`, one row per sample; angles in the shown unit."""
     plant, blocks = problem.plant, []
     for index in trials:
         trial = problem.recordings[index]

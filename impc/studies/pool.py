@@ -14,9 +14,12 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections import deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
+    Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
@@ -29,15 +32,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from impc.errors import ImpcError, SolverError
 from impc.settings_files import ignore_settings_files
-from impc.studies.cache import to_json
+from impc.studies.cache import Cache, to_json
 
 if TYPE_CHECKING:
-    from collections import deque
-    from collections.abc import Callable, Iterator
-    from concurrent.futures import Future
     from multiprocessing.connection import Connection
-
-    from impc.studies.cache import Cache
 
 # Submitted tasks per thread: one that runs and two that wait.
 _AHEAD = 3
@@ -197,10 +195,7 @@ def processes(count: int | None) -> Iterator[Processes]:
 
 @contextmanager
 def threads(count: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads of this process; useful because compiled code and solvers release the GIL.
-
-    If the block ends with an exception, pending work is cancelled.
-    """
+    """Threads, as compiled code releases the GIL; an exception cancels pending work."""
     pool = ThreadPoolExecutor(count)
     try:
         yield pool

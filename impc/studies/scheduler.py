@@ -5,22 +5,18 @@ from __future__ import annotations
 import functools
 import logging
 import time
-from concurrent.futures import CancelledError
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from impc.errors import InputError, OutputError
 from impc.extras import optional
-from impc.studies.pool import answered, processes
+from impc.studies.pool import Answer, Pool, Task, answered, processes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from concurrent.futures import Future
-
     from distributed import Client
-
-    from impc.studies.pool import Answer, Pool, Task
 
 _PATIENCE = "10s"
 # Seconds for which the number of threads is cached; a query takes a millisecond.

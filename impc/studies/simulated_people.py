@@ -8,6 +8,7 @@ contains clock, outputs and disturbance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,19 +20,16 @@ from impc.control.body_steps import body_tape
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.compiled_body import states_from
 from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
 from impc.control.simulation import Scenario, Status
 from impc.errors import InputError
-from impc.model.body import read_body
+from impc.model.body import Body, read_body
+from impc.model.plant import Plant
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import casadi as ca
     from numpy.typing import ArrayLike
 
-    from impc.control.controller import Controller
-    from impc.model.body import Body
-    from impc.model.plant import Plant
     from impc.output_feedback.observer import Observer
 
 

@@ -15,7 +15,7 @@ from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.inverse.refit import refit
 from impc.studies.fit.first import FitProgress, first_fits
-from impc.studies.fit.verdict import fit_verdict
+from impc.studies.fit.verdict import RULES
 from tests.assess.cart_fits import uncertain_cart
 from tests.inverse.test_signal_errors import controller, recorded
 from tests.support import present
@@ -126,4 +126,4 @@ def test_a_wrong_scale_far_from_a_minimum_is_named() -> None:
 def test_a_wrong_body_is_not_named_a_limit_that_no_sample_reaches() -> None:
     """A lower limit makes up for most of another stiffness, and its fit passes no test."""
     made, _, words = KINDS["body"]
-    assert words in fit_verdict(made(0).result).headline
+    assert words in RULES.verdict(made(0).result).headline

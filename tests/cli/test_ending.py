@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-import impc.studies.example.cases
 from impc.cli.ending import ExitStatus, ended
 from impc.cli.main import main
 from impc.errors import ImpcError, brief, one_line
@@ -38,7 +37,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException | type) -> Res
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(impc.studies.example.cases, "run_case", fail)
+    monkeypatch.setattr("impc.cli.example.run_case", fail)
     return CliRunner().invoke(main, ["example", "--out", "out"])
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-import impc.studies.example.cases
 from impc.cli.main import main
 from impc.control.named_solver import SOLVERS
 from impc.errors import SolverError
@@ -98,7 +97,7 @@ def test_the_filter_of_sensory_noise_compiles_only_on_request(
 ) -> None:
     compiled: list[str] = []
     for part in ("loop", "bodies", "filter"):
-        monkeypatch.setattr(f"impc.studies.warm.compile_{part}", partial(compiled.append, part))
+        monkeypatch.setattr(f"impc.cli.warm.compile_{part}", partial(compiled.append, part))
     assert len(run("warm", *more).stdout.splitlines()) == count
     assert compiled == ["loop", "bodies", "filter"][:count]
 
@@ -122,7 +121,7 @@ def test_a_folder_that_cannot_be_written_gets_one_line_at_once(
     def unwanted(*_: object, **__: object) -> None:
         raise AssertionError("the folder is checked before the work")
 
-    monkeypatch.setattr(impc.studies.example.cases, "run_case", unwanted)
+    monkeypatch.setattr("impc.cli.example.run_case", unwanted)
     result = run("example", "--out", str(tmp_path / below))
     check_one_line(result, 2)
     assert str(tmp_path / "file") in result.stderr
@@ -140,7 +139,7 @@ def test_a_failure_of_the_work_gets_one_line_and_no_folder(
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(impc.studies.example.cases, "run_case", fail)
+    monkeypatch.setattr("impc.cli.example.run_case", fail)
     check_one_line(run("example", "--out", str(tmp_path / "new" / "folder")), status)
     assert os.listdir(tmp_path) == []
 

@@ -10,8 +10,8 @@ import msgspec
 from impc.files.configuration import read_configuration
 from impc.nonlinear.files import optimal_fit_settings
 from impc.studies.cohort.study import StudyTable
-from impc.studies.fit.settings import fit_settings
-from impc.studies.selection.settings import select_settings
+from impc.studies.fit.settings import fit_settings, read_settings
+from impc.studies.selection.settings import SelectSettings
 
 __all__ = ["require_valid"]
 
@@ -27,5 +27,5 @@ def require_valid(text: str, folder: Path) -> None:
     found = read_configuration(path, "study", "model", "select")
     path.unlink()
     (optimal_fit_settings if "parameters" in found.fit else fit_settings)(found.fit)
-    select_settings(found.select)
+    read_settings("select", SelectSettings, found.select)
     msgspec.convert(found.study, StudyTable)

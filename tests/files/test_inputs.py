@@ -19,7 +19,6 @@ import pytest
 from click.testing import CliRunner, Result
 
 import impc.studies.pool
-import impc.studies.scheduler
 import impc.studies.selection.model_source
 from impc.cli.main import main
 from impc.studies.pool import Answer, Task
@@ -61,7 +60,7 @@ def here(monkeypatch: pytest.MonkeyPatch, stop: int = -1) -> list[str]:
     def connected(_: object) -> Iterator[Interrupted]:
         yield Interrupted()
 
-    monkeypatch.setattr(impc.studies.scheduler, "connected", connected)
+    monkeypatch.setattr("impc.cli.select.connected", connected)
     monkeypatch.setattr(impc.studies.pool, "_AHEAD", 1)
     return done
 

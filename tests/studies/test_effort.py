@@ -13,7 +13,6 @@ from click.testing import CliRunner
 import impc
 import impc.cli.console
 import impc.studies.cohort.tasks
-import impc.studies.fit.subject
 from impc.arrays import Array, IntArray
 from impc.cli.console import require_consent
 from impc.cli.main import main
@@ -96,7 +95,7 @@ def test_a_request_for_hours_or_memory_ends_at_once(
     def unwanted(*_: object, **__: object) -> None:
         raise AssertionError("the request is refused before the work")
 
-    monkeypatch.setattr(impc.studies.fit.subject, "fit_recordings", unwanted)
+    monkeypatch.setattr("impc.cli.fit.fit_recordings", unwanted)
     _, table, settings = write_study(tmp_path, 1).read_text().partition("[recording]")
     config = tmp_path / "a.toml"
     config.write_text(table + settings.replace("horizon = 10\n", "").replace(

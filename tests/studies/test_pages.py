@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import io
 import json
 import re
@@ -27,33 +28,37 @@ from impc.reporting.finding import csv_bytes
 from impc.reporting.rules import Line, Rules
 from impc.studies.compare import verdict as compare
 from impc.studies.example import report as example
+from impc.studies.example import sweep_report
 from impc.studies.methods_table import methods_data, methods_finding, until_its_end
 from impc.studies.plan import sentences as plan
 from impc.studies.reliability import verdict as reliability
-from impc.studies.selection.verdict import KEY_RULES, SELECT_RULES
+from impc.studies.selection.verdict import KEY_RULES, SELECT_RULES, KeyFacts, SelectFacts
 from plants import yalmip_example
 from tests.support import present
 
-RULES: dict[str, Rules[Any]] = {
-    "select": SELECT_RULES,
-    "key-parameters": KEY_RULES,
-    "reliability": reliability.RULES,
-    "compare": compare.RULES,
-    "plan": plan.RULES,
-    "example": example.RULES,
-    "optimal control": page.RULES,
+# Rules, and the class of their facts.
+RULES: dict[str, tuple[Rules[Any], type]] = {
+    "select": (SELECT_RULES, SelectFacts),
+    "key-parameters": (KEY_RULES, KeyFacts),
+    "reliability": (reliability.RULES, reliability.Facts),
+    "compare": (compare.RULES, compare.Facts),
+    "plan": (plan.RULES, plan.Facts),
+    "example": (example.RULES, example.Facts),
+    "sweep": (sweep_report.RULES, sweep_report.Facts),
+    "optimal control": (page.RULES, page.OptimalFit),
 }
+BOTH = pytest.mark.parametrize(("rules", "facts"), RULES.values(), ids=RULES)
 
 
-@pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
-def test_an_amber_badge_has_its_reason_in_a_box(rules: Rules[Any]) -> None:
+@BOTH
+def test_an_amber_badge_has_its_reason_in_a_box(rules: Rules[Any], facts: type) -> None:
     for kind in rules.kinds:
         if kind.level is Level.AMBER:
             assert all((kind.title, kind.found, kind.means, kind.todo)), kind.headline
 
 
-@pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
-def test_every_word_of_a_template_is_known(rules: Rules[Any]) -> None:
+@BOTH
+def test_every_word_of_a_template_is_known(rules: Rules[Any], facts: type) -> None:
     texts = [
         text
         for kind in rules.kinds
@@ -62,7 +67,8 @@ def test_every_word_of_a_template_is_known(rules: Rules[Any]) -> None:
     for row in (*rules.may, *rules.may_not):
         texts += [row.text, row.why] if isinstance(row, Line) else []
     used = {name for text in texts for _, name, _, _ in Formatter().parse(text) if name}
-    assert used <= set(rules.words), used - set(rules.words)
+    own = {*dir(facts), *re.findall(r"self\.(\w+)", inspect.getsource(facts))}
+    assert used <= own.union(rules.words), used - own.union(rules.words)
 
 
 @pytest.fixture(scope="module")

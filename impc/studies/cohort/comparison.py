@@ -27,23 +27,20 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import scipy
 
+from impc.arrays import Array
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.several_tests import holm
 from impc.checking import replace
 from impc.errors import DataError
 from impc.studies.reliability.icc import icc
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
-
-    from impc.arrays import Array
 
 _FEWEST = 3  # People in each mean
 _LEAST = 2.0  # People of equal shares to whom a mean must correspond, 1 / sum p^2
@@ -101,10 +98,7 @@ class Mean(NamedTuple):
 
 
 def weighted_mean(given: pd.Series[float], squares: pd.Series[float]) -> Mean:
-    """Mean of the values `given` of people, except NaN, with the `squares` of their errors.
-
-    Squares of zero give equal shares.
-    """
+    """Mean of values of people, except NaN; `squares` of their errors, zeros for equal shares."""
     from statsmodels.stats.meta_analysis import combine_effects  # noqa: PLC0415  # a second
 
     known = np.isfinite(given)

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.reporting import style
 from impc.reporting.rendering import number, sentence_case
 from impc.studies.cohort.comparison import mean_of
+from impc.studies.cohort.results import Cohort
 from impc.studies.cohort.unit_result import LOGARITHM
 from impc.studies.fit.facts import between
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from impc.arrays import Array
-    from impc.studies.cohort.results import Cohort
 
 _NAMED = 45  # Largest number of rows with names of subjects
 

@@ -10,18 +10,15 @@ import csv
 import math
 import re
 import unicodedata
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from impc.errors import InputError
 from impc.files.apart import cells_apart
 from impc.files.disk import require_readable
 from impc.files.layout import split_heading
 from impc.files.units import si_unit
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
 
 # Name of a column -> other names, as `_bare` writes them.
 _COLUMNS = {

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,18 +22,12 @@ from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key, Verdict
 from impc.reporting.writer import write_files
 from impc.studies.cohort.figures import forest, subject_figure
-from impc.studies.cohort.results import Cohort
-from impc.studies.cohort.study import safe_name
-from impc.studies.cohort.tables import cohort_tables, row_of
+from impc.studies.cohort.results import Cohort, cohort_tables, row_of
+from impc.studies.cohort.study import Study, Unit, safe_name
+from impc.studies.cohort.tasks import Failures, Store
 from impc.studies.cohort.unit_result import LOGARITHM
-from impc.studies.cohort.verdict import cohort_verdict
+from impc.studies.cohort.verdict import RULES
 from impc.studies.fit.facts import between
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.studies.cohort.study import Study, Unit
-    from impc.studies.cohort.tasks import Failures, Store
 
 _BESIDE = {
     "units": "All numbers of every fit, angles in radians.",
@@ -104,7 +99,7 @@ def write_report(
 
 def _page(study: Study, cohort: Cohort, checks: Sequence[Check], command: str) -> Report:
     """Report of a cohort."""
-    verdict, name = cohort_verdict(cohort), cohort.of(cohort.measure)["name"]
+    verdict, name = RULES.verdict(cohort), cohort.of(cohort.measure)["name"]
     people = len({unit.subject for unit in study.units})
     provenance = Provenance(command=command)
     recordings = f"{sum(len(unit.files) for unit in study.units)} files of {people} people"

@@ -1,17 +1,7 @@
-"""Study file (TOML): which recordings belong together, and how they are fitted.
+"""Study file (docs/howto/cohort.md): which recordings belong together, and how they are fitted.
 
-    [study]
-    plant = "seated-balance"
-    recordings = "data/sub-{subject}/ses-{visit}/sub-{subject}_task-{condition}_run-{trial}.csv"
-    participants = "data/participants.tsv"
-
-    [recording] ... [signals.NAME] ... [plant] ... [fit] ...     as for `impc fit`
-
-All trials with the same subject, visit and condition form a unit, which gets one fit.
-
-Names of subjects, visits, conditions, trials and groups become names of files and folders, table
-cells and terminal output. Only names that are safe in all of them are accepted: letters, digits,
-spaces and . + - _, beginning with a letter or digit.
+All trials with the same subject, visit and condition form a unit, which gets one fit. Names become
+names of files, cells and lines on a terminal: only names that are safe in all are accepted.
 """
 
 from __future__ import annotations
@@ -19,9 +9,10 @@ from __future__ import annotations
 import glob
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -35,9 +26,6 @@ from impc.studies.cohort.participants import (
     read_participants,
     read_sheet,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9.+-]")
 
@@ -143,7 +131,11 @@ def read_study(path: Path) -> Study:
         raise InputError(f"{path}: subject {', '.join(missing)}", f"is not in {named}", "add a row")
     require_distinct([file for unit in units for file in unit.files])
     _require_folders(path, units)
-    _require_reference(path, table.reference, units)
+    names = {name for one in units for name in (one.group, one.visit, one.condition) if name}
+    if table.reference is not None and table.reference not in names:
+        problem = f"{table.reference!a} is no group, visit or condition"
+        remedy = f"use one of {', '.join(sorted(names)) or 'none: there are none'}"
+        raise InputError(f"{path}: study.reference", problem, remedy)
     return Study(
         table.plant or "", configuration, tuple(units), table.model or "", table.reference or ""
     )
@@ -203,15 +195,6 @@ def _require_folders(path: Path, units: Sequence[Unit]) -> None:
             raise InputError(
                 f"{path}: {unit.name}", "is the folder of two units", "use letters, digits, - and +"
             )
-
-
-def _require_reference(path: Path, reference: str | None, units: Iterable[Unit]) -> None:
-    """Raise InputError if no group, visit or condition has the name `reference`."""
-    names = {name for one in units for name in (one.group, one.visit, one.condition) if name}
-    if reference is not None and reference not in names:
-        problem = f"{reference!a} is no group, visit or condition"
-        remedy = f"use one of {', '.join(sorted(names)) or 'none: there are none'}"
-        raise InputError(f"{path}: study.reference", problem, remedy)
 
 
 #: Labels of a trial, and their short names in BIDS.

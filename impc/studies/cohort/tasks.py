@@ -15,10 +15,11 @@ import functools
 import inspect
 import time
 from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import psutil
@@ -26,32 +27,23 @@ import psutil
 from impc.assess.resampling import replicate
 from impc.checking import replace
 from impc.errors import DataError, ImpcError, InputError
-from impc.files.configuration import FILL_IN
+from impc.files.configuration import FILL_IN, Configuration
 from impc.files.digests import content_digest, digest, source_digest, versions
 from impc.files.disk import IN_ITS_PLACE, require_ordinary, unwritable
-from impc.files.plant_sources import made_by, plant_source
+from impc.files.plant_sources import PlantSource, made_by, plant_source
 from impc.files.reading import read_unit
+from impc.inverse.problem import Problem
 from impc.reporting.rendering import plain
 from impc.reporting.shown_units import angles_in
 from impc.studies.cache import Cache
 from impc.studies.cohort.participants import require_faultless
+from impc.studies.cohort.study import Study
 from impc.studies.cohort.unit_result import stored_fit
 from impc.studies.effort import Effort, fit_effort
 from impc.studies.fit.asked import asked_plant, fit_problem
-from impc.studies.fit.settings import fit_settings
+from impc.studies.fit.settings import FitSettings, fit_settings
 from impc.studies.fit.subject import fit_alone
-from impc.studies.pool import Task, run
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-    from pathlib import Path
-
-    from impc.files.configuration import Configuration
-    from impc.files.plant_sources import PlantSource
-    from impc.inverse.problem import Problem
-    from impc.studies.cohort.study import Study
-    from impc.studies.fit.settings import FitSettings
-    from impc.studies.pool import Pool
+from impc.studies.pool import Pool, Task, run
 
 
 @dataclass(frozen=True)
@@ -66,10 +58,7 @@ class FitTask:
 
 
 def study_tasks(study: Study, source: PlantSource) -> tuple[dict[str, FitTask], dict[str, str]]:
-    """Tasks by unit, and reasons for units without a task; reads all files for the digests.
-
-    InputError if the plant refuses the values of a participant.
-    """
+    """Tasks by unit, reasons for units without; InputError if the plant refuses a participant."""
     unused = set(unused_columns(study, source))
     tasks: dict[str, FitTask] = {}
     failed: dict[str, str] = {}

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from impc.assess.assessments import assessed
+from impc.assess.assessments import MethodFit, assessed
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.printed_gain import entry_names, follows_command
-from impc.model.plant import UNKNOWN, gain_unit, weight_unit
+from impc.model.plant import UNKNOWN, Plant, gain_unit, weight_unit
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
-from impc.studies.fit.facts import one_of
-from impc.studies.fit.verdict import fit_verdict
-
-if TYPE_CHECKING:
-    from impc.assess.assessments import MethodFit
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult
+from impc.studies.fit.facts import with_unit
+from impc.studies.fit.result import FitResult
+from impc.studies.fit.verdict import RULES
 
 #: Prefix of columns of logarithms, which are compared as ratios.
 LOGARITHM = "log_cost_weight."
@@ -27,7 +23,7 @@ _CENTRE = "analytic centre (no units)"
 
 def stored_fit(result: FitResult) -> dict[str, Any]:
     """The result of a fit for the tables and pages of a study, and for its replicates."""
-    estimate, verdict = result.estimate, fit_verdict(result).data()
+    estimate, verdict = result.estimate, RULES.verdict(result).data()
     row = {name: verdict[name] for name in ("level", "headline", "kind")} | _row(result)
     return {
         "verdict": verdict,
@@ -142,7 +138,7 @@ def _gain(plant: Plant, control: str, state: str) -> dict[str, Any]:
     name = f"gain on {words}" + f" ({effort})" * (plant.m > 1)
     return _entry(name, words, si) | {
         "scale": scale / factor, "unit": "-" if unit == "1" else unit, "control": effort,
-        "top": top, "per": f"{one_of(of)} of {words}",
+        "top": top, "per": f"{with_unit('1', of)} of {words}",
     }  # fmt: skip
 
 

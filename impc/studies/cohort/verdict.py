@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from impc.levels import Level
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.verdict import Claim, Verdict
+from impc.reporting.verdict import Claim
 from impc.studies.cohort.results import SIGNIFICANT, Cohort
 from impc.studies.cohort.unit_result import LOGARITHM
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # Share of fits with a warning, or of missing fits, above which the report is amber.
 _MANY = 0.1
 # Share of people with a determined gain below which the report is amber.
 _FEW = 0.7
-
-
-def cohort_verdict(cohort: Cohort) -> Verdict:
-    """Verdict of a cohort."""
-    return _RULES.verdict(cohort)
 
 
 def _warnings(cohort: Cohort) -> str:
@@ -124,7 +117,7 @@ _RESULT: Rules[Cohort] = Rules(
         Kind(Level.GREEN, always, "{sentence}", "{numbers}.{without_outliers}"),
     ),
 )  # fmt: skip
-_RULES: Rules[Cohort] = Rules(
+RULES: Rules[Cohort] = Rules(
     _WORDS,
     (
         Kind(Level.RED, lambda c: not len(c.usable) and len(c.units), *_NONE, **_WARNED),

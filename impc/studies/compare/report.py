@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
+from impc.assess.assessments import MethodFit
 from impc.checking import replace
 from impc.inverse.estimates import Status
+from impc.inverse.problem import Problem
 from impc.levels import Level
 from impc.reporting.document import Block, Check, Checks, Copy, Fold, Report, Section
 from impc.reporting.exchange import long_finding
 from impc.reporting.finding import Chart, Finding, Picture
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
@@ -25,13 +28,6 @@ from impc.studies.methods_table import (
     provenance_section,
     trajectory_table,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.assess.assessments import MethodFit
-    from impc.inverse.problem import Problem
-    from impc.reporting.provenance import Provenance
 
 # Number of trials, from the first, whose trajectories are on the page.
 _DRAWN = 6

@@ -6,28 +6,23 @@ docs/howto/compare.md describes the methods and their limitations.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.assess.assessments import evaluate_method
+from impc.assess.assessments import MethodFit, evaluate_method
 from impc.assess.variance_accounted_for import predicted
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
+from impc.inverse.problem import Problem
 from impc.studies.methods_table import method_label
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.assess.assessments import MethodFit
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-
-    #: (title, compute) -> the estimate, stored or computed.
-    Remember = Callable[[str, Callable[[], Estimate]], Estimate]
+#: (title, compute) -> the estimate, stored or computed.
+Remember = Callable[[str, Callable[[], Estimate]], Estimate]
 
 # Excluded: needs `feedback_states`; is compared in its two branches; needs a structure.
 _NOT_COMPARED = ("preliminary", "inverse_lqr", "structured")

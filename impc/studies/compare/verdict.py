@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from operator import attrgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.assessments import MethodFit
 from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
@@ -15,11 +15,6 @@ from impc.reporting.shown_units import signal_name
 from impc.studies.fit.facts import limits, with_unit
 from impc.studies.methods_figure import by_score, explained, largest_commands, unexplained
 from impc.studies.methods_table import method_label
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.assess.assessments import MethodFit
 
 # VAF (%) below which a model is poor; ratio of unexplained variances above which it is worse.
 _HALF, _WORSE = 50.0, 1.1
@@ -106,8 +101,7 @@ _EXPLAINS = Kind[Facts](
     Level.GREEN, always, "“{best}” explains {share} of the variance.", "{sentence}."
 )
 RULES = Rules[Facts](
-    {name: attrgetter(name) for name in ("limit", "word", "where", "sentence", "factor")}
-    | {
+    {
         "best": lambda it: name_of(it.best),
         "share": lambda it: share(it.best),
         "needs": lambda it: needed(it.unbounded),

@@ -6,31 +6,26 @@ passes a plant that has the properties described in its text; reference solution
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Frozen
-from impc.assess.assessments import evaluate_method
+from impc.assess.assessments import MethodFit, evaluate_method
 from impc.assess.weights_test import identifiability
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
 from impc.control.named_solver import COMPILED
 from impc.control.simulation import Simulation, scenario
+from impc.inverse.estimates import Identifiability
 from impc.inverse.problem import Problem
 from impc.inverse.table31 import table_3_1
 from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights, weight_error
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.assess.assessments import MethodFit
-    from impc.inverse.estimates import Identifiability
-    from impc.model.plant import Plant
 
 #: Initial states by name.
 CASES: dict[str, tuple[float, float]] = {"A": (1.0, 3.0), "B": (2.0, 3.0), "C": (2.0, 1.0)}

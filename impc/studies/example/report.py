@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
 
@@ -14,9 +14,10 @@ from impc.model.weights import condition_number
 from impc.reporting.document import Block, Draw, Fold, Lines, Report, Section
 from impc.reporting.exchange import long_finding
 from impc.reporting.finding import Picture
+from impc.reporting.provenance import Provenance
 from impc.reporting.rules import Kind, Line, Rules, always
-from impc.reporting.verdict import Key, Verdict
-from impc.studies.example.cases import BOUND, EXAMPLE, LOST, distance, true_weights
+from impc.reporting.verdict import Key
+from impc.studies.example.cases import BOUND, EXAMPLE, LOST, CaseResult, distance, true_weights
 from impc.studies.fit.figures import movement_figure
 from impc.studies.methods_figure import methods_figure
 from impc.studies.methods_table import (
@@ -27,12 +28,6 @@ from impc.studies.methods_table import (
     methods_long,
     provenance_section,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.reporting.provenance import Provenance
-    from impc.studies.example.cases import CaseResult
 
 # Largest distance to the true weights that counts as found; typical 1e-14.
 _FOUND = 1e-6
@@ -75,7 +70,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     return Report(
         "impc example",
         "example",
-        example_verdict(cases),
+        RULES.verdict(Facts(cases)),
         [
             *(_case_section(case, hero=case is first) for case in cases),
             Section("What the example shows", [_SETTING, _GAIN, LOST, methods_fold(EXAMPLE)]),
@@ -100,7 +95,7 @@ def example_report(cases: Sequence[CaseResult], provenance: Provenance) -> Repor
     )
 
 
-class _Facts:
+class Facts:
     """Methods that stay within the limit in every case, and those that find the true weights."""
 
     def __init__(self, cases: Sequence[CaseResult]) -> None:
@@ -121,18 +116,17 @@ class _Facts:
             self.others += f"{BOUND:g}."
 
 
-_SHOWN = Kind[_Facts](
+_SHOWN = Kind[Facts](
     Level.GREEN, always,
     "{all} methods were tried on the same movement; {few} {need} no more than the limit.",
     "{finds} the true cost weights.{others}", badge="As expected",
 )  # fmt: skip
-RULES = Rules[_Facts](
+RULES = Rules[Facts](
     {
         "all": lambda _: _COUNTS[len(EXAMPLE)],
         "few": lambda it: _COUNTS[len(it.within)].lower(),
         "need": lambda it: "needs" if len(it.within) == 1 else "need",
-    }
-    | {name: attrgetter(name) for name in ("finds", "others")},
+    },
     kinds=(
         replace(
             _SHOWN, level=Level.AMBER, when=lambda it: not it.found, badge="Not as expected",
@@ -153,13 +147,8 @@ RULES = Rules[_Facts](
 )  # fmt: skip
 
 
-def example_verdict(cases: Sequence[CaseResult]) -> Verdict:
-    """Verdict: methods that stay within the limit and methods that find the true weights."""
-    return RULES.verdict(_Facts(cases))
-
-
 def _keys(cases: Sequence[CaseResult]) -> list[Key]:
-    within, found = len(_Facts(cases).within), cases[0].identifiability
+    within, found = len(Facts(cases).within), cases[0].identifiability
     fixed = "numbers of the cost determined by the movement"
     return [
         Key(str(len(EXAMPLE)), "methods", "tried", "on the same recordings"),

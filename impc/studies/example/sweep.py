@@ -13,39 +13,33 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import control
 import numpy as np
 import pandas as pd
 import scipy.stats
 
-from impc.arrays import Frozen
+from impc.arrays import Array, Frozen
 from impc.assess.several_tests import holm
 from impc.assess.variance_accounted_for import saturated_share
 from impc.checking import replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
-from impc.control.simulation import scenario
+from impc.control.simulation import Simulation, scenario
 from impc.errors import ImpcError, SolverError
 from impc.files.digests import digest, versions
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, fit
 from impc.inverse.problem import Problem
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 from impc.model.weights import Weights
-from impc.studies.pool import Task, run
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.arrays import Array
-    from impc.control.simulation import Simulation
-    from impc.inverse.estimates import Estimate
-    from impc.studies.cache import Cache
-    from impc.studies.pool import Pool
+from impc.studies.cache import Cache
+from impc.studies.pool import Pool, Task, run
 
 #: Shares of samples at the limit, %.
 LEVELS = (0, 10, 20, 40, 60)

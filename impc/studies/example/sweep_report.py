@@ -10,6 +10,7 @@ import numpy as np
 from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.style import BLUE, GREEN, HALF, MUTED, VERMILLION, new_figure, plain_log
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from impc.reporting.provenance import Provenance
 
 # The inverse LQR method of the headline: the one with the smallest errors.
 _BEST = "inverse_lqr_output"
@@ -51,7 +50,7 @@ _TEST = (
 )
 
 
-class _Facts:
+class Facts:
     """Sentences on each condition."""
 
     def __init__(self, sweep: Sweep) -> None:
@@ -82,13 +81,12 @@ class _Facts:
         )
 
 
-_BIASED = Kind[_Facts](
+_BIASED = Kind[Facts](
     Level.GREEN, always,
     "Inverse LQR is biased from {level} of the samples at the limit.", "{said}", badge="Shown",
 )  # fmt: skip
-RULES = Rules[_Facts](
-    {"level": lambda it: it.level, "said": lambda it: it.said, "seeds": lambda it: it.seeds,
-     "lost": lambda it: it.lost},
+RULES = Rules[Facts](
+    {},
     kinds=(
         Kind(
             Level.AMBER, lambda it: not it.level,
@@ -116,7 +114,7 @@ RULES = Rules[_Facts](
 
 def sweep_report(sweep: Sweep, title: str, provenance: Provenance) -> Report:
     """Report of `impc example --sweep`."""
-    facts = _Facts(sweep)
+    facts = Facts(sweep)
     verdict, count = RULES.verdict(facts), len(sweep.fits) // len(SWEPT)
     without = sweep.fits[sweep.fits["error_percent"].isna()].groupby("method").size()
     lost = [f"{method_label(str(name))}: {times} of {count}." for name, times in without.items()]
@@ -154,7 +152,7 @@ def sweep_report(sweep: Sweep, title: str, provenance: Provenance) -> Report:
     )  # fmt: skip
 
 
-def _keys(facts: _Facts) -> list[Key]:
+def _keys(facts: Facts) -> list[Key]:
     said = {"noise": "right model, noise", "limit": "limit 20 % too low",
             "plant": "plant 10 % wrong"}  # fmt: skip
     return [
@@ -164,7 +162,7 @@ def _keys(facts: _Facts) -> list[Key]:
     ]  # fmt: skip
 
 
-def _levels(facts: _Facts) -> Finding:
+def _levels(facts: Facts) -> Finding:
     """Table: level from which each inverse LQR method is biased, per condition."""
     import pandas as pd  # noqa: PLC0415  # a third of a second
 

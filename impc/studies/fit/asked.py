@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,22 +12,17 @@ from impc.arrays import Array, frozen
 from impc.checking import checked, replace
 from impc.errors import DataError, InputError
 from impc.files.configuration import require_known
-from impc.files.plant_sources import make_plant, plant_family_of
+from impc.files.plant_sources import PlantSource, make_plant, plant_family_of
 from impc.inverse.problem import Problem
 from impc.inverse.search import with_jumps
 from impc.model.bounds import Bounds
 from impc.model.foresight import physical_states, with_observer, with_preview
+from impc.model.plant import Plant
 from impc.model.plant_family import PlantFamily
 from impc.model.rates import with_rates
+from impc.model.recordings import Recording
 from impc.model.structure import Structure
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.files.plant_sources import PlantSource
-    from impc.model.plant import Plant
-    from impc.model.recordings import Recording
-    from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.settings import FitSettings
 
 
 def output_feedback() -> Any:
@@ -61,10 +57,7 @@ OBSERVER = "observer_rate"
 def asked_plant(
     source: PlantSource, recorded: Sequence[str], settings: FitSettings, aimed: Sequence[str] = ()
 ) -> tuple[Plant, PlantFamily | None]:
-    """Plant of a source and its family, extended by rates, observer and preview.
-
-    Inputs named in `recorded` are disturbances; outputs named in `aimed` have a target.
-    """
+    """Plant with disturbances `recorded` and targets of `aimed`, dressed; and its family."""
     rates = _observer_rates(settings)
     learned = [name for name in settings.free if name in rates]
     unrated = [name for name in settings.free if name.partition(".")[0] == OBSERVER]

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from markupsafe import Markup
 
+from impc.assess import lack_of_fit
 from impc.assess.diagnosis import DIFFERENCE, EXCHANGED, SIGN, SUM
-from impc.assess.lack_of_fit import (
-    DELAY,
-    LEAN,
-    LIMIT,
-    MODE,
-    NONLINEAR,
-    PARAMETERS,
-    STIFFNESS,
-    signal_of,
-)
+from impc.assess.lack_of_fit import LackOfFit, ModelError
 from impc.levels import Level
+from impc.model.plant import Plant
 from impc.model.signal_errors import KINDS
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import number
 from impc.reporting.shown_units import error_unit, signal_name
 from impc.studies.fit.facts import shifted
-
-if TYPE_CHECKING:
-    from impc.assess.lack_of_fit import LackOfFit, ModelError
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult, FittedParameter
+from impc.studies.fit.result import FitResult, FittedParameter
 
 # Standard deviation after the fit over the stated one above which nothing was learned.
 _AS_BEFORE = 0.9
@@ -36,12 +23,12 @@ _AS_BEFORE = 0.9
 _NAMED = 0.05
 
 _KINDS = {
-    DELAY: "a delay of the command",
-    LIMIT: "another limit of the command",
-    LEAN: "a lean, a constant push in each trial",
-    STIFFNESS: "another stiffness or damping where the perturbation acts",
-    MODE: "a further mode of the body",
-    NONLINEAR: "a nonlinear body, or a reaction to noise at the limit",
+    lack_of_fit.DELAY: "a delay of the command",
+    lack_of_fit.LIMIT: "another limit of the command",
+    lack_of_fit.LEAN: "a lean, a constant push in each trial",
+    lack_of_fit.STIFFNESS: "another stiffness or damping where the perturbation acts",
+    lack_of_fit.MODE: "a further mode of the body",
+    lack_of_fit.NONLINEAR: "a nonlinear body, or a reaction to noise at the limit",
 }
 # Words of mistakes in the meaning of a signal, and what to do.
 _MISTAKES = {
@@ -92,7 +79,7 @@ def _stated(result: FitResult) -> list[FittedParameter]:
 
 def _is_added(result: FitResult, item: FittedParameter) -> bool:
     """Whether a parameter was added because the tests of a first fit pointed to it."""
-    added = None if result.added is None else PARAMETERS.get(result.added.name)
+    added = None if result.added is None else lack_of_fit.PARAMETERS.get(result.added.name)
     return added is not None and item.name.startswith(added)
 
 
@@ -109,19 +96,19 @@ def _wider(result: FitResult) -> str:
 def error_words(result: FitResult, error: ModelError) -> str:
     """A model error in words, with its size if it has one."""
     plant, size, deviation = result.given.plant, error.size, error.deviation
-    words, signal = name_words(plant, error.name), signal_of(error.name)
+    words, signal = name_words(plant, error.name), lack_of_fit.signal_of(error.name)
     if signal is not None:
         return f"{words}{_size_words(plant, *signal, size, deviation)}"
     if not np.isfinite(size):
         return words
-    if error.name == DELAY:
+    if error.name == lack_of_fit.DELAY:
         return f"{words} of {1e3 * plant.dt * size:.0f} ± {1e3 * plant.dt * deviation:.0f} ms"
     return f"{words}, by {100 * size:+.1f} ± {100 * deviation:.1f} %"
 
 
 def name_words(plant: Plant, name: str) -> str:
     """A tested error in words, without its size."""
-    signal = signal_of(name)
+    signal = lack_of_fit.signal_of(name)
     if signal is None:
         return _KINDS[name]
     kind, words = signal[0], signal_name(plant, signal[1])
@@ -132,7 +119,7 @@ def name_words(plant: Plant, name: str) -> str:
 
 def remedy_words(result: FitResult, error: ModelError) -> str:
     """What to do about an error that the fit has corrected."""
-    kind, name = signal_of(error.name) or (error.name, "")
+    kind, name = lack_of_fit.signal_of(error.name) or (error.name, "")
     if kind in _MISTAKES:
         return _MISTAKES[kind][1].format(name)
     values = {pair[:2]: pair[2] for pair in result.estimate.problem.fitted_errors}
@@ -162,7 +149,7 @@ def added_sentence(result: FitResult) -> str:
     if added is None:
         return ""
     words = error_words(result, added)
-    signal = signal_of(added.name)
+    signal = lack_of_fit.signal_of(added.name)
     if signal:  # its size is that of the second fit
         words = name_words(result.given.plant, added.name)
     done = "corrected" if signal and signal[0] in _MISTAKES else "added to the unknowns"
@@ -173,7 +160,7 @@ def added_sentence(result: FitResult) -> str:
     unknown = [
         item for item in result.parameters if _is_added(result, item) and not item.determined
     ]
-    if added.name != DELAY or not unknown:
+    if added.name != lack_of_fit.DELAY or not unknown:
         return said
     return (
         f"{said} A gain on the last command compensates for much of a delay, so the intervals are "
@@ -183,7 +170,7 @@ def added_sentence(result: FitResult) -> str:
 
 def alternative_reason(result: FitResult, error: ModelError) -> str:
     """Alternative explanation by noise in the loop, if the limit is reached; else empty."""
-    if result.saturated == 0 or error.name not in (LEAN, NONLINEAR):
+    if result.saturated == 0 or error.name not in (lack_of_fit.LEAN, lack_of_fit.NONLINEAR):
         return ""
     return (
         " A reaction to noise in muscles or senses at the limit has the same effect: the test "

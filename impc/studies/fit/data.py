@@ -45,7 +45,7 @@ Matrices are lists of rows, in SI units. NaN, infinity and undetermined values a
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -53,17 +53,14 @@ from impc.assess.assessments import ASSESSMENTS
 from impc.assess.intent import dominant_sentence
 from impc.assess.printed_gain import lasting_responses
 from impc.model.riccati import solve_lqr
+from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import shown_unit
-from impc.studies.fit.aim import aim_data
-from impc.studies.fit.facts import named_gains
+from impc.studies.fit.facts import aim_data, named_gains
+from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_data
-from impc.studies.fit.verdict import GAIN, fit_verdict, reason
+from impc.studies.fit.verdict import GAIN, RULES
 from impc.studies.methods_table import problem_data
-
-if TYPE_CHECKING:
-    from impc.reporting.provenance import Provenance
-    from impc.studies.fit.result import FitResult
 
 
 def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
@@ -103,8 +100,8 @@ def fit_data(result: FitResult, provenance: Provenance) -> dict[str, Any]:
 
 def _summary(result: FitResult) -> dict[str, Any]:
     """Row of the fit in a table of fits, in shown units; gains that the page forbids are None."""
-    plant, verdict = result.given.plant, fit_verdict(result)
-    label, why = result.given.recordings[0].label, reason(result, GAIN)
+    plant, verdict = result.given.plant, RULES.verdict(result)
+    label, why = result.given.recordings[0].label, RULES.reason(result, GAIN)
     vaf = map(float, result.inverse_mpc.vaf)
     row: dict[str, Any] = {
         **{name: str(getattr(label, name)) for name in ("subject", "visit", "condition")},

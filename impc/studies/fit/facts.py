@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.printed_gain import entry_names, follows_command
+from impc.assess.printed_gain import Interval, entry_names, follows_command
+from impc.assess.weights_ranges import Statement
+from impc.model.foresight import physical_disturbances
+from impc.model.plant import Plant
+from impc.model.signal_errors import KINDS
 from impc.reporting.rendering import fixed, number, sentence_case
-from impc.reporting.shown_units import shown_unit, signal_name
-from impc.studies.fit.result import LITTLE
+from impc.reporting.shown_units import error_unit, shown_unit, signal_name
+from impc.studies.fit.asked import OBSERVER
+from impc.studies.fit.result import LITTLE, FitResult, LimitFound
 from impc.studies.methods_figure import explained
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.assess.printed_gain import Interval
-    from impc.assess.weights_ranges import Statement
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult, LimitFound
 
 #: Ratio of unexplained variances from which a limit is said to matter.
 MATTERS = 2.0
@@ -74,11 +73,6 @@ def with_unit(value: str, unit: str) -> str:
     return f"{value}{unit}" if unit[:1] == "°" else value if unit == "-" else f"{value} {unit}"
 
 
-def one_of(unit: str) -> str:
-    """The number 1 with this unit."""
-    return with_unit("1", unit)
-
-
 def gain_rows(result: FitResult) -> list[GainRow]:
     """All entries of the gain, row by row, in shown units."""
     plant, found = result.given.plant, result.preferred
@@ -91,7 +85,7 @@ def gain_rows(result: FitResult) -> list[GainRow]:
                 continue
             factor, of = shown_unit(plant, state)
             ratio, words = scale / factor, signal_name(plant, state)
-            per = f"{one_of(of)} of {words}"
+            per = f"{with_unit('1', of)} of {words}"
             value = np.nan if item.value is None else ratio * item.value
             ends = ratio * item.low, ratio * item.high
             name = signal_name(plant, control)
@@ -248,10 +242,7 @@ def left_out_text(result: FitResult) -> str:
 
 
 def reported_shares(result: FitResult) -> tuple[Array, str]:
-    """VAF (p,) that counts, and where it was taken; of the gain if no weights have it.
-
-    Left-out trials count if there are any and the fitted ones are explained.
-    """
+    """VAF (p,) that counts: of left-out trials if there are any and the fitted are explained."""
     own, held = result.inverse_mpc.vaf, held_out(result)
     if result.weights_test.rejected:
         own = result.gain_shares
@@ -276,10 +267,7 @@ def explained_words(result: FitResult) -> str:
 
 
 def unlimited_ratio(result: FitResult) -> tuple[float, str]:
-    """Unexplained variance of the best method without a limit over that of the model, in words.
-
-    Of the output for which the ratio is largest; NaN without such a method.
-    """
+    """Largest ratio of unexplained variances, best method without limit over model, in words."""
     others = [
         item.vaf
         for item in result.methods[:-1]
@@ -323,3 +311,56 @@ def statement_text(plant: Plant, item: Statement) -> str:
         return f"A typical {one} costs {more} than a typical {other}."
     pair = f"{sentence_case(one)} and {other}"
     return f"{pair} to the same side cost {more} than to opposite sides."
+
+
+def aim_data(result: FitResult) -> dict[str, Any]:
+    """`aim` in result.json: targets, observer rates (1/s), errors of signals, recorded commands."""
+    problem = result.fitted.problem
+    plant, trials = problem.plant, problem.recordings
+    count = physical_disturbances(plant)
+    learned = zip(plant.disturbances[:count], plant.observer[:count], strict=True)
+    controls = plant.commands or plant.controls
+    recorded = [np.any(np.isfinite(trial.commands), axis=0) for trial in trials]
+    return {
+        "targets": tuple(dict.fromkeys(name for trial in trials for name in trial.signals)),
+        "ahead": plant.ahead,
+        "observer_rate": {name: float(rate) for name, rate in learned if rate > 0},
+        "errors": [
+            {"kind": kind, "signal": name, "values": [float(one) for one in values]}
+            for kind, name, values in problem.fitted_errors
+        ],
+        "commands": tuple(np.array(controls)[np.any(recorded, axis=0)].tolist()),
+    }
+
+
+def aim_sentences(result: FitResult) -> list[str]:
+    """The contents of `aim_data` as a sentence; empty if the controller regulates to rest."""
+    aim, plant = aim_data(result), result.fitted.problem.plant
+    said = []
+    if aim["targets"]:
+        ahead = f", known {plant.ahead * plant.dt:.3g} s ahead" if plant.ahead else ""
+        targets = " and ".join(signal_name(plant, name) for name in aim["targets"])
+        said.append(f"the controller regulates to the target of {targets}{ahead}")
+    for name, rate in aim["observer_rate"].items():
+        how = "knows it at once"
+        if np.isfinite(rate):
+            fitted = (result.preferred.get(key) for key in (f"{OBSERVER}.{name}", OBSERVER))
+            interval = next((item for item in fitted if item is not None), None)
+            between = (
+                f" (fitted, 95 %: {number(interval.low, 3)} to {number(interval.high, 3)})"
+                if interval is not None
+                else ""
+            )
+            how = f"learns it at a rate of {number(rate, 3)} 1/s{between}"
+        said.append(f"it assumes that the {signal_name(plant, name)} persists and {how}")
+    for kind, name, values in result.fitted.problem.fitted_errors:
+        if kind == "shift":  # `shift_words`, with its interval
+            continue
+        factor, unit = error_unit(plant, kind, name)
+        ends = f"{number(factor * min(values), 3)} to {number(factor * max(values), 3)} {unit}"
+        said.append(f"the {signal_name(plant, name)} has {KINDS[kind][0]} in each trial, {ends}")
+    if aim["commands"]:
+        names = ", ".join(signal_name(plant, name) for name in aim["commands"])
+        said.append(f"recorded commands ({names}) are fitted in addition to the outputs")
+    text = "; ".join(said)
+    return [f"{text[0].upper()}{text[1:]}."] if said else []

@@ -6,32 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.assess.assessments import MethodFit
+from impc.assess.frequency_response import FrequencyResponse
 from impc.assess.variance_accounted_for import at_limit
+from impc.model.bounds import Bounds
+from impc.reporting import style
 from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import axis_label, shown_unit, signal_name
-from impc.reporting.style import (
-    BLUE,
-    FORBIDDEN,
-    HALF,
-    INK,
-    MUTED,
-    RECORDED,
-    RULE,
-    VERMILLION,
-    WIDE,
-    new_figure,
-    plain_log,
-    strip,
-)
+from impc.studies.fit.result import FitResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from impc.assess.assessments import MethodFit
-    from impc.assess.frequency_response import FrequencyResponse
-    from impc.model.bounds import Bounds
-    from impc.studies.fit.result import FitResult
 
 _WINDOW = 10.0  # s
 _LAGS = 1.0  # Largest lag of the autocorrelation, s
@@ -49,26 +35,26 @@ def movement_figure(fit: MethodFit, index: int) -> Figure:
     window = shown_window(fit, index)
     outputs, controls = plant.outputs[:_MOST], plant.controls[:_MOST]
     rows = len(outputs) + len(controls)
-    figure = new_figure(HALF, 0.6 + 1.35 * rows)
+    figure = style.new_figure(style.HALF, 0.6 + 1.35 * rows)
     axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True))
     time = np.arange(window.start, window.stop) * plant.dt
     modelled = run.x @ plant.C.T
     for column, (ax, name) in enumerate(zip(axes, outputs, strict=False)):
         factor, _ = shown_unit(plant, name)
         recorded = factor * trial.corrected[window, column]
-        strip(ax, axis_label(plant, name))
-        ax.plot(time, recorded, color=RECORDED, linewidth=4.5, label="recorded")
-        ax.plot(time, factor * modelled[window, column], color=BLUE, label="model")
+        style.strip(ax, axis_label(plant, name))
+        ax.plot(time, recorded, color=style.RECORDED, linewidth=4.5, label="recorded")
+        ax.plot(time, factor * modelled[window, column], color=style.BLUE, label="model")
         if name in trial.signals:
             target = factor * trial.target[window, trial.signals.index(name)]
-            ax.plot(time, target, color=INK, linewidth=0.8, linestyle="--", label="target")
+            ax.plot(time, target, color=style.INK, linewidth=0.8, linestyle="--", label="target")
         reach = 1.18 * float(np.nanmax(np.abs(recorded), initial=1e-9))
         ax.set_ylim(-reach, reach)
     for column, (ax, name) in enumerate(zip(axes[len(outputs) :], controls, strict=True)):
         _command(ax, fit, index, column, window)
         ax.set_title(f"{axis_label(plant, name).replace(' (', ' in the model (')}", pad=5)
     if np.any(np.isfinite(bounds.u_max)):
-        axes[0].plot([], [], color=VERMILLION, linewidth=4.5, label="at the limit")
+        axes[0].plot([], [], color=style.VERMILLION, linewidth=4.5, label="at the limit")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=4, columnspacing=1.2)
     axes[-1].set_xlabel("Time (s)")
@@ -92,21 +78,23 @@ def _command(ax: Axes, fit: MethodFit, index: int, column: int, window: slice) -
     top = 1.15 * float(np.max(np.abs(u), initial=1e-9))
     if np.isfinite(high):
         top = max(top, 1.6 * abs(high))
-        ax.axhspan(high, top, color=FORBIDDEN, linewidth=0)
-        ax.text(time[-1], high + 0.1 * (top - high), "beyond the limit", color=VERMILLION,
+        ax.axhspan(high, top, color=style.FORBIDDEN, linewidth=0)
+        ax.text(time[-1], high + 0.1 * (top - high), "beyond the limit", color=style.VERMILLION,
                 fontsize=10, ha="right", va="bottom")  # fmt: skip
     if np.isfinite(low):
-        ax.axhspan(-top, low, color=FORBIDDEN, linewidth=0)
+        ax.axhspan(-top, low, color=style.FORBIDDEN, linewidth=0)
     recorded = fit.estimate.problem.recordings[index].commands
     if len(recorded):
-        ax.plot(time, factor * recorded[window, column][: len(u)], color=RECORDED, linewidth=4.5)
-    ax.plot(time, u, color=BLUE, linewidth=1.3)
+        ax.plot(
+            time, factor * recorded[window, column][: len(u)], color=style.RECORDED, linewidth=4.5
+        )
+    ax.plot(time, u, color=style.BLUE, linewidth=1.3)
     for limit, side in ((low, -1), (high, 1)):
         if np.isfinite(limit):
-            ax.axhline(limit, color=VERMILLION, linewidth=0.9, linestyle=(0, (4, 3)))
+            ax.axhline(limit, color=style.VERMILLION, linewidth=0.9, linestyle=(0, (4, 3)))
             at = np.where(side * (u - limit) >= -1e-4 * abs(limit), u, np.nan)
             # The marker shows a single sample, of which a line has nothing to draw.
-            ax.plot(time, at, "s", ls="-", color=VERMILLION, linewidth=4.5, markersize=4.5,
+            ax.plot(time, at, "s", ls="-", color=style.VERMILLION, linewidth=4.5, markersize=4.5,
                     markeredgewidth=0, solid_capstyle="butt")  # fmt: skip
     ax.set_ylim(-top, top)
 
@@ -130,14 +118,14 @@ def residual_figure(fit: MethodFit) -> Figure:
         factor * (trial.corrected - run.x @ plant.C.T)[:, 0]
         for trial, run in zip(trials, fit.runs, strict=True)
     ][:_MOST]
-    figure = new_figure(HALF, 3.5)
+    figure = style.new_figure(style.HALF, 3.5)
     above, below = figure.subplots(2, 1)
     name = signal_name(plant, plant.outputs[0])
-    strip(above, f"{sentence_case(name)}, recorded minus model ({unit})")
-    strip(below, "Autocorrelation (no unit)")
+    style.strip(above, f"{sentence_case(name)}, recorded minus model ({unit})")
+    style.strip(below, "Autocorrelation (no unit)")
     lags = min(round(_LAGS / plant.dt), min(map(len, series)) // 4)
     for k, part in enumerate(series):
-        colour, width = (BLUE, 1.2) if k == 0 else (MUTED, 0.7)
+        colour, width = (style.BLUE, 1.2) if k == 0 else (style.MUTED, 0.7)
         stride = -(-len(part) // 700)
         time = np.arange(0, len(part), stride) * plant.dt
         above.plot(time, part[::stride], color=colour, linewidth=0.6, zorder=3 - k)
@@ -146,7 +134,7 @@ def residual_figure(fit: MethodFit) -> Figure:
         values = [float(centred[j:] @ centred[: len(centred) - j]) / power for j in range(lags)]
         below.plot(np.arange(lags) * plant.dt, values, color=colour, linewidth=width, zorder=3 - k)
     band = 1.96 / np.sqrt(len(series[0]))
-    below.axhspan(-band, band, color=RULE, linewidth=0, zorder=0)
+    below.axhspan(-band, band, color=style.RULE, linewidth=0, zorder=0)
     above.set_xlabel("Time (s)")
     below.set_xlabel("Lag (s)")
     return figure
@@ -156,7 +144,7 @@ def frequency_figure(result: FitResult, found: FrequencyResponse) -> Figure:
     """Magnitude, phase and coherence: recorded as points, modelled as lines."""
     plant = result.given.plant
     outputs = plant.outputs[:2]
-    figure = new_figure(WIDE, 5.4)
+    figure = style.new_figure(style.WIDE, 5.4)
     axes = figure.subplots(3, len(outputs), sharex=True, squeeze=False, height_ratios=[2, 2, 1.2])
     drive, _ = shown_unit(plant, found.signal)
     for column, name in enumerate(outputs):
@@ -173,11 +161,11 @@ def frequency_figure(result: FitResult, found: FrequencyResponse) -> Figure:
         ):  # fmt: skip
             turn = 360 * np.round(np.median((values - model)[known] if any(known) else 0) / 360)
             points = values - (turn if ax is phase else 0)
-            ax.errorbar(f[known], points[known], 1.96 * spread[known], fmt="o", color=MUTED,
+            ax.errorbar(f[known], points[known], 1.96 * spread[known], fmt="o", color=style.MUTED,
                         markersize=4, linewidth=0.9, label="recorded")  # fmt: skip
-            ax.plot(f, model, color=BLUE, linewidth=1.6, label="model")
-        coherence.plot(f, found.coherence[:, column], color=MUTED)
-        coherence.plot(f, found.threshold, color=RULE, linestyle="--")
+            ax.plot(f, model, color=style.BLUE, linewidth=1.6, label="model")
+        coherence.plot(f, found.coherence[:, column], color=style.MUTED)
+        coherence.plot(f, found.threshold, color=style.RULE, linestyle="--")
         coherence.set_ylim(0, 1.05)
         magnitude.set_yscale("log")
         words = signal_name(plant, name)
@@ -186,7 +174,7 @@ def frequency_figure(result: FitResult, found: FrequencyResponse) -> Figure:
         phase.set_title("Phase (°)")
         coherence.set_title("Coherence (no unit)")
         coherence.set_xscale("log")
-        plain_log(magnitude.yaxis, coherence.xaxis)
+        style.plain_log(magnitude.yaxis, coherence.xaxis)
         coherence.set_xlabel("Frequency (Hz)")
     axes[0, 0].legend()
     return figure
@@ -196,7 +184,7 @@ def statements_figure(result: FitResult) -> Figure:
     """Range of each difference in cost over all weights with the fitted gain."""
     plant = result.given.plant
     shown = sorted(result.compared, key=lambda item: not item.made)[:_MOST_STATEMENTS]
-    figure = new_figure(WIDE, 1.4 + 0.3 * len(shown))
+    figure = style.new_figure(style.WIDE, 1.4 + 0.3 * len(shown))
     ax = figure.subplots()
     ends = np.array([[item.low, item.high] for item in shown])
     reach = 1.5 * float(np.max(np.abs(ends[np.isfinite(ends)]), initial=1.0))
@@ -207,11 +195,11 @@ def statements_figure(result: FitResult) -> Figure:
         label = f"{one} {'+' if same else 'vs'} {other}{same}"
         labels.append(sentence_case(label))
         low, high = np.clip(ends[row], -reach, reach)
-        colour, width = (BLUE, 7) if item.made else (RECORDED, 5)
+        colour, width = (style.BLUE, 7) if item.made else (style.RECORDED, 5)
         ax.plot([low, high], [row, row], color=colour, linewidth=width, solid_capstyle="butt",
                 marker="|" if high - low < _POINT * reach else "", markersize=12,
                 markeredgewidth=3)  # fmt: skip
-    ax.axvline(0, color=INK, linewidth=1)
+    ax.axvline(0, color=style.INK, linewidth=1)
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
     ax.set_xlim(-reach, reach)
     most = int(np.log10(reach))
@@ -220,10 +208,10 @@ def statements_figure(result: FitResult) -> Figure:
     ax.set_xticks(ticks, [f"{one:g}".replace("-", "\u2212") for one in ticks])
     ax.xaxis.minorticks_off()
     ax.set_yticks(range(len(shown)), labels)
-    ax.tick_params(axis="y", length=0, labelcolor=INK)
+    ax.tick_params(axis="y", length=0, labelcolor=style.INK)
     ax.set_ylim(len(shown) - 0.4, -0.7)
     ax.spines["left"].set_visible(False)
     words = "first costs less  \u2190   \u2192  more"
-    ax.text(0, 1.01, words, transform=ax.get_xaxis_transform(), ha="center", color=MUTED)
+    ax.text(0, 1.01, words, transform=ax.get_xaxis_transform(), ha="center", color=style.MUTED)
     ax.set_xlabel("How much more the first costs (in multiples of its own cost)")
     return figure

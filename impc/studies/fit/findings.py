@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from impc.arrays import Array
 from impc.assess.printed_gain import entry_names
 from impc.files.disk import truth_beside
 from impc.inverse.refit import IDENTIFIED
-from impc.model.plant import UNKNOWN
+from impc.model.plant import UNKNOWN, Plant
 from impc.reporting.exchange import long_rows
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.shown_units import error_unit, shown_unit, signal_name
-from impc.studies.fit.facts import named_gains, shift_halves, statement_text
-from impc.studies.fit.result import shown_trials, trial_name
-from impc.studies.methods_table import (
-    gain_units,
-    methods_long,
-    trajectory_table,
-    weight_entries,
-)
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from pathlib import Path
-
-    from impc.arrays import Array
-    from impc.model.plant import Plant
-    from impc.studies.fit.facts import GainRow
-    from impc.studies.fit.result import FitResult
-    from impc.studies.fit.uncertainty import Alternative
+from impc.studies import methods_table
+from impc.studies.fit.facts import GainRow, named_gains, shift_halves, statement_text
+from impc.studies.fit.result import FitResult, shown_trials, trial_name
+from impc.studies.fit.uncertainty import Alternative
 
 # Smallest component of a direction that is printed.
 _NAMED = 0.15
@@ -197,7 +186,7 @@ def number_name(plant: Plant, name: str) -> str:
 
 def number_units(plant: Plant) -> dict[str, str]:
     """Units of the fitted numbers by name: K.<control>.<state>, u_max.<control>."""
-    return gain_units(plant) | {
+    return methods_table.gain_units(plant) | {
         f"u_max.{control}": plant.unit(control) for control in plant.controls
     }
 
@@ -213,7 +202,9 @@ def result_long(result: FitResult) -> list[dict[str, Any]]:
         for end, value in (*own, ("_identified", item.identified)):
             values[f"{quantity}{end}{dot}{place}"] = value
     labels = {**words, "method": "estimate"}
-    return long_rows(values, number_units(plant), labels) + methods_long(result.methods)
+    return long_rows(values, number_units(plant), labels) + methods_table.methods_long(
+        result.methods
+    )
 
 
 def read_truth(recordings: Iterable[Path], plant: Plant) -> Array | None:
@@ -283,7 +274,7 @@ def trajectory_finding(result: FitResult) -> Finding:
     """Recorded and modelled signals of the trials on the page, one row per sample."""
     names = {index: trial_name(result, index) for index in shown_trials(result)}
     runs = {"simulated": result.inverse_mpc.runs}
-    table = trajectory_table(result.fitted.problem, names, runs)
+    table = methods_table.trajectory_table(result.fitted.problem, names, runs)
     return Finding("trajectories", table, "Recorded and modelled signals, one row per sample.")
 
 
@@ -353,7 +344,7 @@ def weight_finding(result: FitResult) -> Finding:
     none = (np.nan, np.nan)
     rows = [
         (*entry, *(ranges.get(frozenset(entry[1:3]), none) if entry[0] == "Q" else none))
-        for entry in weight_entries(plant, weights)
+        for entry in methods_table.weight_entries(plant, weights)
     ]
     heads = ["matrix", "first", "second", "unit", "value", "low", "high"]
     caption = (

@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from impc.assess.diagnosis import Diagnosis, diagnosed
 from impc.assess.lack_of_fit import LackOfFit, lack_of_fit
-from impc.assess.printed_gain import gain_estimate
+from impc.assess.printed_gain import GainEstimate, gain_estimate
 from impc.checking import replace
 from impc.errors import ImpcError
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import fit
 from impc.inverse.noisy_fit import first_end, fit_controller
+from impc.inverse.problem import Problem
 from impc.inverse.refit import refit
 from impc.inverse.search import FEW
+from impc.inverse.unknowns import Fitted
 from impc.studies.methods_table import method_label
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.assess.printed_gain import GainEstimate
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
 
 # Evidence (-log p) of an alarm in a first search that cannot come from its early end.
 _PLAIN = 50.0

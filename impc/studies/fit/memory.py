@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from impc.checking import replace
 from impc.files.digests import digest, versions
 from impc.files.saved_estimates import decode_estimate, encode_estimate
-from impc.inverse.methods import METHODS, Method
+from impc.inverse.estimates import Estimate
+from impc.inverse.methods import METHODS
+from impc.inverse.problem import Problem
 from impc.studies.cache import Cache, Steps
 from impc.studies.fit.first import FitProgress
+from impc.studies.fit.settings import FitSettings
 from impc.studies.methods_table import method_label
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.studies.fit.settings import FitSettings
 
 # What follows the method in the title of an estimate without one trial.
 _LEFT_OUT = re.compile(r", trial (\d+) left out$")
@@ -66,7 +63,10 @@ class FitMemory(Steps):
                 posed = posed.at(np.array(posed.starts), found, np.array(posed.errors))
             if len(kept["logarithms"]) < len(posed.logarithms):
                 posed = posed.with_body_fixed()
-            return decode_estimate(_seen(posed, METHODS[kept["method"]]), kept)
+            method = METHODS[kept["method"]]
+            if method.name not in ("inverse_mpc", "structured"):
+                posed = method.restrict(posed.with_nuisance_fixed())
+            return decode_estimate(posed, kept)
 
         return self.get(name, compute, decode, encode_estimate)
 
@@ -79,10 +79,3 @@ def open_memory(
     body = () if problem.family is None else (problem.family.names, problem.family.deviations)
     known = digest(replace(problem, family=None), *body, settings, made_of, versions())
     return FitMemory(Cache(folder / f"{command}-in-progress"), known, problem=problem)
-
-
-def _seen(posed: Problem, method: Method) -> Problem:
-    """The problem that a method solves."""
-    if method.name in ("inverse_mpc", "structured"):
-        return posed
-    return method.restrict(posed.with_nuisance_fixed())

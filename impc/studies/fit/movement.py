@@ -7,24 +7,19 @@ limit         whether the command is at its limit, for every frame
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from impc.arrays import Array
 from impc.assess.variance_accounted_for import at_limit
 from impc.errors import PlantError
+from impc.model.plant import Plant
 from impc.reporting.document import Quiet, Section
 from impc.reporting.finding import Moving
 from impc.reporting.rendering import sentence_case
 from impc.reporting.shown_units import signal_name
 from impc.studies.fit.figures import shown_window
-from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.fit.result import FitResult, shown_trials, trial_name
 from impc.studies.methods_table import until_its_end
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.model.plant import Plant
-    from impc.studies.fit.result import FitResult
 
 # Longest part in s, most frames per second, and most numbers on a page: 27,000 are 0.12 MB.
 _LONGEST, _RATE, _MOST = 30.0, 25.0, 27_000
@@ -73,10 +68,7 @@ def _moving(result: FitResult) -> Moving | Quiet | None:
 
 
 def _paths(plant: Plant, states: Array) -> tuple[list[str], str, int]:
-    """SVG paths of the body at `states` (frames, n), empty at NaN; view box; exaggeration.
-
-    The first state is rest.
-    """
+    """SVG paths at `states` (frames, n), the first at rest; view box; exaggeration."""
     known, paths, times = np.all(np.isfinite(states), axis=1), [""] * len(states), 1
     points = np.concatenate(lines := plant.drawing(states[known]), axis=1)
     if np.max(np.abs(points - points[0])) < _SMALL * np.ptp(points[0]):

@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from impc.levels import Level
 from impc.model.foresight import physical_disturbances
 from impc.reporting.document import Copy
+from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.shown_units import shown_unit, signal_name
-from impc.studies.fit.aim import aim_sentences
-from impc.studies.fit.facts import (
-    decided,
-    given_limit,
-    held_out,
-    named_gains,
-    shares,
-    statement_text,
-    unlimited_ratio,
-    with_unit,
-)
+from impc.reporting.verdict import Verdict
+from impc.studies.fit import facts
+from impc.studies.fit.result import FitResult
 from impc.studies.fit.structures import structure_sentences
-from impc.studies.fit.verdict import GAIN, SHARE, WEIGHTS, forbidden, reason
-
-if TYPE_CHECKING:
-    from impc.reporting.provenance import Provenance
-    from impc.reporting.verdict import Verdict
-    from impc.studies.fit.result import FitResult
+from impc.studies.fit.verdict import GAIN, RULES, SHARE, WEIGHTS
 
 
 def paper_text(result: FitResult, verdict: Verdict, provenance: Provenance) -> Copy | str:
@@ -39,7 +25,7 @@ def paper_text(result: FitResult, verdict: Verdict, provenance: Provenance) -> C
 
 
 def _methods(result: FitResult, provenance: Provenance) -> list[str]:
-    plant, problem, limit = result.given.plant, result.fitted.problem, given_limit(result)
+    plant, problem, limit = result.given.plant, result.fitted.problem, facts.given_limit(result)
     trials, dt = result.given.recordings, plant.dt
     seconds, rate = sum(trial.samples for trial in trials) * dt, f"{1 / dt:.3g}"
     names = " and ".join(signal_name(plant, one) for one in plant.outputs)
@@ -53,14 +39,14 @@ def _methods(result: FitResult, provenance: Provenance) -> list[str]:
         "second with a zero-phase low-pass filter.",
         f"The body model was {_model_name(provenance)}{provenance.arguments}. The controller "
         f"predicted {problem.horizon * dt:.3g} s ahead at {rate} samples per second, {bounded}.",
-        *aim_sentences(result),
+        *facts.aim_sentences(result),
         "The feedback gain was estimated by minimising the difference between recorded and "
         "modelled outputs in all trials together; 95 % confidence intervals allow for "
         "autocorrelated residuals.",
     ]
     if any(one.stated is not None for one in result.parameters):
         said.append("They include the stated uncertainty of the body model.")
-    if held_out(result) is not None:
+    if facts.held_out(result) is not None:
         said.append("Predictive accuracy was assessed by leaving out one trial at a time.")
     return said
 
@@ -74,31 +60,33 @@ def _pushed(result: FitResult) -> str:
         factor, unit = shown_unit(plant, name)
         if size > 0:
             sizes.append(
-                f"{signal_name(plant, name)} (up to {with_unit(number(factor * size), unit)})"
+                f"{signal_name(plant, name)} (up to {facts.with_unit(number(factor * size), unit)})"
             )
     return f"The perturbation was the {' and '.join(sizes)}. " if sizes else ""
 
 
 def _results(result: FitResult) -> list[str]:
-    no, held = forbidden(result), held_out(result)
-    left_out = f", and for {shares(result, held)} in left-out trials" if held is not None else ""
+    no, held = RULES.forbidden(result), facts.held_out(result)
+    left_out = (
+        f", and for {facts.shares(result, held)} in left-out trials" if held is not None else ""
+    )
     said = [
-        f"The model accounted for {shares(result, result.inverse_mpc.vaf)} of the variance"
+        f"The model accounted for {facts.shares(result, result.inverse_mpc.vaf)} of the variance"
         f"{left_out}."
     ]
     if result.falls:
         said.append(f"Trials that ended in a fall were left out ({len(result.falls)}).")
-    if given_limit(result) and result.met and SHARE not in no:
-        share, (_, without) = 100 * result.saturated, unlimited_ratio(result)
+    if facts.given_limit(result) and result.met and SHARE not in no:
+        share, (_, without) = 100 * result.saturated, facts.unlimited_ratio(result)
         said.append(f"The command was at its limit for {share:.1f} % of the time.{without}")
     if GAIN in no:
-        why = reason(result, GAIN)
+        why = RULES.reason(result, GAIN)
         return [*said, f"Gains are not reported: {why[:1].lower()}{why[1:]}."]
-    gains = [row.text for _, row in named_gains(result) if row.determined]
+    gains = [row.text for _, row in facts.named_gains(result) if row.determined]
     said.append(f"Gains were {'; '.join(gains)}.")
     if WEIGHTS in no:
         return said
-    made = [statement_text(result.given.plant, one) for one in decided(result)]
+    made = [facts.statement_text(result.given.plant, one) for one in facts.decided(result)]
     if made:
         said.append(f"For all cost weights compatible with the recordings: {' '.join(made)}")
     return [*said, *structure_sentences(result)[:1]]

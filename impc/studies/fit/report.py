@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
+from impc.arrays import Array
 from impc.assess.lack_of_fit import LIMIT
 from impc.assess.printed_gain import LastingResponse, lasting_responses
 from impc.checking import replace
@@ -32,8 +32,7 @@ from impc.reporting.rendering import fixed, number, probability
 from impc.reporting.shown_units import shown_unit, signal_name
 from impc.reporting.verdict import Key
 from impc.studies.charts import trajectories
-from impc.studies.fit import figures, findings
-from impc.studies.fit.aim import aim_sentences
+from impc.studies.fit import facts, figures, findings
 from impc.studies.fit.body_words import (
     added_sentence,
     body_sentence_of,
@@ -41,45 +40,14 @@ from impc.studies.fit.body_words import (
     parameter_words,
 )
 from impc.studies.fit.data import fit_data
-from impc.studies.fit.facts import (
-    MATTERS,
-    amount,
-    between,
-    decided,
-    first_gain,
-    given_limit,
-    held_out,
-    left_out_text,
-    limit_ends,
-    named_gains,
-    no_limit,
-    one_of,
-    shares,
-    shift_words,
-    statement_text,
-    unlimited_ratio,
-    with_unit,
-)
 from impc.studies.fit.movement import movement_section
 from impc.studies.fit.paper import paper_text
-from impc.studies.fit.result import shown_trials, trial_name
+from impc.studies.fit.result import FitResult, shown_trials, trial_name
 from impc.studies.fit.settings import plain_settings
 from impc.studies.fit.structures import structure_section
-from impc.studies.fit.verdict import (
-    GAIN,
-    SHARE,
-    WEIGHTS,
-    fallen_verdict,
-    fit_verdict,
-    forbidden,
-    little,
-)
+from impc.studies.fit.verdict import FALLEN, GAIN, RULES, SHARE, WEIGHTS, little
 from impc.studies.methods_figure import explained, methods_figure
 from impc.studies.methods_table import methods_finding, provenance_section
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.studies.fit.result import FitResult
 
 _HIDDEN = "Not shown as a result, because of the warning above."
 
@@ -88,7 +56,7 @@ def fit_report(
     result: FitResult, provenance: Provenance, truth: Array | None = None, missing: str = ""
 ) -> Report:
     """Report of a fit; `truth` (m, n) is the gain of a simulated subject."""
-    verdict, subject = fit_verdict(result), str(result.given.recordings[0].label.subject)
+    verdict, subject = RULES.verdict(result), str(result.given.recordings[0].label.subject)
     trials, dt = result.given.recordings, result.given.plant.dt
     seconds = sum(trial.samples for trial in trials) * dt
     count = "1 trial" if len(trials) == 1 else f"{len(trials)} trials"
@@ -117,7 +85,7 @@ def fit_report(
 
 def fallen_report(falls: tuple[str, ...], provenance: Provenance) -> Report:
     """Report for a subject who fell in every trial."""
-    verdict = fallen_verdict(falls)
+    verdict = FALLEN.verdict(falls)
     made = Section("Provenance", [Terms(provenance.terms)])
     sections = [Section("Falls", [Lines(falls)]), made]
     words = dict.fromkeys(("headline", "reason"), verdict.headline)
@@ -131,8 +99,8 @@ def _hero(result: FitResult, index: int) -> Picture:
     trial = result.fitted.problem.recordings[index]
     factor, unit = shown_unit(plant, plant.outputs[0])
     left = factor * (trial.corrected - run.x @ plant.C.T)[:, 0]
-    said = with_unit(number(float(np.sqrt(np.nanmean(left**2))), 2), unit)
-    limit = "; orange: at the limit" if given_limit(result) else ""
+    said = facts.with_unit(number(float(np.sqrt(np.nanmean(left**2))), 2), unit)
+    limit = "; orange: at the limit" if facts.given_limit(result) else ""
     name = trial_name(result, index)
     return Picture(
         "movement",
@@ -143,7 +111,7 @@ def _hero(result: FitResult, index: int) -> Picture:
 
 
 def _keys(result: FitResult) -> list[Key]:
-    plant, held = result.given.plant, held_out(result)
+    plant, held = result.given.plant, facts.held_out(result)
     vaf = explained(result.inverse_mpc)
     names = [signal_name(plant, name) for name in plant.outputs]
     others = "; ".join(
@@ -154,29 +122,29 @@ def _keys(result: FitResult) -> list[Key]:
         Key(f"{vaf[0]:.2f}", "%", "of the variance explained",
             f"{names[0]}, {where}{'; ' + others if others else ''}")
     ]  # fmt: skip
-    if SHARE in forbidden(result) and result.limit_found is not None:
+    if SHARE in RULES.forbidden(result) and result.limit_found is not None:
         found = result.limit_found
         keys.append(
             Key(number(found.value), f"{found.unit}, not {number(found.given)}",
-                "limit that fits best", limit_ends(found))
+                "limit that fits best", facts.limit_ends(found))
         )  # fmt: skip
-    elif given_limit(result) and result.met:
+    elif facts.given_limit(result) and result.met:
         each = [100 * one.saturated for one in result.trials]
         keys.append(
             Key(f"{100 * result.saturated:.1f}", "% of the time", "at the limit",
                 f"{min(each):.1f} to {max(each):.1f} % in single trials")
         )  # fmt: skip
     else:
-        largest = amount(result, result.inverse_mpc.largest_input)
+        largest = facts.amount(result, result.inverse_mpc.largest_input)
         value, _, unit = largest.partition(" ")
-        limit = given_limit(result)
+        limit = facts.given_limit(result)
         keys.append(
             Key(value, unit, "largest command in the model",
                 f"with a limit of {limit}" if limit else "no limit was given")
         )  # fmt: skip
-    row, gains = first_gain(result), named_gains(result)
-    if row is None or GAIN in forbidden(result):
-        known = 0 if GAIN in forbidden(result) else sum(row.determined for _, row in gains)
+    row, gains = facts.first_gain(result), facts.named_gains(result)
+    if row is None or GAIN in RULES.forbidden(result):
+        known = 0 if GAIN in RULES.forbidden(result) else sum(row.determined for _, row in gains)
         keys.append(Key(str(known), f"of {len(gains)}", "gains to report", "see the warning"))
     else:
         unit = row.unit if row.unit == "-" else f"{row.unit} per {row.per[1:].partition(' of ')[0]}"
@@ -197,7 +165,7 @@ def _draws(result: FitResult, window: int) -> dict[str, Draw]:
     if result.response is not None:
         response = functools.partial(figures.frequency_figure, result, result.response)
         found["frequency-response"] = response
-    if result.compared and WEIGHTS not in forbidden(result):
+    if result.compared and WEIGHTS not in RULES.forbidden(result):
         found["statements"] = functools.partial(figures.statements_figure, result)
     return found
 
@@ -206,7 +174,7 @@ def _sections(
     result: FitResult, provenance: Provenance, truth: Array | None, missing: str
 ) -> list[Section]:
     """Sections of the page; add a line here for a new section."""
-    no = forbidden(result)
+    no = RULES.forbidden(result)
     return [
         Section("Feedback gain", _gain(result, GAIN in no)),
         *([] if result.person is None else [result.person.section()]),
@@ -230,7 +198,7 @@ def _gain(result: FitResult, hidden: bool) -> list[Block]:
     ]
     if hidden:
         return [
-            *aim_sentences(result),
+            *facts.aim_sentences(result),
             Quiet(f"{_HIDDEN} The numbers below are for troubleshooting only."),
             Fold("Gains (do not report)", [findings.per_unit_finding(result), *tables]),
             *findings.error_findings(result),
@@ -240,9 +208,9 @@ def _gain(result: FitResult, hidden: bool) -> list[Block]:
         "A gain is the opposing command per unit of a deviation, as long as the limit is not "
         f"reached. {body_sentence_of(result)}",
         *filter(None, lasting),
-        *aim_sentences(result),
+        *facts.aim_sentences(result),
         *([added_sentence(result)] if result.added else []),
-        *shift_words(result),
+        *facts.shift_words(result),
         findings.per_unit_finding(result),
         Fold(
             "All gains in SI units, combinations and parameters",
@@ -268,16 +236,17 @@ def _lasting(result: FitResult, found: LastingResponse) -> str:
     gravity = dict(plant.gravity).get(found.state)
     times = f", {number(found.value / gravity, 2)} times m g h" if gravity else ""
     return (
-        f"A quick {words} of {one_of(unit)} is answered with {fixed(at_once)} {of}. If it lasts, "
-        f"{change} {fixed(value)} {of} remain (95 % CI {between(low, high)}){times}."
+        f"A quick {words} of {facts.with_unit('1', unit)} is answered with {fixed(at_once)} {of}. "
+        f"If it lasts, {change} {fixed(value)} {of} remain "
+        f"(95 % CI {facts.between(low, high)}){times}."
     )
 
 
 def _limit(result: FitResult, doubtful: bool) -> list[Block]:
-    ratio, without = unlimited_ratio(result)
-    if given_limit(result) is None or not result.met or doubtful:
-        said = no_limit(result)
-    elif ratio >= MATTERS:
+    ratio, without = facts.unlimited_ratio(result)
+    if facts.given_limit(result) is None or not result.met or doubtful:
+        said = facts.no_limit(result)
+    elif ratio >= facts.MATTERS:
         said = f"Yes. The same recordings were fitted with and without a limit.{without}"
     else:
         said = f"Not measurably.{without}"
@@ -301,7 +270,7 @@ def _intent(result: FitResult, hidden: bool) -> list[Block]:
             Quiet("No comparison of costs is made, because of the warning above."),
             Fold("Cost weights (do not report)", [findings.weight_finding(result)]),
         ]
-    plant, summary, made = result.given.plant, result.uncertainty.weights, decided(result)
+    plant, summary, made = result.given.plant, result.uncertainty.weights, facts.decided(result)
     tables = findings.weight_findings(result)
     if summary is None:
         return [Quiet(f"Not available: {result.uncertainty.weights_reason}"), *tables]
@@ -315,7 +284,7 @@ def _intent(result: FitResult, hidden: bool) -> list[Block]:
     return [
         "Many cost weights lead to exactly this movement. Only statements that hold for all of "
         f"them describe the person: {count}, at the 95 % level.{drawn}",
-        *([Lines([statement_text(plant, item) for item in made])] if made else []),
+        *([Lines([facts.statement_text(plant, item) for item in made])] if made else []),
         *([_STATEMENTS] if summary.statements else []),
         Fold("Cost weights by convention, and their ranges", tables),
     ]
@@ -351,7 +320,7 @@ def _checks(result: FitResult, truth: Array | None) -> list[Block]:
     checks = [
         _recordings(result),
         Check(Level.RED if little(result) else Level.GREEN, "Explained variance",
-              left_out_text(result)),
+              facts.left_out_text(result)),
         _limit_check(result),
         _model(result),
         Check(Level.AMBER if result.weights_test.rejected else Level.GREEN, "Cost weights",
@@ -393,13 +362,13 @@ def _recordings(result: FitResult) -> Check:
 
 
 def _limit_check(result: FitResult) -> Check:
-    limit, found, last = given_limit(result), result.limit_found, result.lack[-1]
+    limit, found, last = facts.given_limit(result), result.limit_found, result.lack[-1]
     level, said = Level.NOTE, f"Given as {limit}; it was not tested."
     if limit is None or not result.met:
-        said = no_limit(result)
+        said = facts.no_limit(result)
     elif found is not None:
         level = Level.AMBER if found.disagrees else Level.GREEN
-        ends = f"{number(found.value)} {found.unit} ({limit_ends(found)})"
+        ends = f"{number(found.value)} {found.unit} ({facts.limit_ends(found)})"
         said = f"Given as {limit}; the recordings point to {ends}."
     elif last is not None:
         tested = [one for one in last.errors if one.name == LIMIT]
@@ -436,8 +405,9 @@ def _others(result: FitResult) -> list[Check]:
         one = result.ceiling
         found.append(
             Check(Level.NOTE, "Repeatable movement",
-                  f"{shares(result, one.vaf, 1)} of the variance repeats with the perturbation "
-                  f"({one.repetitions} repetitions): a model without noise cannot explain more.")
+                  f"{facts.shares(result, one.vaf, 1)} of the variance repeats with the "
+                  f"perturbation ({one.repetitions} repetitions): a model without noise cannot "
+                  "explain more.")
         )  # fmt: skip
     doubts, gain = list(result.fitted.doubts), result.estimate
     if result.fitted.fit.unconfirmed and gain.ended in (Ended.STUCK, Ended.STOPPED):

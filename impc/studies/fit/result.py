@@ -9,31 +9,28 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from impc.assess.assessments import simulated_vaf
+from impc.arrays import Array
+from impc.assess.assessments import MethodFit, simulated_vaf
+from impc.assess.ceiling import Ceiling
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.printed_gain import PARAMETER, entry_names
+from impc.assess.frequency_response import FrequencyResponse
+from impc.assess.intent import Intent
+from impc.assess.lack_of_fit import LackOfFit, ModelError
+from impc.assess.printed_gain import PARAMETER, GainEstimate, Interval, entry_names
+from impc.assess.structures import StructureFit
+from impc.assess.variance_accounted_for import TrialAgreement
+from impc.assess.weights_ranges import Statement
+from impc.assess.weights_test import WeightsTest
 from impc.control.simulation import Status
-from impc.inverse.problem import simulated
+from impc.inverse.estimates import Estimate, Identifiability
+from impc.inverse.problem import Problem, simulated
 from impc.model.plant_family import LIMIT
 from impc.reporting.shown_units import shown_unit
+from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.assess.assessments import MethodFit
-    from impc.assess.ceiling import Ceiling
-    from impc.assess.frequency_response import FrequencyResponse
-    from impc.assess.intent import Intent
-    from impc.assess.lack_of_fit import LackOfFit, ModelError
-    from impc.assess.printed_gain import GainEstimate, Interval
-    from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import TrialAgreement
-    from impc.assess.weights_ranges import Statement
-    from impc.assess.weights_test import WeightsTest
-    from impc.inverse.estimates import Estimate, Identifiability
-    from impc.inverse.problem import Problem
     from impc.output_feedback.models import PersonReport
-    from impc.studies.fit.settings import FitSettings
-    from impc.studies.fit.uncertainty import Uncertainty
 
 #: Largest number of trials on a page: 500 trials gave 51 MB and needed 6.3 GB of memory.
 MOST_TRIALS = 24

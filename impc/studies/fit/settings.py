@@ -255,18 +255,14 @@ def fit_settings(table: Mapping[str, Any]) -> FitSettings:
     for name, limit in given:  # it is squared and divided by
         if isinstance(limit, float) and not (1e-100 <= limit <= 1e100 or limit == np.inf):
             raise InputError(f"[fit] {name}", f"got {limit}", "give at least 1e-100, at most 1e100")
-    _require_distinct(settings)
+    for name in ("free", "offsets", "feedback_states", "profiles", "horizons", "methods"):
+        items = getattr(settings, name)
+        twice = [item for index, item in enumerate(items) if item in items[:index]]
+        if twice:
+            raise InputError(f"[fit] {name}", f"contains {twice[0]} twice", "list each name once")
     for name in settings.methods:
         method_named(name)
     return replace(settings, solver=require_solver(settings.solver))
-
-
-def _require_distinct(settings: FitSettings) -> None:
-    for name in ("free", "offsets", "feedback_states", "profiles", "horizons", "methods"):
-        given = getattr(settings, name)
-        twice = [item for index, item in enumerate(given) if item in given[:index]]
-        if twice:
-            raise InputError(f"[fit] {name}", f"contains {twice[0]} twice", "list each name once")
 
 
 def missing(settings: FitSettings, source: PlantSource) -> str:

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from impc.assess.covariance import TWO_SIDED
 from impc.assess.structured_weights import IDENTIFIED_FACTOR
+from impc.assess.structures import StructureFit
 from impc.assess.variance_accounted_for import innovation_roots, innovations_criterion
 from impc.reporting.document import Block, Fold, Section
 from impc.reporting.finding import Finding, table_of
 from impc.reporting.rendering import probability
 from impc.reporting.shown_units import words_of
 from impc.studies.fit.facts import shares
+from impc.studies.fit.result import FitResult
 from impc.studies.methods_figure import explained
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.assess.structures import StructureFit
-    from impc.studies.fit.result import FitResult
 
 # Power below which the test is said to have little power.
 _BLIND = 0.1

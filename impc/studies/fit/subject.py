@@ -9,50 +9,42 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
 from impc.arrays import Array, frozen
-from impc.assess.assessments import evaluate_method
+from impc.assess.assessments import MethodFit, evaluate_method
 from impc.assess.ceiling import ceiling
 from impc.assess.frequency_response import frequency_response
-from impc.assess.intent import intent
-from impc.assess.printed_gain import gain_estimate
-from impc.assess.structures import assess_structure, no_structure
+from impc.assess.intent import Intent, intent
+from impc.assess.printed_gain import GainEstimate, gain_estimate
+from impc.assess.structures import StructureFit, assess_structure, no_structure
 from impc.assess.variance_accounted_for import agreement, left_out
-from impc.assess.weights_ranges import estimate_draws, weights_summary_or_reason
-from impc.assess.weights_test import identifiability, weights_test
+from impc.assess.weights_ranges import WeightsSummary, estimate_draws, weights_summary_or_reason
+from impc.assess.weights_test import WeightsTest, identifiability, weights_test
 from impc.checking import replace
+from impc.control.simulation import Simulation
 from impc.errors import SolverError, WeightsError
 from impc.inverse.cross_check import cross_checked
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS
+from impc.inverse.problem import Problem
 from impc.inverse.structured import fit_structured
 from impc.studies.fit.asked import fit_structures, output_feedback
 from impc.studies.fit.first import FitProgress, first_fits
 from impc.studies.fit.result import LITTLE, FitResult, FittedParameter
+from impc.studies.fit.settings import FitSettings, ObserverSettings
 from impc.studies.fit.uncertainty import analyses, assess
 from impc.studies.methods_table import method_label
 from impc.studies.pool import threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
     from concurrent.futures import ThreadPoolExecutor
 
-    from impc.assess.assessments import MethodFit
-    from impc.assess.intent import Intent
-    from impc.assess.printed_gain import GainEstimate
-    from impc.assess.structures import StructureFit
-    from impc.assess.variance_accounted_for import TrialAgreement
-    from impc.assess.weights_ranges import WeightsSummary
-    from impc.assess.weights_test import WeightsTest
-    from impc.control.simulation import Simulation
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.model.bounds import Bounds
     from impc.output_feedback.models import PersonReport
-    from impc.studies.fit.settings import FitSettings, ObserverSettings
 
 _THREADS = 2
 # Titles of stages. The number and not the name of a structure: stored results have these names.
@@ -88,10 +80,7 @@ def _left_out_titles(problem: Problem, settings: FitSettings) -> list[str]:
 
 
 def fit_alone(problem: Problem, settings: FitSettings) -> FitResult:
-    """Fit a subject as `fit_recordings` does, without what only its own page shows.
-
-    Left out are the other methods, the set of weights and analyses on request.
-    """
+    """Fit a subject without other methods, the set of weights and analyses on request."""
     settings = replace(settings, structures=[], methods=[], profiles=[], horizons=[])
     settings = replace(settings, unknown_limit=False, replicates=0, observer=None)
     return fit_recordings(problem, replace(settings, feedback_states=[]), alone=True)
@@ -119,6 +108,7 @@ def fit_recordings(
     known, weights = fitted.problem.with_nuisance_fixed(), fitted.stage_weights
     pair = np.array(fitted.gain), np.array(fitted.metrics)
     intended = intent(known.plant, *pair, state_sizes(own.runs), weights)
+    sides = np.array(problem.bounds.u_min), np.array(problem.bounds.u_max)
     doubted = lack[-1] is not None and lack[-1].alarm
     test = weights_test(fitted, estimate, contradicted=doubted)
     usable = bool(np.all(own.vaf >= LITTLE))
@@ -139,7 +129,10 @@ def fit_recordings(
         intent=intended,
         identifiability=identifiability(known, weights),
         uncertainty=uncertainty if usable or alone else replace(uncertainty, intervals=()),
-        trials=_agreements(known, own.runs, problem.bounds),
+        trials=tuple(
+            agreement(known.plant, trial, run, *sides)
+            for trial, run in zip(known.recordings, own.runs, strict=True)
+        ),
         methods=(*others, own),
         lack=lack,
         weights_test=test,
@@ -273,15 +266,6 @@ def _structures(
             )
         progress.done(stage)
     return tuple(found)
-
-
-def _agreements(
-    known: Problem, runs: Sequence[Simulation], bounds: Bounds
-) -> tuple[TrialAgreement, ...]:
-    return tuple(
-        agreement(known.plant, trial, run, np.array(bounds.u_min), np.array(bounds.u_max))
-        for trial, run in zip(known.recordings, runs, strict=True)
-    )
 
 
 def _parameters(estimate: GainEstimate) -> tuple[FittedParameter, ...]:

@@ -8,13 +8,20 @@ gain. On request: bootstrap, profile likelihoods, input limit, other horizons
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.assess.input_limits import input_limit
-from impc.assess.printed_gain import LEVEL, Interval, covariance_intervals, gain_estimate
+from impc.assess.printed_gain import (
+    LEVEL,
+    GainEstimate,
+    Interval,
+    covariance_intervals,
+    gain_estimate,
+)
 from impc.assess.profiles import profile_likelihood, require_numbers
 from impc.assess.resampling import Replicate, bootstrap_intervals, replicate
 from impc.assess.variance_accounted_for import (
@@ -22,22 +29,16 @@ from impc.assess.variance_accounted_for import (
     innovations_criterion,
     left_out,
 )
+from impc.assess.weights_ranges import WeightsSummary
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
+from impc.inverse.estimates import Estimate
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import Problem
 from impc.reporting.shown_units import signal_name
 from impc.studies.cache import from_json, to_json
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.arrays import Array
-    from impc.assess.printed_gain import GainEstimate
-    from impc.assess.weights_ranges import WeightsSummary
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.studies.fit.first import FitProgress
-    from impc.studies.fit.settings import FitSettings
+from impc.studies.fit.first import FitProgress
+from impc.studies.fit.settings import FitSettings
 
 
 @dataclass(frozen=True)

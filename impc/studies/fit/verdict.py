@@ -6,7 +6,7 @@ results that they forbid are hidden.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from impc.checking import replace
 from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
+from impc.studies.fit import facts
 from impc.studies.fit.body_words import (
     alternative_reason,
     error_words,
@@ -22,31 +23,7 @@ from impc.studies.fit.body_words import (
     probability_words,
     remedy_words,
 )
-from impc.studies.fit.facts import (
-    MATTERS,
-    amount,
-    decided,
-    ends_words,
-    enough_words,
-    example_gain,
-    explained_words,
-    given_limit,
-    left_out_text,
-    limit_ends,
-    named_gains,
-    no_limit,
-    outside_offset,
-    reported_shares,
-    shares,
-    unlimited_ratio,
-)
-from impc.studies.fit.result import LITTLE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.reporting.verdict import Verdict
-    from impc.studies.fit.result import FitResult
+from impc.studies.fit.result import LITTLE, FitResult
 
 # VAF (%) below which the residual is large; p of the whiteness test that rules out white noise.
 _MUCH, _COLOURED = 90.0, 1e-3
@@ -60,29 +37,9 @@ _NO_GAIN = frozenset([GAIN, WEIGHTS])
 _NOTHING = frozenset([GAIN, WEIGHTS, SHARE])
 
 
-def fit_verdict(result: FitResult) -> Verdict:
-    """The verdict of a fit."""
-    return _RULES.verdict(result)
-
-
-def forbidden(result: FitResult) -> frozenset[str]:
-    """Results that the page must not show."""
-    return _RULES.forbidden(result)
-
-
-def reason(result: FitResult, what: str) -> str:
-    """Title of the first warning that forbids a result; empty if none does."""
-    return _RULES.reason(result, what)
-
-
-def fallen_verdict(falls: tuple[str, ...]) -> Verdict:
-    """Verdict if every trial ended in a fall, so that nothing was fitted."""
-    return _FALLEN.verdict(falls)
-
-
 def little(result: FitResult) -> bool:
     """Whether the model does not describe the recordings."""
-    found, where = reported_shares(result)
+    found, where = facts.reported_shares(result)
     # Uncertain gains predict short trials badly even if the model is right.
     short = where == "left-out trials" and result.given.recorded_numbers < _SHORT
     return bool(not np.all(found >= LITTLE) and not (short and _weak(result)))
@@ -90,7 +47,7 @@ def little(result: FitResult) -> bool:
 
 def _disagrees(result: FitResult) -> bool:
     found = result.limit_found
-    return found is not None and given_limit(result) is not None and found.disagrees
+    return found is not None and facts.given_limit(result) is not None and found.disagrees
 
 
 def _named_cause(result: FitResult) -> str:
@@ -116,11 +73,7 @@ def _noise(result: FitResult) -> bool:
 
 
 def _weak(result: FitResult) -> bool:
-    return not any(row.determined for _, row in named_gains(result))
-
-
-def _refused(result: FitResult) -> bool:
-    return bool(result.structures) and result.structures[0].refused
+    return not any(row.determined for _, row in facts.named_gains(result))
 
 
 def _of_limit(result: FitResult) -> str:
@@ -160,7 +113,7 @@ def _added(result: FitResult) -> str:
 
 def _names(result: FitResult, *, known: bool) -> str:
     """Names of the gains that are known to within half of their value, or of the others."""
-    names = [name for name, row in named_gains(result) if row.determined == known]
+    names = [name for name, row in facts.named_gains(result) if row.determined == known]
     return ", ".join(dict.fromkeys(names))
 
 
@@ -174,17 +127,17 @@ def _many(count: int, one: str) -> str:
 
 
 _WORDS: dict[str, Callable[[FitResult], object]] = {
-    "limit": lambda it: given_limit(it) or "no limit of the command",
-    "largest": lambda it: amount(it, it.inverse_mpc.largest_input),
-    "explained": explained_words,
-    "where": lambda it: reported_shares(it)[1],
-    "shares": lambda it: f"{shares(it, it.inverse_mpc.vaf, 0)} of the variance",
-    "gain_shares": lambda it: shares(it, it.gain_shares, 0),
-    "left_out": left_out_text,
+    "limit": lambda it: facts.given_limit(it) or "no limit of the command",
+    "largest": lambda it: facts.amount(it, it.inverse_mpc.largest_input),
+    "explained": facts.explained_words,
+    "where": lambda it: facts.reported_shares(it)[1],
+    "shares": lambda it: f"{facts.shares(it, it.inverse_mpc.vaf, 0)} of the variance",
+    "gain_shares": lambda it: facts.shares(it, it.gain_shares, 0),
+    "left_out": facts.left_out_text,
     "status": lambda it: it.fitted.status.sentence,
     "found": _found_limit,
     "found_value": lambda it: number(it.limit_found.value) if it.limit_found else "",
-    "found_ends": lambda it: limit_ends(it.limit_found) if it.limit_found else "",
+    "found_ends": lambda it: facts.limit_ends(it.limit_found) if it.limit_found else "",
     "of_limit": _of_limit,
     "error": _error,
     "reason": _reason,
@@ -197,7 +150,7 @@ _WORDS: dict[str, Callable[[FitResult], object]] = {
         lambda it: _named_cause(it) == "signal",
         "Check units, zeros and clocks of the recording devices.",
     ),
-    "offset": outside_offset,
+    "offset": facts.outside_offset,
     "weights": lambda it: it.weights_test.sentence,
     "conflict": lambda it: it.weights_test.conflict,
     "structure": lambda it: it.structures[0].structure.name if it.structures else "",
@@ -206,25 +159,27 @@ _WORDS: dict[str, Callable[[FitResult], object]] = {
     "others": lambda it: "other" if len(it.falls) == 1 else "others",
     "falls": lambda it: "; ".join(it.falls),
     "fell": lambda it: "One trial" if len(it.falls) == 1 else f"{len(it.falls)} trials",
-    "gains": lambda it: len(named_gains(it)),
-    "ends": ends_words,
-    "enough": enough_words,
+    "gains": lambda it: len(facts.named_gains(it)),
+    "ends": facts.ends_words,
+    "enough": facts.enough_words,
     "held": lambda it: (
         "It predicts trials it was not fitted to, a" if len(it.inverse_mpc.held_out) else "A"
     ),
     "matters": lambda it: (
-        "The limit matters." if unlimited_ratio(it)[0] >= MATTERS else "The limit is reached."
+        "The limit matters."
+        if facts.unlimited_ratio(it)[0] >= facts.MATTERS
+        else "The limit is reached."
     ),
     "time": lambda it: f"{100 * it.saturated:.1f} %",
-    "without": lambda it: unlimited_ratio(it)[1],
+    "without": lambda it: facts.unlimited_ratio(it)[1],
     "known": lambda it: _names(it, known=True),
     "unknown": lambda it: _names(it, known=False),
-    "example": example_gain,
-    "comparisons": lambda it: _many(len(decided(it)), "comparison"),
+    "example": facts.example_gain,
+    "comparisons": lambda it: _many(len(facts.decided(it)), "comparison"),
     "chosen": lambda it: it.identifiability.chosen,
     "free": lambda it: it.identifiability.free,
     "rank": lambda it: it.identifiability.free - it.identifiability.chosen,
-    "no_limit": no_limit,
+    "no_limit": facts.no_limit,
     "trials": lambda it: _many(len(it.trials), "trial"),
 }
 
@@ -315,7 +270,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
     ),
     Kind(
         Level.AMBER,
-        outside_offset,
+        facts.outside_offset,
         "The model follows the movement only about a level that was never recorded.",
         "A fitted offset lies outside the recorded signal. Do not report the gains.",
         "A fitted offset lies outside the recorded signal",
@@ -408,7 +363,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
     ),
     Kind(
         Level.AMBER,
-        _refused,
+        lambda it: it.structures and it.structures[0].refused,
         "The gain is identified, but the structure “{structure}” does not explain it.",
         "Do not report cost weights within this structure.",
         "The recordings reject the structure “{structure}”",
@@ -451,7 +406,7 @@ _KINDS: tuple[Kind[FitResult], ...] = (
     ),
     Kind(
         Level.GREEN,
-        lambda it: given_limit(it) is None,
+        lambda it: facts.given_limit(it) is None,
         "A linear feedback explains this movement; no limit was given.",
         "You may report the gains. Nothing can be said about a limit of the command.",
         "Note: no limit of the command was given",
@@ -488,11 +443,11 @@ _KINDS: tuple[Kind[FitResult], ...] = (
 
 def _allows(result: FitResult, what: str = "") -> bool:
     """Whether the model describes the recordings, and this result is not forbidden."""
-    return not little(result) and what not in forbidden(result)
+    return not little(result) and what not in RULES.forbidden(result)
 
 
 def _limit_matters(result: FitResult) -> bool:
-    return _allows(result, SHARE) and result.met and given_limit(result) is not None
+    return _allows(result, SHARE) and result.met and facts.given_limit(result) is not None
 
 
 _MAY: tuple[Line[FitResult], ...] = (
@@ -509,7 +464,7 @@ _MAY: tuple[Line[FitResult], ...] = (
     Line(lambda it: _allows(it) and it.limit_found is not None and it.met,
          "The limit is {found} ({found_ends}).", "Estimated from the movement, not only assumed."),
     Line(lambda it: _allows(it, GAIN), "The gain on {known}, with intervals.", "{example}"),
-    Line(lambda it: _allows(it, WEIGHTS) and decided(it),
+    Line(lambda it: _allows(it, WEIGHTS) and facts.decided(it),
          "{comparisons} of cost, listed under Intent.",
          "Each holds for all cost weights that fit the recordings."),
     Line(lambda it: it.falls, "The number and times of the falls.", "{falls}."),
@@ -517,16 +472,16 @@ _MAY: tuple[Line[FitResult], ...] = (
 
 
 _MAY_NOT: tuple[Line[FitResult], ...] = (
-    Line(lambda it: GAIN in forbidden(it), "Any gain.", "See the warning above."),
-    Line(lambda it: GAIN not in forbidden(it) and _names(it, known=False),
+    Line(lambda it: GAIN in RULES.forbidden(it), "Any gain.", "See the warning above."),
+    Line(lambda it: GAIN not in RULES.forbidden(it) and _names(it, known=False),
          "The gain on {unknown}, by itself.", "It is not known to within half of its value."),
-    Line(lambda it: WEIGHTS in forbidden(it), "Any cost weight, or comparison of costs.",
+    Line(lambda it: WEIGHTS in RULES.forbidden(it), "Any cost weight, or comparison of costs.",
          "See the warning above."),
-    Line(lambda it: WEIGHTS not in forbidden(it),
+    Line(lambda it: WEIGHTS not in RULES.forbidden(it),
          "The matrix of cost weights, or one of its entries, as a property of the person.",
          "{free} numbers describe the cost. These recordings fix {rank}; a convention chooses the "
          "other {chosen}."),
-    Line(lambda it: SHARE in forbidden(it) or given_limit(it) is None or not it.met,
+    Line(lambda it: SHARE in RULES.forbidden(it) or facts.given_limit(it) is None or not it.met,
          "The time at the limit, or that the limit matters.", "{no_limit}"),
     Line(always, "That the person computes an optimal plan.",
          "Another rule that gives the same command would look the same."),
@@ -534,9 +489,10 @@ _MAY_NOT: tuple[Line[FitResult], ...] = (
          "{trials} of one person in one condition."),
 )  # fmt: skip
 
-_RULES = Rules(_WORDS, _KINDS, _MAY, _MAY_NOT)
+RULES: Rules[FitResult] = Rules(_WORDS, _KINDS, _MAY, _MAY_NOT)
 
-_FALLEN = Rules[tuple[str, ...]](
+#: Rules if every trial ended in a fall, so that nothing was fitted.
+FALLEN = Rules[tuple[str, ...]](
     {"falls": "; ".join},
     (
         Kind(

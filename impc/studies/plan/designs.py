@@ -8,9 +8,8 @@ length of the trial, or if an output exceeds its mechanical stop.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,18 +18,13 @@ from impc.assess.expected import Expectation, expected_intervals
 from impc.assess.printed_gain import follows_command
 from impc.assess.variance_accounted_for import saturated_share
 from impc.control.closed_loop import simulate
+from impc.control.controller import Controller
 from impc.control.simulation import scenario
 from impc.errors import SolverError
 from impc.inverse.problem import Problem
+from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily
 from impc.model.recordings import Recording
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.control.controller import Controller
-    from impc.model.plant import Plant
-    from impc.model.plant_family import PlantFamily
-
 
 #: (amplitude, hold time, number of the draw) -> disturbance (samples, d).
 Perturbation = Callable[[float, float, int], Array]
@@ -161,11 +155,11 @@ def best_of(person: Person, outcomes: Sequence[Outcome], falls: float) -> Outcom
     Variances are relative to the gain and, for a mean that exists if nothing is known of a gain,
     those after a prior with an SD of the gain's size.
     """
-    held = [
-        (_score(relative_errors(person, np.array(item.expected.gain.entries))), item)
-        for item in outcomes
-        if item.expected is not None and item.falls <= falls
-    ]
+    held = []
+    for item in outcomes:
+        if item.expected is not None and item.falls <= falls:
+            errors = relative_errors(person, np.array(item.expected.gain.entries))
+            held.append((float(np.mean(1 / (1 + np.maximum(errors, 1e-100) ** -2))), item))
     if not held:
         least = min(item.falls for item in outcomes)
         raise SolverError(
@@ -175,7 +169,3 @@ def best_of(person: Person, outcomes: Sequence[Outcome], falls: float) -> Outcom
             "reduce amplitude, or increase u_max or the allowed share falls",
         )
     return min(held, key=lambda pair: pair[0])[1]
-
-
-def _score(errors: Array) -> float:
-    return float(np.mean(1 / (1 + np.maximum(errors, 1e-100) ** -2)))

@@ -13,31 +13,16 @@ import pandas as pd
 from impc.assess.covariance import TWO_SIDED
 from impc.reporting.document import Block, Checks, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture, table_of
+from impc.reporting.provenance import Provenance
 from impc.reporting.shown_units import shown_unit
 from impc.reporting.style import BLUE, GREEN, HALF, INK, MUTED, RULE, new_figure, plain_log
-from impc.studies.fit.facts import one_of
+from impc.studies.fit.facts import with_unit
+from impc.studies.plan import sentences
 from impc.studies.plan.designs import gain_places, relative_errors
-from impc.studies.plan.sentences import (
-    expected,
-    gain_names,
-    halves,
-    listed,
-    plan_checks,
-    plan_copy,
-    plan_keys,
-    plan_verdict,
-    shown_gains,
-    stated_as,
-    target,
-    widths,
-)
-from impc.studies.plan.study import spread
+from impc.studies.plan.study import Plan, spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from impc.reporting.provenance import Provenance
-    from impc.studies.plan.study import Plan
 
 _TRIALS = Picture(
     "trials",
@@ -56,13 +41,13 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
     return Report(
         "impc plan",
         "plan of an experiment",
-        plan_verdict(plan),
+        sentences.RULES.verdict(sentences.Facts(plan)),
         [
             Section("Gains", [_gains(plan), *_body(plan)]),
             Section("Experiments", [_experiments(plan)]),
             Section("Groups", [_groups(plan)]),
             Section("Assumed person", [_person(plan)]),
-            Section("Checks", [Checks(plan_checks(plan))]),
+            Section("Checks", [Checks(sentences.plan_checks(plan))]),
             Section("Provenance", [Terms(provenance.terms)]),
         ],
         meta=(
@@ -71,9 +56,9 @@ def plan_report(plan: Plan, provenance: Provenance) -> Report:
             f"{len(plan.outcomes)} experiments simulated",
         ),
         hero=_TRIALS,
-        keys=plan_keys(plan),
+        keys=sentences.plan_keys(plan),
         figures={"trials": lambda: _trials_figure(plan)},
-        copy=plan_copy(plan),
+        copy=sentences.plan_copy(plan),
         data=_data(plan),
         provenance=provenance,
     )
@@ -83,16 +68,16 @@ def _trials_figure(plan: Plan) -> Figure:
     """Half width of each interval over the number of trials."""
     figure = new_figure(HALF, 3.6)
     ax = figure.subplots()
-    counts, sides = widths(plan)
+    counts, sides = sentences.widths(plan)
     shares = np.clip(100 * sides, 1e-3, None)
     shares[shares > _MOST] = np.nan
-    aim, planned = 100 * target(plan), plan.settings.trials
+    aim, planned = 100 * sentences.target(plan), plan.settings.trials
     known = [*shares[np.isfinite(shares)], aim]
     low, high = math.log(min(known) / 1.3), math.log(max(known) * 1.4)
     styles, least = list(itertools.islice(itertools.cycle(_LINES), len(shares.T))), -1.0
     for values, (color, marker, line) in zip(shares.T, styles, strict=True):
         ax.plot(counts, values, color=color, marker=marker, linestyle=line)
-    names = gain_names(plan)
+    names = sentences.gain_names(plan)
     for k in np.argsort(shares[-1])[: np.count_nonzero(np.isfinite(shares[-1]))]:
         # Names at the right ends of the curves, without overlap.
         least = max((math.log(shares[-1, k]) - low) / (high - low), least + _LINE)
@@ -117,7 +102,7 @@ def _trials_figure(plan: Plan) -> Figure:
 
 def _experiments(plan: Plan) -> Finding:
     """Table of experiments with expected 95 % intervals relative to the gains."""
-    plant, shown = plan.person.controller.plant, shown_gains(plan)
+    plant, shown = plan.person.controller.plant, sentences.shown_gains(plan)
     unknown = np.full(np.shape(plan.person.controller.K), np.nan)
     sides = 100 * TWO_SIDED * np.array([
         relative_errors(plan.person, unknown if item.expected is None else item.expected.deviations)
@@ -156,18 +141,18 @@ def _experiments(plan: Plan) -> Finding:
 
 def _gains(plan: Plan) -> Finding:
     """Table of the assumed gains with their expected intervals, in shown units."""
-    found, fits, rows = expected(plan), plan.simulated, shown_gains(plan)
+    found, fits, rows = sentences.expected(plan), plan.simulated, sentences.shown_gains(plan)
     plant, K = plan.person.controller.plant, np.array(plan.person.controller.K)
     commands = [shown_unit(plant, one.control) for one in rows]
     states = [shown_unit(plant, one.state) for one in rows]
     scales = [of[0] / per[0] for of, per in zip(commands, states, strict=True)]
     table = pd.DataFrame(
         {
-            "gain": gain_names(plan),
-            "for_every": [one_of(unit) for _, unit in states],
+            "gain": sentences.gain_names(plan),
+            "for_every": [with_unit("1", unit) for _, unit in states],
             "assumed": K[gain_places(plant)] * scales,
             "unit": [unit for _, unit in commands],
-            "interval": list(map(stated_as, halves(plan).tolist())),
+            "interval": list(map(sentences.stated_as, sentences.halves(plan).tolist())),
             "standard_error_percent": 100 * relative_errors(plan.person, found.deviations),
         }
     )
@@ -195,7 +180,7 @@ def _gains(plan: Plan) -> Finding:
 
 def _body(plan: Plan) -> list[Block]:
     """Table of the benefit of measuring body parameters, most useful first."""
-    found, problem, person = expected(plan), plan.best.problem, plan.person
+    found, problem, person = sentences.expected(plan), plan.best.problem, plan.person
     if found.exact is None or problem is None or problem.family is None:
         return []
     now, exact, tenfold = (
@@ -209,11 +194,11 @@ def _body(plan: Plan) -> list[Block]:
     ]
     plant = person.controller.plant
     each = np.round(100 * found.narrower[gain_places(plant)].T, 1) + 0.0
-    heads = [f"{one.key}_narrower_percent" for one in shown_gains(plan)]
+    heads = [f"{one.key}_narrower_percent" for one in sentences.shown_gains(plan)]
     table = pd.DataFrame(each, columns=heads)
     table.insert(0, "parameter", np.array(problem.parameter_names)[problem.stated])
     table.insert(1, "stated_percent", 100 * problem.parameter_units[problem.stated])
-    words = (f"{name} (%)" for name in gain_names(plan))
+    words = (f"{name} (%)" for name in sentences.gain_names(plan))
     return [
         Finding(
             "body",
@@ -233,7 +218,7 @@ def _groups(plan: Plan) -> Finding:
     powers = [f"power_with_{size}_a_group_percent" for size in settings.groups]
     rows = [
         (name, 100 * item.deviation, *(100 * np.array(item.powers)), item.needed)
-        for item, name in zip(plan.groups, gain_names(plan), strict=True)
+        for item, name in zip(plan.groups, sentences.gain_names(plan), strict=True)
     ]
     heads = ["gain", "deviation_in_a_group_percent", *powers, "persons_a_group_for_80_percent"]
     sizes = zip(powers, settings.groups, strict=True)
@@ -258,9 +243,9 @@ def _person(plan: Plan) -> Terms:
     kind = f"correlated over {tau:g} s" if tau > 0 else "uncorrelated"
     limited = np.isfinite(controller.bounds.u_max)
     names = tuple(np.array(plant.controls)[limited])
-    limit = listed(plan, names, controller.bounds.u_max[limited])
+    limit = sentences.listed(plan, names, controller.bounds.u_max[limited])
     terms = [
-        ("Measurement noise", f"{listed(plan, plant.outputs, person.deviation)}; {kind}"),
+        ("Measurement noise", f"{sentences.listed(plan, plant.outputs, person.deviation)}; {kind}"),
         ("Prediction horizon", f"{controller.horizon * plant.dt:g} s"),
         ("Limit", limit or "none"),
     ]
@@ -268,7 +253,7 @@ def _person(plan: Plan) -> Terms:
 
 
 def _data(plan: Plan) -> dict[str, Any]:
-    person, found, fits = plan.person, expected(plan), plan.simulated
+    person, found, fits = plan.person, sentences.expected(plan), plan.simulated
     simulated = None
     if fits is not None:
         inside = fits.inside(person, found)

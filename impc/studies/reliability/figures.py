@@ -10,14 +10,13 @@ import numpy as np
 import scipy
 
 from impc.reporting import style
+from impc.reporting.document import Draw
 from impc.reporting.rendering import sentence_case
+from impc.studies.reliability.analysis import Reliability, Trials
 from impc.studies.reliability.verdict import BANDS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from impc.reporting.document import Draw
-    from impc.studies.reliability.analysis import Reliability, Trials
 
 _LINES = ((style.BLUE, "-"), (style.VERMILLION, "--"), (style.GREEN, ":"), (style.INK, "-."))
 

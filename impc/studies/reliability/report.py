@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from impc.arrays import Array
 from impc.assess.several_tests import holm
+from impc.files.digests import Inputs
 from impc.levels import Level
-from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
+from impc.reporting.document import Block, Check, Checks, Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number, probability, sentence_case
 from impc.reporting.verdict import Key
-from impc.studies.reliability.analysis import MEASURES
-from impc.studies.reliability.figures import reliability_figures
-from impc.studies.reliability.verdict import (
-    RULES,
-    Facts,
-    change_text,
-    icc_text,
-    interval_band,
-    lowest,
+from impc.studies.reliability import verdict as rules
+from impc.studies.reliability.analysis import (
+    MEASURES,
+    CmcResult,
+    MeasureResult,
+    Reliability,
+    Trials,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.arrays import Array
-    from impc.files.digests import Inputs
-    from impc.reporting.document import Block
-    from impc.studies.reliability.analysis import CmcResult, MeasureResult, Reliability, Trials
+from impc.studies.reliability.figures import reliability_figures
 
 _HERO = Picture(
     "icc", "ICC of every measure with its interval, over bands from poor to excellent",
@@ -74,7 +68,7 @@ _CMC = (
 
 def reliability_report(trials: Trials, result: Reliability, command: str, inputs: Inputs) -> Report:
     """Report of `impc reliability`."""
-    tables, band, facts = reliability_findings(result), result.band, Facts(result)
+    tables, band, facts = reliability_findings(result), result.band, rules.Facts(result)
     people, visits, sways = facts.people, facts.visits, facts.sways
     size = f"{people} × {visits} × {max(map(len, trials.cells.values()))}"
     keys = [Key(size, "", "people × visits × trials")]
@@ -94,15 +88,15 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
     if sways:
         keys = [*_keys(sways), *keys]
         results = "; ".join(
-            f"{item.name} {item.condition}: {icc_text(item)}, smallest detectable change "
-            f"{change_text(item)}"
+            f"{item.name} {item.condition}: {rules.icc_text(item)}, smallest detectable change "
+            f"{rules.change_text(item)}"
             for item in sways
         )
         copied = Copy(_METHODS.format(size=size, **ends), f"{sentence_case(results)}.")
         own: list[Block] = [tables["icc-rms"], tables["icc-energy"]]
         sections = {"ICC": own, "Change of one person": [_BLAND_ALTMAN], **sections}
     return Report(
-        "impc reliability", "reliability report", RULES.verdict(facts),
+        "impc reliability", "reliability report", rules.RULES.verdict(facts),
         [Section(title, blocks) for title, blocks in sections.items()],
         meta=("Reliability", f"{people} people", f"{visits} visits", ", ".join(result.conditions)),
         hero=_HERO if sways else None,
@@ -117,9 +111,9 @@ def reliability_report(trials: Trials, result: Reliability, command: str, inputs
 
 def _keys(sways: Sequence[MeasureResult]) -> list[Key]:
     """Key numbers: lowest ICC, and smallest detectable change of a person."""
-    least = lowest(sways)
-    value, _, interval = icc_text(least).removeprefix("ICC ").partition(" ")
-    change, _, unit = change_text(sways[0]).partition(" ")
+    least = rules.lowest(sways)
+    value, _, interval = rules.icc_text(least).removeprefix("ICC ").partition(" ")
+    change, _, unit = rules.change_text(sways[0]).partition(" ")
     return [
         Key(value, "ICC", f"lowest: {least.name}, {least.condition}",
             f"{interval.strip('()')}; ICC(A,k), generalised interval"),
@@ -128,7 +122,7 @@ def _keys(sways: Sequence[MeasureResult]) -> list[Key]:
     ]  # fmt: skip
 
 
-def _checks(result: Reliability, facts: Facts) -> list[Check]:
+def _checks(result: Reliability, facts: rules.Facts) -> list[Check]:
     """Checks of completeness and learning."""
     notes = dict.fromkeys(note for item in result.measures for note in item.notes)
     lacking = "; ".join([*notes, *result.notes])
@@ -178,7 +172,7 @@ def _icc(measure: str, own: Sequence[MeasureResult]) -> Finding:
         mean, sd, _ = _spread(item.scores.mean(axis=1))
         rows.append(_row(
             item, icc=value, low=low, high=high, low_f=item.icc_f.low, high_f=item.icc_f.high,
-            reliability=interval_band(low, high) if people else None, mean=mean, sd=sd,
+            reliability=rules.interval_band(low, high) if people else None, mean=mean, sd=sd,
             sem=item.error.sem, mdc=item.error.mdc, unit=item.unit, people=people,
             notes="; ".join(item.notes),
         ))  # fmt: skip

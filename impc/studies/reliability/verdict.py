@@ -6,9 +6,8 @@ after Cicchetti (1994), whatever the estimate (docs/howto/reliability_selection.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from operator import attrgetter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +15,8 @@ from impc.levels import Level
 from impc.reporting.rendering import number, sentence_case
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.reporting.verdict import Claim
+from impc.studies.reliability.analysis import MeasureResult, Reliability
 from impc.studies.reliability.icc import GOOD
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.studies.reliability.analysis import MeasureResult, Reliability
 
 #: Upper ends and names of the bands of an ICC (Cicchetti 1994).
 BANDS = ((0.40, "poor"), (0.60, "fair"), (0.75, "good"), (np.inf, "excellent"))
@@ -82,8 +77,7 @@ _PART = replace(
           "Average over more trials or visits before you compare people."),
 )  # fmt: skip
 RULES = Rules[Facts](
-    {name: attrgetter(name) for name in ("lowest", "bad", "cases", "people", "visits")}
-    | {"each": lambda it: _headline(it.sways)},
+    {"each": lambda it: _headline(it.sways)},
     kinds=(
         Kind(
             Level.AMBER, lambda it: not it.sways,

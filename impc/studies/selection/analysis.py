@@ -19,8 +19,8 @@ Key, by four consecutive filters (5.5):
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -46,15 +46,9 @@ from impc.studies.selection.fisher import (
     sweep,
 )
 from impc.studies.selection.lasso import Lasso, lasso_of_size
-from impc.studies.selection.model import Trial
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from impc.studies.selection.fisher import Selection
-    from impc.studies.selection.model import ParametricModel, Trial
-    from impc.studies.selection.model_source import Runner
-    from impc.studies.selection.settings import SelectSettings
+from impc.studies.selection.model import ParametricModel, Trial
+from impc.studies.selection.model_source import Runner
+from impc.studies.selection.settings import SelectSettings
 
 
 @dataclass(frozen=True)

@@ -16,25 +16,19 @@ white, their long-run variance if they are autocorrelated.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from impc.arrays import Array, Frozen, IntArray, frozen
 from impc.assess.covariance import TWO_SIDED
-from impc.assess.long_run_covariance import spread_of_sum
+from impc.assess.long_run_covariance import ResidualNoise, spread_of_sum
 from impc.assess.variance_accounted_for import vaf as share_explained
 from impc.errors import DataError, InputError
 from impc.inverse.columns import TrialSpan
-from impc.studies.selection.model import normalised, physical, stacked
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.assess.long_run_covariance import ResidualNoise
-    from impc.studies.selection.model import ParametricModel, Trial
+from impc.studies.selection.model import ParametricModel, Trial, normalised, physical, stacked
 
 # Fits with the prior, each with the noise of the previous one; it then changes by less than 1 %.
 _ROUNDS = 3
@@ -78,10 +72,7 @@ def estimate(
     start: Array,
     pull: Array | None = None,
 ) -> Estimate:
-    """Fit the free parameters to all trials, from `start` (k,).
-
-    `pull` (free,) weighs residuals of their distances from typical values, in normalised units.
-    """
+    """Fit from `start` (k,); `pull` (free,) weighs distances from the typical values."""
     if not trials:
         raise DataError("trials", "the list is empty", "pass at least one trial")
     chosen: IntArray = np.asarray(free, dtype=np.int64)

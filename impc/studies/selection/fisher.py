@@ -17,19 +17,14 @@ grown by one parameter at a time from feasible sets, with the same result as exh
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.errors import InputError
-from impc.studies.selection.model import stacked
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
-
-    from impc.studies.selection.model import ParametricModel, Trial
+from impc.studies.selection.model import ParametricModel, Trial, stacked
 
 # Relative size below which singular values of the sensitivity count as zero.
 _RANK = 1e-6
@@ -96,10 +91,7 @@ class Selection:
 
 
 def subset_variances(informations: Sequence[Array], subsets: Sequence[Sequence[int]]) -> Array:
-    """Largest diagonal entry of F_s^-1 over all `informations` (k, k), for each subset (5.5).
-
-    Infinite if F_s is singular to working precision.
-    """
+    """Largest diagonal entry of F_s^-1 over `informations`, by subset (5.5); inf if singular."""
     chosen = np.asarray(subsets, dtype=int)
     worst = np.zeros(len(chosen))
     for F in informations:

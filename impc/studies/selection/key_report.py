@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from impc.arrays import Array
+from impc.files.digests import Inputs
 from impc.reporting.document import Copy, Report, Section, Terms
 from impc.reporting.finding import Finding, Picture
 from impc.reporting.provenance import Provenance
@@ -14,15 +16,12 @@ from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, PAPER, new_figure
 from impc.reporting.verdict import Key
 from impc.studies.reliability.icc import icc
+from impc.studies.selection.analysis import KeyParameters
+from impc.studies.selection.model import ParametricModel
 from impc.studies.selection.verdict import KEY_RULES, KeyFacts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from impc.arrays import Array
-    from impc.files.digests import Inputs
-    from impc.studies.selection.analysis import KeyParameters
-    from impc.studies.selection.model import ParametricModel
 
 _OTHER = (
     "impc select asks another question: which parameters can be estimated in each person, with "

@@ -10,8 +10,9 @@ the mean square in the outputs' unit squared.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,12 +20,7 @@ import numpy as np
 from impc.arrays import Array, Frozen, frozen
 from impc.control.named_solver import require_solver, silent
 from impc.studies.selection.estimation import Estimate, estimate, residuals
-from impc.studies.selection.model import physical, stacked
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.studies.selection.model import ParametricModel, Trial
+from impc.studies.selection.model import ParametricModel, Trial, physical, stacked
 
 _ROUNDS, _HALVINGS, _SOLVES = 60, 30, 40
 _ROUNDING = 1e-12  # Distance from a typical value that is rounding error

@@ -21,8 +21,9 @@ B, which CasADi computes; with X_i = dx / dtheta_i
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -31,9 +32,6 @@ import scipy
 from impc.arrays import Array, Frozen, IntArray, frozen
 from impc.errors import InputError
 from impc.jit import njit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 _STEP = 1e-4
 

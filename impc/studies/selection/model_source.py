@@ -20,8 +20,9 @@ from __future__ import annotations
 import functools
 import json
 from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -30,21 +31,15 @@ from impc.files.digests import digest, source_digest, versions
 from impc.files.plant_sources import import_function, users_code
 from impc.files.reading import read_recordings, require_whole
 from impc.model.plant import Plant
-from impc.studies.cache import from_json
-from impc.studies.pool import Task, run
+from impc.studies.cache import Cache, from_json
+from impc.studies.cohort.study import Study
+from impc.studies.pool import Pool, Result, Task, run
 from impc.studies.selection.model import (
     ParametricModel,
     Trial,
     linear_functions,
     parametric_model,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from impc.studies.cache import Cache
-    from impc.studies.cohort.study import Study
-    from impc.studies.pool import Pool, Result
 
 T = TypeVar("T")
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 import scipy
 
+from impc.arrays import Array
+from impc.files.digests import Inputs
 from impc.files.disk import truth_beside
 from impc.levels import Level
 from impc.reporting.document import Check, Checks, Copy, Report, Section, Terms
@@ -18,19 +22,13 @@ from impc.reporting.provenance import Provenance
 from impc.reporting.rendering import number
 from impc.reporting.style import BLUE, HALF, MUTED, RECORDED, RULE, new_figure
 from impc.reporting.verdict import Key
+from impc.studies.selection.analysis import StudySelection
 from impc.studies.selection.fisher import unseen_scalings
+from impc.studies.selection.model import ParametricModel
 from impc.studies.selection.verdict import BIAS, SELECT_RULES, STUCK, SelectFacts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from matplotlib.figure import Figure
-
-    from impc.arrays import Array
-    from impc.files.digests import Inputs
-    from impc.studies.selection.analysis import StudySelection
-    from impc.studies.selection.model import ParametricModel
 
 _AT_LIMIT = 0.1  # Distance in % of the search range that counts as at a limit
 _WIDTH = "width_percent_of_the_range"
@@ -64,10 +62,7 @@ def selection_report(
     truths: Mapping[str, Array],
     whom: tuple[int, int] = (1, 1),
 ) -> Report:
-    """Report of `impc select`; `truths` are the true parameters (k,) of simulated subjects.
-
-    `whom` are the numbers of people and visits.
-    """
+    """Report of `impc select`; `truths` (k,) by subject; `whom`: number of people and visits."""
     table = _intervals(model, found, truths)
     facts, truth, size = SelectFacts(model, found, table), _truth(table), model.size
     verdict, provenance = SELECT_RULES.verdict(facts), Provenance(command=command, inputs=inputs)

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta
-
-from impc.studies.fit.settings import read_settings
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 Variance = Annotated[float, Meta(gt=0, le=1e100)]
 Count = Annotated[int, Meta(ge=1, le=1000)]
@@ -52,8 +47,3 @@ class SelectSettings:
     replicates: Annotated[int, Meta(ge=2, le=100_000)] = 200
     draw: Literal["single", "block"] = "block"
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-
-
-def select_settings(table: Mapping[str, Any]) -> SelectSettings:
-    """Read the [select] table of a study file."""
-    return read_settings("select", SelectSettings, table)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,12 +19,11 @@ from impc.levels import Level
 from impc.reporting.rendering import number
 from impc.reporting.rules import Kind, Line, Rules, always
 from impc.studies.reliability.icc import GOOD
+from impc.studies.selection.analysis import KeyParameters, StudySelection
+from impc.studies.selection.model import ParametricModel
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from impc.studies.selection.analysis import KeyParameters, StudySelection
-    from impc.studies.selection.model import ParametricModel
 
 _POOR = 50.0  # VAF of a poor model, %
 #: Column of the bias by fixing parameters, and end of a note on an estimate.
@@ -75,8 +73,7 @@ _REACHED = replace(
           "Use a richer movement of the target, more trials, or a wider search range."),
 )  # fmt: skip
 SELECT_RULES = Rules[SelectFacts](
-    {name: attrgetter(name) for name in ("size", "estimated", "names", "open_names", "reached",
-                                         "condition", "shift")},
+    {},
     kinds=(
         Kind(
             Level.RED, lambda it: it.poor, "The model explains less than half of this movement.",
@@ -158,8 +155,7 @@ _NONE = Kind[KeyFacts](
 )  # fmt: skip
 _MORE_PEOPLE = "Measure more people, or the same people at more visits."
 KEY_RULES = Rules[KeyFacts](
-    {name: attrgetter(name) for name in ("size", "keys", "names", "fixed", "people", "visits",
-                                         "icc", "filters")},
+    {},
     kinds=(
         _NONE,
         replace(

@@ -14,7 +14,7 @@ from impc.files.disk import IN_ITS_PLACE
 from impc.reporting.writer import owned
 from impc.studies.cohort import tasks
 from impc.studies.cohort.report import write_report
-from impc.studies.cohort.tables import cohort_tables
+from impc.studies.cohort.results import cohort_tables
 from impc.studies.cohort.tasks import Failures, Store, open_store, run_study, work_kept
 from tests.studies.cohort.made_up import fit_of, made_up_study, replicate_of, tasks_of
 from tests.support import ThisProcess

@@ -10,8 +10,8 @@ import pytest
 import impc
 from impc.files.plant_sources import plant_source
 from impc.studies.cohort.comparison import compare_cohort
+from impc.studies.cohort.results import cohort_tables
 from impc.studies.cohort.study import Study, read_study
-from impc.studies.cohort.tables import cohort_tables
 from impc.studies.cohort.tasks import Store, fit_unit, study_tasks
 from tests.studies.cohort.carts import write_study
 from tests.support import present

@@ -14,7 +14,7 @@ from impc.studies.cohort.figures import forest
 from impc.studies.cohort.report import comparisons, subjects
 from impc.studies.cohort.results import Cohort
 from impc.studies.cohort.study import Study, Unit
-from impc.studies.cohort.verdict import cohort_verdict
+from impc.studies.cohort.verdict import RULES
 from impc.studies.fit.verdict import UNDETERMINED
 from tests.studies.cohort.made_up import column, gain_column
 from tests.support import present
@@ -78,17 +78,17 @@ HEADLINES: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("given", "headline"), HEADLINES)
 def test_headlines(given: dict[str, Any], headline: str) -> None:
-    found = cohort_verdict(cohort(**given))
+    found = RULES.verdict(cohort(**given))
     level = Level.AMBER if "wide" in given else Level.RED if "red" in given else Level.GREEN
     assert (found.level, found.headline) == (level, headline)
 
 
 def test_numbers_of_a_difference_and_no_claim_of_equality_without_one() -> None:
-    found = cohort_verdict(cohort(-139.0, spread=0.1))
+    found = RULES.verdict(cohort(-139.0, spread=0.1))
     for part in ("n = 20 people", "95 % CI 2.4258 to 2.4281 N m/° less", "p_holm < .001",
                  "Hedges' g"):  # fmt: skip
         assert part in found.sentence
-    found = cohort_verdict(cohort(0.0))
+    found = RULES.verdict(cohort(0.0))
     assert any("equal" in claim.text for claim in found.may_not)
     assert "p_holm = .208" in found.sentence
 
@@ -109,7 +109,7 @@ def test_fits_far_from_their_group_are_named_and_tried_without() -> None:
     made = cohort(-139.0)
     ends = [GAIN, "K_low.command.theta1", "K_high.command.theta1"]
     made.units.loc[[3, 15], ends] = 3000.0, 2900.0, 3100.0
-    found = cohort_verdict(made)
+    found = RULES.verdict(made)
     assert found.level is Level.AMBER
     assert found.headline == "No difference in a gain between the groups was found."
     assert "Without the 2 fits to look at it is 2.6 N m/° less" in found.sentence
@@ -145,9 +145,9 @@ def test_the_reference_is_subtracted() -> None:
 
 def test_warnings_make_it_amber_and_are_tried_without() -> None:
     """One does not, and a fit that determines no gain is no warning of the study."""
-    assert cohort_verdict(cohort(-139.0, warned=(3,))).level is Level.GREEN
+    assert RULES.verdict(cohort(-139.0, warned=(3,))).level is Level.GREEN
     made = cohort(-139.0, warned=(3, 4, 12, 13))
-    found = cohort_verdict(made)
+    found = RULES.verdict(made)
     assert found.level is Level.AMBER
     (alert,) = found.alerts
     assert alert.title == "4 of 20 fits have a warning"
@@ -155,11 +155,11 @@ def test_warnings_make_it_amber_and_are_tried_without() -> None:
     assert "n = 16" in alert.found
     units = made.units.assign(kind=made.units["kind"].where(made.units.index != 3, UNDETERMINED))
     assert Cohort(units, COLUMNS, {}).warned == 3
-    assert cohort_verdict(Cohort(units.drop(index=[12, 13]), COLUMNS, {})).level is Level.GREEN
+    assert RULES.verdict(Cohort(units.drop(index=[12, 13]), COLUMNS, {})).level is Level.GREEN
 
 
 def test_a_study_of_which_nothing_was_fitted_is_red() -> None:
-    assert cohort_verdict(Cohort(pd.DataFrame(), {}, {"sub-1": "no"})).level is Level.RED
+    assert RULES.verdict(Cohort(pd.DataFrame(), {}, {"sub-1": "no"})).level is Level.RED
 
 
 def test_people_whose_gain_is_not_determined_are_hollow() -> None:
@@ -177,7 +177,7 @@ def test_cost_weights_are_compared_as_ratios() -> None:
     units.loc[units["group"] == "second", "log_cost_weight.theta1"] -= np.log(2.0)
     weight = {"log_cost_weight.theta1": column("cost weight of seat tilt", "seat tilt", "-")}
     made = Cohort(units.assign(structure_refused=False), weight, {})
-    headline = cohort_verdict(made).headline
+    headline = RULES.verdict(made).headline
     assert headline.startswith("The cost weight of seat tilt is 0.5 times as high in the second")
     table = present(comparisons(made).table)
     row = table[table["measure"] == "cost weight of seat tilt"].iloc[0]

@@ -19,7 +19,7 @@ from impc.model.weights import Weights
 from impc.reporting.document import json_bytes
 from impc.reporting.provenance import Provenance
 from impc.studies.example.cases import CASES, EXAMPLE, CaseResult
-from impc.studies.example.report import example_data, example_report, example_verdict
+from impc.studies.example.report import RULES, Facts, example_data, example_report
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +82,9 @@ def test_another_method_within_the_limit_is_counted(case_a: CaseResult) -> None:
         replace(item, exceeded=0.0) if item.name == "feedback_gain" else item
         for item in case_a.methods
     )
-    verdict = example_verdict([replace(case_a, methods=methods), case_a])
+    verdict = RULES.verdict(Facts([replace(case_a, methods=methods), case_a]))
     assert "two need" in verdict.headline  # of all cases
-    assert "three need" in example_verdict([replace(case_a, methods=methods)]).headline
+    assert "three need" in RULES.verdict(Facts([replace(case_a, methods=methods)])).headline
 
 
 def test_an_example_that_finds_nothing_says_so_in_a_box(case_a: CaseResult) -> None:
@@ -92,6 +92,6 @@ def test_an_example_that_finds_nothing_says_so_in_a_box(case_a: CaseResult) -> N
         return replace(item, estimate=replace(item.estimate, weights=None))
 
     methods = tuple(map(without_weights, case_a.methods))
-    verdict = example_verdict([replace(case_a, methods=methods)])
+    verdict = RULES.verdict(Facts([replace(case_a, methods=methods)]))
     assert verdict.level is Level.AMBER
     assert verdict.alerts[0].found.startswith("No method finds the true cost weights")

@@ -22,7 +22,7 @@ from impc.studies.fit.findings import read_truth, truth_found
 from impc.studies.fit.report import fit_report
 from impc.studies.fit.result import FitResult
 from impc.studies.fit.subject import fit_recordings
-from impc.studies.fit.verdict import UNDETERMINED, WEIGHTS, fit_verdict, forbidden
+from impc.studies.fit.verdict import RULES, UNDETERMINED, WEIGHTS
 from tests.studies.fit.test_verdict import explained, model_error
 from tests.support import present
 
@@ -118,7 +118,7 @@ def test_the_level_follows_from_the_tables(
 
 def test_left_out_trials_count_even_if_weights_are_rejected() -> None:
     """The gain fits, its nearest weights do not, and left-out trials are not predicted."""
-    verdict = fit_verdict(made_up(99.0, -0.3, rejected=True))
+    verdict = RULES.verdict(made_up(99.0, -0.3, rejected=True))
     assert verdict.level is Level.RED
     assert "nothing of the place of the cart" in verdict.sentence
     assert not any("limit" in claim.text for claim in verdict.may)
@@ -214,7 +214,7 @@ def test_less_than_half_explained_gives_no_interval_and_no_statement() -> None:
     assert np.max(result.inverse_mpc.vaf) < 50
     assert found["usable"] is False
     assert not {"gain", "directions", "statements"} & set(found["findings"])
-    assert fit_verdict(result).level is Level.RED
+    assert RULES.verdict(result).level is Level.RED
     assert found["verdict"]["level"] == "red"
     assert data(stick_fit())["usable"] is True
 
@@ -223,9 +223,9 @@ def test_no_weights_is_said_before_any_weights() -> None:
     """A gain without weights, with little noise, and the gain of a regulator."""
     result = stick_fit(-60.0, -4.0)
     assert result.weights_test.rejected
-    verdict = fit_verdict(result)
+    verdict = RULES.verdict(result)
     assert "no cost weights explain it" in verdict.headline
-    assert WEIGHTS in forbidden(result)
+    assert WEIGHTS in RULES.forbidden(result)
     assert np.min(result.gain_shares) > 99
     assert f"{result.gain_shares[0]:.0f} %" in verdict.may[0].why
     assert "statements" not in data(result)["findings"]

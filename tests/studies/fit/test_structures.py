@@ -22,7 +22,7 @@ from impc.studies.fit.result import FitResult
 from impc.studies.fit.settings import fit_settings
 from impc.studies.fit.structures import structure_data, structure_section, structure_sentences
 from impc.studies.fit.subject import fit_recordings, stages
-from impc.studies.fit.verdict import fit_verdict
+from impc.studies.fit.verdict import RULES
 from tests.studies.fit.test_verdict import model_error
 from tests.support import regulator
 
@@ -85,7 +85,7 @@ def test_a_rejection_comes_first_and_may_be_the_fault_of_the_model() -> None:
     assert result.structures[0].refused
     assert lines[0].startswith("The recordings reject the structure “one by one”")
     assert not any("combinations" in line or "error of the body model" in line for line in lines)
-    assert any(re.search("rejects|reject the", one.title) for one in fit_verdict(result).alerts)
+    assert any(re.search("rejects|reject the", one.title) for one in RULES.verdict(result).alerts)
     wrong = impc.replace(result, lack=(model_error(),))
     assert "error of the body model" in structure_sentences(wrong)[1]
     whole = impc.replace(fitted(0.0), lack=(model_error(),))

@@ -29,7 +29,7 @@ from impc.studies.fit.report import fallen_report, fit_report
 from impc.studies.fit.result import FittedParameter
 from impc.studies.fit.settings import missing
 from impc.studies.fit.subject import fit_recordings, stages
-from impc.studies.fit.verdict import GAIN, WEIGHTS, fit_verdict, forbidden
+from impc.studies.fit.verdict import GAIN, RULES, WEIGHTS
 from tests.support import regulator
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def model_error(name: str = "delay", size: float = 1.0, deviation: float = 0.1) 
 def test_a_fit_that_nothing_speaks_against() -> None:
     result = explained()
     assert not len(result.inverse_mpc.held_out)  # of a single trial
-    verdict = fit_verdict(result)
+    verdict = RULES.verdict(result)
     assert (verdict.level, list(verdict.alerts)) == (Level.GREEN, [])
     assert "1 m/s^2 explains this movement" in verdict.headline
     share = f"{100 * result.trials[0].saturated:.1f} %"
@@ -89,10 +89,10 @@ def test_a_fit_that_nothing_speaks_against() -> None:
 
 def test_an_error_of_the_model_forbids_gains() -> None:
     result = impc.replace(fitted(1.0), lack=(model_error(),))
-    verdict = fit_verdict(result)
+    verdict = RULES.verdict(result)
     assert verdict.level is Level.AMBER
     assert "a delay of the command of 100 ± 10 ms (p < 0.0001)" in verdict.alerts[0].found
-    assert forbidden(result) == {GAIN, WEIGHTS}
+    assert RULES.forbidden(result) == {GAIN, WEIGHTS}
     assert not any("gain on" in claim.text for claim in verdict.may)
     report = fit_report(result, Provenance())
     assert isinstance(report.copy, Copy)
@@ -122,7 +122,7 @@ def test_an_error_of_the_model_forbids_gains() -> None:
 def test_an_error_is_said_with_its_size(name: str, size: float, words: str) -> None:
     """At 10 samples/s, with a standard error of 0.1."""
     result = impc.replace(fitted(1.0), lack=(model_error(name, size),))
-    assert words in fit_verdict(result).alerts[0].found
+    assert words in RULES.verdict(result).alerts[0].found
 
 
 def test_a_corrected_error_is_said_with_its_remedy() -> None:
@@ -157,7 +157,7 @@ def test_an_unconfirmed_gain_at_no_minimum_is_said(
 @pytest.mark.full
 def test_no_limit_and_a_limit_that_is_not_reached() -> None:
     for limit, words in ((np.inf, "no limit was given"), (50.0, "never reached")):
-        verdict = fit_verdict(explained(limit))
+        verdict = RULES.verdict(explained(limit))
         assert verdict.level is Level.GREEN
         assert words in verdict.headline
         assert verdict.alerts[0].level is Level.NOTE
@@ -165,7 +165,7 @@ def test_no_limit_and_a_limit_that_is_not_reached() -> None:
 
 def test_a_fall_is_said_and_counted() -> None:
     falls = ("trial_2.csv: the subject fell at 5.1 s",)
-    verdict = fit_verdict(impc.replace(explained(), falls=falls))
+    verdict = RULES.verdict(impc.replace(explained(), falls=falls))
     assert verdict.level is Level.AMBER
     assert "1 of 2 trials" in verdict.headline
     page = fallen_report(falls, Provenance()).page()
@@ -180,13 +180,13 @@ def test_a_limit_that_the_recordings_contradict() -> None:
     names = tuple(result.given.plant.controls)
     for value, level in ((0.7, Level.AMBER), (1.002, Level.GREEN)):
         item = FittedParameter(f"u_max.{names[0]}", 1.0, value, 5e-4, 0.3, 0.0)
-        found = fit_verdict(impc.replace(added, parameters=(item,)))
+        found = RULES.verdict(impc.replace(added, parameters=(item,)))
         assert found.level is level
         assert ("probably wrong" in found.headline) == (level is Level.AMBER)
     close = FittedParameter(f"u_max.{names[0]}", 1.0, 0.95, 5e-4, 0.05, 0.0)
-    assert fit_verdict(impc.replace(result, parameters=(close,))).level is Level.GREEN
+    assert RULES.verdict(impc.replace(result, parameters=(close,))).level is Level.GREEN
     # Not estimated, but the residuals of the last fit still point to it.
-    doubted = fit_verdict(impc.replace(result, lack=(low,)))
+    doubted = RULES.verdict(impc.replace(result, lack=(low,)))
     assert any("u_max" in remedy for remedy in doubted.alerts[0].todo)
     assert not any("limit" in claim.text for claim in doubted.may)
 
@@ -271,12 +271,12 @@ def test_weights_that_fit_as_well_forbid_a_gain_that_excludes_them() -> None:
     ours = impc.replace(
         result.weights_test, statistic=220.0, likelihood_ratio=24.7, freedom=10, p_value=0.006
     )
-    found = fit_verdict(impc.replace(result, weights_test=ours))
+    found = RULES.verdict(impc.replace(result, weights_test=ours))
     assert found.level is Level.AMBER
     assert "less certain than its interval" in found.headline
     assert "(chi-squared 24.7)" in found.alerts[0].found
-    assert {GAIN, WEIGHTS} <= forbidden(impc.replace(result, weights_test=ours))
+    assert {GAIN, WEIGHTS} <= RULES.forbidden(impc.replace(result, weights_test=ours))
     both = impc.replace(ours, likelihood_ratio=200.0, p_value=1e-9)
     rejected = impc.replace(result, weights_test=both)
-    assert "no cost weights explain it" in fit_verdict(rejected).headline
-    assert GAIN not in forbidden(rejected)
+    assert "no cost weights explain it" in RULES.verdict(rejected).headline
+    assert GAIN not in RULES.forbidden(rejected)

@@ -22,10 +22,11 @@ from impc.reporting.provenance import Provenance
 from impc.studies.plan.designs import Design, Person, try_design
 from impc.studies.plan.report import plan_report
 from impc.studies.plan.sentences import (
+    RULES,
+    Facts,
     halves,
     plan_checks,
     plan_copy,
-    plan_verdict,
     stated_as,
     target,
     trials_needed,
@@ -138,9 +139,9 @@ def test_a_body_that_is_loosely_known_needs_more_persons_and_is_worth_measuring(
         assert other.deviation > known.deviation
     levels = [{check.name: check.level for check in plan_checks(one)} for one in (exact, loose)]
     assert [found["Body"] for found in levels] == [Level.AMBER, Level.GREEN]
-    assert plan_verdict(exact).words == "Enough"
-    assert plan_verdict(loose).words in ("Depends", "Not enough")
-    assert any("table of the body" in step for step in plan_verdict(loose).alerts[0].todo)
+    assert RULES.verdict(Facts(exact)).words == "Enough"
+    assert RULES.verdict(Facts(loose)).words in ("Depends", "Not enough")
+    assert any("table of the body" in step for step in RULES.verdict(Facts(loose)).alerts[0].todo)
     tables = {item.name: item.rows for item in plan_report(loose, Provenance()).findings()}
     assert [row[0] for row in tables["body"]] in (
         ["force", "u_max.force1"], ["u_max.force1", "force"]
@@ -155,7 +156,7 @@ def test_trials_that_are_needed_are_enough() -> None:
     noisy = replace(person(), deviation=np.array([0.1]))
     one = replace(SETTINGS, amplitude=[0.8], dwell=[2.0], difference=3.0)
     plan = make_plan(noisy, one, perturbation)
-    assert plan_verdict(plan).words != "Enough"
+    assert RULES.verdict(Facts(plan)).words != "Enough"
     needed = trials_needed(plan)
     assert 1 < needed < 10
     counts, sides = widths(plan)
@@ -164,7 +165,7 @@ def test_trials_that_are_needed_are_enough() -> None:
     np.testing.assert_allclose(sides[0] / sides[2], 2.0, rtol=1e-6)
     for trials, words in ((needed, "Enough"), (max(needed // 2, 1), "Depends Not enough")):
         again = make_plan(noisy, replace(one, trials=int(trials)), perturbation)
-        assert plan_verdict(again).words in words
+        assert RULES.verdict(Facts(again)).words in words
     assert again.best.expected is not None
     assert np.max(halves(again)) > target(plan)
 
@@ -181,7 +182,7 @@ def test_who_is_compared_by_a_gain_that_is_not_determined_is_told_so() -> None:
     plan = make_plan(noisy, replace(SETTINGS, amplitude=[0.4], dwell=[1.0]), perturbation)
     assert np.isinf([item.needed for item in plan.groups]).all()
     assert plan_copy(plan) == "No number of persons would be enough to detect the difference."
-    assert plan_verdict(plan).level is Level.RED
+    assert RULES.verdict(Facts(plan)).level is Level.RED
 
 
 @pytest.mark.parametrize(
@@ -209,7 +210,7 @@ def test_fits_outside_the_intervals_make_a_plan_doubtful() -> None:
     plan = make_plan(person(), one, perturbation)
     for factor, words in ((1.0, "Enough"), (2.0, "Doubtful")):
         fits = SimulatedFits(np.tile(factor * np.array(GAIN), (20, 1, 1)), 0)
-        assert plan_verdict(replace(plan, simulated=fits)).words == words
+        assert RULES.verdict(Facts(replace(plan, simulated=fits))).words == words
 
 
 def test_noise_has_the_deviation_and_the_colour_that_were_asked_for() -> None:

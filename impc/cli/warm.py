@@ -1,4 +1,4 @@
-"""Compile the numba code of simulations and fits in advance (docs/howto/speed.md).
+"""`impc warm`: compile the numba code of simulations and fits (docs/howto/speed.md).
 
 A cart is simulated in each way that has its own compiled code: with derivatives, along the
 trajectory of a nonlinear body, and with sensory noise.
@@ -6,9 +6,8 @@ trajectory of a nonlinear body, and with sensory noise.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import casadi as ca
+import click
 import numpy as np
 
 from impc.control.body_steps import body_tape, next_state, slopes_along
@@ -16,15 +15,25 @@ from impc.control.closed_loop import simulate_and_differentiate
 from impc.control.compiled_body import states_from
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
-from impc.control.simulation import scenario
+from impc.control.simulation import Scenario, scenario
+from impc.jit import say_when_compiling
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
 from impc.model.recordings import Recording
 
-if TYPE_CHECKING:
-    from impc.control.simulation import Scenario
-
 _LIMIT, _STEPS = 0.8, 40
+
+
+def run_warm(sensory_noise: bool) -> None:
+    """Compile the inner loops, and say what is done."""
+    say_when_compiling(lambda _: None)  # this command prints its own lines
+    compile_loop()
+    click.echo("compiled: the constrained controller and its closed loop")
+    compile_bodies()
+    click.echo("compiled: nonlinear bodies")
+    if sensory_noise:
+        compile_filter()
+        click.echo("compiled: the filter of sensory noise")
 
 
 def compile_loop() -> None:
