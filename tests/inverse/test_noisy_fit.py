@@ -33,9 +33,7 @@ from tests.support import posed
 
 FULL, SLOW = pytest.mark.full, pytest.mark.slow
 # At 4.5 Nm clipped LQR diverges, and a search takes ten times as long.
-limits = pytest.mark.parametrize(
-    "limit", [6.0, *(pytest.param(one, marks=FULL) for one in (70.0, 4.5))]
-)
+limits = pytest.mark.parametrize("limit", [70.0, 6.0, pytest.param(4.5, marks=FULL)])
 
 
 @functools.cache
