@@ -3,10 +3,11 @@
     minimise over u_0 .. u_{N-1}    x_N'P x_N / 2 + sum_k (x_k'Q x_k + u_k'R u_k) / 2
     subject to    u_min <= u_k <= u_max,    E x_k <= b (k < N),    H x_N <= h
 
-from (Q, R, P), P by Newton's iteration on the Riccati equation. Where an answer comes from does not
-matter (`tests/exact_search.py`): it is proved here, in the plainest recursions. x_k forward and the
-multipliers backward give every Karush-Kuhn-Tucker condition; where there is no answer, they give
-the best that inputs within their bounds can do against the multipliers of excluded rows.
+from (Q, R, P), P by Newton's iteration on the Riccati equation. `first_input` searches by Goldfarb
+and Idnani's method (Math. Programming 27, 1983) from a guess, and proves what it found in the
+plainest recursions: x_k forward and the multipliers backward give every Karush-Kuhn-Tucker
+condition; where there is no answer, they give the best that inputs within their bounds can do
+against the multipliers of excluded rows.
 """
 
 from __future__ import annotations
@@ -90,6 +91,17 @@ class ExactProgram:
         upper, lower = (np.tile(exact(side), self.horizon) for side in (self.u_max, -self.u_min))
         return np.concatenate([upper, lower, self.rows[2]])
 
+    @cached_property
+    def dense(self) -> tuple[Exact, Exact]:
+        """Inverse of the Hessian (N m, N m), and the rows (2 N m + r, N m), of the inputs alone."""
+        origin, nothing = zeros(len(self.A)), zeros(len(self.sides))
+        hessian, rows = [], []
+        for unit in exact(np.eye(self.width)).reshape(-1, self.horizon, len(self.u_max)):
+            plan = self.states(origin, unit)
+            hessian.append(self.pull(plan, unit, nothing).ravel())
+            rows.append(self.heights(plan, unit))
+        return solve(np.array(hessian), exact(np.eye(self.width))), np.array(rows).T
+
     def states(self, x: Exact, u: Exact) -> Exact:
         """States (N + 1, n) from the first on, with inputs (N, m)."""
         A, B, _, _ = self.matrices
@@ -160,7 +172,7 @@ def solve(matrix: Exact, right: Exact) -> Exact:
     for i in range(count):
         share = matrix[i + 1 :, i] / matrix[i, i]
         matrix[i + 1 :, i + 1 :] -= np.outer(share, matrix[i, i + 1 :])
-        right[i + 1 :] -= np.outer(share, right[i])
+        right[i + 1 :] -= np.multiply.outer(share, right[i])
     for i in range(count - 1, -1, -1):
         if i + 1 < count:
             right[i] = right[i] - matrix[i, i + 1 :] @ right[i + 1 :]
@@ -179,3 +191,100 @@ def _riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> Exac
             P = P + power.T @ P @ power
             power = power @ power
     return P
+
+
+def first_input(
+    program: ExactProgram, x: np.ndarray, guess: np.ndarray, kept: Decimal = ROUNDED
+) -> np.ndarray | None:
+    """The proved first input at a state (n,); None when it is proved that there is none."""
+    start = exact(x)
+    search = _Search(program, start, np.flatnonzero(guess).tolist())
+    if search.run(kept):
+        u = search.inputs.reshape(program.horizon, -1)
+        if not program.is_optimal(start, u, search.cost_weight, kept):
+            raise ArithmeticError("the plan is not proved")
+        return np.array([float(value) for value in u[0]])
+    if not program.is_excluded(start, search.cost_weight):
+        raise ArithmeticError("the rows are not proved to exclude each other")
+    return None
+
+
+class _Search:
+    """Multipliers stay positive while the rows become kept, one after the other."""
+
+    def __init__(self, program: ExactProgram, x: Exact, guess: list[int]) -> None:
+        self.program, (self.inverse, self.rows) = program, program.dense
+        self.cost_weight = zeros(len(program.sides))
+        still = zeros(program.horizon, len(program.u_max))
+        plan = program.states(x, still)
+        self.slope = program.pull(plan, still, self.cost_weight).ravel()
+        self.sides = program.sides - program.heights(plan, still)
+        self.active = [guess[place] for place in _independent(self._gram(guess))]
+        while self.active:
+            excess = self._excess()[self.active]
+            values = solve(self._gram(self.active), excess)
+            if np.all(values >= 0):
+                self.cost_weight[self.active] = values
+                break
+            pairs = zip(self.active, values, strict=True)
+            self.active = [row for row, value in pairs if value >= 0]
+
+    @property
+    def inputs(self) -> Exact:
+        """The best inputs (N m,) with these multipliers."""
+        return -(self.inverse @ (self.slope + self.cost_weight @ self.rows))
+
+    def run(self, kept: Decimal) -> bool:
+        """Whether there is a plan; if not, the multipliers are those of rows without one."""
+        for _ in range(10 * len(self.sides)):
+            broken = self._excess() / self.program.sides - kept
+            broken[self.active] = ZERO
+            row = int(np.argmax(broken))
+            if broken[row] <= 0:
+                return True
+            if not self._enter(row):
+                return False
+        raise ArithmeticError("no end of the search")
+
+    def _enter(self, row: int) -> bool:
+        """Raise the multiplier of a broken row until it is tight; false where nothing stops it."""
+        response = self.inverse @ self.rows[row]
+        while True:
+            across = self.rows[self.active] @ response
+            fall = solve(self._gram(self.active), across)
+            alone = self.rows[row] @ response
+            gain = alone - across @ fall
+            steps = [self.cost_weight[one] / down if down > NOTHING else None
+                     for one, down in zip(self.active, fall, strict=True)]  # fmt: skip
+            ends = [step for step in steps if step is not None]
+            if gain > NOTHING * alone:
+                ends.append(self._excess()[row] / gain)
+            elif not ends:
+                self.cost_weight[:] = ZERO
+                self.cost_weight[self.active] = np.maximum(-fall, ZERO)
+                self.cost_weight[row] = Decimal(1)
+                return False
+            step = min(ends)
+            self.cost_weight[self.active] -= step * fall
+            self.cost_weight[row] += step
+            if step not in steps:
+                self.active.append(row)
+                return True
+            left = self.active.pop(steps.index(step))
+            self.cost_weight[left] = ZERO
+
+    def _excess(self) -> Exact:
+        return self.rows @ self.inputs - self.sides
+
+    def _gram(self, rows: list[int]) -> Exact:
+        return self.rows[rows] @ self.inverse @ self.rows[rows].T
+
+
+def _independent(gram: Exact) -> list[int]:
+    """Which rows of a positive semidefinite matrix do not depend on those before them."""
+    left, found = gram.copy(), []
+    for i in range(len(gram)):
+        if left[i, i] > NOTHING * gram[i, i]:
+            found.append(i)
+            left[i + 1 :, i + 1 :] -= np.outer(left[i + 1 :, i] / left[i, i], left[i, i + 1 :])
+    return found

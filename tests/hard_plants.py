@@ -22,8 +22,7 @@ from impc.control.simulation import Scenario, Simulation, Status, scenario
 from impc.errors import SolverError
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.weights import Weights
-from tests.exact_mpc import NOTHING, ExactProgram, exact
-from tests.exact_search import first_input
+from tests.exact_mpc import NOTHING, ExactProgram, exact, first_input
 from tests.support import random_plant, random_weights
 
 STEPS = 40

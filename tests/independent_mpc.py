@@ -10,7 +10,6 @@ import clarabel
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from scipy.optimize import linprog
 
 Matrix = np.ndarray
 
@@ -96,20 +95,3 @@ def _polished(H: Matrix, f: Matrix, G: Matrix, h: Matrix) -> Matrix:
     system = np.block([[(H + H.T) / 2, G.T], [G, np.zeros((rows, rows))]])
     solution = np.linalg.lstsq(system, np.concatenate([-f, h]), rcond=1e-13)[0]
     return np.asarray(solution[:count])
-
-
-def has_plan(A: Matrix, B: Matrix, horizon: int, x: Matrix, u_max: float, x_max: float) -> bool:
-    """Whether |u| <= u_max can keep |x_k| <= x_max for k < horizon: a linear program in (x, u)."""
-    n, m = B.shape
-    count = horizon * n
-    moves = np.eye(count, count + horizon * m)
-    for k in range(1, horizon):
-        moves[k * n : (k + 1) * n, (k - 1) * n : k * n] = -A
-        moves[k * n : (k + 1) * n, count + (k - 1) * m : count + k * m] = -B
-    answer = linprog(
-        np.zeros(count + horizon * m),
-        A_eq=moves,
-        b_eq=np.r_[x, np.zeros(count - n)],
-        bounds=[(-x_max, x_max)] * count + [(-u_max, u_max)] * (horizon * m),
-    )
-    return bool(answer.status == 0)

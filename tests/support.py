@@ -7,8 +7,11 @@ import io
 import json
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any, TypeVar
 
 import control
@@ -18,19 +21,15 @@ import scipy.optimize
 from hypothesis import settings
 from matplotlib.figure import Figure
 
+import impc
 from impc.control.closed_loop import simulate
-from impc.control.controller import Controller
-from impc.control.simulation import scenario
-from impc.inverse.problem import Problem, controller_for
+from impc.inverse.problem import controller_for
 from impc.inverse.residuals import linearise
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.recordings import Recording
-from impc.model.weights import Weights
 from impc.studies.cache import Steps
 from impc.studies.example.cases import CASES
 from impc.studies.pool import Answer, Task, answered
 
+ROOT = Path(__file__).parents[1]
 Given = TypeVar("Given")
 #: How many times the examples of `make test` are drawn: 1, or what `make search` asks for.
 SEARCH = int(os.environ.get("IMPC_SEARCH", "1"))
@@ -50,6 +49,14 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Figure, "savefig", blank)
     patch.setattr(Figure, "draw_without_rendering", lambda _: None)
     patch.setattr("impc.reporting.style._set_literally", lambda _: None)
+
+
+def new_python(code: str, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """What a fresh Python prints that runs a program in the folder of the checkout."""
+    words = [sys.executable, *options, "-c", code]
+    return subprocess.run(
+        words, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
+    )
 
 
 def present(value: Given | None) -> Given:
@@ -107,55 +114,55 @@ def differences(function: Callable[[Any], Any], at: Any, step: float = 1e-6) -> 
     return np.array(columns).T
 
 
-def slopes(problem: Problem, K: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, ...]:
+def slopes(problem: impc.Problem, K: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, ...]:
     """Residual (r,), and its derivatives by entries of K, parameters and those of the trial."""
     law = {"K": np.eye(K.size, K.size + len(problem.logarithms)).reshape(*K.shape, -1)}
     found = linearise(problem, controller_for(problem, K, S), law)
     return found.residual, *found.parts(problem)
 
 
-def plant_of(A: Any, B: Any, C: Any = None, dt: float = 1.0) -> Plant:
+def plant_of(A: Any, B: Any, C: Any = None, dt: float = 1.0) -> impc.Plant:
     """A plant without disturbances; all states are outputs unless C is given."""
-    return Plant(control.ss(A, B, np.eye(len(np.asarray(A))) if C is None else C, 0, dt))
+    return impc.Plant(control.ss(A, B, np.eye(len(np.asarray(A))) if C is None else C, 0, dt))
 
 
 def named_plant(
     A: Any, B: Any, C: Any, dt: float, states: str, inputs: str, outputs: str, **more: Any
-) -> Plant:
+) -> impc.Plant:
     """A plant with names of its signals, each a word; the first input is the control."""
     names: Any = {"states": states.split(), "inputs": inputs.split(), "outputs": outputs.split()}
-    return Plant(control.ss(A, B, C, 0, dt, **names), names["inputs"][:1], **more)
+    return impc.Plant(control.ss(A, B, C, 0, dt, **names), names["inputs"][:1], **more)
 
 
 def regulator(
-    plant: Plant, Q: Any, limit: Any, horizon: int, R: Any = 1, *, terminal_set: bool = False
-) -> Controller:
+    plant: impc.Plant, Q: Any, limit: Any, horizon: int, R: Any = 1, *, terminal_set: bool = False
+) -> impc.Controller:
     """The controller of weights Q and R, and |u| <= limit."""
-    bounds = Bounds(plant, u_min=-limit, u_max=limit)
-    return Controller(plant, Weights(Q, R), bounds, horizon, terminal_set=terminal_set)
+    bounds = impc.Bounds(plant, u_min=-limit, u_max=limit)
+    return impc.Controller(plant, impc.Weights(Q, R), bounds, horizon, terminal_set=terminal_set)
 
 
-def posed(law: Controller, *trials: Recording, **given: Any) -> Problem:
+def posed(law: impc.Controller, *trials: impc.Recording, **given: Any) -> impc.Problem:
     """The inverse problem of recordings of a controller."""
-    return Problem(law.plant, law.bounds, law.horizon, trials, **given)
+    return impc.Problem(law.plant, law.bounds, law.horizon, trials, **given)
 
 
 @functools.cache
-def example_plant() -> Plant:
+def example_plant() -> impc.Plant:
     """The example of section 3.4: unstable, two states, one input."""
-    return Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+    return impc.Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
 
 
 @functools.cache
-def example_problem(case: str, scale: float = 1.0) -> Problem:
+def example_problem(case: str, scale: float = 1.0) -> impc.Problem:
     """The example recorded under Q = I and R = 1; all numbers `scale` times as large."""
     plant = example_plant()
     law = regulator(plant, np.eye(2), scale, 3, terminal_set=True)
-    run = simulate(law, scenario(plant, x0=scale * np.array(CASES[case]), steps=20))
-    return posed(law, Recording(plant, run.x))
+    run = simulate(law, impc.scenario(plant, x0=scale * np.array(CASES[case]), steps=20))
+    return posed(law, impc.Recording(plant, run.x))
 
 
-def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int = 0) -> Plant:
+def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int = 0) -> impc.Plant:
     """A random discrete plant with the given spectral radius and d disturbances."""
     A = rng.normal(size=(n, n))
     A *= radius / np.max(np.abs(np.linalg.eigvals(A)))
@@ -168,7 +175,7 @@ def random_plant(rng: np.random.Generator, n: int, m: int, radius: float, d: int
         True,
         inputs=[*names, *(f"d{i}" for i in range(d))],
     )
-    return Plant(system, names)
+    return impc.Plant(system, names)
 
 
 def random_weights(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -189,25 +196,25 @@ def easier_seat(configuration: str) -> str:
 
 def saturated_problem(
     rng: np.random.Generator, n: int, m: int
-) -> tuple[Weights, Controller, Problem]:
+) -> tuple[impc.Weights, impc.Controller, impc.Problem]:
     """An exact recording of n states and m inputs, 2 to 30 % of which stand at their bounds."""
     while True:
         plant = random_plant(rng, n, m, rng.uniform(0.8, 1.1), d=1)
-        weights = Weights(random_weights(rng, n), random_weights(rng, m))
-        bounds = Bounds(plant, u_min=-1, u_max=1)
-        controller = Controller(plant, weights, bounds, 5, terminal_set=False)
+        weights = impc.Weights(random_weights(rng, n), random_weights(rng, m))
+        bounds = impc.Bounds(plant, u_min=-1, u_max=1)
+        controller = impc.Controller(plant, weights, bounds, 5, terminal_set=False)
         push = rng.choice([-1.0, 0.0, 1.0], size=40).repeat(5)
         for size in 10 * 0.8 ** np.arange(40):
-            run = simulate(controller, scenario(plant, np.zeros(n), disturbance=size * push))
+            run = simulate(controller, impc.scenario(plant, np.zeros(n), disturbance=size * push))
             saturated = np.mean(np.abs(np.abs(run.u) - 1) < 1e-9)
             if run.complete and 0.02 < saturated < 0.3:
-                trial = Recording(plant, run.x, np.append(size * push, 0))
-                problem = Problem(plant, bounds, 5, (trial,), terminal_set=False)
+                trial = impc.Recording(plant, run.x, np.append(size * push, 0))
+                problem = impc.Problem(plant, bounds, 5, (trial,), terminal_set=False)
                 return weights, controller, problem
 
 
 @functools.cache
-def random_problem(seed: int, m: int) -> tuple[Controller, Problem]:
+def random_problem(seed: int, m: int) -> tuple[impc.Controller, impc.Problem]:
     """`saturated_problem` of 2 to 6 states and m inputs."""
     return saturated_problem(np.random.default_rng([14, m, seed]), 2 + seed % 5, m)[1:]
 

@@ -18,22 +18,8 @@ import pytest
 
 import impc
 from impc.arrays import Frozen, as_numbers
-from impc.checking import checked, replace
-from impc.control.controller import Controller
-from impc.control.simulation import scenario
-from impc.control.terminal_set import maximal_invariant_set
+from impc.checking import checked
 from impc.errors import BoundsError, DataError, ImpcError, InputError, PlantError, WeightsError
-from impc.files.formats import read_table
-from impc.files.reading import read_recordings
-from impc.files.saved_estimates import load
-from impc.files.table import make_table
-from impc.inverse.problem import Problem
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.recordings import Recording
-from impc.model.structure import Structure
-from impc.model.targets import steady_state
-from impc.model.weights import Weights
 from tests.wrong_arguments import calls, values, wrong_values
 
 # Classes of results, which impc makes, and of errors.
@@ -44,7 +30,7 @@ FIRST = {"self", "controller", "estimate", "fitted", "given", "settings", "chang
 # Functions that take long if they are given what they can use.
 SLOW = ("table_3_1", "fit", "fit_optimal_control", "fit_output_feedback")
 USABLE = (type(None), bool, int, float, np.float32)
-PLANT = Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
+PLANT = impc.Plant(control.ss([[2, -1], [1, 0.2]], [[1], [0]], np.eye(2), 0, True))
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -102,19 +88,19 @@ def test_right_arguments_are_right() -> None:
 
 def test_what_means_the_same_is_welcome() -> None:
     outputs = np.round(np.random.default_rng(0).normal(size=(20, 2)), 2).astype(np.float32)
-    expected = Recording(PLANT, outputs.astype(float)).outputs
+    expected = impc.Recording(PLANT, outputs.astype(float)).outputs
     frame = pd.DataFrame(outputs, columns=["x", "y"])
     for given in (outputs, outputs.tolist(), frame, np.ma.masked_array(outputs), tuple(outputs)):
-        np.testing.assert_array_equal(Recording(PLANT, given).outputs, expected)
-    np.testing.assert_array_equal(Recording(PLANT, frame.astype("Float32")).outputs, expected)
-    named = Bounds(PLANT, x_min={PLANT.states[1]: -2}, u_max={PLANT.controls[0]: 1})
+        np.testing.assert_array_equal(impc.Recording(PLANT, given).outputs, expected)
+    np.testing.assert_array_equal(impc.Recording(PLANT, frame.astype("Float32")).outputs, expected)
+    named = impc.Bounds(PLANT, x_min={PLANT.states[1]: -2}, u_max={PLANT.controls[0]: 1})
     np.testing.assert_array_equal(named.x_min, [-np.inf, -2])
     np.testing.assert_array_equal(named.u_max, [1])
-    one = Controller(PLANT, Weights(np.eye(2), 1), Bounds(PLANT, u_max=[1]), 4)
-    other = Controller(
+    one = impc.Controller(PLANT, impc.Weights(np.eye(2), 1), impc.Bounds(PLANT, u_max=[1]), 4)
+    other = impc.Controller(
         PLANT,
-        Weights(pd.DataFrame(np.eye(2, dtype=int)), np.float32(1)),
-        Bounds(PLANT, u_max=pd.Series([1], dtype="Int64")),
+        impc.Weights(pd.DataFrame(np.eye(2, dtype=int)), np.float32(1)),
+        impc.Bounds(PLANT, u_max=pd.Series([1], dtype="Int64")),
         np.int8(4),  # type: ignore[arg-type]
         terminal_set=np.bool_(True),  # type: ignore[arg-type]
     )
@@ -133,9 +119,9 @@ def test_masked_samples_are_missing_not_data() -> None:
     outputs = np.ma.masked_array(np.ones((20, 2)))
     outputs[7, 1] = 1e6
     outputs[7, 1] = np.ma.masked
-    assert np.argwhere(np.isnan(Recording(PLANT, outputs).outputs)).tolist() == [[7, 1]]
+    assert np.argwhere(np.isnan(impc.Recording(PLANT, outputs).outputs)).tolist() == [[7, 1]]
     with pytest.raises(DataError, match="NaN or infinite"):
-        scenario(PLANT, np.ma.masked_array([1.0, 2.0], mask=[False, True]), 10)
+        impc.scenario(PLANT, np.ma.masked_array([1.0, 2.0], mask=[False, True]), 10)
     np.testing.assert_array_equal(
         as_numbers("x", np.ma.masked_array([1, 2], mask=[False, True])), [1.0, np.nan]
     )
@@ -166,7 +152,7 @@ def test_arrays_stay_read_only_in_copies_and_pickles(name: str) -> None:
     if name == "set":
         assert value.cones  # of Clarabel's, which have no pickle: they stay behind
     made = [pickle.loads(pickle.dumps(value, protocol)) for protocol in (2, 4, 5)]
-    made += [copy.copy(value), copy.deepcopy(value), replace(value)]
+    made += [copy.copy(value), copy.deepcopy(value), impc.replace(value)]
     for one in made:
         assert type(one) is type(value)
         for array, same in zip(arrays_of(one), arrays_of(value), strict=True):
@@ -178,19 +164,19 @@ def test_arrays_stay_read_only_in_copies_and_pickles(name: str) -> None:
 
 def test_columns_of_a_table_are_numbers_and_what_is_masked_is_missing() -> None:
     given = np.ma.masked_array([0.1, 0.2, -999.0, 0.4], mask=[False, False, True, False])
-    found = make_table(
+    found = impc.make_table(
         "lab", {"angle": given, "none": np.ma.masked_array(np.ones(4), mask=True)}
     ).columns
     np.testing.assert_array_equal(found["angle"], [0.1, 0.2, np.nan, 0.4])
     assert np.isnan(found["none"]).all()
     frame: Any = pd.DataFrame({"a": [1, 2]})
-    assert make_table("lab", frame).columns["a"].tolist() == [1.0, 2.0]
+    assert impc.make_table("lab", frame).columns["a"].tolist() == [1.0, 2.0]
     for wrong in ({"a": "xy"}, [1, 2], {"a": [[1.0]]}, {1: [1.0]}, {"a": [1j, 2]}):
         with pytest.raises(ImpcError):
-            make_table("lab", wrong)  # type: ignore[arg-type]
+            impc.make_table("lab", wrong)  # type: ignore[arg-type]
 
 
-BOX, PAIR, MATRIX = Bounds(PLANT, u_max=1), Weights(np.eye(2), 1), np.ones((1, 1))
+BOX, PAIR, MATRIX = impc.Bounds(PLANT, u_max=1), impc.Weights(np.eye(2), 1), np.ones((1, 1))
 MIXED = np.diag([2.0, 0.5]), [[0], [1]], np.eye(2)
 ENDS = np.r_[np.ones((3, 2)), np.full((2, 2), np.nan)]
 
@@ -198,7 +184,7 @@ ENDS = np.r_[np.ones((3, 2)), np.full((2, 2), np.nan)]
 def law(*given: Any, **more: Any) -> Callable[[], object]:
     """A controller with the first of its arguments exchanged."""
     arguments: Any = [*given, *(PLANT, PAIR, BOX, 4)[len(given) :]]
-    return lambda: Controller(*arguments, **more)
+    return lambda: impc.Controller(*arguments, **more)
 
 
 def made(kind: Any, *given: Any, **more: Any) -> Callable[[], object]:
@@ -206,14 +192,14 @@ def made(kind: Any, *given: Any, **more: Any) -> Callable[[], object]:
 
 
 def plant(*matrices: Any, controls: Any = None) -> Callable[[], object]:
-    return lambda: Plant(control.ss(*matrices), controls)
+    return lambda: impc.Plant(control.ss(*matrices), controls)
 
 
 #: What is called, with the class of the error and its words.
 WRONG: list[tuple[Callable[[], object], type[ImpcError], str]] = [
     (law(None), InputError, "plant: expected a Plant, got None; make it"),
     (law(PLANT, BOX), InputError, "weights: expected a Weights, got Bounds"),
-    (law(PLANT, Weights(np.eye(3), 1)), InputError,
+    (law(PLANT, impc.Weights(np.eye(3), 1)), InputError,
      "weights: has 3 states, but an earlier argument has 2; use the same plant for all"),
     (law(PLANT, PAIR, BOX, 4.0), InputError, "horizon: got 4.0; give a whole number"),
     (law(PLANT, PAIR, BOX, 0), InputError, "^horizon: got 0; give a whole number"),
@@ -222,51 +208,58 @@ WRONG: list[tuple[Callable[[], object], type[ImpcError], str]] = [
     (law(softening=-1), InputError, "^softening: got -1"),
     *[(law(solver=name), InputError, f"^solver: got '{name}'; choose one of")
       for name in ("gurobi", "", "DAQ", "OSQP")],
-    (made(Problem, PLANT, BOX, 4, [Recording(PLANT, np.ones((3, 2)))], solver="gurobi"),
+    (made(impc.Problem, PLANT, BOX, 4, [impc.Recording(PLANT, np.ones((3, 2)))], solver="gurobi"),
      InputError, "^solver: got 'gurobi'; choose one of"),
-    (made(maximal_invariant_set, PLANT, [[1, 0]], BOX, tolerance=-1.0), InputError, "^tolerance"),
-    (made(maximal_invariant_set, PLANT, [[1, 0]], BOX, max_steps=0), InputError, "^max_steps"),
-    (made(maximal_invariant_set, PLANT, [[1], [0]], BOX), DataError, "^gain: expected shape"),
-    (made(scenario, PLANT, [1, 3]), DataError, "^steps: is missing, without a disturbance"),
-    (made(scenario, PLANT, [1, np.nan], 5), DataError, "^x0: 1 of 2 entries are NaN"),
-    (made(steady_state, PLANT, disturbance=[0.1]), DataError,
+    (made(impc.maximal_invariant_set, PLANT, [[1, 0]], BOX, tolerance=-1.0), InputError,
+     "^tolerance"),
+    (made(impc.maximal_invariant_set, PLANT, [[1, 0]], BOX, max_steps=0), InputError, "^max_steps"),
+    (made(impc.maximal_invariant_set, PLANT, [[1], [0]], BOX), DataError, "^gain: expected shape"),
+    (made(impc.scenario, PLANT, [1, 3]), DataError, "^steps: is missing, without a disturbance"),
+    (made(impc.scenario, PLANT, [1, np.nan], 5), DataError, "^x0: 1 of 2 entries are NaN"),
+    (made(impc.steady_state, PLANT, disturbance=[0.1]), DataError,
      r"^disturbance: expected shape \(0\)"),
-    (made(Controller.from_gain, PLANT, [[0, 0]], BOX, 3), InputError, "^gain: does not stabilise"),
-    (made(Controller.from_gain, PLANT, [1, 1], BOX, 3), DataError, "^gain: expected shape"),
-    (made(Weights, [[1, 2], [3]], 1), InputError, "Q: expected real numbers, got list"),
-    (made(Weights, np.eye(2) * 1j, 1), InputError, "Q: expected real numbers, got an array"),
-    (made(Weights, [5, 2], 0.1), InputError, r"Q: expected a square .* np.diag\(\[5.0, 2.0\]\)"),
-    (made(Weights, np.zeros((0, 0)), 1), InputError, r"Q: expected a square .* shape \(0, 0\)"),
-    (made(Weights, -np.eye(2), 1), WeightsError, "^Q: is not positive semidefinite"),
-    (made(Weights, np.eye(2), 0), WeightsError, "^R: is not positive definite"),
-    (made(Weights, [[1, 2], [0, 1]], 1), InputError, "^Q: is not symmetric"),
-    (made(Weights, [[1]]), InputError, "Weights: missing a required argument: 'R'"),
-    (made(Weights, [[1]], 1, 1), InputError, "too many positional arguments"),
-    (made(Weights, [[1]], R=1, S=1), InputError, "unexpected keyword argument 'S'"),
-    (made(Bounds, PLANT, u_max=["1"]), InputError, "u_max: expected real numbers, got an"),
-    (made(Bounds, PLANT, x_max={"v": 1.0}), InputError, "x_max: there is no signal 'v'; choose"),
-    (made(Bounds, PLANT, x_max={PLANT.states[0]: "1"}), InputError, "']: got '1'; give a number"),
-    (made(Bounds, PLANT, u_min=1, u_max=-1), BoundsError, "cross for u"),
-    (made(Bounds, PLANT, u_min=1, u_max=2), BoundsError, "exclude the origin"),
-    (made(Bounds, PLANT, u_min=0, u_max=1), ImpcError, "has a bound of u.* at 0"),
-    (made(Bounds, PLANT, u_max=np.nan), BoundsError, "has NaN"),
-    (made(Bounds, PLANT, x_max=[1, 2, 3]), BoundsError, "^x_max: got"),
+    (made(impc.Controller.from_gain, PLANT, [[0, 0]], BOX, 3), InputError,
+     "^gain: does not stabilise"),
+    (made(impc.Controller.from_gain, PLANT, [1, 1], BOX, 3), DataError, "^gain: expected shape"),
+    (made(impc.Weights, [[1, 2], [3]], 1), InputError, "Q: expected real numbers, got list"),
+    (made(impc.Weights, np.eye(2) * 1j, 1), InputError, "Q: expected real numbers, got an array"),
+    (made(impc.Weights, [5, 2], 0.1), InputError,
+     r"Q: expected a square .* np.diag\(\[5.0, 2.0\]\)"),
+    (made(impc.Weights, np.zeros((0, 0)), 1), InputError,
+     r"Q: expected a square .* shape \(0, 0\)"),
+    (made(impc.Weights, -np.eye(2), 1), WeightsError, "^Q: is not positive semidefinite"),
+    (made(impc.Weights, np.eye(2), 0), WeightsError, "^R: is not positive definite"),
+    (made(impc.Weights, [[1, 2], [0, 1]], 1), InputError, "^Q: is not symmetric"),
+    (made(impc.Weights, [[1]]), InputError, "Weights: missing a required argument: 'R'"),
+    (made(impc.Weights, [[1]], 1, 1), InputError, "too many positional arguments"),
+    (made(impc.Weights, [[1]], R=1, S=1), InputError, "unexpected keyword argument 'S'"),
+    (made(impc.Bounds, PLANT, u_max=["1"]), InputError, "u_max: expected real numbers, got an"),
+    (made(impc.Bounds, PLANT, x_max={"v": 1.0}), InputError,
+     "x_max: there is no signal 'v'; choose"),
+    (made(impc.Bounds, PLANT, x_max={PLANT.states[0]: "1"}), InputError,
+     "']: got '1'; give a number"),
+    (made(impc.Bounds, PLANT, u_min=1, u_max=-1), BoundsError, "cross for u"),
+    (made(impc.Bounds, PLANT, u_min=1, u_max=2), BoundsError, "exclude the origin"),
+    (made(impc.Bounds, PLANT, u_min=0, u_max=1), ImpcError, "has a bound of u.* at 0"),
+    (made(impc.Bounds, PLANT, u_max=np.nan), BoundsError, "has NaN"),
+    (made(impc.Bounds, PLANT, x_max=[1, 2, 3]), BoundsError, "^x_max: got"),
     (plant(*MIXED, 0, True), PlantError, "not stabilisable"),
     (plant(0.5, 1, 1, 1, True), PlantError, "D: is not zero"),
     (plant(np.nan, 1, 1, 0, True), PlantError, "NaN or infinite"),
     (plant(0.5, 1, 1, 0, True, controls=["torque"]), PlantError, "controls: .*the inputs are"),
-    (made(Plant, np.eye(2)), PlantError, "expected a control.StateSpace"),
-    (made(Plant, [[1]], MATRIX), ImpcError, r"system: .* pass control.ss\(A, B, C, D, dt\)"),
-    (lambda: Plant(control.ss(-1, 1, 1, 0)).require_discrete(), PlantError, "is continuous"),
-    (made(Recording, PLANT, ENDS), InputError,
+    (made(impc.Plant, np.eye(2)), PlantError, "expected a control.StateSpace"),
+    (made(impc.Plant, [[1]], MATRIX), ImpcError, r"system: .* pass control.ss\(A, B, C, D, dt\)"),
+    (lambda: impc.Plant(control.ss(-1, 1, 1, 0)).require_discrete(), PlantError, "is continuous"),
+    (made(impc.Recording, PLANT, ENDS), InputError,
      "outputs: are NaN from sample 3 on; cut them there"),
-    (made(Recording, PLANT, np.ones((2, 9))), ImpcError, r"transpose it: outputs.T"),
-    (made(load, "a\0b"), ImpcError, "path: has a zero byte"),
-    (made(load, "x" * 5000), ImpcError, "File name too long"),
-    (made(read_table, "\ud800.csv"), ImpcError, "give a name that is text"),
-    (made(read_table, None), ImpcError, "path: got None; give a path"),
-    (made(read_recordings, [], None, PLANT), ImpcError, "configuration: expected a Conf"),
-    (made(Structure, PLANT, ["1e-320 x[0]"]), ImpcError, "has a factor of .*scale it to about 1"),
+    (made(impc.Recording, PLANT, np.ones((2, 9))), ImpcError, r"transpose it: outputs.T"),
+    (made(impc.load, "a\0b"), ImpcError, "path: has a zero byte"),
+    (made(impc.load, "x" * 5000), ImpcError, "File name too long"),
+    (made(impc.read_table, "\ud800.csv"), ImpcError, "give a name that is text"),
+    (made(impc.read_table, None), ImpcError, "path: got None; give a path"),
+    (made(impc.read_recordings, [], None, PLANT), ImpcError, "configuration: expected a Conf"),
+    (made(impc.Structure, PLANT, ["1e-320 x[0]"]), ImpcError,
+     "has a factor of .*scale it to about 1"),
 ]  # fmt: skip
 
 
@@ -280,18 +273,18 @@ def test_a_wrong_call_says_what_to_do(index: int) -> None:
 
 def test_a_value_made_by_hand_is_checked_and_not_the_callers() -> None:
     Q = np.eye(2)
-    made = Weights(Q, [[1]])
+    made = impc.Weights(Q, [[1]])
     Q[0, 0] = 5.0
     assert made.Q[0, 0] == 1.0
     assert made.R.dtype == np.float64
     wrong: Any
     for wrong in ("text", np.eye(3)[:2], np.full((2, 2), np.nan)):
         with pytest.raises(InputError, match="Q: "):
-            replace(made, Q=wrong)
+            impc.replace(made, Q=wrong)
     with pytest.raises(InputError, match="B: expected shape"):
-        replace(PLANT, B=np.ones((3, 1)))
+        impc.replace(PLANT, B=np.ones((3, 1)))
     with pytest.raises(DataError, match="B: has shape"):  # unchanged fields no longer agree
-        replace(PLANT, A=np.eye(3))
+        impc.replace(PLANT, A=np.eye(3))
 
 
 def test_an_annotation_that_is_not_in_the_table_is_told_at_import() -> None:
@@ -299,4 +292,4 @@ def test_an_annotation_that_is_not_in_the_table_is_told_at_import() -> None:
 
     with pytest.raises(TypeError, match="bytearray is not known"):
         checked(function)
-    assert isinstance(PLANT, Plant)
+    assert isinstance(PLANT, impc.Plant)

@@ -13,8 +13,8 @@ import pytest
 
 import impc.jit
 from impc.jit import keep_caches
+from tests.support import ROOT, new_python
 
-ROOT = Path(__file__).parents[1]
 # Nobody can make a folder there, not even root, who runs the tests of a container.
 NOWHERE = f"{__file__}/none"  # below a file no folder can be made
 
@@ -72,11 +72,7 @@ def test_the_library_compiles_in_memory_without_a_place_for_caches(tmp_path: Pat
         "loop = impc.control.compiled_loop\n"
         "print(type(loop.run._cache).__name__, loop.__file__)\n"
     )
-    homeless = {"PYTHONPATH": str(tmp_path), "HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}
-    words = [sys.executable, "-P", "-c", code]
-    done = subprocess.run(
-        words, env=os.environ | homeless, capture_output=True, text=True, check=False
-    )
+    done = new_python(code, "-P", PYTHONPATH=str(tmp_path), HOME=NOWHERE, XDG_CACHE_HOME=NOWHERE)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["NullCache", str(tmp_path / "impc/control/compiled_loop.py")]
 

@@ -6,7 +6,6 @@ import ast
 import doctest
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import pytest
 
 import impc
-from tests.documents.blocks import ROOT
+from tests.support import ROOT, new_python
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 # Libraries that are loaded for one purpose, such as a figure, a plant or a workbook.
@@ -47,10 +46,7 @@ def test_a_type_checker_sees_the_same_names_in_the_same_modules() -> None:
 def loaded(line: str) -> set[str]:
     """Names of the modules that a fresh Python has after a line."""
     said = "import atexit, json, sys; atexit.register(lambda: print(json.dumps([*sys.modules])))"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{said}\n{line}"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = new_python(f"{said}\n{line}")
     assert "Traceback" not in done.stderr
     return set(json.loads(done.stdout.splitlines()[-1]))
 

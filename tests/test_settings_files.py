@@ -19,15 +19,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import impc
 from experiments.reference_mpc import solve_mpc
 from impc.control.casadi_controller import build_mpc
-from impc.control.controller import Controller
-from impc.errors import InfeasibleError
-from impc.files.formats import write_table
-from impc.files.table import make_table
-from impc.model.bounds import Bounds
-from impc.model.plant import Plant
-from impc.model.weights import Weights
 from tests.nonlinear.test_problem import TRUTH, made
 from tests.studies.cohort.carts import cart_plant, subject_trial
 
@@ -55,28 +49,17 @@ def hook(event, args):
 busy = []
 sys.addaudithook(hook)
 """
-SETTINGS = {
+TRAPS = """
+pip.conf pip.ini .pip/pip.conf dask.yaml .dask/dask.yaml .config/dask/dask.yaml setup.cfg
+distributed.yaml openblas.conf .openblas .env pyvenv.cfg python._pth python311._pth evil.pth
+pyproject.toml .netrc mpl.mplstyle .matplotlib/matplotlibrc .pdbrc conftest.py evil.py
+sitecustomize.py usercustomize.py fatrop.opt highs.opt impc.toml evil.so
+libcasadi_nlpsol_ipopt.so libopenblas.so libhsl.so
+"""
+SETTINGS = dict.fromkeys(TRAPS.split(), "raise SystemExit('sprung')\n") | {
     ".numba_config.yaml": "cache_dir: .cache\ndisable_jit: 1\n",
     "matplotlibrc": "text.usetex: True\nlines.linewidth: 0\nbackend: module://evil\nnonsense\n",
     "ipopt.opt": 'output_file "sprung"\nprint_level 5\nfile_print_level 5\nhsllib ./evil.so\n',
-    **dict.fromkeys(
-        [
-            *("pip.conf", "pip.ini", ".pip/pip.conf", "dask.yaml", ".dask/dask.yaml", "setup.cfg"),
-            *(".config/dask/dask.yaml", "distributed.yaml", "openblas.conf", ".openblas", ".env"),
-            *(
-                "pyvenv.cfg",
-                "python._pth",
-                "python311._pth",
-                "evil.pth",
-                "pyproject.toml",
-                ".netrc",
-            ),
-            *("mpl.mplstyle", ".matplotlib/matplotlibrc", ".pdbrc", "conftest.py", "evil.py"),
-            *("sitecustomize.py", "usercustomize.py", "fatrop.opt", "highs.opt", "impc.toml"),
-            *("libcasadi_nlpsol_ipopt.so", "libopenblas.so", "libhsl.so", "evil.so"),
-        ],
-        "raise SystemExit('sprung')\n",
-    ),
 }
 STUDY = """
 [study]
@@ -111,7 +94,7 @@ def filled(folder: Path) -> Path:
         "position": trial.outputs[:samples, 0],
         "push": trial.disturbance[:samples, 0],
     }
-    write_table(folder / "sub-1.mat", make_table("simulated", columns))
+    impc.write_table(folder / "sub-1.mat", impc.make_table("simulated", columns))
     (folder / "study.toml").write_text(STUDY)
     return folder
 
@@ -204,16 +187,19 @@ def test_results_are_those_of_the_folder_without(runs: tuple[Path, Path, list[st
 
 
 def test_ipopt_obeys_no_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, example_plant: Plant, example_bounds: Bounds
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    example_plant: impc.Plant,
+    example_bounds: impc.Bounds,
 ) -> None:
     """Of the optimal control problem, of the row that cannot be kept, and of the controller."""
     monkeypatch.chdir(tmp_path)
     Path("ipopt.opt").write_text(SETTINGS["ipopt.opt"])
     point = made()
     point.plan(TRUTH, [1, 0])
-    with pytest.raises(InfeasibleError):
+    with pytest.raises(impc.InfeasibleError):
         made(signed=["limit"]).plan(TRUTH | {"limit": -1.0}, [1, 0])
-    weights = Weights(np.eye(2), 1)
-    controller = Controller(example_plant, weights, example_bounds, 3)
+    weights = impc.Weights(np.eye(2), 1)
+    controller = impc.Controller(example_plant, weights, example_bounds, 3)
     solve_mpc(build_mpc(controller, "ipopt"), [0.1, 0.1])
     assert os.listdir() == ["ipopt.opt"]

@@ -29,7 +29,6 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
-from impc.inverse.residuals import scaled_changes
 from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
 
@@ -246,30 +245,17 @@ def auxiliary_weights(
     gain: Array,
     start: Weights | None,
     *,
-    metric: Array | None = None,
     condition_weight: float = AUXILIARY_CONDITION_WEIGHT,
     tolerance: float = 1e-11,
 ) -> ConditionedFit:
     """Auxiliary problem (3.7): well-conditioned weights with a gain near `gain` (m, n).
 
-        minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
-
-    With a `metric` (m, m), the distance to it is added.
+    minimise  ||K(Q, R) - gain||_2 + condition_weight kappa(blkdiag(Q, R))
     """
-    m, size = plant.m, gain.size
-    target = None if metric is None else m * metric / np.trace(metric)
 
     def distance(solution: LqrSolution) -> Residual:
         beyond = (solution.K - gain).ravel()
-        if target is None:
-            return Residual(beyond, lambda dK, _: dK.reshape(-1, size).T)
-        S = np.array(solution.S)
-
-        def along(dK: Array, dS: Array) -> Array:
-            scaled = scaled_changes(S, dS).reshape(len(dS), -1)
-            return np.hstack([dK.reshape(-1, size), scaled]).T
-
-        return Residual(np.append(beyond, m * S / np.trace(S) - target), along)
+        return Residual(beyond, lambda dK, _: dK.reshape(-1, gain.size).T)
 
     begin = Weights(np.eye(plant.n), np.eye(plant.m)) if start is None else start
     objective = Objective(distance, 1.0, condition_weight, squared=False)

@@ -12,11 +12,8 @@ from experiments.benchmarks.workloads import Workload, chain_of_masses, example,
 from impc.arrays import Array
 from impc.assess.bounded_weights import (
     WeightsSet,
-    all_negative,
     entry_ranges,
-    linear_maxima,
     linear_ranges,
-    set_near,
     weights_set,
 )
 from impc.assess.weights_ranges import pair_statements
@@ -119,24 +116,3 @@ def test_statements_agree_with_sampled_members() -> None:
 def test_a_ratio_must_leave_room() -> None:
     with pytest.raises(impc.InputError, match="ratio"):
         set_of(example(), 1.0)
-
-
-def test_signs_and_the_set_of_a_near_gain_are_those_of_whole_programs() -> None:
-    """Early ends of programs and a set without a program change no statement."""
-    work = seat(1, 10.0)
-    plant, whole = work.problem.plant, set_of(work)
-    moved = impc.solve_lqr(plant, impc.Weights(work.weights.Q * 1.03, work.weights.R))
-    near = set_near(whole, impc.gain_fibre(plant, moved.K))
-    exact = weights_set(near.fibre)
-    assert exact.limit <= near.limit <= 1.2 * exact.limit
-    places = [(i, j) for i in range(4) for j in range(i)]
-    functions = np.zeros((2 * len(places), len(whole.first), len(whole.first)))
-    for function, (i, j) in zip(functions, places * 2, strict=False):
-        function[i, i], function[j, j] = 1.0, -1.0
-    functions[len(places) :] *= -1
-    for found in (whole, near):
-        assert all_negative(found, functions) == tuple(
-            end.value < 0 for end in linear_maxima(found, functions)
-        )
-    assert any(all_negative(near, functions))
-    assert not all(all_negative(near, functions))

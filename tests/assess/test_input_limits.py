@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 
 import impc
-from experiments.benchmarks.workloads import seat
 from experiments.coverage import cart, true_controller
-from experiments.simulated_subjects import noisy_recordings
 from impc.assess import input_limits
-from impc.assess.input_limits import LimitEstimate, input_limit, with_limit
+from impc.assess.input_limits import input_limit, with_limit
 from impc.assess.profiles import QUANTILE
 from impc.control.closed_loop import simulate
 from impc.inverse.noisy_fit import fit_controller
 from tests.assess.cart_fits import cart_fit
-from tests.support import present
 
 SEED = 3
 
@@ -59,27 +56,6 @@ def test_the_search_starts_at_the_given_limit(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(input_limits, "_typical_peak", lambda *_: 1e3)
     found = input_limit(cart_fit(SEED, u_max=1.2))
     assert found.value == pytest.approx(1.0, rel=0.02)
-
-
-@pytest.mark.slow
-def test_limits_of_noisy_subjects() -> None:
-    """Seat at 6 Nm, 12.5 % of samples saturated, seeds 0 to 4; at 70 Nm not identified."""
-    # At a VAF of 90 % the limit has a standard error of 1 %: the median of five subjects must be
-    # within 2 %, and no interval may miss by more than half its width.
-    plant = seat(1, 1.0).problem.plant
-
-    def found(limit: float, seed: int) -> LimitEstimate:
-        trials = noisy_recordings(limit, seed, 0.9)
-        return input_limit(fit_controller(impc.fit_problem(plant, trials, impc.FitSettings())))
-
-    errors = []
-    for seed in range(5):
-        at_six, at_seventy = found(6.0, seed), found(70.0, seed)
-        assert at_seventy.value is None
-        half = (at_six.high - at_six.low) / 2
-        errors.append(abs(present(at_six.value) - 6.0) / 6.0)
-        assert at_six.low - half < 6.0 < at_six.high + half
-    assert np.median(errors) < 0.02, errors
 
 
 def test_with_limit_changes_one_input_only() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,38 +10,22 @@ import pytest
 import impc
 from experiments.residual_study import diagnosed
 from experiments.uncertain_body import cart
-from impc.arrays import Array
-from impc.assess import lack_of_fit as module
 from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, LackOfFit, lack_of_fit
 from impc.assess.printed_gain import gain_estimate
 from impc.inverse.further_unknowns import (
-    with_delay_unknown,
     with_errors_unknown,
-    with_limit_unknown,
 )
 from impc.inverse.laws import GainLaw
-from impc.inverse.residuals import residual_only
 from impc.inverse.unknowns import Unknowns
 from impc.studies.fit.subject import fit_recordings
 from tests.assess.cart_fits import uncertain_cart, uncertain_fit
-from tests.support import posed, present, regulator, slopes
+from tests.support import posed, present, regulator
 
 
 @functools.cache
 def result_of(seed: int, error: str, root: float = 0.0) -> LackOfFit:
     found = present(lack_of_fit(gain_estimate(uncertain_fit(seed, error, root))))
     return found
-
-
-def problem_and_gain() -> tuple[impc.Problem, Array, Array]:
-    """Cart at its limit for part of the time, at its true gain."""
-    problem, K, _ = uncertain_cart()
-    return problem.with_body_fixed(), K, np.eye(1)
-
-
-def column(name: str) -> Array:
-    problem, K, S = problem_and_gain()
-    return module._columns(problem, K, S)[name]
 
 
 @pytest.mark.parametrize(("seed", "root"), [(0, 0.0), (1, 0.0), (0, 0.9), (1, 0.9)])
@@ -70,34 +53,6 @@ def test_an_error_is_named_with_its_size(
         assert found.deviation < 0.2 * size
 
 
-@pytest.mark.parametrize(
-    ("name", "wider", "size"),
-    [(DELAY, with_delay_unknown, 0.05), (LIMIT, with_limit_unknown, 1e-6)],
-)
-def test_the_column_of_a_delay_or_of_a_limit_is_a_derivative(
-    name: str, wider: Callable[[impc.Problem], impc.Problem | None], size: float
-) -> None:
-    """By the plant with that unknown: the delayed command is a state, with a gain of zero."""
-    problem, K, S = problem_and_gain()
-    with_it = present(wider(problem))
-    K = np.pad(K, ((0, 0), (0, with_it.plant.n - problem.plant.n)))
-    expected = slopes(with_it, K, S)[2][:, 0]
-    # The planned commands include the delay, the forcing does not: columns differ at the limit.
-    assert np.linalg.norm(column(name)[:, 0] - expected) < size * np.linalg.norm(expected)
-
-
-def test_the_column_of_a_lean_is_a_difference() -> None:
-    """Constant push in the first trial."""
-    problem, K, S = problem_and_gain()
-    first, step, ends = problem.recordings[0], 1e-5, []
-    for push in (step, -step):
-        moved = impc.replace(first, disturbance=np.array(first.disturbance) + push)
-        ends.append(residual_only(impc.replace(problem, recordings=(moved,)), K, S))
-    expected = (ends[0] - ends[1]) / (2 * step)
-    found = column(LEAN)[: len(expected), 0]
-    np.testing.assert_allclose(found, expected, atol=1e-3 * np.max(np.abs(expected)))
-
-
 def test_what_is_named_is_fitted_too() -> None:
     """One sample of delay, seed 1: the second fit includes it and covers the gain."""
     problem, truth, _ = uncertain_cart(1, "delay")
@@ -113,7 +68,8 @@ def test_what_is_named_is_fitted_too() -> None:
 
 
 def test_what_is_fitted_or_absent_is_not_tested() -> None:
-    problem, K, S = problem_and_gain()
+    person, K, _ = uncertain_cart()
+    problem, S = person.with_body_fixed(), np.eye(1)
     offset = ("offset", problem.plant.outputs[0])
     with_offset, unlimited = with_errors_unknown(problem, [offset]), problem.without_bounds()
     for name, one, tested in (
@@ -133,17 +89,6 @@ def test_too_little_is_not_tested() -> None:
     y = law.simulate([0, 0], disturbance=push).outputs[:-1]
     problem = posed(law, impc.Recording(law.plant, y, push))
     assert lack_of_fit(gain_estimate(impc.fit(problem))) is None
-
-
-def test_some_of_many_trials_and_none_with_gaps_are_tested() -> None:
-    problem = uncertain_cart().problem
-    trial, outputs = problem.recordings[0], np.array(problem.recordings[0].outputs)
-    outputs[50:60] = np.nan
-    gapped = impc.replace(trial, outputs=outputs)
-    for trials, count in ((problem.recordings * 20, 10), ((gapped, trial), 1)):
-        tested = module._some_trials(impc.replace(problem, recordings=trials)).recordings
-        assert len(tested) == count
-        assert all(one is not gapped for one in tested)
 
 
 @pytest.mark.slow

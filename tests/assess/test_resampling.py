@@ -45,12 +45,6 @@ def test_replicates_draw_what_is_known_of_the_body_again() -> None:
     assert [one.name for one in found] == list(printed_gain.entry_names(plant))
 
 
-def first_order(root: float, samples: int, seed: int) -> Array:
-    rng = np.random.default_rng(seed)
-    white = rng.standard_normal((samples + 500, 2)) @ np.array([[1.0, 0.6], [0.0, 0.8]])
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -root], white, axis=0)[500:])
-
-
 def replicate(at: printed_gain.GainEstimate, index: int, seed: int = SEED) -> resampling.Replicate:
     return resampling.replicate(at.problem, np.array(at.K), np.array(at.S), index, seed)
 
@@ -148,29 +142,3 @@ def test_a_replicate_ends_where_a_whole_fit_of_its_recordings_does(root: float) 
     found, whole = replicate(at, 0), printed_gain.gain_estimate(fit_controller(asked))
     assert np.all(np.abs(found.K - whole.K) < 0.01 * whole.covariance.entries)
     assert np.all(np.abs(found.K - at.K) > 0.01 * whole.covariance.entries)
-
-
-@both_roots
-def test_drawn_residuals_have_the_colour_of_the_given(root: float) -> None:
-    """Variance, cross-correlation and autocorrelation; 40 draws of 2 x 2000 samples."""
-    given = [first_order(root, 2000, SEED), first_order(root, 1500, SEED + 1)]
-    rng = np.random.default_rng(SEED)
-    drawn = [resampling.block_residuals(given, rng) for _ in range(40)]
-    assert [part.shape for part in drawn[0]] == [(2000, 2), (1500, 2)]
-
-    def moments(trials: list[Array]) -> Array:
-        lagged = sum(part[1:].T @ part[:-1] for part in trials) / sum(map(len, trials))
-        return np.concatenate([np.cov(np.concatenate(trials).T).ravel(), np.ravel(lagged)])
-
-    found = np.mean([moments(part) for part in drawn], axis=0)
-    expected = moments([part - part.mean(axis=0) for part in given])
-    np.testing.assert_allclose(found, expected, atol=0.08 * np.max(np.abs(expected)))
-
-
-def test_block_length_of_first_order_noise() -> None:
-    """Closed form of Politis and White at the estimated coefficient."""
-    given = [first_order(0.9, 4000, SEED)]
-    assert resampling.block_length(given) == pytest.approx(
-        np.cbrt(6 * 0.81 / (1 - 0.81) ** 2 * 4000), rel=0.15
-    )
-    assert resampling.block_length([np.zeros((50, 1))]) == 1

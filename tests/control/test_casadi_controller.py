@@ -1,23 +1,27 @@
-"""The program at every sample, and rejected arguments; test_solvers.py compares solutions."""
+"""What is said of programs without a solution; test_solvers.py compares solutions."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import control
 import numpy as np
 import pytest
 
 from experiments.reference_mpc import simulate_mpc, solve_mpc
+from impc.checking import replace
 from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.controller import Controller
 from impc.control.feasibility import require_complete
 from impc.control.named_solver import SOLVERS
-from impc.control.simulation import Status, scenario
-from impc.errors import InfeasibleError, PlantError, SolverError
+from impc.control.simulation import Simulation, Status, scenario
+from impc.errors import DataError, InfeasibleError, PlantError, SolverError
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.model.weights import Weights
-from tests.independent_mpc import has_plan
+from tests.exact_mpc import ExactProgram, first_input
 from tests.support import random_plant, random_weights
 
 STEPS = 12
@@ -37,6 +41,9 @@ def test_a_solver_says_what_happened(example_plant: Plant, example_bounds: Bound
         run = simulate_mpc(mpc, scenario(example_plant, [30, 1], 3))
         with pytest.raises(InfeasibleError, match=r"^x0: no input sequence keeps the bound u\[0\]"):
             require_complete(controller, run)
+        named = simulate(replace(controller, solver=name), scenario(example_plant, [30, 1], 3))
+        assert named.status[0] == Status.INFEASIBLE
+        assert named.failed_row >= 0
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -57,7 +64,7 @@ def test_a_solver_that_fails_proves_nothing(name: str) -> None:
 
 
 @pytest.mark.parametrize("block", range(3))
-def test_infeasible_is_said_where_linear_programming_finds_no_plan(block: int) -> None:
+def test_infeasible_is_said_where_it_is_proved(block: int) -> None:
     """Starts inside, at and outside the feasible set of random plants, by several solvers."""
     said = set()
     for seed in range(15):
@@ -69,29 +76,70 @@ def test_infeasible_is_said_where_linear_programming_finds_no_plan(block: int) -
         controller = Controller(plant, weights, bounds, 6, terminal_set=False)
         x = 10 ** rng.uniform(-0.5, 0.8) * rng.normal(size=n)
         status = solve_mpc(build_mpc(controller, SOLVERS[block]), x).status
-        assert (status is Status.INFEASIBLE) == (not has_plan(plant.A, plant.B, 6, x, 1.0, 3.0)), (
-            seed
-        )
+        box, one = (np.vstack([np.eye(n), -np.eye(n)]), np.full(2 * n, 3.0)), np.ones(1)
+        program = ExactProgram(plant.A, plant.B, weights.Q, weights.R, 6, -one, one, box)
+        proved = first_input(program, x, np.zeros(len(program.sides), dtype=bool))
+        assert (status is Status.INFEASIBLE) == (proved is None), seed
         said.add(status)
     assert {Status.INFEASIBLE, Status.FREE} <= said
 
 
+@pytest.mark.parametrize(
+    ("sides", "horizon", "x0", "said"),
+    [
+        ({"u_min": -1, "u_max": 1}, 3, [3, 1], r"^x0: no input sequence keeps the bound u\[0\]"),
+        ({"u_min": -1, "u_max": 1}, 3, [90, 3], r"u\[0\] <= 1 in the terminal set, at sample 3"),
+        ({"u_min": -1, "u_max": 1}, 2, [3, 3], "terminal set.*terminal_set=False"),
+        ({"x_max": 1}, 3, [3, 1], r"keeps the bound x\[0\] <= 1 at sample 0 of"),
+    ],
+)
 def test_an_infeasible_start_names_the_bound_and_the_step(
-    example_plant: Plant, example_bounds: Bounds
+    example_plant: Plant, sides: dict[str, Any], horizon: int, x0: list[float], said: str
 ) -> None:
-    controller = Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3)
-    run = simulate(controller, scenario(example_plant, [3, 1], 20))
+    bounds = Bounds(example_plant, **sides)
+    controller = Controller(example_plant, Weights(np.eye(2), 1), bounds, horizon)
+    run = simulate(controller, scenario(example_plant, x0, 20))
     assert run.reached == 0
-    with pytest.raises(InfeasibleError, match=r"^x0: no input sequence keeps the bound u\[0\]"):
+    with pytest.raises(InfeasibleError, match=said):
         require_complete(controller, run)
-    run = simulate(controller, scenario(example_plant, [90, 3], 5))
-    with pytest.raises(InfeasibleError, match=r"u\[0\] <= 1 in the terminal set, at sample 3"):
-        require_complete(controller, run)
-    boxed = Bounds(example_plant, x_max=1)
-    outside = Controller(example_plant, Weights(np.eye(2), 1), boxed, 3)
-    run = simulate(outside, scenario(example_plant, [3, 1], 20))
-    with pytest.raises(InfeasibleError, match=r"keeps the bound x\[0\] <= 1 at sample 0 of"):
-        require_complete(outside, run)
+
+
+def test_a_start_beyond_feasibility_is_nan_and_no_recording() -> None:
+    """Regression: the state was frozen with u = 0, and weights were inferred without a warning."""
+    plant = Plant(control.ss([[2.0]], [[1]], [[1]], 0, 1))
+    law = Controller(plant, Weights(1, 1), Bounds(plant, u_min=-1, u_max=1), 3)
+    with pytest.warns(UserWarning, match="sample 0: .*; later samples are NaN"):
+        run = law.simulate([2.0], steps=5)
+    assert run.status[0] == Status.INFEASIBLE
+    assert run.x[0] == 2.0
+    assert np.all(np.isnan(run.x[1:]))
+    assert np.all(np.isnan(run.u))
+    with pytest.raises(DataError, match="NaN"):
+        Recording(plant, run.x)
+
+
+def ended(plant: Plant, statuses: list[Status]) -> Simulation:
+    steps = len(statuses)
+    codes = np.array(statuses, dtype=np.int8)
+    return Simulation(plant, np.zeros((steps + 1, 2)), np.zeros((steps, 1)), codes, 0, -1)
+
+
+@pytest.mark.parametrize("status", list(Status))
+def test_every_status_is_said_in_words(status: Status, example_plant: Plant) -> None:
+    """Statuses with an input are not failures; a failure's description is in the error."""
+    assert len(status.sentence) > 10
+    controller = Controller(
+        example_plant, Weights(np.eye(2), 1), Bounds(example_plant, u_max=1, u_min=-1), 3
+    )
+    run = ended(example_plant, [Status.FREE, status, Status.NOT_REACHED])
+    assert not run.complete
+    run = ended(example_plant, [Status.FREE, status])
+    assert (run.complete, run.reached) == ((True, 2) if status <= Status.SOFTENED else (False, 1))
+    if status <= Status.SOFTENED:
+        assert require_complete(controller, run) is run
+    elif status is not Status.INFEASIBLE:
+        with pytest.raises(SolverError, match=f"sample 1.*{status.sentence}"):
+            require_complete(controller, run)
 
 
 def test_the_loop_stays_feasible_from_every_feasible_start() -> None:

@@ -7,18 +7,18 @@ from typing import Any
 import control
 import numpy as np
 import pytest
-from scipy.optimize import linprog
 
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate, simulate_and_differentiate
-from impc.control.compiled_dual import CONVERGED, INCONSISTENT, solve_dual
+from impc.control.compiled_dual import CONVERGED, solve_dual
 from impc.control.constraint_rows import Directions, directions
 from impc.control.controller import Controller
 from impc.control.simulation import Scenario, Simulation, Status, scenario
 from impc.model.bounds import Bounds, bound_rows
 from impc.model.plant import Plant
+from impc.model.riccati import solve_lqr
 from impc.model.weights import Weights
-from tests.support import random_plant, random_weights
+from tests.support import differences, random_plant, random_weights
 
 dual: Any = solve_dual
 
@@ -125,14 +125,6 @@ def test_jacobian_equals_central_differences(seed: int, softening: float | None)
     check_jacobian(controller, drive)
 
 
-@pytest.mark.parametrize("x0", [(1, 3), (2, 3), (2, 1)])
-def test_jacobian_of_the_example_equals_central_differences(
-    example_plant: Plant, example_bounds: Bounds, x0: tuple[int, int]
-) -> None:
-    controller = Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3)
-    check_jacobian(controller, scenario(example_plant, x0, 20))
-
-
 def check_jacobian(controller: Controller, drive: Scenario, *without: str) -> None:
     """Compare every derivative, except some parts, with fourth-order differences, to 1e-6."""
     wanted = [(part, index) for part, index in entries(controller) if part not in without]
@@ -168,10 +160,15 @@ def test_soft_rows_are_part_of_the_comparison() -> None:
 
 def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
     """A start at which the terminal set is active: the trajectory without it differs."""
-    bounds = Bounds(example_plant, u_min=-1, u_max=1)
-    weights = Weights(np.eye(2), 1)
-    controller = Controller(example_plant, weights, bounds, 2)
-    bare = Controller(example_plant, weights, bounds, 2, terminal_set=False)
+    gain = solve_lqr(example_plant, Weights(np.eye(2), 1)).K
+
+    def law(change: np.ndarray, *, kept: bool = True) -> Controller:
+        """With the terminal set of the changed gain and bound."""
+        bounds = Bounds(example_plant, u_min=-1, u_max=1 + change[2])
+        return Controller.from_gain(example_plant, gain + change[:2], bounds, 2, terminal_set=kept)
+
+    here = np.zeros(3)
+    controller, bare = law(here), law(here, kept=False)
     for x0 in np.ndindex(40, 40):
         drive = scenario(example_plant, np.array(x0) / 10, 12)
         run, without = simulate(controller, drive), simulate(bare, drive)
@@ -181,42 +178,10 @@ def test_active_terminal_rows_are_differentiated(example_plant: Plant) -> None:
     assert run.complete
     assert differs
     wanted = [("K", (0, 0)), ("K", (0, 1)), ("bounds", (0,))]
-    _, exact = simulate_and_differentiate(controller, drive, unit_directions(controller, wanted))
-    step = 1e-7
-    for column, (part, index) in enumerate(wanted):
-        up, down = (
-            # The set is recomputed for the changed gain or bound.
-            simulate(
-                Controller.from_gain(
-                    example_plant,
-                    controller.K + sign * step * _unit(part, index),
-                    Bounds(example_plant, u_min=-1, u_max=1 + sign * step * (part == "bounds")),
-                    2,
-                ),
-                drive,
-            )
-            for sign in (1, -1)
-        )
-        difference = (up.x - down.x) / (2 * step)
-        np.testing.assert_allclose(exact.x[..., column], difference, rtol=1e-5, atol=1e-6)
-
-
-def _unit(part: str, index: tuple[int, ...]) -> np.ndarray:
-    unit = np.zeros((1, 2))
-    if part == "K":
-        unit[index] = 1
-    return unit
-
-
-def test_weights_with_the_same_gain_give_the_same_trajectories(
-    example_plant: Plant, example_bounds: Bounds
-) -> None:
-    """The two Q of the reference that have the gain of Q = I, R = 1 to the printed digits."""
-    drive = scenario(example_plant, [2, 3], 20)
-    true = simulate(Controller(example_plant, Weights(np.eye(2), 1), example_bounds, 3), drive)
-    for Q in ([[1.3, 0.06], [0.06, 0.712]], [[0.5, -0.1], [-0.1, 1.48]]):
-        controller = Controller(example_plant, Weights(Q, 1), example_bounds, 3)
-        np.testing.assert_allclose(simulate(controller, drive).x, true.x, atol=1e-12)
+    along = unit_directions(controller, wanted)
+    exact = simulate_and_differentiate(controller, drive, along)[1].x.reshape(-1, 3)
+    found = differences(lambda change: simulate(law(change), drive).x, here, 1e-7)
+    np.testing.assert_allclose(exact, found, rtol=1e-5, atol=1e-6)
 
 
 def test_samples_at_a_change_of_the_active_set_are_counted(
@@ -231,80 +196,23 @@ def test_samples_at_a_change_of_the_active_set_are_counted(
     assert simulate(controller, scenario(example_plant, 0.9 * x, 1)).weakly_active == 0
 
 
-def test_dual_solver_calls_random_infeasible_rows_inconsistent() -> None:
-    """Against scipy's linear programming, an independent test of feasibility."""
-    seed = 4
-    print("seed", seed)
-    rng = np.random.default_rng(seed)
-    seen = []
-    for _ in range(300):
-        rows, width = int(rng.integers(3, 16)), int(rng.integers(1, 6))
-        W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
-        if rng.random() < 0.3:
-            W[-1] = -W[0]  # parallel rows, as a lower and an upper bound are
-        lam, *room = dual_workspace(rows, width)
-        tight = np.full(rows, np.inf), np.full(rows, 1e-12)
-        code, _ = dual(W, np.full(rows, width), W @ W.T, d, *tight, lam, *room, 0)
-        verdict = linprog(np.zeros(width), A_ub=W, b_ub=d, bounds=(None, None), method="highs")
-        assert code == (INCONSISTENT if verdict.status == 2 else CONVERGED)
-        seen.append(code)
-        if code == CONVERGED:
-            v = -W.T @ lam
-            assert np.all(W @ v <= d + 1e-9)
-            assert np.all(lam >= 0)
-            assert abs(lam @ (W @ v - d)) <= 1e-8
-    assert 30 < seen.count(INCONSISTENT) < 270
-
-
-@pytest.mark.parametrize("cost_weight", [np.inf, 0.5])
-def test_dual_solver_finds_the_same_from_where_the_last_problem_ended(cost_weight: float) -> None:
-    """Warm starts: rows at their limits are relaxed at some samples and kept at the next."""
-    rng, begun, limited = np.random.default_rng(8), 0, 0
-    for _ in range(40):
-        rows, width = int(rng.integers(3, 16)), int(rng.integers(4, 9))
-        W, d = rng.normal(size=(rows, width)), rng.normal(size=rows) + 0.4
-        given = W, np.full(rows, width), W @ W.T, np.full(rows, cost_weight), np.full(rows, 1e-12)
-        warm, count = dual_workspace(rows, width), 0
-        for _ in range(60):  # the factor is computed anew on the way
-            d = d + 0.1 * rng.normal(size=rows)
-            cold = dual_workspace(rows, width)
-            code, _ = dual(*given[:3], d, *given[3:], *cold, 0)
-            begun += count > 0
-            found, count = dual(*given[:3], d, *given[3:], *warm, count)
-            assert found == code
-            if code != CONVERGED:
-                count = 0
-                continue
-            limited += bool(np.any(cold[0] == cost_weight))
-            np.testing.assert_allclose(
-                W.T @ warm[0], W.T @ cold[0], rtol=0, atol=1e-9 * (1 + np.max(cold[0]))
-            )
-            assert sorted(warm[1][:count]) == list(
-                np.flatnonzero((warm[0] > 0) & (warm[0] < cost_weight))
-            )
-    assert begun > 300
-    assert limited > (100 if cost_weight < np.inf else -1)
-
-
 def test_dual_solver_begins_anew_where_the_slack_is_no_number() -> None:
-    W, reach, tight = np.eye(2), np.full(2, 2), (np.full(2, np.inf), np.full(2, 1e-12))
-    lam, *room = dual_workspace(2, 2)
-    code, count = dual(W, reach, W, np.array([-1.0, -2.0]), *tight, lam, *room, 0)
-    assert (code, count) == (CONVERGED, 2)
-    lost = np.array([np.nan, -2.0])
-    _, count = dual(W, reach, W, lost, *tight, lam, *room, count)
-    assert np.all(np.isfinite(lam[1:]))
-    again, *room = dual_workspace(2, 2)
-    assert dual(W, reach, W, lost, *tight, again, *room, 0)[1] == count
-    np.testing.assert_array_equal(lam, again)
+    W, reach, limits = np.eye(2), np.full(2, 2), (np.full(2, np.inf), np.full(2, 1e-12))
 
+    def room() -> tuple[np.ndarray, ...]:
+        places, none = np.empty(3, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        return np.zeros(2), places, np.empty((3, 3)), np.zeros((3, 2)), none
 
-def dual_workspace(rows: int, width: int) -> tuple[np.ndarray, ...]:
-    """Multipliers, free rows, factor, basis and number of removals of `solve_dual`."""
-    room = min(rows, width) + 1
-    free = np.empty(room, dtype=np.int64)
-    none = np.zeros(1, dtype=np.int64)
-    return np.zeros(rows), free, np.empty((room, room)), np.zeros((room, width)), none
+    def solved(slack: list[float], room: tuple[np.ndarray, ...], count: int) -> tuple[int, int]:
+        found: tuple[int, int] = dual(W, reach, W, np.array(slack), *limits, *room, count)
+        return found
+
+    first, again = room(), room()
+    assert solved([-1.0, -2.0], first, 0) == (CONVERGED, 2)
+    _, count = solved([np.nan, -2.0], first, 2)
+    assert np.all(np.isfinite(first[0][1:]))
+    assert solved([np.nan, -2.0], again, 0)[1] == count
+    np.testing.assert_array_equal(first[0], again[0])
 
 
 @pytest.mark.parametrize("softening", [1e4, None])

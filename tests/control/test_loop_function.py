@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import runpy
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,7 +16,6 @@ from impc.control.closed_loop import simulate, simulate_and_differentiate
 from impc.control.constraint_rows import directions
 from impc.control.controller import Controller
 from impc.control.loop_function import closed_loop_function
-from impc.control.simulation import Scenario
 from impc.errors import DataError, InputError
 from impc.model.bounds import Bounds
 from impc.model.plant import Plant
@@ -85,33 +83,6 @@ def test_jacobian_and_reverse_are_those_of_the_loop(block: int, softening: float
         assert np.max(np.abs(jacobian - expected)) <= 1e-8 * size, seed  # measured: 1e-13
         adjoint = weigh @ expected
         assert np.max(np.abs(gradient.ravel() - adjoint)) <= 1e-8 * size * np.sqrt(len(weigh)), seed
-
-
-def test_the_disturbance_moves_the_loop_as_differences_say() -> None:
-    """Against differences, as the compiled loop has no such derivative; 1 to 3 inputs at bounds."""
-    for seed in (3, 4, 5):
-        controller, drive, _ = problem(seed, None)
-        loop = closed_loop_function(controller, drive.steps)
-        jacobian = loop.jacobian()
-        given = controller.K, controller.S, drive.x0, drive.disturbance
-        slopes = jacobian(*given, *loop(*given))
-        for sample in (0, 4):
-            for output, slope in zip(("x", "u"), (slopes[3].full(), slopes[7].full()), strict=True):
-                expected = disturbed(controller, drive, sample, output)
-                found = slope[:, sample].reshape(expected.shape, order="F")
-                np.testing.assert_allclose(found, expected, atol=1e-6 * np.max(np.abs(expected)))
-
-
-def disturbed(controller: Controller, drive: Scenario, sample: int, output: str) -> np.ndarray:
-    """Derivative of the states or inputs with respect to one sample of the disturbance."""
-    change = np.zeros(drive.disturbance.shape)
-    change[sample] = 1.0
-
-    def moved(step: float) -> Any:
-        there = replace(drive, disturbance=drive.disturbance + step * change)
-        return getattr(simulate(controller, there), output)
-
-    return extrapolated_slope(moved, 1e-4)
 
 
 def test_weights_move_the_loop_as_differences_say() -> None:

@@ -13,7 +13,6 @@ from impc.arrays import Array
 from impc.checking import replace
 from impc.control.constraint_rows import directions
 from impc.errors import DataError, InputError, PlantError
-from impc.model.foresight import physical_states
 from impc.model.plant import Plant
 from tests.independent_mpc import first_input
 from tests.support import random_plant, random_weights
@@ -152,16 +151,6 @@ def test_slopes_where_every_target_is_beyond_reach(seed: int) -> None:
     wanted = (at(1e-6) - at(-1e-6)) / 2e-6
     assert np.max(np.abs(wanted)) > 0
     assert slope.x[..., 0] == pytest.approx(wanted, abs=1e-6 * np.max(np.abs(wanted)))
-
-
-def test_preview_moves_before_the_target_does() -> None:
-    plant, _, known, weights, _, _ = a_loop(0, ahead=3)
-    law = impc.Controller(known, weights, impc.Bounds(known), 3, terminal_set=False)
-    step = np.r_[np.zeros(10), np.ones(11)]
-    run = law.simulate(np.zeros(plant.n), disturbance=np.zeros(20), target={plant.states[0]: step})
-    moved = np.flatnonzero(np.any(np.abs(run.u) > 1e-9, axis=1))
-    assert moved[0] == 10 - 3
-    assert physical_states(known) == plant.n
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 import impc
-from experiments.reference_mpc import simulate_mpc
-from impc.control.casadi_controller import build_mpc
 from impc.control.closed_loop import simulate
 from impc.control.simulation import Scenario, Simulation, Status
 from tests.independent_mpc import first_input
@@ -103,54 +101,6 @@ def test_derivatives_along_the_weights(seed: int, kind: str, softening: float | 
         else:
             expected = (loop(step) - loop(-step)) / (2 * step)
         assert found == pytest.approx(expected, abs=1e-6 * max(1.0, np.max(np.abs(expected))))
-
-
-@pytest.mark.parametrize("softening", [None, 20.0])
-def test_casadi_and_named_solvers_agree(softening: float | None) -> None:
-    law, drive, run, _ = own_loop(2, "weight and set", softening)
-    other = simulate_mpc(build_mpc(law, "qpoases"), drive)
-    named = simulate(impc.replace(law, solver="daqp"), drive)
-    assert other.u == pytest.approx(run.u, abs=1e-6)
-    assert named.u == pytest.approx(run.u, abs=1e-8)
-    step = impc.mpc_function(law)
-    assert step(run.x[0]).full().ravel() == pytest.approx(run.u[0], abs=1e-5)
-
-
-def test_the_riccati_weight_given_is_the_default() -> None:
-    """The Riccati gain's invariant set, supplied by the user, is the maximal invariant set."""
-    law, drive, _, parts = own_loop(0, "set", None)
-    weights = impc.Weights(parts["Q"], parts["R"])
-    solution = impc.solve_lqr(law.plant, weights)
-    terminal = impc.maximal_invariant_set(law.plant, solution.K, law.bounds)
-    given = impc.Controller(
-        law.plant, weights, law.bounds, 4, terminal_weight=solution.P, terminal_set=terminal
-    )
-    drive = impc.scenario(law.plant, 0.3 * np.array(drive.x0), disturbance=drive.disturbance)
-    default = simulate(impc.Controller(law.plant, weights, law.bounds, 4), drive)
-    assert default.complete
-    assert simulate(given, drive).u == pytest.approx(default.u, abs=1e-9)
-
-
-def test_gaps_offsets_and_commands_of_a_finite_horizon() -> None:
-    rng = np.random.default_rng(2)
-    plant = random_plant(rng, 2, 1, 1.05, d=1)
-    structure = impc.Structure(plant, "diagonal")
-    truth = structure.weights(np.array([0.5, -0.3]))
-    bounds, push = impc.Bounds(plant, u_min=-0.5, u_max=0.5), rng.normal(size=60)
-    given: dict[str, Any] = {"terminal_weight": 0}
-    law = impc.Controller(plant, truth, bounds, 4, terminal_set=False, **given)
-    target = {plant.states[0]: 0.2 * np.sign(np.sin(np.arange(61) / 9))}
-    run = law.simulate([1, -1], disturbance=push, target=target)
-    y = run.x + np.array([0.1, 0.0])
-    y[rng.random(y.shape) < 0.3] = np.nan
-    trial = impc.Recording(plant, y, push, target=target, commands=run.u)
-    problem = impc.Problem(
-        plant, bounds, 4, [trial], structure=structure, offsets=plant.outputs[:1], **given
-    )
-    found = impc.fit(problem)
-    assert found.explained
-    assert impc.weight_error(found.stage_weights, truth) < 1e-6
-    assert found.problem.errors[0, 0, 0] == pytest.approx(0.1, abs=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -14,40 +14,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+import impc
 from experiments.certificates import invariance_violation, maximality_violation
 from impc.arrays import Array
-from impc.checking import replace
 from impc.control.halfspaces import supports
-from impc.control.terminal_set import TerminalSet, maximal_invariant_set
-from impc.errors import DataError, ImpcError, InputError, PlantError, SolverError
-from impc.model.bounds import Bounds, bound_rows
-from impc.model.plant import Plant
-from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights
+from impc.model.bounds import bound_rows
 from plants.seated_balance import seated_balance_plant
-from tests.support import draws
+from tests.support import draws, plant_of
 
-Case = tuple[Plant, Any, "Bounds"]
-
-
-def sampled(A: Any, B: Any, dt: float = 1.0) -> Plant:
-    a, b = np.array(A, dtype=float), np.array(B, dtype=float)
-    return Plant(control.ss(a, b, np.eye(len(a)), np.zeros(b.shape), dt))
+Case = tuple[impc.Plant, Any, impc.Bounds]
 
 
-def regulator(plant: Plant) -> Array:
-    return solve_lqr(plant, Weights(np.eye(plant.n), np.eye(plant.m))).K
+def regulator(plant: impc.Plant) -> Array:
+    return impc.solve_lqr(plant, impc.Weights(np.eye(plant.n), np.eye(plant.m))).K
 
 
 def example() -> Case:
     """Primary example with an input bound only."""
-    plant = sampled([[2, -1], [1, 0.2]], [[1], [0]])
-    return plant, regulator(plant), Bounds(plant, u_min=-1, u_max=1)
+    plant = plant_of([[2, -1], [1, 0.2]], [[1], [0]])
+    return plant, regulator(plant), impc.Bounds(plant, u_min=-1, u_max=1)
 
 
 def cannon(upper: float = 10.0) -> Case:
-    plant = sampled([[1.1, 2], [0, 0.95]], [[0], [0.0787]])
-    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=-10, x_max=upper)
+    plant = plant_of([[1.1, 2], [0, 0.95]], [[0], [0.0787]])
+    bounds = impc.Bounds(plant, u_min=-1, u_max=1, x_min=-10, x_max=upper)
     return plant, regulator(plant), bounds
 
 
@@ -59,20 +49,20 @@ def slow_rotations() -> Case:
         for r, a in zip(radii, angles, strict=True)
     ]
     T = np.random.default_rng(0).standard_normal((10, 10))
-    plant = sampled(T @ scipy.linalg.block_diag(*turns) @ np.linalg.inv(T), np.ones((10, 1)))
-    return plant, np.zeros((1, 10)), Bounds(plant, x_min=-1, x_max=1)
+    plant = plant_of(T @ scipy.linalg.block_diag(*turns) @ np.linalg.inv(T), np.ones((10, 1)))
+    return plant, np.zeros((1, 10)), impc.Bounds(plant, x_min=-1, x_max=1)
 
 
 def seat() -> Case:
     """Seated balance, ten states; bounds on the command, both angles and both rates."""
-    plant = Plant(seated_balance_plant(), controls=["command"])
+    plant = impc.Plant(seated_balance_plant(), controls=["command"])
     intent = np.array([0.70, 0.65, 0.22, 0.20])
     Q = 1e-2 * np.eye(10)
     Q[:4, :4] = 6e5 * np.outer(intent, intent) + np.diag([2e4, 2e4, 500, 500])
     limit = np.full(10, np.inf)
     limit[:4] = [np.deg2rad(12), np.deg2rad(15), 1.5, 1.5]
-    bounds = Bounds(plant, u_min=-6, u_max=6, x_min=-limit, x_max=limit)
-    return plant, solve_lqr(plant, Weights(Q, 1.0)).K, bounds
+    bounds = impc.Bounds(plant, u_min=-6, u_max=6, x_min=-limit, x_max=limit)
+    return plant, impc.solve_lqr(plant, impc.Weights(Q, 1.0)).K, bounds
 
 
 def plain_support(direction: Array, H: Array, h: Array) -> float:
@@ -86,7 +76,7 @@ def plain_support(direction: Array, H: Array, h: Array) -> float:
     return -float(answer.fun or 0.0)
 
 
-def worst_excess(terminal: TerminalSet, x: Array, steps: int) -> float:
+def worst_excess(terminal: impc.TerminalSet, x: Array, steps: int) -> float:
     """Largest bound violation along the closed loop from x, relative to the bounds, by rollout."""
     rows, worst = terminal.rows, -np.inf
     for _ in range(steps):
@@ -101,25 +91,16 @@ def area(corners: Array) -> float:
     return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
 
 
-def pairs(terminal: TerminalSet) -> list[tuple[int, int]]:
+def pairs(terminal: impc.TerminalSet) -> list[tuple[int, int]]:
     return list(zip(terminal.step.tolist(), terminal.family.tolist(), strict=True))
 
 
-def assert_certified(terminal: TerminalSet) -> None:
+def assert_certified(terminal: impc.TerminalSet) -> None:
     assert invariance_violation(terminal) <= 1e-8
     assert maximality_violation(terminal) <= 1e-8
 
 
 # Known answers
-
-
-def test_scalar_set_with_one_bound_is_an_interval() -> None:
-    # F = -1/2, x <= 1: the next step asks -x/2 <= 1, the one after x/4 <= 1 which follows.
-    plant = sampled([[0.5]], [[1.0]])
-    terminal = maximal_invariant_set(plant, [[1.0]], Bounds(plant, x_max=1))
-    np.testing.assert_allclose(terminal.h[:, None] / terminal.H, [[1], [-2]], rtol=1e-12)
-    assert terminal.determinedness == 1
-    assert_certified(terminal)
 
 
 def test_a_set_of_fewer_rows_than_states_has_supports_and_no_corner() -> None:
@@ -136,20 +117,20 @@ def test_a_set_of_fewer_rows_than_states_has_supports_and_no_corner() -> None:
 
 
 def test_the_tighter_of_two_bounds_stays_and_of_equal_ones_the_first() -> None:
-    plant = sampled([[1.2]], [[1.0]])
-    tight = maximal_invariant_set(plant, [[0.9]], Bounds(plant, u_min=-0.45, u_max=0.45))
-    both = maximal_invariant_set(
-        plant, [[0.9]], Bounds(plant, u_min=-0.45, u_max=0.45, x_min=-1, x_max=1)
+    plant = plant_of([[1.2]], [[1.0]])
+    tight = impc.maximal_invariant_set(plant, [[0.9]], impc.Bounds(plant, u_min=-0.45, u_max=0.45))
+    both = impc.maximal_invariant_set(
+        plant, [[0.9]], impc.Bounds(plant, u_min=-0.45, u_max=0.45, x_min=-1, x_max=1)
     )
     assert pairs(both) == pairs(tight) == [(0, 0), (0, 1)]
-    equal = Bounds(sampled([[0.5]], [[1.0]]), u_min=-1, u_max=1, x_min=-1, x_max=1)
-    assert pairs(maximal_invariant_set(plant, [[1.0]], equal)) == [(0, 0), (0, 1)]
+    equal = impc.Bounds(plant_of([[0.5]], [[1.0]]), u_min=-1, u_max=1, x_min=-1, x_max=1)
+    assert pairs(impc.maximal_invariant_set(plant, [[1.0]], equal)) == [(0, 0), (0, 1)]
 
 
 def test_deadbeat_double_integrator_has_the_parallelogram_of_two_steps() -> None:
     # K = (1, 3/2) gives F^2 = 0: |x1 + 3/2 x2| <= 1 and, a step later, |x1 + x2 / 2| <= 1.
-    plant = sampled([[1, 1], [0, 1]], [[0.5], [1]])
-    terminal = maximal_invariant_set(plant, [[1, 1.5]], Bounds(plant, u_min=-1, u_max=1))
+    plant = plant_of([[1, 1], [0, 1]], [[0.5], [1]])
+    terminal = impc.maximal_invariant_set(plant, [[1, 1.5]], impc.Bounds(plant, u_min=-1, u_max=1))
     corners = terminal.vertices()
     start = int(np.argmin(np.abs(corners - [1, 0]).sum(axis=1)))
     expected = [[1, 0], [-2, 2], [-1, 0], [2, -2]]
@@ -165,20 +146,20 @@ def test_deadbeat_double_integrator_has_the_parallelogram_of_two_steps() -> None
 def test_known_sets_have_their_rows_and_steps(
     case: Callable[[], Case], rows: int, steps: int
 ) -> None:
-    terminal = maximal_invariant_set(*case())
+    terminal = impc.maximal_invariant_set(*case())
     assert (len(terminal.h), terminal.determinedness) == (rows, steps)
     assert_certified(terminal)
 
 
 def test_ten_slow_states_are_certified() -> None:
-    terminal = maximal_invariant_set(*slow_rotations())
+    terminal = impc.maximal_invariant_set(*slow_rotations())
     assert len(terminal.h) > 300
     assert_certified(terminal)
 
 
 def test_rows_are_the_pairs_they_say() -> None:
     plant, K, bounds = cannon(upper=7.0)
-    terminal = maximal_invariant_set(plant, K, bounds)
+    terminal = impc.maximal_invariant_set(plant, K, bounds)
     rows, F = bound_rows(bounds, plant), plant.A - plant.B @ K
     for i, (c, k) in enumerate(zip(terminal.family, terminal.step, strict=True)):
         expected = ((rows.E - rows.F @ K) @ np.linalg.matrix_power(F, int(k)))[c]
@@ -196,13 +177,13 @@ def cases(draw: st.DrawFn) -> Case:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     A = rng.standard_normal((n, n))
     A *= draw(st.floats(0.3, 1.4)) / np.max(np.abs(np.linalg.eigvals(A)))
-    plant = sampled(A, rng.standard_normal((n, m)))
+    plant = plant_of(A, rng.standard_normal((n, m)))
     upper, lower = np.exp(rng.uniform(-1, 2, n)), -np.exp(rng.uniform(-1, 2, n))
     if draw(st.booleans()):
         lower = -upper
     missing = rng.random(n) < draw(st.sampled_from([0.0, 0.5, 1.0]))
     upper[missing], lower[missing] = np.inf, -np.inf
-    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=lower, x_max=upper)
+    bounds = impc.Bounds(plant, u_min=-1, u_max=1, x_min=lower, x_max=upper)
     return plant, regulator(plant), bounds
 
 
@@ -213,7 +194,7 @@ few = draws(25)
 @few
 @given(cases(), st.integers(0, 2**32 - 1))
 def test_inside_stays_inside_and_outside_leaves(case: Case, seed: int) -> None:
-    terminal = maximal_invariant_set(*case)
+    terminal = impc.maximal_invariant_set(*case)
     directions = np.random.default_rng(seed).standard_normal((20, case[0].n))
     reach = np.max((terminal.H @ directions.T) / terminal.h[:, None], axis=0)
     for direction, gauge in zip(directions, reach, strict=True):
@@ -229,7 +210,7 @@ def test_inside_stays_inside_and_outside_leaves(case: Case, seed: int) -> None:
 @few
 @given(cases())
 def test_rows_are_the_needed_ones_of_a_long_horizon(case: Case) -> None:
-    terminal = maximal_invariant_set(*case)
+    terminal = impc.maximal_invariant_set(*case)
     H, h = terminal.H, terminal.h
     for i in range(len(h)):
         rest = np.arange(len(h)) != i
@@ -246,24 +227,24 @@ def test_rows_are_the_needed_ones_of_a_long_horizon(case: Case) -> None:
 @given(cases(), st.floats(1e-6, 0.1), st.integers(0, 2**32 - 1))
 def test_a_near_set_changes_nothing(case: Case, change: float, seed: int) -> None:
     plant, K, bounds = case
-    start = maximal_invariant_set(plant, K, bounds)
+    start = impc.maximal_invariant_set(plant, K, bounds)
     moved = K * (1 + change * np.random.default_rng(seed).uniform(-1, 1, K.shape))
     if np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ moved))) < 0.99:
-        cold = maximal_invariant_set(plant, moved, bounds)
-        warm = maximal_invariant_set(plant, moved, bounds, near=start)
+        cold = impc.maximal_invariant_set(plant, moved, bounds)
+        warm = impc.maximal_invariant_set(plant, moved, bounds, near=start)
         assert pairs(warm) == pairs(cold)
         assert warm.determinedness == cold.determinedness
         np.testing.assert_array_equal(warm.H, cold.H)
 
 
 def test_a_near_set_of_the_same_gain_needs_no_programs(monkeypatch: pytest.MonkeyPatch) -> None:
-    start = maximal_invariant_set(*cannon())
+    start = impc.maximal_invariant_set(*cannon())
 
     def refuse(*_: object, **__: object) -> None:
         pytest.fail("a linear program was solved")
 
     monkeypatch.setattr("impc.control.halfspaces.linprog", refuse)
-    assert pairs(maximal_invariant_set(*cannon(), near=start)) == pairs(start)
+    assert pairs(impc.maximal_invariant_set(*cannon(), near=start)) == pairs(start)
 
 
 # Shape of the answer
@@ -272,12 +253,12 @@ def test_a_near_set_of_the_same_gain_needs_no_programs(monkeypatch: pytest.Monke
 def test_units_of_the_states_do_not_matter() -> None:
     plant, K, bounds = cannon(upper=7.0)
     scale = np.array([1e-6, 1e6])
-    other = replace(plant, A=plant.A * scale[:, None] / scale, B=plant.B * scale[:, None])
-    scaled = Bounds(
+    other = impc.replace(plant, A=plant.A * scale[:, None] / scale, B=plant.B * scale[:, None])
+    scaled = impc.Bounds(
         other, u_min=-1, u_max=1, x_min=bounds.x_min * scale, x_max=bounds.x_max * scale
     )
-    first = maximal_invariant_set(plant, K, bounds)
-    second = maximal_invariant_set(other, K / scale, scaled)
+    first = impc.maximal_invariant_set(plant, K, bounds)
+    second = impc.maximal_invariant_set(other, K / scale, scaled)
     assert pairs(first) == pairs(second)
     assert_certified(second)
 
@@ -285,40 +266,42 @@ def test_units_of_the_states_do_not_matter() -> None:
 def test_a_direction_that_no_bound_sees_is_free() -> None:
     T = np.array([[1.0, 2.0, 0.5], [-1.0, 1.0, 0.0], [0.3, 0.2, 1.0]])
     loop = np.array([[0.9, 0.4, 0.0], [-0.4, 0.9, 0.0], [0.0, 0.0, 0.95]])
-    plant = sampled(T @ loop @ np.linalg.inv(T), T @ [[1.0], [0.0], [0.0]])
+    plant = plant_of(T @ loop @ np.linalg.inv(T), T @ [[1.0], [0.0], [0.0]])
     K = np.array([[0.5, 0.2, 0.0]]) @ np.linalg.inv(T)
-    terminal = maximal_invariant_set(plant, K, Bounds(plant, u_min=-1, u_max=1))
+    terminal = impc.maximal_invariant_set(plant, K, impc.Bounds(plant, u_min=-1, u_max=1))
     assert len(terminal.h) > 2
     np.testing.assert_allclose(terminal.H @ T[:, 2], 0, atol=1e-12)
     assert terminal.contains(1e4 * T[:, 2])
     assert_certified(terminal)
-    plane = sampled([[0.9, 0.4], [-0.4, 0.9]], [[1.0], [0.0]])
-    same = maximal_invariant_set(plane, [[0.5, 0.2]], Bounds(plane, u_min=-1, u_max=1))
+    plane = plant_of([[0.9, 0.4], [-0.4, 0.9]], [[1.0], [0.0]])
+    same = impc.maximal_invariant_set(plane, [[0.5, 0.2]], impc.Bounds(plane, u_min=-1, u_max=1))
     assert pairs(same) == pairs(terminal)
 
 
 def test_no_bounds_no_rows() -> None:
     plant, K, _ = example()
-    terminal = maximal_invariant_set(plant, K, Bounds(plant))
+    terminal = impc.maximal_invariant_set(plant, K, impc.Bounds(plant))
     assert terminal.H.shape == (0, 2)
     assert terminal.contains([1e9, -1e9])
     assert invariance_violation(terminal) == maximality_violation(terminal) == 0
-    still = sampled([[0.5]], [[1.0]])
-    unused = maximal_invariant_set(still, [[0.0]], Bounds(still, u_min=-1, u_max=1))
+    still = plant_of([[0.5]], [[1.0]])
+    unused = impc.maximal_invariant_set(still, [[0.0]], impc.Bounds(still, u_min=-1, u_max=1))
     assert unused.H.shape == (0, 1)
-    with pytest.raises(InputError, match="whole space"):
+    with pytest.raises(impc.InputError, match="whole space"):
         terminal.to_pytope()
 
 
 def test_certificates_notice_a_wrong_set() -> None:
-    terminal = maximal_invariant_set(*cannon())
-    loose = replace(terminal, **{n: getattr(terminal, n)[2:] for n in ("H", "h", "family", "step")})
+    terminal = impc.maximal_invariant_set(*cannon())
+    loose = impc.replace(
+        terminal, **{n: getattr(terminal, n)[2:] for n in ("H", "h", "family", "step")}
+    )
     assert max(invariance_violation(loose), maximality_violation(loose)) > 1e-3
-    assert maximality_violation(replace(terminal, h=0.9 * terminal.h)) > 0.05
-    assert maximality_violation(replace(terminal, H=1.1 * terminal.H)) > 0.05
+    assert maximality_violation(impc.replace(terminal, h=0.9 * terminal.h)) > 0.05
+    assert maximality_violation(impc.replace(terminal, H=1.1 * terminal.H)) > 0.05
     early = terminal.step < terminal.determinedness
     short = {n: getattr(terminal, n)[early] for n in ("H", "h", "family", "step")}
-    cut = replace(terminal, determinedness=terminal.determinedness - 1, **short)
+    cut = impc.replace(terminal, determinedness=terminal.determinedness - 1, **short)
     assert maximality_violation(cut) <= 1e-9
     assert invariance_violation(cut) > 1e-3
 
@@ -329,7 +312,7 @@ def test_certificates_notice_a_wrong_set() -> None:
 @pytest.mark.parametrize("case", [example(), cannon(), cannon(upper=7.0)])
 def test_pytope_agrees_in_the_plane(case: Case) -> None:
     pytope = pytest.importorskip("pytope", reason="the extra polytope is not installed")
-    terminal = maximal_invariant_set(*case)
+    terminal = impc.maximal_invariant_set(*case)
     rows, count = terminal.rows, terminal.determinedness + 4
     normal = rows.E - rows.F @ terminal.gain
     powers = [np.linalg.matrix_power(terminal.F, k) for k in range(count)]
@@ -350,24 +333,24 @@ def test_pytope_agrees_in_the_plane(case: Case) -> None:
 
 def test_pytope_takes_one_row_and_ten_states_without_corners() -> None:
     pytest.importorskip("pytope", reason="the extra polytope is not installed")
-    plant = sampled([[0.5]], [[1.0]])
-    half_line = maximal_invariant_set(plant, [[0.0]], Bounds(plant, x_max=1))
+    plant = plant_of([[0.5]], [[1.0]])
+    half_line = impc.maximal_invariant_set(plant, [[0.0]], impc.Bounds(plant, x_max=1))
     assert np.all(half_line.to_pytope().A == 1)
-    assert not maximal_invariant_set(*seat()).to_pytope().in_V_rep
+    assert not impc.maximal_invariant_set(*seat()).to_pytope().in_V_rep
 
 
 def test_pytope_absent_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pytope", None)
-    with pytest.raises(ImpcError, match=r"impc\[polytope\]"):
-        maximal_invariant_set(*example()).to_pytope()
+    with pytest.raises(impc.ImpcError, match=r"impc\[polytope\]"):
+        impc.maximal_invariant_set(*example()).to_pytope()
 
 
 def test_corners_and_shadow_of_three_states_support_what_linear_programs_do() -> None:
     rng = np.random.default_rng(4)
     A = 0.8 * np.array([[1.0, 0.3, 0.0], [0.0, 0.9, 0.4], [0.1, 0.0, 0.8]])
-    plant = sampled(A, [[0.0], [0.0], [1.0]])
-    bounds = Bounds(plant, u_min=-1, u_max=1, x_min=[-2, -1, -3], x_max=[1, 2, 3])
-    terminal = maximal_invariant_set(plant, [[0.1, 0.1, 0.2]], bounds)
+    plant = plant_of(A, [[0.0], [0.0], [1.0]])
+    bounds = impc.Bounds(plant, u_min=-1, u_max=1, x_min=[-2, -1, -3], x_max=[1, 2, 3])
+    terminal = impc.maximal_invariant_set(plant, [[0.1, 0.1, 0.2]], bounds)
     corners, shadow = terminal.vertices(), terminal.project(0, 2)
     assert all(terminal.contains(corner) for corner in corners)
     for direction in rng.standard_normal((20, 3)):
@@ -378,15 +361,15 @@ def test_corners_and_shadow_of_three_states_support_what_linear_programs_do() ->
 
 
 def test_polygon_refuses_what_it_cannot_draw() -> None:
-    plant = sampled(np.diag([0.5, 0.8]), [[1.0], [0.0]])
-    strip = maximal_invariant_set(plant, [[0.3, 0.0]], Bounds(plant, u_min=-1, u_max=1))
-    cone = maximal_invariant_set(plant, [[0.0, 0.0]], Bounds(plant, x_max=1))
-    none = maximal_invariant_set(plant, [[0.0, 0.0]], Bounds(plant))
+    plant = plant_of(np.diag([0.5, 0.8]), [[1.0], [0.0]])
+    strip = impc.maximal_invariant_set(plant, [[0.3, 0.0]], impc.Bounds(plant, u_min=-1, u_max=1))
+    cone = impc.maximal_invariant_set(plant, [[0.0, 0.0]], impc.Bounds(plant, x_max=1))
+    none = impc.maximal_invariant_set(plant, [[0.0, 0.0]], impc.Bounds(plant))
     for terminal in (strip, cone, none):
-        with pytest.raises(InputError, match="unbounded"):
+        with pytest.raises(impc.InputError, match="unbounded"):
             terminal.vertices()
-    with pytest.raises(InputError, match="10 states"):
-        maximal_invariant_set(*slow_rotations()).vertices()
+    with pytest.raises(impc.InputError, match="10 states"):
+        impc.maximal_invariant_set(*slow_rotations()).vertices()
 
 
 # Errors
@@ -394,20 +377,20 @@ def test_polygon_refuses_what_it_cannot_draw() -> None:
 
 def test_errors_say_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     plant, K, bounds = example()
-    with pytest.raises(InputError, match=r"spectral radius of A - BK is 1\.18"):
-        maximal_invariant_set(plant, 0 * K, bounds)
-    with pytest.raises(SolverError, match="max_steps = 3"):
-        maximal_invariant_set(*cannon(), max_steps=3)
-    assert maximal_invariant_set(*cannon(), max_steps=4).determinedness == 4
-    continuous = Plant(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
-    with pytest.raises(PlantError, match="continuous"):
-        maximal_invariant_set(continuous, [[0.0]], Bounds(continuous, u_max=1))
-    with pytest.raises(DataError, match="x: expected shape"):
-        maximal_invariant_set(plant, K, bounds).contains([1.0])
+    with pytest.raises(impc.InputError, match=r"spectral radius of A - BK is 1\.18"):
+        impc.maximal_invariant_set(plant, 0 * K, bounds)
+    with pytest.raises(impc.SolverError, match="max_steps = 3"):
+        impc.maximal_invariant_set(*cannon(), max_steps=3)
+    assert impc.maximal_invariant_set(*cannon(), max_steps=4).determinedness == 4
+    continuous = impc.Plant(control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
+    with pytest.raises(impc.PlantError, match="continuous"):
+        impc.maximal_invariant_set(continuous, [[0.0]], impc.Bounds(continuous, u_max=1))
+    with pytest.raises(impc.DataError, match="x: expected shape"):
+        impc.maximal_invariant_set(plant, K, bounds).contains([1.0])
 
     def fail(*arguments: Any, **options: Any) -> Any:
         return linprog(*arguments, **{**options, "options": {"maxiter": 0, "presolve": False}})
 
     monkeypatch.setattr("impc.control.halfspaces.linprog", fail)
-    with pytest.raises(SolverError, match="HiGHS failed"):
-        maximal_invariant_set(plant, K, bounds)
+    with pytest.raises(impc.SolverError, match="HiGHS failed"):
+        impc.maximal_invariant_set(plant, K, bounds)

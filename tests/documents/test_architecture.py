@@ -1,4 +1,4 @@
-"""Imports point down, and files that pages and docstrings name exist."""
+"""Imports point down, functions fit a screen, and files that pages and docstrings name exist."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ CODE = [path for folder in ("impc", "plants", "experiments", "tests", "docs")
         for path in sorted((ROOT / folder).rglob("*.py"))
         if "_examples" not in path.parts]  # fmt: skip  # written by the site's build
 GRAPH = imports()
+LONGEST = 60
+#: Compiled inner loops: a call would have to pass, and allocate, what they keep in registers.
+KERNELS = {"impc/control/compiled_dual.py": {"solve_dual"}}
 
 
 def upwards(graph: dict[str, set[str]]) -> list[tuple[str, str]]:
@@ -115,3 +118,20 @@ def test_every_file_that_a_page_or_a_docstring_names_is_there() -> None:
             )
             missing |= {(code.name, name) for name in named if not (ROOT / name).exists()}
     assert missing == set()
+
+
+def lines(node: ast.FunctionDef) -> int:
+    """Of its code, without the docstring and its example."""
+    stated = node.body[0] if ast.get_docstring(node) else None
+    whole = (node.end_lineno or 0) - node.lineno + 1
+    return whole - (0 if stated is None else (stated.end_lineno or 0) - stated.lineno + 1)
+
+
+def test_functions_fit_a_screen() -> None:
+    long: dict[str, set[str]] = {}
+    for package in ("impc", "plants"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef) and lines(node) > LONGEST:
+                    long.setdefault(path.relative_to(ROOT).as_posix(), set()).add(node.name)
+    assert long == KERNELS

@@ -102,33 +102,21 @@ def test_every_option_of_a_command_has_its_help() -> None:
 
 
 def test_a_poor_docstring_is_found() -> None:
-    def poor(gain: Array, sample_time: float, count: int) -> Array:
+    def poor(gain: Array, count: int) -> Array:
         """Return something.
 
         Parameters
         ----------
         gain : Array
             Of the regulator.
-        sample_time : float
-            Between samples.
         other : int
-
-        Returns
-        -------
-        Array
-            Scaled.
 
         Raises
         ------
         NoSuchError
             Never.
         """
-        return gain
+        return gain * count
 
-    assert sorted(faults(poor)) == [
-        "NoSuchError: in Raises, does not exist",
-        "count: not described",
-        "gain: no shape",
-        "other: there is none",
-        "returns Array: no shape",
-    ]
+    said = ["NoSuchError: in Raises, does not exist", "count: not described", "gain: no shape"]
+    assert sorted(faults(poor)) == [*said, "other: there is none"]

@@ -1,18 +1,24 @@
-"""Inverse KKT: exact if its assumption holds; smoothing compared with simulated states."""
+"""Inverse KKT, exact if its assumption holds, and the two solvers of the upper level."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cvxpy
 import numpy as np
 import pytest
 
-from experiments.benchmarks.workloads import seat
+from experiments.benchmarks.upper_level import Route, prox_linear, smooth_surrogate
+from experiments.benchmarks.workloads import example, seat
 from experiments.inverse_kkt import Smoothed, smoothed_trials, stationarity_weights
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
 from impc.errors import DataError
+from impc.inverse.problem import Problem
+from impc.inverse.residuals import misfit_or_reason
+from impc.inverse.table31 import CONDITION_WEIGHT
 from impc.model.riccati import solve_lqr
-from impc.model.weights import Weights
+from impc.model.weights import Weights, condition_number
 from tests.support import random_plant, random_weights
 
 SEED = 6
@@ -79,3 +85,16 @@ def test_smoothing_finds_states_and_commands() -> None:
     error = np.max(np.abs(found.x - run.x)[20:-20], axis=0) / size
     assert np.all(error[:2] < 1e-4)
     assert np.all(error[2:4] < 1e-2)
+
+
+@pytest.mark.parametrize("route", [prox_linear, smooth_surrogate])
+def test_a_route_says_misfit_and_condition_number_with_one_weight(
+    route: Callable[[Problem, Weights], Route],
+) -> None:
+    """Prox-linear steps and the surrogate use the same condition weight."""
+    problem = example().problem
+    found = route(problem, Weights(np.diag([2.0, 0.2]), 1))
+    solution = solve_lqr(problem.plant, found.weights)
+    misfit, _ = misfit_or_reason(problem, solution.K, solution.S)
+    expected = misfit + CONDITION_WEIGHT * condition_number(found.weights)
+    assert found.objective == pytest.approx(expected, rel=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.peer_benchmark import LOOPS, coverage, demonstration, fit_from
+from experiments.peer_benchmark import coverage, demonstration, fit_from
 from experiments.peer_systems import SYSTEMS
 
 pytestmark = pytest.mark.full
@@ -31,28 +31,3 @@ def test_intervals_of_noisy_recordings_hold_the_truth() -> None:
     assert odd == []
     assert len(held) == 8
     assert sum(sum(item) for item in held.values()) >= 20  # of 24; 22.8 are expected
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_nine_of_ten_starts_a_tenth_off_end_at_the_truth(name: str) -> None:
-    system = SYSTEMS[name]()
-    recording = demonstration(system)
-    found = [fit_from(system, recording, system.truth, 0.1, seed) for seed in range(10)]
-    good = [one for one in found if one.loss < 1e-10]
-    assert len(good) >= 9
-    assert max(one.error for one in good) < 1e-5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LOOPS)
-def test_a_closed_loop_recovers_the_identified_products(name: str) -> None:
-    """60 samples, horizon 20; limits of inputs and of states are reached."""
-    system = SYSTEMS[name](20)
-    x0, changes = LOOPS[name]
-    truth = system.truth | changes
-    loop = system.problem.closed_loop(truth, x0, 60, mu=1e-12)
-    met = {row.split("[")[0] for plan in loop.plans for row, _ in plan.active}
-    assert len(met) == 2
-    found = fit_from(system, system.problem.recorded_loop(loop.x, loop.u), truth, 0.1, 0)
-    assert found.error < 1e-5

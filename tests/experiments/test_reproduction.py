@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.reproduction.example import controller_values
-from experiments.reproduction.page import CLAIMS, FIGURES, VERDICTS, claims_page, joined, table
+from experiments.reproduction.page import CLAIMS, FIGURES, VERDICTS, claims_page
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reproduction"
 PAGE = (FOLDER / "index.md").read_text(encoding="utf-8")
@@ -90,13 +90,3 @@ def test_a_statement_that_does_not_hold_is_not_reproduced() -> None:
     assert f"{counts[False]} reproduced in kind" in text[False]
     assert "VAF 1.5 and 1.5 %. **not reproduced**." in text[False]
     assert "VAF 1.5 and 1.5 %. **reproduced in kind**." in text[True]
-
-
-def test_parts_of_a_page_are_filled_and_tables_are_not() -> None:
-    long, wide = "word " * 30, table(["a", "b"], [["1" * 80, "2" * 80]])
-    text = joined("# Head", f"{long}\n\n- {long}\n- short", wide)
-    lines = text.splitlines()
-    assert max(len(line) for line in lines if not line.startswith("|")) <= 100
-    assert [line[:2] for line in lines if line[:1] == "-"] == ["- ", "- "]
-    assert lines[-1] == f"| {'1' * 80} | {'2' * 80} |"
-    assert " ".join(text.split()) == " ".join(f"# Head {long} - {long} - short {wide}".split())

@@ -21,62 +21,12 @@ from impc.studies.plan.designs import try_design
 pytestmark = pytest.mark.full
 
 
-def shares(count: int, root: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Share of recordings (seeds 0 to count - 1) whose 95 % interval covers each entry of K."""
-    scores = np.array([covered(seed, root) for seed in range(count)])
-    return np.asarray(np.mean(np.abs(scores) <= 1.96, axis=0))
-
-
-@pytest.mark.full
-def test_fifty_recordings() -> None:
-    """Binomial bounds: 50 of 95 % fall below 42 once in a thousand."""
-    white, coloured = shares(50, 0.0), shares(50, 0.9)
-    assert np.all(white >= 0.84)
-    assert np.all(coloured[1] >= 0.82)
-    assert np.all(coloured[0] < 0.6)
-
-
-@pytest.mark.slow
-def test_four_hundred_recordings() -> None:
-    white, coloured = shares(400, 0.0), shares(400, 0.9)
-    assert np.all((white >= 0.92) & (white <= 0.98))
-    assert np.all((coloured[1] >= 0.92) & (coloured[1] <= 0.98))
-    assert np.all(coloured[0] < 0.6)
-
-
 def test_the_truth_of_a_short_default_subject_is_found(tmp_path: Path) -> None:
     """Seed 0, a trial of 10 s: the nonlinear body has the smaller misfit; intervals are wide."""
     files = simulated_files(tmp_path / "one", 0, "--trials", "1", "--duration", "10")
     own, linear = (fitted_subject(files, body) for body in ("nonlinear", "linear"))
     assert own.inside == [True] * 10
     assert linear.misfit > 1.1 * own.misfit
-
-
-@pytest.mark.slow
-def test_twenty_default_subjects(tmp_path: Path) -> None:
-    """The coverage of `python -m experiments.default_subjects`."""
-    found = []
-    for seed in range(20):
-        files = simulated_files(tmp_path / str(seed), seed)
-        found.append(fitted_subject(files, "nonlinear"))
-    assert np.mean([one.inside for one in found]) >= 0.92
-
-
-def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 4.5 Nm and 1 % noise inverse MPC has a point more VAF than methods without bounds.
-
-    Trials of 10 s instead of the 30 s of the study.
-    """
-    monkeypatch.setattr(
-        noise_study, "seat", lambda trials, seconds, limit: seat(trials, seconds / 3, limit)
-    )
-    found = study_cell(4.5, 99.0, 0)
-    assert list(found) == list(COMPARED)
-    ours = found["inverse_mpc"]["missed"]
-    assert ours < 0.1
-    for name in ("feedback_gain", "inverse_lqr_output", "inverse_kkt"):
-        assert found[name]["missed"] > ours + 1
-    assert not found["inverse_lqr_lmi"]["gain"]
 
 
 def drawn(study: str, seed: int) -> Row:
@@ -139,10 +89,32 @@ def test_a_subject_is_scored_against_its_truth() -> None:
     assert 0.05 < found.probability <= 1  # seed 0
 
 
-@pytest.mark.slow
-def test_the_level_of_the_test_and_its_power() -> None:
-    """Of 40 at 5 % two rejections are expected: 7 or more have a probability of 0.5 %."""
-    people = [score(cart_person(k, 90.0, 0.8, 0.0), intervals=False) for k in range(40)]
-    assert sum(item.probability < 0.05 for item in people) <= 6
-    crossed = [score(cart_person(k, 90.0, 0.0, 0.5), intervals=False) for k in range(5)]
-    assert np.mean([item.probability < 0.05 for item in crossed]) == 1.0
+def shares(count: int, root: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Share of recordings (seeds 0 to count - 1) whose 95 % interval covers each entry of K."""
+    scores = np.array([covered(seed, root) for seed in range(count)])
+    return np.asarray(np.mean(np.abs(scores) <= 1.96, axis=0))
+
+
+def test_fifty_recordings() -> None:
+    """Binomial bounds: 50 of 95 % fall below 42 once in a thousand."""
+    white, coloured = shares(50, 0.0), shares(50, 0.9)
+    assert np.all(white >= 0.84)
+    assert np.all(coloured[1] >= 0.82)
+    assert np.all(coloured[0] < 0.6)
+
+
+def test_a_cell_with_saturation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 4.5 Nm and 1 % noise inverse MPC has a point more VAF than methods without bounds.
+
+    Trials of 10 s instead of the 30 s of the study.
+    """
+    monkeypatch.setattr(
+        noise_study, "seat", lambda trials, seconds, limit: seat(trials, seconds / 3, limit)
+    )
+    found = study_cell(4.5, 99.0, 0)
+    assert list(found) == list(COMPARED)
+    ours = found["inverse_mpc"]["missed"]
+    assert ours < 0.1
+    for name in ("feedback_gain", "inverse_lqr_output", "inverse_kkt"):
+        assert found[name]["missed"] > ours + 1
+    assert not found["inverse_lqr_lmi"]["gain"]

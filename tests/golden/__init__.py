@@ -1,1 +1,1 @@
-"""Golden results: ten runs and the numbers at which they end, in golden.json."""
+"""Golden results: five runs and the numbers at which they end, in golden.json."""

@@ -1,10 +1,11 @@
-"""Ten runs, most of them as their users type them, and the numbers at which they end.
+"""Runs as their users type them, and the numbers at which they end.
 
     python -m tests.golden.runs      runs all and writes golden.json again
 
 An identified number of an exact recording has to agree to 1e-6 of itself, one of a noisy recording
 to 1e-3 of its standard error; words have to be the same. Nothing is kept that another processor
 might settle differently: no sentences, no timings, no numbers that are chosen by convention only.
+What has a known truth is compared with it in other tests.
 """
 
 from __future__ import annotations
@@ -18,19 +19,14 @@ import numpy as np
 import pandas as pd
 from click.testing import CliRunner
 
-import impc
-from experiments.benchmarks.workloads import seat
-from experiments.peer_systems import SYSTEMS
 from impc.cli.main import main
 from tests.cli.test_plan import EXACT
 from tests.studies.cohort.carts import write_study
 from tests.studies.selection.test_methods import MINE, blood_study
-from tests.support import saturated_problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from impc.inverse.problem import Problem
 
 __all__ = ["GOLDEN", "RUNS", "Numbers"]
 
@@ -75,37 +71,6 @@ def _fitted(found: dict[str, Any]) -> Numbers:
     }
 
 
-def _example(folder: Path) -> Numbers:
-    case = _typed(folder, "example", "--case", "A")["cases"]["A"]
-    methods = {"truth": case["truth"], **case["methods"]}
-    return {
-        f"{name} {key}": _exact(found[key])
-        for name, found in methods.items()
-        for key in ("Q", "K")
-        if found[key] is not None and (key == "K" or name.startswith("inverse_mpc"))
-    }
-
-
-def _recovered(problem: Problem) -> Numbers:
-    """The gain behind exact recordings."""
-    found = impc.fit(problem)
-    return {"gain": _exact(found.gain), "status": found.status.value}
-
-
-def _seat(_folder: Path) -> Numbers:
-    return _recovered(seat(1, 10.0, 70.0).problem)
-
-
-def _seat_at_its_limit(_folder: Path) -> Numbers:
-    return _recovered(seat(1, 10.0, 4.5).problem)
-
-
-def _two_inputs(_folder: Path) -> Numbers:
-    """An exact recording of three states and two commands that meet their limits at times."""
-    _, _, problem = saturated_problem(np.random.default_rng(7), 3, 2)
-    return _recovered(problem)
-
-
 def _cart(folder: Path) -> Numbers:
     study = write_study(folder, 1)
     settings = study.read_text(encoding="utf-8").partition("[recording]")
@@ -114,23 +79,6 @@ def _cart(folder: Path) -> Numbers:
         folder, "fit", str(folder / "sub-01/cart_1.csv"), "--config", str(folder / "cart.toml"),
         "--plant", _CART,
     ))  # fmt: skip
-
-
-def _arm(_folder: Path) -> Numbers:
-    """A demonstration of the robot arm, searched from parameters that are a tenth off."""
-    arm = SYSTEMS["robot arm"]()
-    plan = arm.problem.plan(arm.truth, arm.x0, mu=1e-12)
-    start = {name: value * (1.1 if index % 2 else 0.9) for index, (name, value) in
-             enumerate(arm.truth.items())}  # fmt: skip
-    trial = arm.problem.recorded_plan(plan.x, plan.u)
-    found = impc.fit_optimal_control(arm.problem, [trial], start)
-    combined = {
-        " ".join(f"{name}^{power:g}" for name, power in one.exponents.items()): one.value
-        for one in found.combinations.identified
-    }
-    return {name: _within(value, 1e-5 * abs(value)) for name, value in combined.items()} | {
-        "settled": found.settled
-    }
 
 
 def _cohort(folder: Path) -> Numbers:
@@ -185,12 +133,7 @@ def _selection(folder: Path) -> Numbers:
 
 #: By name, in the order of the design.
 RUNS: dict[str, Callable[[Path], Numbers]] = {
-    "example": _example,
-    "seat": _seat,
-    "seat at its limit": _seat_at_its_limit,
-    "two inputs": _two_inputs,
     "cart with noise": _cart,
-    "robot arm": _arm,
     "cohort of four": _cohort,
     "plan": _plan,
     "reliability": _reliability,

@@ -18,7 +18,6 @@ from impc.inverse.search import refine_gain
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.model.plant import change_coordinates
 from tests.support import (
-    differences,
     example_plant,
     example_problem,
     plant_of,
@@ -109,25 +108,6 @@ def test_directions_of_the_metric_are_counted_and_said(limit: float, rank: int) 
     assert impc.fit(problem, start=weights).misfit <= begun + 1e-9
 
 
-@pytest.mark.full
-def test_the_rank_is_that_of_the_derivative() -> None:
-    """One trial with two inputs and 12 outputs, against singular values of finite differences."""
-    known = next(first_of(lambda seed: random_problem(seed, 2, half=True, samples=12), 1))
-    found = fit_controller(known.problem)
-    problem, K = found.problem, np.array(found.gain)
-    start = np.array(problem.recordings[0].x0)
-
-    def residual(unknowns: np.ndarray) -> np.ndarray:
-        gain, x0 = np.split(unknowns, [K.size])
-        return residual_only(problem.at(x0[None], np.zeros(0)), gain.reshape(K.shape), found.metric)
-
-    on_gain, on_start = np.split(differences(residual, [*K.ravel(), *start]), [K.size], axis=1)
-    left = on_gain - on_start @ np.linalg.lstsq(on_start, on_gain)[0]
-    values = np.linalg.svd(left, compute_uv=False)
-    assert found.fit.rank <= np.count_nonzero(values > 1e-7 * values[0])
-    assert found.fit.rank >= np.count_nonzero(values > 1e-3 * values[0])
-
-
 @pytest.mark.parametrize(("x0", "horizon"), [((-1.9, -2.6), 2), ((0.6, 1.4), 1)])
 def test_the_terminal_set_is_decided_by_the_recordings(x0: list[float], horizon: int) -> None:
     """Controllers with and without a terminal set differ, and each is found."""
@@ -143,26 +123,7 @@ def test_the_terminal_set_is_decided_by_the_recordings(x0: list[float], horizon:
     assert np.max(np.abs(runs[0] - runs[1])) > 0.01
 
 
-def test_an_infeasible_terminal_set_is_named() -> None:
-    law = regulator(example_plant(), np.eye(2), 1, 2, terminal_set=True)
-    with pytest.warns(match="terminal set.*terminal_set=False"):
-        law.simulate([3.0, 3.0], 3)
-
-
 UNITS = [1e-12, 1e-5, 1e5, 1e12]
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("name", ["A", "B"])
-def test_table_3_1_does_not_depend_on_a_common_unit(name: str) -> None:
-    plain = impc.table_3_1(example_problem(name))
-    truth = impc.solve_lqr(example_problem(name).plant, impc.Weights(np.eye(2), 1)).K
-    for scale in [1.0, *UNITS]:
-        found = impc.table_3_1(example_problem(name, scale))
-        assert found["inverse_mpc"].explained
-        np.testing.assert_allclose(found["inverse_mpc"].gain, truth, rtol=1e-9)
-        for line in ("feedback_gain", "inverse_mpc"):
-            assert found[line].evaluations < 1.5 * plain[line].evaluations + 3
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import impc
 from experiments.benchmarks.workloads import seat
 from impc.arrays import Array
 from impc.inverse.equivalent_weights import SLACK, analytic_centre, inverse_factor, weights_margin
-from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_each, solve_semidefinite
+from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from impc.inverse.solution_set import GainFibre
 from impc.model.weights import condition_number
 from tests.support import draws, example_plant, plant_of, present, random_weights
@@ -286,19 +286,6 @@ def test_a_bound_with_a_norm_is_never_above_the_distance() -> None:
         )
         assert found.bound <= truth * (1 + 1e-14)
         assert found.bound >= truth - 100 * tolerance
-
-
-def test_each_objective_over_the_same_cone_has_its_own_end() -> None:
-    """min c'y over the disc |y| <= 1 is -|c| for each of several objectives."""
-    rng = np.random.default_rng(6)
-    basis = np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
-    cone = matrix_inequality(np.eye(2), basis)
-    objectives = rng.normal(size=(20, 2)) * 10 ** rng.uniform(-3, 1, size=(20, 1))
-    sizes = np.linalg.norm(objectives, axis=1)
-    found = solve_each(objectives, [cone], reach=np.full(2, 2.0))
-    for objective, size, one in zip(objectives, sizes, found, strict=True):
-        np.testing.assert_allclose(one.y, -objective / size, atol=2e-5)
-        assert -size * (1 + 1e-8) <= one.bound <= -size * (1 - 1e-14)
 
 
 def test_a_solver_that_breaks_off_is_an_error_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:

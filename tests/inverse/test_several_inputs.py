@@ -8,20 +8,17 @@ import numpy as np
 import pytest
 
 import impc
-from experiments.printed_intervals import carts, fit, noisy_recording, random_recording
+from experiments.printed_intervals import carts, fit, noisy_recording
 from experiments.printed_intervals import regulator as cart_regulator
 from impc.control.closed_loop import simulate
 from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.laws import GainLaw
-from impc.inverse.metric_family import metric_family
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.residuals import residual_only
 from impc.inverse.search import fit_gain, refine_gain
-from impc.inverse.starts import pair_of_inactive_samples
 from impc.inverse.table31 import inverse_mpc_reduced
 from impc.inverse.unknowns import Unknowns
 from impc.model.weights import condition_number
-from tests.support import extrapolated_jacobian, plant_of, posed, present, random_problem, regulator
+from tests.support import plant_of, posed, random_problem, regulator
 
 FULL, SLOW = pytest.mark.full, pytest.mark.slow
 # Largest misfit of reported weights relative to the recorded outputs.
@@ -142,32 +139,6 @@ def test_a_step_at_which_the_solver_breaks_off_is_tried_shorter() -> None:
     assert found.misfit <= 1.05 * found.noise
 
 
-# At (3, 5) the inputs outnumber the states.
-@pytest.mark.parametrize(("m", "seed"), [(2, 1), (2, 4), (3, 0), (3, 4), (3, 5)])
-def test_the_family_of_metrics_is_that_of_weights(m: int, seed: int) -> None:
-    """S K A^-1 B = B'PB of every member is symmetric, and the true metric is a member."""
-    controller, problem = random_problem(seed, m)
-    plant, K, S = problem.plant, np.array(controller.K), np.array(controller.S)
-    family, rng = metric_family(plant, K), np.random.default_rng(seed)
-    assert family is not None
-    for z in rng.standard_normal((5, family.count)):
-        product = family.metric(z) @ K @ np.linalg.solve(plant.A, plant.B)
-        assert np.linalg.norm(product - product.T) < 1e-9 * np.linalg.norm(product)
-    np.testing.assert_allclose(family.metric(family.nearest(S)), S, rtol=1e-7, atol=1e-9)
-    found = np.reshape(family.changes(0.3 * z), (family.count, -1)).T
-    expected = extrapolated_jacobian(family.metric, 0.3 * z)
-    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
-
-
-# At (2, 12) inactive samples are a third of all; at (3, 5) inputs outnumber states.
-@pytest.mark.parametrize(("m", "seed"), [(2, 4), (2, 12), (3, 5), (3, 40), (3, 67), (3, 89)])
-def test_inactive_samples_determine_the_gain(m: int, seed: int) -> None:
-    controller, problem = random_problem(seed, m)
-    found = present(pair_of_inactive_samples(problem))
-    truth = problem.plant.B @ controller.K
-    assert np.max(np.abs(problem.plant.B @ found[0] - truth)) < 1e-7 * np.max(np.abs(truth))
-
-
 @pytest.mark.parametrize("B", [[[0, 0], [1, 2]], [[0, 0], [1, 1]]])
 @pytest.mark.parametrize("method", ["inverse_mpc", "inverse_mpc_reduced"])
 def test_two_motors_of_one_joint(method: str, B: list[list[float]]) -> None:
@@ -208,26 +179,3 @@ def test_a_noisy_fit_stays_where_it_ended() -> None:
     assert found.converged
     assert not found.explained
     assert moved < 0.1 * error
-
-
-@pytest.mark.parametrize(
-    ("m", "seed"),
-    [
-        # Starts at the edge of the set of weights: two fits failed at the start's program; two
-        # were 4 and 7 % above the truth.
-        *(pytest.param(3, seed, marks=FULL) for seed in (49, 82, 89, 92)),
-        # Local minima of their starts, 1.4 to 29 % above the misfit of the truth.
-        (2, 76),
-        pytest.param(2, 88, marks=FULL),
-        pytest.param(2, 59, marks=FULL),
-        pytest.param(3, 55, marks=FULL),
-        pytest.param(3, 24, marks=SLOW),
-    ],
-)
-def test_a_noisy_fit_reaches_the_misfit_of_the_truth(m: int, seed: int) -> None:
-    """In per cent of the residual power, from the initial state of the truth."""
-    truth, trial = random_recording(seed, m, 90.0)
-    settings = impc.FitSettings(horizon=truth.horizon, u_max=list(truth.bounds.u_max))
-    problem = impc.fit_problem(truth.plant, [trial], settings)
-    least = np.linalg.norm(residual_only(problem, np.array(truth.K), np.array(truth.S)))
-    assert 100 * ((fit(truth, trial).misfit / least) ** 2 - 1) < 1

@@ -197,14 +197,6 @@ def test_placed_signals_simulate_as_before(estimate: GainEstimate) -> None:
         np.testing.assert_allclose(after.x, before.x, atol=1e-12)
 
 
-def test_the_prior_counts_in_the_objective() -> None:
-    problem = timed(DT / 2)
-    errors = np.array(problem.errors)
-    errors[:, SHIFT, 2] = [0.5, -1.0]
-    moved = problem.at(np.array(problem.starts), np.zeros(0), errors)
-    assert moved.unlikely == pytest.approx(1.0**2 + 2.0**2)
-
-
 @pytest.mark.parametrize(("name", "value"), [("wind", 0.1), ("push", -1.0), ("push", np.inf)])
 def test_a_timing_that_cannot_be_is_refused(name: str, value: float) -> None:
     law = controller()

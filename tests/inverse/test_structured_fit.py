@@ -11,8 +11,6 @@ import pytest
 import scipy.linalg
 
 import impc
-import plants
-from experiments.benchmarks.workloads import seat
 from experiments.driver import with_noise
 from experiments.printed_intervals import carts
 from impc.arrays import Array
@@ -25,7 +23,6 @@ from impc.inverse.unknowns import Unknowns
 from impc.output_feedback.simulation import simulate_person
 from tests.support import extrapolated_slope, named_plant, nelder_mead, posed, present, regulator
 
-BODY = ("theta1", "theta2", "theta1_rate", "theta2_rate")
 ONE = np.log([4.0, 1.0])
 
 
@@ -41,29 +38,6 @@ def pushed(
 def size_of(problem: impc.Problem, structure: impc.Structure, cost_weights: Any) -> float:
     solution = impc.solve_lqr(problem.plant, structure.weights(cost_weights))
     return misfit_or_reason(problem, np.array(solution.K), np.array(solution.S))[0]
-
-
-def seat_problem(
-    kind: str, cost_weights: Any, noise: float = 0.0
-) -> tuple[impc.Controller, impc.Problem, impc.Structure]:
-    """Ten seconds of the seat without a limit, under weights over angles and rates."""
-    plant = impc.Plant(plants.seated_balance_plant(), ["command"])
-    shape, rng = impc.Structure(plant, kind, over=BODY), np.random.default_rng(0)
-    truth = regulator(plant, shape.weights(cost_weights).Q, np.inf, 20)
-    torque = plants.ternary_torque(duration=10.0, rate=100)
-    y = truth.simulate(np.zeros(plant.n), disturbance=torque).outputs[:-1]
-    trial = impc.Recording(plant, y + noise * rng.standard_normal(y.shape), torque)
-    given: Any = {"terminal_set": False, "unknown_start": True, "structure": shape}
-    return truth, posed(truth, trial, **given), shape
-
-
-def test_the_prices_of_the_seat_without_noise() -> None:
-    """From a gain that is 5 % wrong; the search starts at Bryson's rule."""
-    wanted = np.log([6e3, 9e3, 6e2, 4e2])
-    truth, problem, shape = seat_problem("diagonal", wanted)
-    found = fit_structure(problem, shape, 1.05 * truth.K, np.array(truth.S))
-    assert np.max(np.abs(found.cost_weights - wanted)) < 1e-6
-    assert found.misfit < 1e-9 * np.sqrt(2000)
 
 
 def test_a_price_that_is_not_needed_is_zero() -> None:
@@ -177,23 +151,6 @@ def test_over_a_delay_the_controller_predicts(features: str | list[str]) -> None
         np.testing.assert_allclose(on_body @ predicted, gain[0], rtol=1e-9)
         assert outside(found, gain) < 1e-9
     assert outside(found, np.eye(5)[4]) > 0.1  # a gain on the delay alone is outside
-
-
-def test_on_the_seat_five_dimensions_hold_them_all() -> None:
-    """Weights over angles and rates, from 0.01 to 100 times those of the benchmark."""
-    work = seat(1, 2.0)
-    plant, rng = work.controller.plant, np.random.default_rng(2)
-    structure = impc.Structure(plant, "full", over=plant.states[:4])
-    first = np.array(work.controller.K)
-    found, (T, _) = spanned(structure, plant, first), natural_coordinates(plant, first)
-    assert len(found) == 5
-    root = np.linalg.cholesky(np.array(work.weights.Q)[:4, :4])
-    for size in (0.01, 1.0, 100.0):
-        mixed = root @ (np.eye(4) + 0.5 * np.tril(rng.normal(size=(4, 4))))
-        Q = scipy.linalg.block_diag(size * mixed @ mixed.T, np.zeros((6, 6)))
-        natural, row = found[:, 0] @ T, regulator(plant, Q, np.inf, 1).K[0] @ T
-        # Measured: 1e-4; the sampled Padé delay is not exactly all-pass.
-        assert np.linalg.norm(row - natural.T @ (natural @ row)) < 5e-4 * np.linalg.norm(row)
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import impc
+from experiments.benchmarks.workloads import seat
 from experiments.certificates import cholesky_parameters, weights_from_parameters
 from impc.arrays import Array
 from impc.control.closed_loop import simulate
@@ -23,6 +24,8 @@ from tests.inverse.test_equivalent_weights import NO_WEIGHTS_GAIN
 from tests.support import present
 
 IDENTITY = impc.Weights(np.eye(2), 1)
+TRUTH = impc.solve_lqr(support.example_plant(), IDENTITY).K
+UNITS = [1.0, *(pytest.param(one, marks=pytest.mark.full) for one in (1e-12, 1e-5, 1e5, 1e12))]
 
 
 def of_block(problem: impc.Problem, block: Array) -> Array:
@@ -33,9 +36,12 @@ def of_block(problem: impc.Problem, block: Array) -> Array:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_table_3_1_recovers_the_weights(case: str) -> None:
-    problem = support.example_problem(case)
+@pytest.mark.parametrize("unit", UNITS)
+def test_table_3_1_recovers_the_weights(case: str, unit: float) -> None:
+    problem = support.example_problem(case, unit)
     lines = impc.table_3_1(problem)
+    assert lines["inverse_mpc"].explained
+    np.testing.assert_allclose(lines["inverse_mpc"].gain, TRUTH, rtol=1e-9)
     for name in ("inverse_mpc", "inverse_mpc_reduced"):
         assert impc.weight_error(lines[name].stage_weights, IDENTITY) <= 1e-6
         assert keeps_hard(problem, lines[name].stage_weights)
@@ -105,6 +111,13 @@ def test_identifiability_of_the_example(monkeypatch: pytest.MonkeyPatch) -> None
     bare = impc.identifiability(problem, IDENTITY)
     assert bare.others == ()
     assert (bare.rank, bare.free) == (found.rank, found.free)
+
+
+def test_the_recording_of_the_seat_determines_ten_of_fifty_five_directions() -> None:
+    work = seat()
+    counts = impc.identifiability(work.problem, work.weights)
+    assert (counts.free, counts.rank) == (55, 10)
+    assert all(item.misfit < 1e-6 for item in counts.others)
 
 
 def test_output_penalty_reaches_what_a_derivative_free_search_reaches() -> None:

@@ -7,21 +7,13 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from impc.errors import WeightsError
-from impc.model.plant import Plant
-from impc.model.riccati import (
-    gain_gradients,
-    lyapunov_series,
-    metric_gradients,
-    regulator_changes,
-    solve_lqr,
-)
-from impc.model.weights import Weights
+import impc
+from impc.model.riccati import gain_gradients, lyapunov_series, metric_gradients, regulator_changes
 from tests.support import extrapolated_slope, random_plant, random_weights
 
 
-def continuous_plant(rng: np.random.Generator) -> Plant:
-    return Plant(control.ss(rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), np.eye(3), 0))
+def continuous_plant(rng: np.random.Generator) -> impc.Plant:
+    return impc.Plant(control.ss(rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), np.eye(3), 0))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -30,13 +22,13 @@ def test_gain_equals_that_of_python_control(seed: int) -> None:
     Q, R = random_weights(rng, 4), random_weights(rng, 2)
     plant = random_plant(rng, 4, 2, 1.2)
     K, P, _ = control.dlqr(plant.A, plant.B, Q, R)
-    found = solve_lqr(plant, Weights(Q, R))
+    found = impc.solve_lqr(plant, impc.Weights(Q, R))
     np.testing.assert_allclose(found.K, K, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.P, P, rtol=1e-9)
     smooth = continuous_plant(rng)
     Q, R = random_weights(rng, 3), random_weights(rng, 2)
     K, P, _ = control.lqr(smooth.A, smooth.B, Q, R)
-    found = solve_lqr(smooth, Weights(Q, R))
+    found = impc.solve_lqr(smooth, impc.Weights(Q, R))
     np.testing.assert_allclose(found.K, K, rtol=1e-8, atol=1e-9)
     np.testing.assert_allclose(found.P, P, rtol=1e-8, atol=1e-9)
 
@@ -45,8 +37,8 @@ def test_cost_of_any_inputs_is_distance_to_the_gain() -> None:
     """The identity of docs/why/theory.md, section 2, for random inputs."""
     rng = np.random.default_rng(1)
     plant = random_plant(rng, 3, 2, 1.3)
-    weights = Weights(random_weights(rng, 3), random_weights(rng, 2))
-    found = solve_lqr(plant, weights)
+    weights = impc.Weights(random_weights(rng, 3), random_weights(rng, 2))
+    found = impc.solve_lqr(plant, weights)
     x = rng.normal(size=3)
     first = x @ found.P @ x
     cost = distance = 0.0
@@ -66,8 +58,8 @@ def test_gradients_equal_central_differences(seed: int, discrete: bool) -> None:
     Q, R = random_weights(rng, 3), random_weights(rng, 2)
     dQ, dR = (part + part.T for part in (rng.normal(size=(3, 3)), rng.normal(size=(2, 2))))
     step = 1e-5
-    up, down = (solve_lqr(plant, Weights(Q + s * dQ, R + s * dR)) for s in (step, -step))
-    here = solve_lqr(plant, Weights(Q, R))
+    up, down = (impc.solve_lqr(plant, impc.Weights(Q + s * dQ, R + s * dR)) for s in (step, -step))
+    here = impc.solve_lqr(plant, impc.Weights(Q, R))
     pairs = [(gain_gradients(here), up.K - down.K)]
     if discrete:
         pairs.append((metric_gradients(here), up.S - down.S))
@@ -92,25 +84,27 @@ def test_lyapunov_series_equals_scipy_up_to_slow_loops() -> None:
 
 
 def test_a_mode_without_weight_is_an_error() -> None:
-    plant = Plant(control.ss(np.diag([1.0, 0.5]), [[1], [1]], np.eye(2), 0, True))
-    with pytest.raises(WeightsError, match="penalise every mode"):
-        solve_lqr(plant, Weights(np.diag([0.0, 1.0]), 1))
+    plant = impc.Plant(control.ss(np.diag([1.0, 0.5]), [[1], [1]], np.eye(2), 0, True))
+    with pytest.raises(impc.WeightsError, match="penalise every mode"):
+        impc.solve_lqr(plant, impc.Weights(np.diag([0.0, 1.0]), 1))
 
 
 def test_changes_of_a_regulator_along_weights_and_plant() -> None:
     """Forward differential of gain and metric against extrapolated differences."""
     rng = np.random.default_rng(3)
-    plant, weights = random_plant(rng, 4, 2, 1.2), Weights(random_weights(rng, 4), np.eye(2))
+    plant, weights = random_plant(rng, 4, 2, 1.2), impc.Weights(random_weights(rng, 4), np.eye(2))
     dQ, dR = random_weights(rng, 4), random_weights(rng, 2)
     dA, dB = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
 
     def regulator(step: float) -> np.ndarray:
         moved = control.ss(plant.A + step * dA, plant.B + step * dB, plant.C, 0, plant.dt)
-        there = Weights(weights.Q + step * dQ, weights.R + step * dR)
-        found = solve_lqr(Plant(moved), there)
+        there = impc.Weights(weights.Q + step * dQ, weights.R + step * dR)
+        found = impc.solve_lqr(impc.Plant(moved), there)
         return np.concatenate([found.K.ravel(), found.S.ravel()])
 
-    found = regulator_changes(solve_lqr(plant, weights), *(part[None] for part in (dQ, dR, dA, dB)))
+    found = regulator_changes(
+        impc.solve_lqr(plant, weights), *(part[None] for part in (dQ, dR, dA, dB))
+    )
     exact = np.concatenate([part[0].ravel() for part in found])
     # Ridders' table leaves 1e-10 here.
     np.testing.assert_allclose(exact, extrapolated_slope(regulator, 1e-3), rtol=1e-7, atol=1e-8)

@@ -13,16 +13,14 @@ from impc.errors import PlantError
 from impc.model.plant import Plant, gain_unit, weight_unit
 from impc.reporting.shown_units import angles_in, axis_label, shown_angle, shown_unit
 from plants import cursor_plant, seated_balance_plant, yalmip_example
+from tests.support import named_plant
 
 UNITS = {"angle": "rad", "rate": "rad/s", "torque": "N m", "share": "1"}
 
 
 def plant(units: dict[str, str]) -> Plant:
-    system = control.ss(
-        np.diag([0.5, 0.4, 0.3]), np.ones((3, 1)), np.eye(1, 3), 0, 0.1,
-        states=["angle", "rate", "share"], inputs=["torque"], outputs=["angle"],
-    )  # fmt: skip
-    return Plant(system, units=units)
+    A, B, C = np.diag([0.5, 0.4, 0.3]), np.ones((3, 1)), np.eye(1, 3)
+    return named_plant(A, B, C, 0.1, "angle rate share", "torque", "angle", units=units)
 
 
 def same(one: str, other: str) -> bool:
@@ -91,11 +89,8 @@ def test_radians_where_they_are_asked_for() -> None:
 
 
 def test_of_a_plant_that_says_none_angles_are_told_by_their_names() -> None:
-    system = control.ss(
-        np.eye(2) / 2, np.ones((2, 1)), np.eye(2), 0, 0.1,
-        states=["yaw_rate", "level"], inputs=["u"], outputs=["yaw", "share"],
-    )  # fmt: skip
-    plant = Plant(system, units={"share": "1"})
+    A, B, names = np.eye(2) / 2, np.ones((2, 1)), ("yaw_rate level", "u", "yaw share")
+    plant = named_plant(A, B, np.eye(2), 0.1, *names, units={"share": "1"})
     assert shown_unit(plant, "yaw_rate")[1] == "°/s"
     assert axis_label(plant, "level") == "Level (SI)"
     assert axis_label(plant, "share") == "Share (-)"

@@ -9,7 +9,6 @@ import pytest
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
 import impc
-from impc.control.closed_loop import simulate
 from impc.output_feedback.compiled_filter import Likelihood
 from impc.output_feedback.likelihood import (
     NoiseDirections,
@@ -246,26 +245,6 @@ def test_scores_have_the_covariance_that_is_expected() -> None:
     values = np.linalg.eigvalsh(root @ scores.T @ scores @ root.T / len(runs))
     # Of 100 draws in six directions: between .57 and 1.55 (Marchenko and Pastur), and some more.
     assert 0.5 < values[0] < values[-1] < 1.7
-
-
-def test_the_limit_of_no_noise_is_the_simulation() -> None:
-    """W, V -> 0: the innovations are recorded minus simulated outputs."""
-    who = SATURATING._replace(motor=1e-9, process=0.0, sensory=(1e-9, 1e-9))
-    rng = np.random.default_rng(7)
-    run = simulate(who.controller(), impc.scenario(who.plant(), who.start, disturbance=push(200)))
-    outputs = run.x[:200, :1] + who.recorder * rng.standard_normal((200, 1))
-    found = likelihood(who, outputs)
-    np.testing.assert_allclose(found.innovations, outputs - run.x[:200, :1], rtol=0, atol=1e-9)
-
-
-def test_who_does_what_is_believed_errs_as_the_filter_says() -> None:
-    """Simulated estimation errors have the stationary covariance of the subject's filter."""
-    who = Someone(sensory=(0.02, 0.05))
-    found = recorded(who, 20000)
-    joint = joint_loop(who.plant(), who.observer(), np.array([who.recorder]))
-    error = found.states - found.estimates
-    # 20000 samples, correlated over some ten: 3 % of a covariance.
-    np.testing.assert_allclose(np.cov(error.T), joint.P0[:2, :2], rtol=0.15)
 
 
 def test_an_expectation_without_a_command_is_an_error() -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support import ROOT, new_python
+
 # Script that runs in a package without the subpackage; each printed line is compared.
 TRIED = """
 import importlib, pkgutil, sys
@@ -48,10 +47,7 @@ def test_the_rest_works_without_it(tmp_path: Path) -> None:
         "    except (impc.ImpcError, ImportError) as error:\n"
         "        print(error)\n"
     )
-    place = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code], env=place, capture_output=True, text=True, check=False
-    )
+    done = new_python(code, "-P", PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         "True",

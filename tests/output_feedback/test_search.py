@@ -24,7 +24,6 @@ from impc.output_feedback.intervals import (
     person_covariance,
     profile,
 )
-from impc.output_feedback.unknowns import NoisyUnknowns
 from tests.output_feedback.fits import cart, fitted, posed, unknown_truth
 
 pytestmark = pytest.mark.full
@@ -43,15 +42,6 @@ def test_levels_that_slide_do_not_hold_back_the_rest() -> None:
     place, _, spent, settled = maximise(space, space.at(space.start), 2)
     assert (spent, settled) == (2, False)
     assert place.identified.value == space.value(place.theta) < found.log_likelihood
-
-
-def test_with_infinite_spread_the_prior_is_constant() -> None:
-    found = fitted("sliding")
-    request, own, theta = found.space.request, found.space.space, np.array(found.theta)
-    nothing = NoisyUnknowns(own, dataclasses.replace(request, spread=np.inf), found.space.first)
-    assert nothing.log_prior(theta) == nothing.lost(theta, found.identified) == 0.0
-    assert not np.any(nothing.slopes(theta)[1])
-    assert not np.any(reml_slope(nothing, nothing.at(theta)))
 
 
 def test_initial_states_are_as_any_other_state() -> None:
@@ -196,16 +186,6 @@ def test_a_sense_that_is_hardly_told_leaves_the_motor_noise_its_own(seed: int) -
     free = impc.fit_output_feedback(first, blind(who), spread=np.inf)
     assert np.max(person_covariance(free, "expected").levels) > 10
     assert free.observer.motor[0] > fit.observer.motor[0]
-
-
-@pytest.mark.slow
-def test_all_levels_are_in_their_intervals() -> None:
-    """A subject with noise in motor and senses, at the limit, as the report prints it."""
-    who = subject("cart", 1, "both", 90.0, 0.7)
-    fit = impc.fit_output_feedback(impc.fit(recorded(who, 1).problem), blind(who))
-    true = [*who.person.levels[who.person.levels > 0], *who.recorder]
-    intervals = level_intervals(fit, person_covariance(fit, "expected"))
-    assert all(low < level < high for level, (low, high) in zip(true, intervals, strict=True))
 
 
 def test_covariances_agree_where_the_model_is_true() -> None:

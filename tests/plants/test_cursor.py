@@ -1,10 +1,11 @@
-"""The cursor plant against closed forms."""
+"""The cursor plant against closed forms, and the named example against the reference."""
 
 from __future__ import annotations
 
 import control
 import numpy as np
 import pytest
+import scipy.linalg
 
 import plants
 
@@ -46,3 +47,14 @@ def test_the_pursued_hand_answers_whole_samples_late() -> None:
     since = np.maximum(time - 7 * dt, 0.0)
     np.testing.assert_allclose(found, since - lag * (1 - np.exp(-since / lag)), atol=1e-14)
     np.testing.assert_array_equal(system.B[:, 1], [-dt, *np.zeros(8)])
+
+
+def test_poles_gain_and_riccati_solution_are_those_of_the_reference() -> None:
+    plant = plants.yalmip_example()
+    np.testing.assert_allclose(
+        sorted(np.linalg.eigvals(plant.A), key=np.imag), [1.1 - 0.43589j, 1.1 + 0.43589j], atol=1e-5
+    )
+    P = scipy.linalg.solve_discrete_are(plant.A, plant.B, np.eye(2), np.eye(1))
+    K = np.linalg.solve(1 + plant.B.T @ P @ plant.B, plant.B.T @ P @ plant.A)
+    np.testing.assert_allclose(K, [[1.49383, -0.88111]], atol=5e-6)
+    np.testing.assert_allclose(P, [[5.36016, -1.21933], [-1.21933, 1.98969]], atol=5e-6)
