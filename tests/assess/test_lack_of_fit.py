@@ -12,9 +12,7 @@ from experiments.residual_study import diagnosed
 from experiments.uncertain_body import cart
 from impc.assess.lack_of_fit import DELAY, LEAN, LIMIT, LackOfFit, lack_of_fit
 from impc.assess.printed_gain import gain_estimate
-from impc.inverse.further_unknowns import (
-    with_errors_unknown,
-)
+from impc.inverse.further_unknowns import with_errors_unknown
 from impc.inverse.laws import GainLaw
 from impc.inverse.unknowns import Unknowns
 from impc.studies.fit.subject import fit_recordings
@@ -81,6 +79,25 @@ def test_what_is_fitted_or_absent_is_not_tested() -> None:
         space = Unknowns(one, GainLaw(one, K, S))
         found = present(lack_of_fit(space.ended(space.start)))
         assert (name in [*found.untestable, *(item.name for item in found.errors)]) == tested
+
+
+def test_trials_with_gaps_are_left_out() -> None:
+    person, K, _ = uncertain_cart()
+    problem, trial = person.with_body_fixed(), person.recordings[0]
+    outputs = np.array(trial.outputs)
+    outputs[20:30] = np.nan
+    gapped = impc.replace(trial, outputs=outputs)
+
+    def tested(recordings: tuple[impc.Recording, ...]) -> LackOfFit | None:
+        one = impc.replace(problem, recordings=recordings)
+        space = Unknowns(one, GainLaw(one, K, np.eye(1)))
+        return lack_of_fit(space.ended(space.start))
+
+    whole, with_it = (present(tested((*problem.recordings, *more))) for more in ((), (gapped,)))
+    assert [one.name for one in with_it.errors] == [one.name for one in whole.errors]
+    expected = [one.evidence for one in whole.errors]
+    assert [one.evidence for one in with_it.errors] == pytest.approx(expected, rel=1e-9)
+    assert tested((gapped,)) is None
 
 
 def test_too_little_is_not_tested() -> None:
