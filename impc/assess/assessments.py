@@ -7,24 +7,19 @@ need further fits (intervals, other horizons) see `impc.studies.fit.uncertainty`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.variance_accounted_for import explained_share
 from impc.control.simulation import Simulation
+from impc.inverse.estimates import Estimate
+from impc.model.bounds import Bounds
 from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.model.weights import condition_number
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.inverse.estimates import Estimate
-    from impc.model.bounds import Bounds
-    from impc.model.recordings import Recording
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ least-condition member, members lie so far out that the programs are inaccurate.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -29,21 +29,15 @@ from impc.arrays import Array, Frozen
 from impc.checking import checked
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.equivalent_weights import (
+    EquivalentWeights,
     analytic_centre,
     inverse_factor,
     least_condition_weights,
     nearest_weights,
 )
-from impc.inverse.semidefinite import Cone, matrix_inequality, solve_each
-from impc.inverse.solution_set import pair_blocks, split_blocks
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.inverse.equivalent_weights import EquivalentWeights
-    from impc.inverse.semidefinite import SemidefiniteSolution
-    from impc.inverse.solution_set import GainFibre
-    from impc.model.weights import Weights
+from impc.inverse.semidefinite import Cone, SemidefiniteSolution, matrix_inequality, solve_each
+from impc.inverse.solution_set import GainFibre, pair_blocks, split_blocks
+from impc.model.weights import Weights
 
 # Relative gap of the programs, and tolerance of the step back into the set.
 _GAP, _CLOSE = 1e-10, 1e-11

@@ -11,20 +11,16 @@ The interval follows from the scatter of s^2 over pieces of time, assumed indepe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.problem import Problem
-    from impc.model.recordings import Recording
+from impc.inverse.problem import Problem
+from impc.model.recordings import Recording
 
 # Relative difference up to which perturbations are equal: noise of a recorded torque.
 _SAME = 0.02

@@ -22,24 +22,20 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.long_run_covariance import ResidualNoise, residual_noise, spread_of_sum
-from impc.inverse.columns import trial_span
+from impc.inverse.columns import TrialSpan, trial_span
 from impc.inverse.estimates import DETERMINED, determined
 from impc.inverse.laws import GainLaw
-from impc.inverse.problem import noise_of_residual
+from impc.inverse.problem import Problem, noise_of_residual
 from impc.inverse.refit import IDENTIFIED
 from impc.inverse.residuals import residual_only, residual_or_reason
 from impc.inverse.unknowns import linear_at
 from impc.model.signal_errors import SHIFT
-
-if TYPE_CHECKING:
-    from impc.inverse.columns import TrialSpan
-    from impc.inverse.problem import Problem
 
 #: Model of the residuals of each trial, given the span of the fitted columns.
 NoiseModel = Callable[[list[Array], "TrialSpan"], ResidualNoise]

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from impc.arrays import frozen
+from impc.arrays import Array, frozen
 from impc.assess.lack_of_fit import (
     DELAY,
     LEAN,
@@ -37,17 +38,12 @@ from impc.inverse.further_unknowns import (
     with_limit_unknown,
 )
 from impc.inverse.noisy_fit import first_end
+from impc.inverse.problem import Problem
 from impc.inverse.refit import refit
 from impc.inverse.search import prediction_misfit, seen_at
+from impc.inverse.unknowns import Fitted
+from impc.model.plant import Plant
 from impc.model.signal_errors import OFFSET
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from impc.arrays import Array
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
-    from impc.model.plant import Plant
 
 #: Mistakes in the meaning of a signal.
 SIGN, EXCHANGED, SUM, DIFFERENCE = "sign", "exchanged", "sum", "difference"

@@ -9,9 +9,9 @@ uncertainties enter as priors. More trials are less noise: the same derivatives,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, frozen, with_shape
 from impc.assess.covariance import (
@@ -24,13 +24,9 @@ from impc.assess.long_run_covariance import ResidualNoise
 from impc.checking import checked, replace
 from impc.control.controller import Controller
 from impc.errors import InputError
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import along_bounds
 from impc.model.bounds import bound_rows
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.inverse.problem import Problem
 
 # A larger coefficient is a drift, not noise.
 _LARGEST_ROOT = 0.999

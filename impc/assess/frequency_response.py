@@ -9,21 +9,17 @@ coherence c from n independent pieces the magnitude has a relative standard erro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, IntArray, frozen
+from impc.control.simulation import Simulation
+from impc.inverse.problem import Problem
 from impc.model.foresight import physical_disturbances
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.control.simulation import Simulation
-    from impc.inverse.problem import Problem
-    from impc.model.recordings import Recording
+from impc.model.recordings import Recording
 
 # Length of a piece in s, its least number of samples, and the least number of pieces.
 _PIECE, _LEAST, _FEWEST = 10.0, 32, 4

@@ -8,22 +8,18 @@ they still give a lower end, the least limit that D allows.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.assess.profiles import QUANTILE, FitCurve, standard_error
 from impc.checking import replace
 from impc.errors import InputError
+from impc.inverse.estimates import Estimate
 from impc.inverse.further_unknowns import with_free_limit
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import simulated
+from impc.inverse.problem import Problem, simulated
 from impc.model.bounds import Bounds
 from impc.model.plant_family import LIMIT
-
-if TYPE_CHECKING:
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
 
 # Largest number of rounds of limit and controller, and a change of the limit that ends them.
 _ROUNDS, _STAYS = 5, 0.01

@@ -9,8 +9,8 @@ See docs/why/equivalent_weights.md and docs/why/conclusions.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +19,8 @@ from impc.assess.bounded_weights import linear_maxima, weights_set
 from impc.errors import SolverError, WeightsError
 from impc.inverse.equivalent_weights import analytic_centre, least_condition_weights
 from impc.inverse.solution_set import gain_fibre
+from impc.model.plant import Plant
 from impc.model.weights import Weights, condition_number, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.model.plant import Plant
 
 
 def dominant_direction(Q: Array) -> Array:

@@ -27,7 +27,6 @@ samples replaces it. Holm's correction keeps the level over all groups.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -36,27 +35,22 @@ import scipy.stats
 from impc.arrays import Array, Frozen, IntArray
 from impc.assess.covariance import by_trial, spread_of_rows
 from impc.assess.long_run_covariance import residual_noise
+from impc.assess.printed_gain import GainEstimate
 from impc.assess.several_tests import holm
 from impc.checking import replace
 from impc.control.body_steps import slopes_along
 from impc.control.closed_loop import prepare_loop, run_loop
 from impc.control.constraint_rows import directions
+from impc.control.simulation import Simulation
 from impc.inverse.columns import trial_span
 from impc.inverse.further_unknowns import with_errors_unknown
 from impc.inverse.laws import GainLaw
-from impc.inverse.problem import controller_for, drive_of, noise_of_residual
-from impc.inverse.residuals import along_bounds
-from impc.inverse.unknowns import Unknowns
+from impc.inverse.problem import Problem, controller_for, drive_of, noise_of_residual
+from impc.inverse.residuals import Linear, along_bounds
+from impc.inverse.unknowns import Fitted, Unknowns
 from impc.model import plant_family
 from impc.model.bounds import bound_rows
-
-if TYPE_CHECKING:
-    from impc.assess.printed_gain import GainEstimate
-    from impc.control.simulation import Simulation
-    from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Linear
-    from impc.inverse.unknowns import Fitted
-    from impc.model.recordings import Recording
+from impc.model.recordings import Recording
 
 #: Probability of any alarm under a correct model, by these distributions. Trials close to a fall
 #: have heavier tails: at this level 4 % of 161 carts gave an alarm, at 0.05 7 %.

@@ -22,6 +22,7 @@ and the bracket, with S estimated from the residuals, is added back lag by lag
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -29,12 +30,9 @@ import numpy as np
 import scipy.signal
 
 from impc.arrays import Array, Frozen, frozen
+from impc.inverse.columns import TrialSpan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.inverse.columns import TrialSpan
-
     Taken = tuple[Array, Array]
 
 # Andrews and Monahan: larger roots cannot be distinguished from one.

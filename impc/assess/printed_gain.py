@@ -19,19 +19,16 @@ from impc.assess.covariance import FOREIGN, TWO_SIDED, GainCovariance, gain_cova
 from impc.assess.long_run_covariance import residual_noise, spread_of_sum
 from impc.checking import checked, replace
 from impc.inverse.command_regression import regress_commands
-from impc.inverse.estimates import SearchEnd
+from impc.inverse.estimates import Estimate, SearchEnd
 from impc.inverse.minimiser import Ended
+from impc.inverse.problem import Problem
 from impc.inverse.refit import refit
 from impc.inverse.residuals import misfit_or_reason
 from impc.model.continuous_gain import continuous_gain
-from impc.model.plant import UNKNOWN, gain_unit
+from impc.model.plant import UNKNOWN, Plant, gain_unit
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
 
 
 @dataclass(frozen=True)

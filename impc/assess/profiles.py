@@ -19,29 +19,23 @@ from __future__ import annotations
 import contextlib
 import itertools
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
 import scipy.special
 
-from impc.assess.covariance import gain_covariance
+from impc.arrays import Array
+from impc.assess.covariance import GainCovariance, gain_covariance
 from impc.assess.long_run_covariance import residual_noise, white_noise
-from impc.assess.printed_gain import LEVEL, Interval, entry_names
+from impc.assess.printed_gain import LEVEL, GainEstimate, Interval, entry_names
 from impc.errors import InputError, SolverError, WeightsError
 from impc.inverse.laws import GainLaw
 from impc.inverse.minimiser import PROMISE, Stop
-from impc.inverse.unknowns import Unknowns
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from impc.arrays import Array
-    from impc.assess.covariance import GainCovariance
-    from impc.assess.printed_gain import GainEstimate
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
+from impc.inverse.problem import Problem
+from impc.inverse.unknowns import Fitted, Unknowns
 
 #: Chi-squared quantile of one degree of freedom at the level of the intervals.
 QUANTILE = float(scipy.special.chdtri(1, 1 - LEVEL))

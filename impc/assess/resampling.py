@@ -11,23 +11,17 @@ refit starts at the estimate and moves only the gain (`refit`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, Frozen, frozen
-from impc.assess.printed_gain import Interval, entry_names
+from impc.assess.printed_gain import GainEstimate, Interval, entry_names
 from impc.checking import replace
-from impc.inverse.problem import modelled, recorded, simulated
+from impc.inverse.problem import Problem, modelled, recorded, simulated
 from impc.inverse.refit import refit
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.assess.printed_gain import GainEstimate
-    from impc.inverse.problem import Problem
-    from impc.model.recordings import Recording
+from impc.model.recordings import Recording
 
 
 @dataclass(frozen=True)

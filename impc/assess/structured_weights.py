@@ -13,22 +13,16 @@ weight of zero is at its bound and left out; `weight_profiles` gives its upper e
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
-from impc.assess.covariance import TWO_SIDED, Slopes, slopes_at
-from impc.assess.long_run_covariance import residual_noise, white_noise
+from impc.assess.covariance import TWO_SIDED, NoiseModel, Slopes, slopes_at
+from impc.assess.long_run_covariance import ResidualNoise, residual_noise, white_noise
 from impc.inverse.laws import regulator_slopes
-from impc.model.riccati import solve_lqr
-
-if TYPE_CHECKING:
-    from impc.assess.covariance import NoiseModel
-    from impc.assess.long_run_covariance import ResidualNoise
-    from impc.inverse.problem import Problem
-    from impc.model.riccati import LqrSolution
-    from impc.model.structure import Structure
+from impc.inverse.problem import Problem
+from impc.model.riccati import LqrSolution, solve_lqr
+from impc.model.structure import Structure
 
 #: A combination of logarithms is identified if its 95 % interval ends within this factor.
 IDENTIFIED_FACTOR = 10.0

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.stats
@@ -28,25 +27,21 @@ import scipy.stats
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.assessments import evaluate_method
 from impc.assess.long_run_covariance import residual_noise
-from impc.assess.structured_weights import WeightCovariance, tangent, weight_covariance
+from impc.assess.structured_weights import Tangent, WeightCovariance, tangent, weight_covariance
 from impc.assess.variance_accounted_for import (
     innovation_roots,
     innovations_criterion,
     predicted,
 )
 from impc.assess.weight_profiles import WeightInterval, WeightProfiles
-from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.estimates import Estimate
+from impc.inverse.problem import EXPLAINED, Problem, recorded_size
 from impc.inverse.refit import IDENTIFIED
 from impc.inverse.structured import feature_sizes, search_from
+from impc.model.recordings import Recording
 from impc.model.riccati import solve_lqr
+from impc.model.structure import Structure
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from impc.assess.structured_weights import Tangent
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.model.recordings import Recording
-    from impc.model.structure import Structure
 
 
 @dataclass(frozen=True)

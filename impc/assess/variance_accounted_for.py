@@ -11,8 +11,8 @@ with k fitted numbers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.special
@@ -20,24 +20,18 @@ import scipy.special
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.assess.covariance import by_trial
 from impc.assess.long_run_covariance import residual_noise
+from impc.assess.printed_gain import GainEstimate
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
+from impc.control.simulation import Simulation
 from impc.errors import InputError
-from impc.inverse.problem import EXPLAINED, controller_for, scenarios
+from impc.inverse.estimates import Estimate
+from impc.inverse.problem import EXPLAINED, Problem, controller_for, scenarios
 from impc.inverse.refit import refit
 from impc.inverse.residuals import residual_only
 from impc.inverse.search import with_fitted_starts
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.assess.printed_gain import GainEstimate
-    from impc.control.simulation import Simulation
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
-    from impc.model.recordings import Recording
-
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 
 # One second of lags reveals a missed rhythm; at least ten lags.
 _LEAST_LAGS = 10

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -30,14 +30,11 @@ import scipy.optimize
 
 from impc.arrays import Array
 from impc.assess.profiles import QUANTILE, Curve
-from impc.assess.structured_weights import tangent
+from impc.assess.structured_weights import Tangent, WeightCovariance, tangent
 from impc.errors import WeightsError
 from impc.inverse.laws import regulator_slopes
 from impc.inverse.residuals import scaled_changes
 from impc.model.riccati import solve_lqr
-
-if TYPE_CHECKING:
-    from impc.assess.structured_weights import Tangent, WeightCovariance
 
 # Prior SD of a log cost weight about the fit: far wider than any finite interval.
 _SPREAD, _TRIES = 20.0, 30

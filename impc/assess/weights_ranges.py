@@ -18,35 +18,30 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array, BoolArray
 from impc.assess.bounded_weights import (
+    WeightsSet,
     all_negative,
     entry_ranges,
     linear_ranges,
     set_near,
     weights_set,
 )
+from impc.assess.covariance import GainCovariance
 from impc.assess.intent import angle_between, dominant_direction
+from impc.assess.printed_gain import GainEstimate
 from impc.checking import replace
 from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.solution_set import gain_fibre, split_blocks
-from impc.model.riccati import gain_gradients, solve_lqr
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from impc.arrays import Array, BoolArray
-    from impc.assess.bounded_weights import WeightsSet
-    from impc.assess.covariance import GainCovariance
-    from impc.assess.printed_gain import GainEstimate
-    from impc.model.plant import Plant
-    from impc.model.riccati import LqrSolution
-    from impc.model.weights import Weights
+from impc.model.plant import Plant
+from impc.model.riccati import LqrSolution, gain_gradients, solve_lqr
+from impc.model.weights import Weights
 
 # Largest condition number in the set, as a multiple of the least.
 _RATIO = 10.0

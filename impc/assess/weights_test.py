@@ -24,31 +24,24 @@ column rank). The condition number fixes the other directions by convention.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.special
 
 from impc.arrays import Array, frozen
+from impc.assess.printed_gain import GainEstimate
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.equivalent_weights import other_weights, weights_margin
-from impc.inverse.estimates import ROUNDING, Identifiability, OtherWeights
-from impc.inverse.problem import misfit, recorded_size, simulated
+from impc.inverse.estimates import ROUNDING, Estimate, Identifiability, OtherWeights
+from impc.inverse.problem import Problem, misfit, recorded_size, simulated
 from impc.inverse.proximal_search import weight_jacobian
 from impc.inverse.proximal_step import block_basis
-from impc.inverse.solution_set import gain_fibre
+from impc.inverse.solution_set import GainFibre, gain_fibre
 from impc.inverse.table31 import closed_loop_residual
+from impc.model.plant import Plant
 from impc.model.riccati import solve_lqr
-
-if TYPE_CHECKING:
-    from impc.assess.printed_gain import GainEstimate
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.inverse.solution_set import GainFibre
-    from impc.model.plant import Plant
-    from impc.model.weights import Weights
-
+from impc.model.weights import Weights
 
 # p-value below which weights are rejected.
 _LEVEL = 1e-3

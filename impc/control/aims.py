@@ -10,19 +10,15 @@ the coming targets if the plant knows them (`with_preview`). Bounds apply to the
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.control.compiled_values import Aim
-from impc.control.constraint_rows import families
+from impc.control.constraint_rows import Directions, families
+from impc.control.controller import Controller
+from impc.control.simulation import Scenario
 from impc.errors import InputError
 from impc.model.targets import PlantChange, SteadyStates, expected_disturbance, signal_rows
-
-if TYPE_CHECKING:
-    from impc.control.constraint_rows import Directions
-    from impc.control.controller import Controller
-    from impc.control.simulation import Scenario
 
 # Share of its bound up to which a target counts as using none of it.
 _NOTHING = 1e-9

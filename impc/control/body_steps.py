@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import functools
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -19,14 +20,9 @@ from llvmlite import ir
 from impc.arrays import Array
 from impc.control.compiled_body import move_along, states_along
 from impc.control.compiled_values import BodyTape
-from impc.model.body import OPERATIONS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.control.constraint_rows import Directions
-    from impc.model.body import Body
-    from impc.model.plant import Plant
+from impc.control.constraint_rows import Directions
+from impc.model.body import OPERATIONS, Body
+from impc.model.plant import Plant
 
 
 def body_tape(body: Body | None, n: int, given: int, *, moving: bool) -> BodyTape:

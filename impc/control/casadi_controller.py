@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,13 +17,11 @@ import scipy.linalg
 
 from impc.arrays import BoolArray
 from impc.checking import checked
+from impc.control.compiled_values import Rows
 from impc.control.constraint_rows import build_rows
 from impc.control.controller import Controller
 from impc.control.named_solver import PLUGINS, SOLVERS, silent
 from impc.errors import InputError
-
-if TYPE_CHECKING:
-    from impc.control.compiled_values import Rows
 
 # Slacks are linear in the cost, so the Hessian is singular, which DAQP does not accept; with its
 # proximal iterations it declares feasible programs infeasible. Its slacks get a quadratic cost of

@@ -18,7 +18,7 @@ while the controller predicts with A and B (docs/howto/nonlinear.md).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,21 +29,25 @@ from impc.control.body_steps import body_tape, pushes
 from impc.control.compiled_loop import run
 from impc.control.compiled_values import (
     TOO_SHORT,
+    Aim,
+    BodyTape,
     LoopMatrices,
     RowDirections,
+    Rows,
     Trace,
     workspace,
 )
-from impc.control.constraint_rows import build_rows, differentiate_rows, directions
-from impc.control.named_solver import COMPILED, Program, active_set, build_program, excluded_row
-from impc.control.simulation import Sensitivity, Simulation, Status
-
-if TYPE_CHECKING:
-    from impc.control.compiled_values import Aim, BodyTape, Rows
-    from impc.control.constraint_rows import Directions
-    from impc.control.controller import Controller
-    from impc.control.named_solver import ActiveSet
-    from impc.control.simulation import Scenario
+from impc.control.constraint_rows import Directions, build_rows, differentiate_rows, directions
+from impc.control.controller import Controller
+from impc.control.named_solver import (
+    COMPILED,
+    ActiveSet,
+    Program,
+    active_set,
+    build_program,
+    excluded_row,
+)
+from impc.control.simulation import Scenario, Sensitivity, Simulation, Status
 
 # Longest horizon whose problem is solved as a whole at once, and number of its first stages with
 # which a longer one begins.

@@ -7,7 +7,8 @@ by zero gives infinity, and the loop then diverges.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable
+from typing import Any, cast
 
 from llvmlite import ir
 from numba.core import types
@@ -17,9 +18,6 @@ from impc.arrays import Buffer
 from impc.control.compiled_kernel import copy
 from impc.control.compiled_values import BodyTape
 from impc.jit import inner, njit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @inner()

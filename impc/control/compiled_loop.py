@@ -11,7 +11,8 @@ time (`python -m experiments.benchmarks`), so the loop borrows its arrays: they 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba.core import cgutils, types
@@ -32,9 +33,6 @@ from impc.control.compiled_values import (
     Workspace,
 )
 from impc.jit import njit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def _borrowed(_context: Any, value: Any) -> Any:

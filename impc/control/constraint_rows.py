@@ -18,21 +18,17 @@ solution satisfies the rows of all later stages as well, it solves the whole pro
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, IntArray
 from impc.checking import checked
 from impc.control.compiled_values import RowDirections, Rows
+from impc.control.controller import Controller
 from impc.errors import DataError, InputError
+from impc.model.body import Body
 from impc.model.bounds import BoundRows, bound_rows
-from impc.model.riccati import finite_horizon_changes
-
-if TYPE_CHECKING:
-    from impc.control.controller import Controller
-    from impc.model.body import Body
-    from impc.model.riccati import FiniteHorizonLqr
+from impc.model.riccati import FiniteHorizonLqr, finite_horizon_changes
 
 
 @dataclass(frozen=True)

@@ -11,31 +11,31 @@ terminal weight the same holds with one gain and metric per stage.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, frozen, symmetric_matrix
 from impc.attached_methods import attach
 from impc.checking import Value, checked
 from impc.control.named_solver import COMPILED, require_solver
-from impc.control.terminal_set import maximal_invariant_set, own_terminal_set
+from impc.control.simulation import Simulation
+from impc.control.terminal_set import TerminalSet, maximal_invariant_set, own_terminal_set
 from impc.errors import InputError
+from impc.model.bounds import Bounds
 from impc.model.continuous_gain import held_gain
-from impc.model.riccati import solve_finite_horizon, solve_lqr, stabilises, terminal_matrix
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
-    from numpy.typing import ArrayLike
-
-    from impc.control.simulation import Simulation
-    from impc.control.terminal_set import TerminalSet
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
-    from impc.model.riccati import FiniteHorizonLqr
-    from impc.model.weights import Weights
+from impc.model.plant import Plant
+from impc.model.riccati import (
+    FiniteHorizonLqr,
+    solve_finite_horizon,
+    solve_lqr,
+    stabilises,
+    terminal_matrix,
+)
+from impc.model.weights import Weights
 
 #: Samples; memory of the rows is quadratic in the horizon (0.4 GB at this one with two bounds).
 LONGEST_HORIZON = 5000

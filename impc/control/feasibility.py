@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.checking import checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.constraint_rows import build_rows, families
-from impc.control.simulation import Status, scenario
+from impc.control.controller import Controller
+from impc.control.simulation import Simulation, Status, scenario
 from impc.errors import InfeasibleError, SolverError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
-
-    from impc.control.controller import Controller
-    from impc.control.simulation import Simulation
 
 
 @checked(steps=(1, 10_000_000))

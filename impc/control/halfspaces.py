@@ -12,18 +12,13 @@ are feasible they are optimal by duality.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csc_array
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
+from impc.arrays import Array, BoolArray, IntArray
 from impc.errors import InputError, SolverError
-
-if TYPE_CHECKING:
-    from impc.arrays import Array, BoolArray, IntArray
-
 
 # A direction that the normalised rows see less than this, relative to the best seen one, counts as
 # unbounded: rounding (2e-16) would move the set along it by more than 1e-6 of its size.

@@ -14,10 +14,12 @@ of fixed size represents: the loop cannot be saved or exported to C. The control
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, frozen
 from impc.checking import checked
@@ -31,10 +33,6 @@ from impc.model.riccati import regulator_changes, solve_lqr
 from impc.model.weights import Weights
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import ArrayLike
-
     Shapes = dict[str, tuple[int, int]]
 
 # CasADi does not keep Python callbacks alive; this list does.

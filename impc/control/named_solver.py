@@ -16,8 +16,9 @@ from __future__ import annotations
 import contextlib
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -25,13 +26,9 @@ import scipy.optimize
 
 from impc.arrays import Array, BoolArray, IntArray
 from impc.control.compiled_dual import DEPENDENT
+from impc.control.compiled_values import Rows
 from impc.errors import InputError
 from impc.settings_files import IPOPT_ALONE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from impc.control.compiled_values import Rows
 
 #: Name of the built-in method, see `compiled_dual`.
 COMPILED = "compiled"

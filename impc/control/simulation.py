@@ -6,26 +6,24 @@ A simulation never raises because of its course: it has a `Status` for each samp
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, as_numbers, finite_array, frozen
 from impc.checking import Value, checked
 from impc.control import compiled_values
 from impc.errors import DataError
 from impc.model.foresight import physical_disturbances, with_steps
+from impc.model.plant import Plant
 from impc.model.targets import reference
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import pandas as pd
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
 
 
 class Status(IntEnum):

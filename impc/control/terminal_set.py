@@ -19,10 +19,12 @@ E. G. Gilbert, K. T. Tan, Linear systems with state and control constraints, IEE
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, IntArray, finite_array, frozen
 from impc.checking import Value, checked
@@ -36,16 +38,8 @@ from impc.control.halfspaces import (
 )
 from impc.errors import InputError, SolverError
 from impc.extras import optional
-from impc.model.bounds import BoundRows, bound_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
-
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
-
+from impc.model.bounds import BoundRows, Bounds, bound_rows
+from impc.model.plant import Plant
 
 # Largest number of states for which corners are listed; with more there are thousands.
 _MOST_STATES = 6

@@ -6,18 +6,14 @@ linearly with the number of trials.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.problem import Problem
+from impc.inverse.problem import Problem
 
 # Rows of one block: a few thousand fit into the cache of the processor.
 _BLOCK = 4096

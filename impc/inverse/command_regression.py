@@ -11,20 +11,16 @@ x_t do. The fitted controller decides at which samples no bound is active over t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array, BoolArray, frozen
 from impc.control.aims import aim_of
 from impc.control.constraint_rows import build_rows, directions
+from impc.control.controller import Controller
 from impc.errors import DataError, SolverError
-from impc.inverse.problem import controller_for, drive_of, recorded_states
-
-if TYPE_CHECKING:
-    from impc.control.controller import Controller
-    from impc.inverse.problem import Problem
-    from impc.model.recordings import Recording
+from impc.inverse.problem import Problem, controller_for, drive_of, recorded_states
+from impc.model.recordings import Recording
 
 # Largest error of the driven plant relative to the 2-norm of the outputs.
 _FOLLOWS = 0.5

@@ -10,21 +10,17 @@ fits better afterwards.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from impc.arrays import Array
 from impc.checking import replace
 from impc.errors import ImpcError
+from impc.inverse.estimates import Estimate
 from impc.inverse.methods import METHODS, of_fitted_gain, output_penalty
 from impc.inverse.noisy_fit import fit_controller
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.search import refine_gain
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
 
 # Relative difference below which two misfits count as equal.
 _SAME = 1e-3

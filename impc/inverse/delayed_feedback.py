@@ -9,7 +9,7 @@ model excludes prediction over the delay; the parameters compensate for it as fa
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,16 +17,12 @@ from impc.arrays import Array, BoolArray
 from impc.errors import InputError, SolverError
 from impc.inverse.laws import GainLaw
 from impc.inverse.minimiser import PROMISE, Stop
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.starts import regulators
 from impc.inverse.unknowns import Unknowns
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
+from impc.model.plant import Plant
 
 _SCALES = np.geomspace(1.0, 1e-3, 25)
 _EVALUATIONS = 60

@@ -7,19 +7,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, BoolArray, Frozen, frozen
 from impc.attached_methods import attach
 from impc.checking import replace
 from impc.control.controller import Controller
+from impc.control.simulation import Simulation
 from impc.control.simulation import Status as SampleStatus
 from impc.errors import SolverError, WeightsError
 from impc.inverse.columns import trial_span
 from impc.inverse.laws import GainLaw
+from impc.inverse.minimiser import Ended
 from impc.inverse.problem import (
+    Problem,
     controller_for,
     explains,
     misfit,
@@ -28,21 +33,13 @@ from impc.inverse.problem import (
     recorded_size,
     simulated,
 )
-from impc.inverse.unknowns import linear_at
+from impc.inverse.unknowns import Fitted, linear_at
 from impc.model.bounds import bound_rows
 from impc.model.riccati import stabilises
 from impc.model.weights import Weights, normalised
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import pandas as pd
-    from numpy.typing import ArrayLike
-
-    from impc.control.simulation import Simulation
-    from impc.inverse.minimiser import Ended
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
 
 
 class Status(Enum):

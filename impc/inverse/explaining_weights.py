@@ -10,24 +10,19 @@ gain (`metric_family`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array
 from impc.errors import SolverError, WeightsError
-from impc.inverse.equivalent_weights import least_condition_weights
+from impc.inverse.equivalent_weights import EquivalentWeights, least_condition_weights
 from impc.inverse.metric_family import fitted_metric, metric_family, unidentified_metrics
-from impc.inverse.problem import EXPLAINED, recorded_size
+from impc.inverse.problem import EXPLAINED, Problem, recorded_size
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import gain_fibre
+from impc.inverse.unknowns import Fitted
 from impc.model.riccati import solve_lqr
-
-if TYPE_CHECKING:
-    from impc.inverse.equivalent_weights import EquivalentWeights
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
-    from impc.model.weights import Weights
+from impc.model.weights import Weights
 
 
 @dataclass(frozen=True)

@@ -6,18 +6,14 @@ recordings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from impc.arrays import frozen
 from impc.checking import replace
+from impc.inverse.problem import Problem
 from impc.model.plant_family import DELAY, LIMIT, PlantFamily, plant_at
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.problem import Problem
 
 # Prior SDs: relative for the limit, in samples for the delay.
 _LIMIT, _DELAY = 0.3, 1.0

@@ -8,10 +8,10 @@ the distance between the gains. After Priess et al., IEEE TCST 23 (2015) 770.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
@@ -20,14 +20,9 @@ from impc.inverse.equivalent_weights import least_condition_weights, weights_mar
 from impc.inverse.proximal_step import block_basis
 from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
 from impc.inverse.solution_set import gain_fibre, natural_coordinates, split_blocks
-from impc.model.riccati import gain_gradients, is_stable, solve_lqr, stabilises
+from impc.model.plant import Plant
+from impc.model.riccati import LqrSolution, gain_gradients, is_stable, solve_lqr, stabilises
 from impc.model.weights import Weights, condition_number, normalised
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
-    from impc.model.riccati import LqrSolution
 
 # Floor of the eigenvalues in the gradient method, relative to the mean eigenvalue of the start.
 _FLOOR = 1e-9

@@ -12,25 +12,19 @@ Cost weights: z = logarithms of the free cost weights of a structure over those 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from impc.arrays import Array
-from impc.inverse.problem import controller_for, require_riccati, weights_controller
+from impc.arrays import Array, BoolArray
+from impc.control.controller import Controller
+from impc.control.terminal_set import TerminalSet
+from impc.inverse.prediction import Correction
+from impc.inverse.problem import Problem, controller_for, require_riccati, weights_controller
 from impc.inverse.residuals import scaled_changes, stable_controller
 from impc.inverse.solution_set import natural_coordinates
+from impc.model.plant import Plant
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import LqrSolution, regulator_changes, solve_lqr
-
-if TYPE_CHECKING:
-    from impc.arrays import BoolArray
-    from impc.control.controller import Controller
-    from impc.control.terminal_set import TerminalSet
-    from impc.inverse.prediction import Correction
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
-    from impc.model.structure import Structure
+from impc.model.structure import Structure
 
 
 class FixedLaw:

@@ -15,10 +15,10 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.checking import checked, replace
 from impc.errors import ImpcError, InputError, WeightsError
 from impc.inverse.command_regression import regress_commands
@@ -29,20 +29,15 @@ from impc.inverse.explaining_weights import weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.natural_search import in_plant_units, inverse_mpc_natural
 from impc.inverse.noisy_fit import fit_controller
-from impc.inverse.problem import require_riccati
+from impc.inverse.problem import Problem, require_riccati
 from impc.inverse.proximal_search import auxiliary_weights
 from impc.inverse.search import free_gain, noise_of, refine_gain, with_fitted_starts
 from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.structured import fit_structured, fit_weights
-from impc.model.plant import change_coordinates
+from impc.inverse.unknowns import Fitted
+from impc.model.plant import Plant, change_coordinates
 from impc.model.riccati import solve_lqr, stabilises
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
-    from impc.model.plant import Plant
 
 _LOG = logging.getLogger("impc")
 # Relative misfit by which weights may exceed the gain for which they were found.

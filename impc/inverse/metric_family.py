@@ -17,19 +17,16 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 
 from impc.arrays import Array
 from impc.inverse.laws import GainLaw
+from impc.inverse.problem import Problem
 from impc.inverse.residuals import misfit_or_reason, unusable
 from impc.inverse.unknowns import linear_at
-
-if TYPE_CHECKING:
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
+from impc.model.plant import Plant
 
 # Largest condition number of the eigenvectors, and relative imaginary part that counts as real.
 _DEFECTIVE, _REAL = 1e8, 1e-4

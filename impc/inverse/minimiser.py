@@ -24,12 +24,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from impc.arrays import Array
+from impc.arrays import Array
 
 # Initial and least damping; its factors after a rejected or poor and after a good step, by ratios
 # of the gained to the predicted decrease.

@@ -14,31 +14,30 @@ the solution if that is larger: there the penalty equals the noise of one sample
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
 from impc.arrays import Array, frozen
 from impc.checking import replace
+from impc.control.terminal_set import TerminalSet
 from impc.errors import SolverError, WeightsError
 from impc.inverse.columns import triangular_rows
 from impc.inverse.equivalent_weights import least_condition_weights
 from impc.inverse.laws import GainLaw
-from impc.inverse.proximal_search import Objective, Residual, conditioned_fit
-from impc.inverse.solution_set import gain_fibre, natural_coordinates, pair_blocks, split_blocks
+from impc.inverse.problem import Problem
+from impc.inverse.proximal_search import ConditionedFit, Objective, Residual, conditioned_fit
+from impc.inverse.solution_set import (
+    GainFibre,
+    gain_fibre,
+    natural_coordinates,
+    pair_blocks,
+    split_blocks,
+)
 from impc.inverse.unknowns import linear_at
 from impc.model.plant import change_coordinates
-from impc.model.riccati import solve_lqr
+from impc.model.riccati import LqrSolution, solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.control.terminal_set import TerminalSet
-    from impc.inverse.problem import Problem
-    from impc.inverse.proximal_search import ConditionedFit
-    from impc.inverse.solution_set import GainFibre
-    from impc.model.riccati import LqrSolution
 
 #: Penalty at the condition number of the start, in squared noise SDs of one sample: it decides
 #: along directions that noise leaves open. Scaled by all samples (1e-3 of the squared misfit) it

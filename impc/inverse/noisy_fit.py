@@ -12,7 +12,7 @@ Finally the initial states are refitted with the controller fixed.
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 import scipy.special
@@ -36,12 +36,13 @@ from impc.inverse.natural_search import (
 )
 from impc.inverse.problem import (
     EXPLAINED,
+    Problem,
     explains,
     misfit,
     recorded_size,
     with_or_without_set,
 )
-from impc.inverse.proximal_search import weights_near
+from impc.inverse.proximal_search import ConditionedFit, weights_near
 from impc.inverse.refit import refit, several_ends
 from impc.inverse.residuals import keeps_hard, misfit_or_reason, verify_hard
 from impc.inverse.search import (
@@ -57,17 +58,8 @@ from impc.inverse.solution_set import gain_fibre, natural_coordinates
 from impc.inverse.starts import regulators
 from impc.inverse.unknowns import Fitted, Unknowns
 from impc.model.plant import change_coordinates
-from impc.model.riccati import solve_lqr
-from impc.model.weights import condition_number, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.inverse.problem import Problem
-    from impc.inverse.proximal_search import ConditionedFit
-    from impc.model.riccati import LqrSolution
-    from impc.model.weights import Weights
-
+from impc.model.riccati import LqrSolution, solve_lqr
+from impc.model.weights import Weights, condition_number, normalised
 
 # Promise at which a first search ends.
 _ROUGH = 0.1

@@ -18,18 +18,14 @@ so the same loop simulates them, with other matrices and y as a further disturba
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array
 from impc.checking import replace
-from impc.inverse.problem import scenarios
-
-if TYPE_CHECKING:
-    from impc.control.simulation import Scenario
-    from impc.inverse.problem import Problem
+from impc.control.simulation import Scenario
+from impc.inverse.problem import Problem, scenarios
 
 # Process noise on every mode relative to command noise, for modes that B does not reach; the larger
 # values are tried if the Riccati equation fails in double precision.

@@ -10,36 +10,30 @@ values have zero residuals.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, BoolArray, finite_array, frozen, with_shape
 from impc.checking import Value, checked, replace
 from impc.control.closed_loop import simulate
 from impc.control.controller import LONGEST_HORIZON, Controller
 from impc.control.named_solver import COMPILED, require_solver
-from impc.control.simulation import Scenario
+from impc.control.simulation import Scenario, Simulation
+from impc.control.terminal_set import TerminalSet
 from impc.errors import DataError, InputError, SolverError, WeightsError
 from impc.model.bounds import Bounds
 from impc.model.foresight import physical_states
-from impc.model.plant_family import plant_at
+from impc.model.plant import Plant
+from impc.model.plant_family import PlantFamily, plant_at
+from impc.model.recordings import Recording
 from impc.model.riccati import terminal_matrix
 from impc.model.signal_errors import KINDS, SHIFT, distorted
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from impc.control.simulation import Simulation
-    from impc.control.terminal_set import TerminalSet
-    from impc.model.plant import Plant
-    from impc.model.plant_family import PlantFamily
-    from impc.model.recordings import Recording
-    from impc.model.structure import Structure
-    from impc.model.weights import Weights
+from impc.model.structure import Structure
+from impc.model.weights import Weights
 
 #: Largest misfit, relative to the recorded outputs, of recordings that count as explained.
 EXPLAINED = 1e-9

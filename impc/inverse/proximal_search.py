@@ -19,8 +19,8 @@ trust region does not depend on the units of the states (docs/why/theory.md).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -29,15 +29,9 @@ from impc.arrays import Array, Frozen, frozen
 from impc.checking import checked
 from impc.errors import SolverError, WeightsError
 from impc.inverse.proximal_step import StepProgram, block_basis, solve_step
-from impc.model.riccati import gain_gradients, metric_gradients, solve_lqr
+from impc.model.plant import Plant
+from impc.model.riccati import LqrSolution, gain_gradients, metric_gradients, solve_lqr
 from impc.model.weights import Weights, condition_number, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from impc.model.plant import Plant
-    from impc.model.riccati import LqrSolution
-
 
 _STATIONARY = 1e-5
 # In units of the current weights: a step of 1 can double a direction or make it singular.

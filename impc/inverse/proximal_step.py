@@ -14,16 +14,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
-from impc.inverse.semidefinite import matrix_inequality, norm_bound, solve_semidefinite
-
-if TYPE_CHECKING:
-    from impc.inverse.semidefinite import Cone
+from impc.inverse.semidefinite import Cone, matrix_inequality, norm_bound, solve_semidefinite
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import scipy.linalg
@@ -37,15 +37,9 @@ from impc.checking import replace
 from impc.errors import ImpcError
 from impc.inverse.laws import GainLaw
 from impc.inverse.minimiser import CREASE, PROMISE, Ended
-from impc.inverse.problem import explains, require_riccati
+from impc.inverse.problem import Problem, explains, require_riccati
 from impc.inverse.search import best_of, cut, seen_at, stop_at, with_fitted_starts
-from impc.inverse.unknowns import Unknowns
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
+from impc.inverse.unknowns import Fitted, Unknowns
 
 #: Largest standard error, in whitened units, of an identified direction. Beyond it the prior of the
 #: search and the curvature of the problem matter.

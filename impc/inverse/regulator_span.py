@@ -11,19 +11,15 @@ no such result, so that all gains are searched.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from impc.arrays import Array
+from impc.inverse.problem import Problem
 from impc.inverse.solution_set import RANK
+from impc.model.plant import Plant
 from impc.model.riccati import regulator_changes, solve_lqr
+from impc.model.structure import Structure
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
-    from impc.model.structure import Structure
 
 # Weights of whitened states relative to that of the command: seat gains from 1/3 to 8 units.
 _SIZES = (1e-2, 1.0, 1e2)

@@ -8,18 +8,22 @@ predictions.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from impc.arrays import Array
 from impc.checking import replace
 from impc.control.closed_loop import prepare_loop, run_loop, simulate
-from impc.control.constraint_rows import directions
-from impc.control.simulation import Status
+from impc.control.constraint_rows import Directions, directions
+from impc.control.controller import Controller
+from impc.control.simulation import Scenario, Sensitivity, Simulation, Status
+from impc.control.terminal_set import TerminalSet
 from impc.errors import ImpcError, SolverError
+from impc.inverse.prediction import Correction
 from impc.inverse.problem import (
+    Problem,
     controller_for,
     missed,
     modelled,
@@ -29,22 +33,11 @@ from impc.inverse.problem import (
     weights_controller,
 )
 from impc.model.bounds import bound_rows
-from impc.model.plant_family import plant_differential
+from impc.model.plant_family import PlantDifferential, plant_differential
+from impc.model.recordings import Recording
 from impc.model.riccati import stabilises
 from impc.model.signal_errors import distortion, resampled
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from impc.control.constraint_rows import Directions
-    from impc.control.controller import Controller
-    from impc.control.simulation import Scenario, Sensitivity, Simulation
-    from impc.control.terminal_set import TerminalSet
-    from impc.inverse.prediction import Correction
-    from impc.inverse.problem import Problem
-    from impc.model.plant_family import PlantDifferential
-    from impc.model.recordings import Recording
-    from impc.model.weights import Weights
+from impc.model.weights import Weights
 
 # Residual assigned to each sample after an infeasible one, relative to the RMS output.
 _NOT_REACHED = 1e3

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from impc.errors import ImpcError, SolverError
 from impc.inverse.laws import FixedLaw, GainLaw
 from impc.inverse.minimiser import PROMISE, Stop
 from impc.inverse.prediction import correction
-from impc.inverse.problem import EXPLAINED, recorded_size, require_riccati
+from impc.inverse.problem import EXPLAINED, Problem, recorded_size, require_riccati
 from impc.inverse.residuals import misfit_or_reason
 from impc.inverse.starts import (
     balanced_regulator,
@@ -34,17 +35,10 @@ from impc.inverse.starts import (
     pair_of_inactive_samples,
     regulators,
 )
-from impc.inverse.unknowns import Unknowns
-from impc.model.riccati import solve_lqr, stabilises
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
-    from impc.model.recordings import Recording
-    from impc.model.riccati import LqrSolution
-    from impc.model.weights import Weights
+from impc.inverse.unknowns import Fitted, Unknowns
+from impc.model.recordings import Recording
+from impc.model.riccati import LqrSolution, solve_lqr, stabilises
+from impc.model.weights import Weights
 
 #: Largest number of recorded values for which the search is repeated many times.
 FEW = 2000

@@ -8,9 +8,10 @@ Passed to Clarabel directly: cvxpy needs 4 to 9 ms to build what Clarabel solves
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import clarabel
 import numpy as np
@@ -18,9 +19,6 @@ import scipy.sparse
 
 from impc.arrays import Array
 from impc.errors import SolverError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 # Error of bounds, in units of the relative residuals of a program with an objective of norm 1.
 _UNSURE = 10.0

@@ -18,22 +18,18 @@ independent of units and the computation is well conditioned.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, finite_array, frozen, symmetric_matrix
 from impc.checking import checked
 from impc.errors import InputError, WeightsError
 from impc.inverse.proximal_step import block_basis
+from impc.model.plant import Plant
 from impc.model.riccati import lyapunov_series, stabilises
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
 
 #: Singular values of the optimality condition below this share of the largest count as zero. Exact
 #: gains leave 1e-15 (singular A, or a metric given with its own gain); the seat's least is 4e-3.

@@ -12,7 +12,7 @@ satisfy the same equation (docs/why/theory.md).
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -20,16 +20,10 @@ from impc.arrays import Array, BoolArray
 from impc.errors import WeightsError
 from impc.inverse.metric_family import fitted_metric, metric_family
 from impc.inverse.prediction import command_sizes
-from impc.inverse.problem import recorded_states
+from impc.inverse.problem import Problem, recorded_states
 from impc.inverse.solution_set import natural_coordinates
-from impc.model.riccati import solve_lqr
+from impc.model.riccati import LqrSolution, solve_lqr
 from impc.model.weights import Weights, normalised
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from impc.inverse.problem import Problem
-    from impc.model.riccati import LqrSolution
 
 # Cost weight of unobserved states relative to the others.
 _UNSEEN = 1e-8

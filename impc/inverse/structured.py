@@ -16,7 +16,7 @@ Bryson's rule over a range of command weights, and that rule itself.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.linalg
@@ -27,19 +27,13 @@ from impc.checking import replace
 from impc.errors import ImpcError, SolverError, WeightsError
 from impc.inverse.estimates import Estimate, determined, simulated_estimate
 from impc.inverse.laws import GainLaw, WeightLaw, regulator_slopes
-from impc.inverse.problem import EXPLAINED, explains, recorded_size, simulated
+from impc.inverse.problem import EXPLAINED, Problem, explains, recorded_size, simulated
 from impc.inverse.residuals import controlled_residual
 from impc.inverse.search import stop_at
 from impc.inverse.starts import regulators
-from impc.inverse.unknowns import Unknowns, linear_at
+from impc.inverse.unknowns import Fitted, Unknowns, linear_at
 from impc.model.riccati import solve_lqr
 from impc.model.structure import Structure
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.problem import Problem
-    from impc.inverse.unknowns import Fitted
 
 # Prior SD of a log cost weight during a search: a factor of 150 about the start.
 _SPREAD = 5.0

@@ -13,17 +13,26 @@ from __future__ import annotations
 
 import itertools
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.checking import checked, replace
+from impc.control.terminal_set import TerminalSet
 from impc.errors import SolverError
 from impc.inverse.estimates import Estimate, no_estimate, simulated_estimate
-from impc.inverse.explaining_weights import weights_behind
+from impc.inverse.explaining_weights import WeightsBehind, weights_behind
 from impc.inverse.inverse_lqr import inverse_lqr_gradient, inverse_lqr_lmi
 from impc.inverse.laws import GainLaw
-from impc.inverse.problem import EXPLAINED, recorded_size, typical_output, with_or_without_set
+from impc.inverse.problem import (
+    EXPLAINED,
+    Problem,
+    recorded_size,
+    typical_output,
+    with_or_without_set,
+)
 from impc.inverse.proximal_search import (
     AUXILIARY_CONDITION_WEIGHT,
     Objective,
@@ -35,17 +44,8 @@ from impc.inverse.proximal_search import (
 from impc.inverse.search import fit_gain, refine_gain
 from impc.inverse.starts import regulators
 from impc.inverse.unknowns import linear_at
-from impc.model.riccati import solve_lqr
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from impc.arrays import Array
-    from impc.control.terminal_set import TerminalSet
-    from impc.inverse.explaining_weights import WeightsBehind
-    from impc.inverse.problem import Problem
-    from impc.model.riccati import LqrSolution
-    from impc.model.weights import Weights
+from impc.model.riccati import LqrSolution, solve_lqr
+from impc.model.weights import Weights
 
 # The value of c in (3.5) to (3.7) is unknown. This one is small enough that an exact fit
 # minimises (3.6) in the 2-norm (docs/why/theory.md).

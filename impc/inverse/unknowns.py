@@ -14,33 +14,27 @@ the plant, extend its `PlantFamily`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
 
 from impc.arrays import Array, Frozen, frozen
 from impc.checking import replace
+from impc.control.controller import Controller
+from impc.control.terminal_set import TerminalSet
 from impc.errors import ImpcError
 from impc.inverse.columns import triangular_rows
-from impc.inverse.minimiser import Ended, Prior, Rows, log_square, minimise
-from impc.inverse.problem import explains, noise_of_residual, recorded_size, simulated
-from impc.inverse.residuals import controlled_residual, linearise, unusable
+from impc.inverse.minimiser import Ended, Prior, Rows, Stop, log_square, minimise
+from impc.inverse.prediction import Correction
+from impc.inverse.problem import Problem, explains, noise_of_residual, recorded_size, simulated
+from impc.inverse.residuals import Linear, controlled_residual, linearise, unusable
 from impc.inverse.solution_set import floored_covariance, natural_coordinates
 from impc.model.riccati import stabilises
 from impc.model.signal_errors import search_unit
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from impc.control.controller import Controller
-    from impc.control.terminal_set import TerminalSet
-    from impc.inverse.minimiser import Stop
-    from impc.inverse.prediction import Correction
-    from impc.inverse.problem import Problem
-    from impc.inverse.residuals import Linear
 
 _START_FLOOR = 1e-8
 # Relative size below which columns are rounding.

@@ -9,18 +9,16 @@ are constants of the list.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from impc.arrays import Array, IntArray, finite_array, frozen
 from impc.checking import Value, replace
 from impc.errors import PlantError, one_line
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
 
 _MOST = 200  # points of a drawing
 #: Names of the operations in CasADi, without ``OP_``; code refers to them by index.

@@ -9,18 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, BoolArray, frozen
 from impc.checking import Value, checked
 from impc.errors import BoundsError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
+from impc.model.plant import Plant
 
 
 @dataclass(frozen=True, init=False)

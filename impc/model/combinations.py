@@ -7,15 +7,12 @@ docs/why/output_feedback.md).
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
 from impc.arrays import Array
 from impc.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 # Range of the largest factor of a feature; its square stays a normal floating-point number.
 _SIZES = 1e-50, 1e50

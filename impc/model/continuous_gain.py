@@ -12,16 +12,12 @@ function of G, which is inverted near K by Powell's hybrid method with the exact
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy
 
 from impc.arrays import Array
 from impc.errors import InputError, PlantError
-
-if TYPE_CHECKING:
-    from impc.model.plant import Plant
+from impc.model.plant import Plant
 
 # Relative tolerances for the plant sampled again, and for the gain held again.
 _SAMPLED, _HELD = 1e-8, 1e-11

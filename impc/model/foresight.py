@@ -14,22 +14,17 @@ so that the gain on them is the feedforward of the LQR (docs/why/theory.md, sect
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, as_numbers, finite_array, frozen
 from impc.checking import checked, replace
 from impc.errors import PlantError
 from impc.model.bounds import Bounds
+from impc.model.plant import Plant
 from impc.model.targets import SteadyStates, signal_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
 
 
 @checked

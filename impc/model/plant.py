@@ -12,9 +12,9 @@ R[0, 0] = 1.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -23,9 +23,6 @@ from impc.arrays import Array, System, as_numbers, finite_array, frozen
 from impc.checking import Value, asked, checked, replace
 from impc.errors import PlantError, brief
 from impc.model.body import Body, lines_at, read_body
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 
 @dataclass(frozen=True, init=False)

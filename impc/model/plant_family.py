@@ -11,23 +11,18 @@ docs/howto/fit.md.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from impc.arrays import Array, frozen
+from impc.arrays import Array, BoolArray, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import InputError, PlantError
-from impc.model.plant import UNKNOWN
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
-    from impc.arrays import BoolArray
-    from impc.model.body import Body
-    from impc.model.bounds import Bounds
-    from impc.model.plant import Plant
+from impc.model.body import Body
+from impc.model.bounds import Bounds
+from impc.model.plant import UNKNOWN, Plant
 
 _STEP, _FORWARD = 1e-3, 1e-7
 #: Uncertainties that are not parameters of `make`.

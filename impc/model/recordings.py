@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, as_numbers, finite_array, frozen, require_finite, with_shape
 from impc.checking import Value, checked
 from impc.errors import DataError
 from impc.model.foresight import physical_disturbances, physical_states, with_steps
+from impc.model.plant import Plant
 from impc.model.signal_errors import KINDS, OFFSET, undistorted
 from impc.model.targets import reference
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
 
 
 @dataclass(frozen=True)

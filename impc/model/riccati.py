@@ -15,21 +15,16 @@ gain, from the same equations backwards: P_k from P_{k+1}, and dP_k from dP_{k+1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, frozen, symmetric_matrix
 from impc.checking import checked
 from impc.errors import WeightsError
-from impc.model.weights import require_semidefinite
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
-    from impc.model.weights import Weights
+from impc.model.plant import Plant
+from impc.model.weights import Weights, require_semidefinite
 
 # Smallest eigenvalue ratio of a metric; below it the inverse has no correct digit.
 _SINGULAR = 1e-14

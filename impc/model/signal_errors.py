@@ -16,12 +16,9 @@ further kind is a row of `KINDS`, an entry of `search_unit` and a term of `disto
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from impc.arrays import Array, IntArray
+from impc.arrays import Array, IntArray
 
 #: By name, in the order of the rows of `Recording.errors`: words for pages; unit, after that of the
 #: signal if it begins with a space or is empty; its size; power of the sampling interval in it.

@@ -10,8 +10,9 @@ do not depend on units. The first cost weight of the inputs is 1, for scale.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -20,12 +21,8 @@ from impc.arrays import Array, frozen
 from impc.checking import Value, checked
 from impc.errors import InputError, WeightsError
 from impc.model.combinations import linear_combination
+from impc.model.plant import Plant
 from impc.model.weights import Weights
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from impc.model.plant import Plant
 
 _WORDS = ("diagonal", "full", "outputs")
 # Features count as dependent below this ratio of singular values: their cost weights are ambiguous.

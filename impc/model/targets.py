@@ -12,24 +12,18 @@ active bounds z_s solves one linear system, whose derivative is that of the targ
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, as_numbers
 from impc.checking import checked
 from impc.errors import DataError
-from impc.model.bounds import Bounds, bound_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
-
-    from impc.model.bounds import BoundRows
-    from impc.model.plant import Plant
+from impc.model.bounds import BoundRows, Bounds, bound_rows
+from impc.model.plant import Plant
 
 # Relative violation up to which a target satisfies a bound.
 _KEPT = 1e-12

@@ -6,20 +6,17 @@ are compared after `normalised`: R[0, 0] = 1, which for a single input is the R 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, frozen, symmetric_matrix
 from impc.checking import Value, checked, replace
 from impc.errors import WeightsError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True, init=False)

@@ -6,17 +6,13 @@ sandwich covariance of its estimates is the inverse Fisher information (White 19
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy.stats
 
+from impc.arrays import Array
 from impc.control.simulation import Status
+from impc.output_feedback.fit import OutputFeedbackFit
 from impc.output_feedback.intervals import confusion, person_covariance
-
-if TYPE_CHECKING:
-    from impc.arrays import Array
-    from impc.output_feedback.fit import OutputFeedbackFit
 
 # p-value below which prediction errors are not white, or follow the perturbation.
 _UNLIKELY = 0.01

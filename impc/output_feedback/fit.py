@@ -8,6 +8,7 @@ Broyden's update, and computes it by differences where it ends.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,26 +20,20 @@ from impc.assess.variance_accounted_for import whiteness
 from impc.attached_methods import attach
 from impc.checking import checked
 from impc.errors import ImpcError, InputError, SolverError
+from impc.inverse.estimates import Estimate
 from impc.inverse.minimiser import Prior, Rows, Stop, minimise
-from impc.inverse.problem import require_riccati
+from impc.inverse.problem import Problem, require_riccati
 from impc.inverse.starts import regulators
 from impc.inverse.unknowns import Point
-from impc.output_feedback.observer import LEVELS
+from impc.output_feedback.observer import LEVELS, Observer
 from impc.output_feedback.unknowns import (
     Iterate,
+    LikelihoodTerms,
     NoisyUnknowns,
     Request,
     gain_space,
     suggested,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.output_feedback.observer import Observer
-    from impc.output_feedback.unknowns import LikelihoodTerms
 
 # Lags of the whiteness test: 1 s, which shows a missed rhythm; at least this many.
 _LEAST_LAGS = 10

@@ -16,7 +16,6 @@ agree if the model is true; if not, the sandwich covariance still describes the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
@@ -24,11 +23,8 @@ import scipy.linalg
 from impc.arrays import Array, Frozen, frozen
 from impc.assess.covariance import TWO_SIDED
 from impc.errors import InputError
-from impc.output_feedback.fit import maximise
-
-if TYPE_CHECKING:
-    from impc.output_feedback.fit import OutputFeedbackFit
-    from impc.output_feedback.unknowns import Iterate, NoisyUnknowns
+from impc.output_feedback.fit import OutputFeedbackFit, maximise
+from impc.output_feedback.unknowns import Iterate, NoisyUnknowns
 
 #: A gain entry is individually identified if its standard error is below this, in whitened units.
 IDENTIFIED = 0.25

@@ -15,32 +15,32 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from impc.arrays import Array
 from impc.control.aims import aim_of
-from impc.control.closed_loop import prepare_loop
+from impc.control.closed_loop import PreparedLoop, prepare_loop
 from impc.control.compiled_values import RowDirections, Rows, workspace
+from impc.control.constraint_rows import Directions
+from impc.control.controller import Controller
 from impc.control.simulation import Scenario, Status
 from impc.errors import SolverError
 from impc.model.bounds import bound_rows
-from impc.output_feedback.compiled_filter import Belief, Clip, FilterParts, Likelihood, run_filter
-from impc.output_feedback.observer import Body, filter_changes, stationary_filter
+from impc.model.recordings import Recording
+from impc.output_feedback.compiled_filter import (
+    Belief,
+    Clip,
+    FilterParts,
+    JointLoop,
+    Likelihood,
+    run_filter,
+)
+from impc.output_feedback.observer import Body, Observer, filter_changes, stationary_filter
 from impc.output_feedback.simulation import joint_directions, joint_loop
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.arrays import Array
-    from impc.control.closed_loop import PreparedLoop
-    from impc.control.constraint_rows import Directions
-    from impc.control.controller import Controller
-    from impc.model.recordings import Recording
-    from impc.output_feedback.compiled_filter import JointLoop
-    from impc.output_feedback.observer import Observer
 
 # Status of samples at which the likelihood is undefined.
 _FAILED = (Status.INFEASIBLE, Status.UNSOLVED, Status.DIVERGED)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,28 +21,22 @@ from impc.control.aims import aim_of, window
 from impc.control.closed_loop import prepare_loop
 from impc.control.constraint_rows import directions
 from impc.errors import ImpcError
-from impc.inverse.problem import controller_for, drive_of
+from impc.inverse.estimates import Estimate
+from impc.inverse.problem import Problem, controller_for, drive_of
 from impc.inverse.regulator_span import kept_to
 from impc.model.bounds import bound_rows
+from impc.model.plant import Plant
+from impc.model.recordings import Recording
 from impc.output_feedback import intervals
 from impc.output_feedback.doubts import at_limit
-from impc.output_feedback.fit import End, fit_output_feedback, person_at
+from impc.output_feedback.fit import End, OutputFeedbackFit, fit_output_feedback, person_at
+from impc.output_feedback.intervals import PersonCovariance
 from impc.output_feedback.observer import Observer
 from impc.output_feedback.simulation import joint_loop, run_joint
 from impc.output_feedback.unknowns import Request, space_at
 from impc.reporting.document import Block, Fold, Section
 from impc.reporting.finding import Finding
 from impc.reporting.shown_units import shown_unit, signal_name
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.inverse.estimates import Estimate
-    from impc.inverse.problem import Problem
-    from impc.model.plant import Plant
-    from impc.model.recordings import Recording
-    from impc.output_feedback.fit import OutputFeedbackFit
-    from impc.output_feedback.intervals import PersonCovariance
 
 # Horizons in s at which predictions are evaluated; largest number of starts in a trial.
 _AHEAD, _STARTS = (0.0, 0.1, 0.5), 100

@@ -24,23 +24,19 @@ differential does not contain dL: with G = F - L C and dG = dF - L dC,
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, as_numbers, finite_array, frozen
 from impc.checking import Value, checked, replace
 from impc.errors import InputError, SolverError
 from impc.model.combinations import linear_combination
+from impc.model.plant import Plant
 from impc.model.riccati import is_stable, lyapunov_series
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from impc.model.plant import Plant
 
 #: Kinds of noise SDs, in the order of the unknowns.
 LEVELS = ("motor", "share", "process", "sensory", "walk")

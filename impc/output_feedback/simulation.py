@@ -17,39 +17,33 @@ At the first sample the estimate is given, and the error has its stationary cova
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from impc.arrays import Array, Frozen, finite_array, frozen
 from impc.checking import checked
 from impc.control.aims import aim_of
-from impc.control.closed_loop import prepare_loop
-from impc.control.compiled_values import workspace
+from impc.control.closed_loop import PreparedLoop, prepare_loop
+from impc.control.compiled_values import Aim, workspace
 from impc.control.constraint_rows import directions
+from impc.control.controller import Controller
 from impc.control.simulation import Status, scenario
+from impc.model.plant import Plant
 from impc.model.riccati import lyapunov_series
 from impc.output_feedback.compiled_filter import JointLoop, Trace, run_noisy
 from impc.output_feedback.observer import (
     Body,
+    Observer,
     believed_filter,
     believed_matrices,
     diagonal,
     filter_changes,
     moving_noise,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike
-
-    from impc.control.closed_loop import PreparedLoop
-    from impc.control.compiled_values import Aim
-    from impc.control.controller import Controller
-    from impc.model.plant import Plant
-    from impc.output_feedback.observer import Observer
 
 # Complex step: its square vanishes next to 1.
 _STEP = 1e-30j

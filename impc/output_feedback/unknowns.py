@@ -18,31 +18,27 @@ its information: the REML term (restricted likelihood: Patterson and Thompson 19
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from impc.arrays import Array, IntArray, frozen
-from impc.control.constraint_rows import directions
+from impc.control.constraint_rows import Directions, directions
+from impc.control.controller import Controller
 from impc.errors import ImpcError, SolverError
 from impc.inverse.laws import GainLaw, WeightLaw
+from impc.inverse.problem import Problem
 from impc.inverse.regulator_span import kept_to, regulators_alone
 from impc.inverse.residuals import residual_only
 from impc.inverse.solution_set import natural_coordinates
 from impc.inverse.unknowns import Point, Unknowns
 from impc.model.plant_family import plant_differential
 from impc.model.riccati import is_stable, lyapunov_series
+from impc.output_feedback.compiled_filter import Likelihood
 from impc.output_feedback.likelihood import NoiseDirections, joint_likelihoods, prepare_filter
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from impc.control.constraint_rows import Directions
-    from impc.control.controller import Controller
-    from impc.inverse.problem import Problem
-    from impc.output_feedback.compiled_filter import Likelihood
-    from impc.output_feedback.observer import Observer
+from impc.output_feedback.observer import Observer
 
 # Largest absolute log noise SD: its square stays in the range of double precision.
 _SQUARED = 300.0
